@@ -1,0 +1,27 @@
+# Everything happens in .venv; `make study` and `make test` need Python 3.11, git and make, nothing else.
+PYTHON ?= python3
+RUN := .venv/bin/python
+
+.PHONY: study test lint benchmark clean
+
+study: .venv/installed
+	$(RUN) -m safevar_sumo study rain
+
+test: .venv/installed
+	$(RUN) -m pytest
+
+lint: .venv/installed
+	$(RUN) -m ruff check .
+	$(RUN) -m mypy
+	.venv/bin/lint-imports --no-logo
+
+benchmark: .venv/installed
+	$(RUN) benchmarks/evaluation.py
+
+.venv/installed: setup.cfg pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(RUN) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[test]"
+	touch $@
+
+clean:
+	rm -rf .venv

@@ -1,0 +1,10 @@
+"""Automated driving systems by name."""
+
+from safevar_sumo.ads.base import Ads, Checked, PerVehicle, ScalarAds
+from safevar_sumo.ads.world_on_rails import WorldOnRails
+
+ADS = {
+    "world_on_rails": WorldOnRails,
+}
+
+__all__ = ["ADS", "Ads", "Checked", "PerVehicle", "ScalarAds"]

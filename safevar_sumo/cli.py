@@ -1,0 +1,201 @@
+"""The commands: parse, call, print."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+import msgspec
+import numpy as np
+import pandas as pd
+from rich.console import Console
+
+from safevar_sumo import terminal
+from safevar_sumo.ads import ADS
+from safevar_sumo.campaign import algorithm_of, carry_out
+from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.metrics import METRICS, time_to_collision
+from safevar_sumo.records import FloatArray, Run
+from safevar_sumo.results import ResultsDirectory, record, solutions_frame
+from safevar_sumo.scenarios import SCENARIOS, WEATHERS
+from safevar_sumo.search import ALGORITHMS
+from safevar_sumo.simulation import Engine, assemble, score, simulate
+from safevar_sumo.study import Study, load_study, study_names
+from safevar_sumo.vehicles import VEHICLES, CharacteristicSet
+
+INTERRUPTED = 130
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="safevar_sumo")
+def commands() -> None:
+    """Search the smallest variations of a vehicle that make its automated driving system unsafe, on SUMO.
+
+    STUDY is the name of a study (see: list) or the path of a study file.
+    """
+
+
+@commands.command()
+@click.argument("study")
+@click.option("--runs", type=click.IntRange(min=1), help="Runs of each algorithm.")
+@click.option("--evaluations", type=click.IntRange(min=1), help="Simulations of each run.")
+@click.option("--algorithms", help="Which algorithms, separated by commas.")
+@click.option("--seed", type=click.IntRange(min=0, max=2**63 - 1), help="Seed of the whole study.")
+@click.option("--batch", type=click.IntRange(min=1),
+              help="Settings per SUMO simulation; never changes a result.  [default: the population's size]")
+@click.option("--out", type=click.Path(path_type=Path), help="Directory of the results.  [default: results/STUDY]")
+def study(study: str, batch: int | None, out: Path | None, **options: Any) -> None:
+    """Search STUDY, and leave manifest.json and solutions.csv in a directory."""
+    chosen = _with_options(load_study(study), **options)
+    system = assemble(chosen)
+    for name in chosen.search.algorithms:
+        algorithm_of(name, chosen)
+    results = ResultsDirectory(out or Path("results") / chosen.name, chosen)
+    console = Console()
+    with terminal.CampaignProgress(Console(stderr=True), chosen) as progress:
+        campaign = carry_out(chosen, progress, batch)
+    results.write(campaign.original, solutions_frame(system.characteristics.names, campaign.solutions.items()))
+    terminal.print_summary(console, chosen, campaign)
+    console.print(f"Results: {results.path}", soft_wrap=True)
+
+
+@commands.command(name="simulate")
+@click.argument("study")
+@click.option("--set", "changes", multiple=True, metavar="NAME=VALUE", help="A characteristic's value, in its unit; may be repeated.")
+@click.option("--no-filter", is_flag=True, help="Keep changes that are smaller than the filter's thresholds.")
+@click.option("--trace", type=click.Path(path_type=Path), metavar="FILE.csv", help="Write the run, step by step.")
+@click.option("--gui", is_flag=True, help="Show it in sumo-gui.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def simulate_command(study: str, changes: tuple[str, ...], no_filter: bool, trace: Path | None, gui: bool, as_json: bool) -> None:
+    """Simulate STUDY once."""
+    chosen = load_study(study)
+    system = assemble(chosen)
+    setting = system.characteristics.setting(_assignments(changes), "--set")[np.newaxis]
+    if not no_filter:
+        setting = system.characteristics.filter(setting)
+    run = simulate(system, setting, Engine.GUI if gui else Engine.LIBSUMO)
+    if trace is not None:
+        _write_trace(trace, run)
+    values = dict(zip(system.characteristics.names, setting[0].tolist(), strict=True))
+    result = {"study": chosen.name, "vcs": values, **record(score(system, setting, run), 0)}
+    if as_json:
+        click.echo(json.dumps(result, indent=2, allow_nan=False))
+    else:
+        terminal.print_evaluation(Console(), chosen, result, system.characteristics)
+
+
+@commands.command(name="list")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def list_command(as_json: bool) -> None:
+    """List studies, vehicles, ADSs, scenarios, weathers, algorithms and metrics."""
+    studies = [load_study(name) for name in study_names()]
+    if as_json:
+        click.echo(json.dumps(_catalogue(studies), indent=2))
+    else:
+        _print_catalogue(Console(), studies)
+
+
+def main() -> None:
+    """Run the program; its exit code is 0, 1 (failed), 2 (bad input) or 130 (interrupted)."""
+    try:
+        code = commands.main(standalone_mode=False, prog_name="safevar-sumo")
+    except click.exceptions.Abort:
+        _fail("interrupted", INTERRUPTED)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except SafevarError as error:
+        _fail(str(error), error.exit_code)
+    except KeyboardInterrupt:
+        _fail("interrupted", INTERRUPTED)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _fail(message: str, code: int) -> None:
+    click.echo(f"safevar-sumo: {message}", err=True)
+    sys.exit(code)
+
+
+def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:
+    """The study with a command's options in place of its own search table."""
+    changes: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
+    if algorithms is not None:
+        changes["algorithms"] = list(dict.fromkeys(name.strip() for name in algorithms.split(",")))
+    return msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, **changes))
+
+
+def _assignments(changes: tuple[str, ...]) -> dict[str, float]:
+    values = {}
+    for change in changes:
+        name, _, text = change.partition("=")
+        try:
+            values[name] = float(text)
+        except ValueError:
+            raise InputError("--set", repr(change), "NAME=VALUE with a number in the characteristic's unit") from None
+    return values
+
+
+def _write_trace(path: Path, run: Run) -> None:
+    """One row per simulation step of the only vehicle, units in the header."""
+    trace = run.trace
+    shown = trace.active[:, 0]
+    acceleration = np.diff(trace.speed, axis=0, prepend=trace.speed[:1]) / trace.step
+    columns: dict[str, FloatArray] = {
+        "time [s]": trace.time[:, np.newaxis], "position [m]": trace.position, "speed [m/s]": trace.speed,
+        "acceleration [m/s^2]": acceleration, "gap [m]": trace.gap, "ttc [s]": time_to_collision(run),
+        "throttle [-]": trace.throttle, "brake [-]": trace.brake, "gear [-]": trace.gear}
+    frame = pd.DataFrame({name: values[shown, 0] for name, values in columns.items()}).replace(np.inf, np.nan)
+    try:
+        frame.to_csv(path, index=False, lineterminator="\n")
+    except OSError as error:
+        raise InputError("--trace", f"cannot write {path}: {error.strerror or error}", "a file in a directory that exists") from None
+
+
+def _catalogue(studies: list[Study]) -> dict[str, Any]:
+    vehicles: dict[str, list[dict[str, Any]]] = {}
+    for one in studies:
+        vehicles.setdefault(one.vehicle.model, [
+            {"name": member.name, "unit": member.unit, "original": member.original, "lower": member.lower, "upper": member.upper,
+             "threshold": member.threshold} for member in CharacteristicSet.of(one.vehicle.characteristics)])
+    return {
+        "studies": [{"name": one.name, "title": one.title, "vehicle": one.vehicle.model, "ads": one.ads.model,
+                     "scenario": one.scenario.model, "weather": _weather_name(one)} for one in studies],
+        "vehicles": [{"name": name, "characteristics": vehicles.get(name, [])} for name in VEHICLES],
+        "ads": [_described(name, cls) for name, cls in ADS.items()],
+        "scenarios": [_described(name, cls) for name, cls in SCENARIOS.items()],
+        "weathers": [msgspec.to_builtins(weather) for weather in WEATHERS.values()],
+        "algorithms": [_described(name, cls) for name, cls in ALGORITHMS.items()],
+        "metrics": [_described(name, metric) for name, metric in METRICS.items()],
+    }
+
+
+def _weather_name(study: Study) -> str:
+    return study.weather if isinstance(study.weather, str) else study.weather.name
+
+
+def _described(name: str, what: Callable[..., Any]) -> dict[str, str]:
+    """Its name, and the first sentence of its docstring."""
+    return {"name": name, "description": (what.__doc__ or "").strip().partition("\n")[0]}
+
+
+def _print_catalogue(console: Console, studies: list[Study]) -> None:
+    catalogue = _catalogue(studies)
+    terminal.print_names(console, "Studies", [tuple(row.values()) for row in catalogue["studies"]],
+                         ("name", "title", "vehicle", "ADS", "scenario", "weather"))
+    for vehicle in catalogue["vehicles"]:
+        rows = [(row["name"], row["unit"], *(f"{row[key]:g}" for key in ("original", "lower", "upper", "threshold")))
+                for row in vehicle["characteristics"]]
+        heads = ("characteristic", "unit", "original", "lower", "upper", "threshold")
+        terminal.print_names(console, f"Vehicle {vehicle['name']}", rows, heads)
+    weathers = [(row["name"], f"{row['road_friction']:g}", f"{row['visibility']:g}") for row in catalogue["weathers"]]
+    terminal.print_names(console, "Weathers", weathers, ("name", "road friction", "visibility"))
+    for title, key in (("ADSs", "ads"), ("Scenarios", "scenarios"), ("Algorithms", "algorithms"), ("Metrics", "metrics")):
+        terminal.print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "what"))

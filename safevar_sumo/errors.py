@@ -1,0 +1,44 @@
+"""What can go wrong in a way that a user can mend: told in one or two lines, never as a traceback."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class SafevarError(Exception):
+    """A failure that is not a bug of this package; the command ends with `exit_code`."""
+
+    exit_code = 1
+
+
+class InputError(SafevarError):
+    """A value that the user gave and that cannot be used.
+
+    Parameters
+    ----------
+    source
+        Where the value stands: a file, a flag or a command's argument.
+    problem
+        The key and the value, and what is wrong with them.
+    legal
+        What would be right.
+    """
+
+    exit_code = 2
+
+    def __init__(self, source: object, problem: str, legal: str = "") -> None:
+        self.source, self.problem, self.legal = source, problem, legal
+        super().__init__(source, problem, legal)
+
+    def __str__(self) -> str:
+        message = f"{self.source}: {self.problem}"
+        return f"{message}\nlegal: {self.legal}" if self.legal else message
+
+
+class SimulationError(SafevarError):
+    """SUMO, a network or an ADS failed while a simulation was prepared or ran."""
+
+
+def one_of(names: Iterable[str]) -> str:
+    """List the legal names of a choice for an error message."""
+    return "one of " + ", ".join(sorted(names))

@@ -1,0 +1,28 @@
+"""Average deceleration of the braking cycle (method section 4)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from safevar_sumo.metrics.sampling import every, total
+from safevar_sumo.records import FloatArray, Run
+from safevar_sumo.study import MetricsTable
+
+STILL = 1e-3
+"""Below this speed the vehicle no longer moves, and the braking cycle is over [m/s]."""
+
+
+def average_deceleration(run: Run, thresholds: MetricsTable) -> FloatArray:
+    """Mean loss of speed per time over the samples in which the brake is commanded and the vehicle moves.
+
+    In m/s^2, positive when slowing down; shape (N,); NaN for a vehicle that never braked.
+    """
+    stride = every(run.trace.step, thresholds.sampling_interval)
+    interval = stride * run.trace.step
+    speed, active = run.trace.speed[::stride], run.trace.active[::stride]
+    braking = (run.trace.brake[::stride] > 0) & (np.abs(speed) > STILL)
+    lost = (speed[:-1] - speed[1:]) / interval
+    counts = braking[:-1] & active[1:]
+    number = np.count_nonzero(counts, axis=0)
+    summed = total(np.where(counts, lost, 0.0))
+    return np.asarray(np.divide(summed, number, out=np.full_like(summed, np.nan), where=number > 0))

@@ -1,0 +1,164 @@
+"""What passes between the stages: what an ADS sees and commands, what a run was, what it was worth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+
+class Outcome(StrEnum):
+    """How a simulation ended."""
+
+    STOPPED = "stopped"
+    PASSED = "passed"
+    COLLISION = "collision"
+    TIMEOUT = "timeout"
+    NEVER_MOVED = "never-moved"
+    SIMULATOR_ERROR = "simulator-error"
+
+
+class Observation(NamedTuple):
+    """What the sensors of N vehicles tell their ADS; every array has shape (N,).
+
+    `gap` is the distance along the vehicle's path from its front bumper to the obstacle, infinite
+    while the obstacle is not detected [m]; `lateral` is the obstacle's offset from the middle of the
+    vehicle's lane, negative on the side that it comes from [m].
+    """
+
+    time: float
+    speed: FloatArray
+    gap: FloatArray
+    closing_speed: FloatArray
+    lateral: FloatArray
+    lateral_speed: FloatArray
+    visibility: float
+
+
+class Command(NamedTuple):
+    """Pedals that the ADS of N vehicles commands, each in [0, 1], shape (N,)."""
+
+    throttle: FloatArray
+    brake: FloatArray
+
+
+class Nominal(NamedTuple):
+    """The original vehicle as its SUMO type describes it: all that an ADS knows of the vehicle.
+
+    Mass [kg], accel and decel [m/s^2], max_speed [m/s], tau [s].
+    """
+
+    mass: float
+    accel: float
+    decel: float
+    max_speed: float
+    tau: float
+
+
+class Encounter(NamedTuple):
+    """The geometry of N vehicles and their obstacle; shape (T, N).
+
+    `separation` counts for the safety degree, `distance` and `closing_speed` for the time to
+    collision [m, m, m/s]; `in_conflict` tells when they count at all.
+    """
+
+    separation: FloatArray
+    distance: FloatArray
+    closing_speed: FloatArray
+    in_conflict: BoolArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trace:
+    """T samples of N vehicles, `step` seconds apart; arrays of shape (T, N), `time` (T,).
+
+    A vehicle's samples count while `active`; later ones are whatever SUMO did with the rest of the batch.
+    `vehicle_length`, `position`, `gap` and `lateral` in m, speeds in m/s, `throttle` and `brake` as commanded.
+    """
+
+    step: float
+    vehicle_length: float
+    time: FloatArray
+    position: FloatArray
+    speed: FloatArray
+    gap: FloatArray
+    lateral: FloatArray
+    lateral_speed: FloatArray
+    throttle: FloatArray
+    brake: FloatArray
+    gear: FloatArray
+    active: BoolArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """N simulations as they went; `outcome` holds values of `Outcome`, `collision_speed` is NaN without one [m/s]."""
+
+    trace: Trace
+    encounter: Encounter
+    outcome: npt.NDArray[np.str_]
+    collision_speed: FloatArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluations:
+    """M evaluated settings: what was simulated, how it ended, metrics and objectives.
+
+    `settings` has shape (M, n) and holds the filtered values in their table units, all else (M,).
+    `metrics` has the columns of `safevar_sumo.metrics.METRICS`; an undefined value is NaN.
+    `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count.
+    """
+
+    settings: FloatArray
+    outcome: npt.NDArray[np.str_]
+    collision_speed: FloatArray
+    metrics: Mapping[str, FloatArray]
+    f_diff: FloatArray
+    f_num_diff: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.settings)
+
+    @property
+    def f_safe(self) -> FloatArray:
+        """First objective: the safety degree (method section 3) [m, or -m/s on a collision]."""
+        return self.metrics["safety_degree"]
+
+    @property
+    def objectives(self) -> FloatArray:
+        """The three objectives, all minimised, shape (M, 3)."""
+        return np.stack([self.f_safe, self.f_diff, self.f_num_diff], axis=1)
+
+    @property
+    def collided(self) -> BoolArray:
+        return np.asarray(self.outcome == Outcome.COLLISION)
+
+    @property
+    def valid(self) -> BoolArray:
+        """Where the simulation ended in a way that can be scored."""
+        return np.asarray(self.outcome != Outcome.SIMULATOR_ERROR)
+
+    def take(self, rows: Sequence[int] | npt.NDArray[np.intp] | BoolArray) -> Evaluations:
+        """The evaluations of `rows`, in that order."""
+        return Evaluations(
+            settings=self.settings[rows], outcome=self.outcome[rows], collision_speed=self.collision_speed[rows],
+            metrics={name: values[rows] for name, values in self.metrics.items()},
+            f_diff=self.f_diff[rows], f_num_diff=self.f_num_diff[rows])
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Evaluations]) -> Evaluations:
+        """Several evaluations one after the other."""
+        def joined(name: str) -> np.ndarray:
+            return np.concatenate([getattr(part, name) for part in parts])
+
+        return cls(
+            settings=joined("settings"), outcome=joined("outcome"), collision_speed=joined("collision_speed"),
+            metrics={name: np.concatenate([part.metrics[name] for part in parts]) for name in parts[0].metrics},
+            f_diff=joined("f_diff"), f_num_diff=joined("f_num_diff"))

@@ -1,0 +1,64 @@
+"""The contract of a scenario: who meets the vehicle under test, and what of it counts."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+from safevar_sumo.records import BoolArray, Encounter, FloatArray, Trace
+
+VUT = "vut"
+"""Id of the vehicle under test in every network's traffic."""
+
+
+class World(Protocol):
+    """N copies of a network while SUMO simulates them, as a scenario sees them."""
+
+    def vehicle_positions(self, actor: str) -> FloatArray:
+        """Front bumpers of a vehicle in its N copies; shape (N, 2) [m]."""
+
+    def person_positions(self, actor: str) -> FloatArray:
+        """Positions of a person in its N copies; shape (N, 2) [m]."""
+
+    def vehicle_length(self, actor: str) -> float:
+        """Length of a vehicle [m]."""
+
+    def lane_start(self, lane: str) -> tuple[float, float]:
+        """First point of a lane's middle line, the same in all copies [m]."""
+
+    def person_width(self, actor: str) -> float:
+        """Width of a person [m]."""
+
+    def turn_back(self, person: str) -> None:
+        """Let a person turn round where it is and walk back to the edge that it came from, as fast as before."""
+
+
+class Scene(NamedTuple):
+    """The obstacle relative to N vehicles, each of shape (N,); see `Observation` for the quantities.
+
+    `over` tells where the encounter has ended and cannot come back.
+    """
+
+    gap: FloatArray
+    lateral: FloatArray
+    lateral_speed: FloatArray
+    over: BoolArray
+
+
+class Scenario(Protocol):
+    """A scenario. Its fields are the parameters that a study gives under `scenario.parameters`.
+
+    `network` is a folder of `sumo_nets/`, or the path of a folder with the same files;
+    `duration` is the length of a run [s].
+    """
+
+    network: str
+    duration: float
+
+    def begin(self, world: World) -> Any:
+        """Look at the world once, before the first step; returns what `observe` remembers."""
+
+    def observe(self, world: World, step: float, memory: Any) -> tuple[Scene, Any]:
+        """Where the obstacle is now, `step` seconds after the last look; moves it on where SUMO does not."""
+
+    def encounter(self, trace: Trace) -> Encounter:
+        """The geometry that the metrics are computed from."""

@@ -1,0 +1,53 @@
+"""NHTSA pre-crash scenario "lead vehicle stopped": both lanes ahead are blocked by parked vehicles."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import Struct
+
+from safevar_sumo.records import Encounter, FloatArray, Trace
+from safevar_sumo.scenarios.base import VUT, Scene, World
+
+PARKED = "parked_ahead"
+
+
+class _Memory(NamedTuple):
+    """Rear bumper of the parked vehicle [m] and arrays that never change; shape (N,)."""
+
+    rear: FloatArray
+    nothing: FloatArray
+
+
+class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The vehicle starts at rest and drives up to vehicles that are parked in both lanes.
+
+    Parameters
+    ----------
+    duration
+        Length of a run [s].
+
+    Notes
+    -----
+    A run ends with a collision or with its time: whoever stands may drive on.
+    """
+
+    network: str = "lead_vehicle_stopped"
+    duration: float = 16.0
+
+    def begin(self, world: World) -> _Memory:
+        rear = world.vehicle_positions(PARKED)[:, 0] - world.vehicle_length(PARKED)
+        return _Memory(rear, np.zeros_like(rear))
+
+    def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
+        gap = memory.rear - world.vehicle_positions(VUT)[:, 0]
+        return Scene(gap, memory.nothing, memory.nothing, memory.nothing > 0), memory
+
+    def encounter(self, trace: Trace) -> Encounter:
+        """Safety degree from centre to centre of two vehicles of one length; TTC = (centre distance - length) / v (method section 4)."""
+        return Encounter(
+            separation=trace.gap + trace.vehicle_length,
+            distance=trace.gap,
+            closing_speed=trace.speed,
+            in_conflict=trace.gap > 0)

@@ -1,0 +1,78 @@
+"""NHTSA pre-crash scenario "pedestrian crash with prior vehicle manoeuvre": a pedestrian walks into the lane."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import Struct
+
+from safevar_sumo.records import Encounter, FloatArray, Trace
+from safevar_sumo.scenarios.base import VUT, Scene, World
+
+PEDESTRIAN = "pedestrian"
+CROSSING_LANE = ":crossing_c0_0"
+
+
+class _Memory(NamedTuple):
+    """Where the paths cross, what lies behind it, the pedestrian's last place [m]; whether it has turned round."""
+
+    conflict_point: float
+    clear_point: float
+    place: FloatArray
+    turned: bool
+
+
+class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A pedestrian crosses the lane at right angles, turns round and walks back; never reacts to the vehicle.
+
+    Parameters
+    ----------
+    duration
+        Length of a run [s].
+    turns_after
+        How far past the middle of the lane the pedestrian turns round [m]; nothing: it walks on.
+    lane_width
+        Beyond half of it from the lane's middle the pedestrian has left the lane [m].
+
+    Notes
+    -----
+    Positions, speed and the turn are those of the published study's package.
+    """
+
+    network: str = "pedestrian_crossing"
+    duration: float = 9.5
+    turns_after: float | None = 0.7
+    lane_width: float = 4.0
+
+    def begin(self, world: World) -> _Memory:
+        lateral = world.person_positions(PEDESTRIAN)[:, 1] - world.vehicle_positions(VUT)[:, 1]
+        path, half_width = world.lane_start(CROSSING_LANE)[0], world.person_width(PEDESTRIAN) / 2
+        return _Memory(path - half_width, path + half_width + world.vehicle_length(VUT), lateral, turned=False)
+
+    def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
+        vehicle = world.vehicle_positions(VUT)
+        lateral = world.person_positions(PEDESTRIAN)[:, 1] - vehicle[:, 1]
+        if self.turns_after is not None and not memory.turned and lateral[0] >= self.turns_after:
+            world.turn_back(PEDESTRIAN)
+            memory = memory._replace(turned=True)
+        front = vehicle[:, 0]
+        lateral_speed = (lateral - memory.place) / step
+        left = (np.abs(lateral) > self.lane_width / 2) & (lateral * lateral_speed > 0)
+        passed = front > memory.clear_point
+        return Scene(memory.conflict_point - front, lateral, lateral_speed, left | passed), memory._replace(place=lateral)
+
+    def encounter(self, trace: Trace) -> Encounter:
+        """Front bumper to the pedestrian's path; TTC along the line of sight from the vehicle's centre.
+
+        TTC = (centre distance - half length) / (v cos(theta) + v_ped sin(theta)) (method section 4).
+        """
+        half_length = trace.vehicle_length / 2
+        ahead = trace.gap + half_length
+        centre_distance = np.sqrt(ahead * ahead + trace.lateral * trace.lateral)
+        nearing = trace.speed * ahead - trace.lateral_speed * trace.lateral
+        return Encounter(
+            separation=trace.gap,
+            distance=centre_distance - half_length,
+            closing_speed=nearing / centre_distance,
+            in_conflict=trace.gap > 0)

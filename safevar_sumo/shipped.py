@@ -1,0 +1,17 @@
+"""The data that ships with the code: studies and SUMO networks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def _folder(name: str) -> Path:
+    """In an installed package the folder lies inside it, in a checkout beside it."""
+    inside = _PACKAGE / name
+    return inside if inside.is_dir() else _PACKAGE.parent / name
+
+
+STUDIES = _folder("studies")
+NETWORKS = _folder("sumo_nets")

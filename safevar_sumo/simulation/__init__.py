@@ -1,0 +1,7 @@
+"""Simulation: many settings of a study in one SUMO process."""
+
+from safevar_sumo.simulation.batch import evaluate, score, simulate
+from safevar_sumo.simulation.sumo import Engine
+from safevar_sumo.simulation.system import System, assemble, nominal
+
+__all__ = ["Engine", "System", "assemble", "evaluate", "nominal", "score", "simulate"]

@@ -1,0 +1,130 @@
+"""Many settings in one SUMO simulation: the kernel of everything."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Observation, Outcome, Run, Trace
+from safevar_sumo.scenarios import VUT
+from safevar_sumo.simulation.network import copied_network
+from safevar_sumo.simulation.sumo import Engine, SumoWorld, open_world
+from safevar_sumo.simulation.system import System, nominal
+
+STANDSTILL = 1e-3
+"""Below this speed a vehicle counts as standing [m/s]."""
+
+
+def evaluate(system: System, settings: FloatArray) -> Evaluations:
+    """Simulate filtered settings, shape (N, n), in one batch and score them.
+
+    A pure function: row i of the result depends on row i of `settings` alone, to the bit.
+    """
+    return score(system, settings, simulate(system, settings))
+
+
+def score(system: System, settings: FloatArray, run: Run) -> Evaluations:
+    """Metrics and objectives of simulated settings."""
+    return Evaluations(
+        settings=settings,
+        outcome=run.outcome,
+        collision_speed=run.collision_speed,
+        metrics={name: metric(run, system.metrics) for name, metric in METRICS.items()},
+        f_diff=system.characteristics.largest_change(settings),
+        f_num_diff=system.characteristics.number_changed(settings))
+
+
+def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = ()) -> Run:
+    """Run the scenario once for every setting; shape (N, n).
+
+    Raises
+    ------
+    SimulationError
+        If SUMO fails.
+    InputError
+        If a user's ADS fails.
+    """
+    n = len(settings)
+    with open_world(copied_network(system.scenario.network, n), n, engine, options) as world:
+        return _drive(system, settings, world)
+
+
+def _drive(system: System, settings: FloatArray, world: SumoWorld) -> Run:
+    vehicle, scenario, step, n = system.vehicle, system.scenario, world.step_length, len(settings)
+    characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
+    prepared = vehicle.prepare(characteristics, system.weather.road_friction, step)
+    world.set_types(vehicle.sumo_type(prepared))
+    world.depart()
+
+    state = vehicle.at_rest(prepared)
+    driver = system.ads.start(n, nominal(system, step), step)
+    memory = scenario.begin(world)
+    log = _Log(n, round(scenario.duration / step) + 1)
+    verdict = _Verdict(n)
+    for sample in range(log.length):
+        speed = world.speeds()
+        scene, memory = scenario.observe(world, step, memory)
+        active = verdict.open & ~scene.over
+        verdict.judge(speed, scene.over, world.collisions(), last=sample == log.length - 1)
+        seen = Observation(sample * step, speed, scene.gap, speed, scene.lateral, scene.lateral_speed, system.weather.visibility)
+        seen, state = vehicle.sense(prepared, state, seen)
+        command, driver = system.ads.drive(seen, driver)
+        log.write(sample, position=world.vehicle_positions(VUT)[:, 0], speed=speed, gap=scene.gap, lateral=scene.lateral,
+                  lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active)
+        if not verdict.open.any():
+            break
+        state = vehicle.advance(prepared, state, command)
+        world.advance(np.where(verdict.open, state.speed, 0.0))
+    trace = log.trace(sample + 1, step, world.vehicle_length(VUT))
+    return Run(trace=trace, encounter=scenario.encounter(trace), outcome=verdict.outcome(), collision_speed=verdict.collision_speed)
+
+
+class _Log:
+    """Samples of a run in arrays of shape (T, N)."""
+
+    _COLUMNS = ("position", "speed", "gap", "lateral", "lateral_speed", "throttle", "brake", "gear", "active")
+
+    def __init__(self, n: int, length: int) -> None:
+        self.length = length
+        self._rows = {name: np.zeros((length, n), dtype=bool if name == "active" else float) for name in self._COLUMNS}
+
+    def write(self, sample: int, **columns: FloatArray | BoolArray) -> None:
+        for name, values in columns.items():
+            self._rows[name][sample] = values
+
+    def trace(self, length: int, step: float, vehicle_length: float) -> Trace:
+        rows = {name: values[:length] for name, values in self._rows.items()}
+        return Trace(step=step, vehicle_length=vehicle_length, time=np.arange(length, dtype=float) * step, **rows)
+
+
+class _Verdict:
+    """How N simulations end; `open` where the outcome can still change. Method section 4."""
+
+    def __init__(self, n: int) -> None:
+        self.open = np.ones(n, dtype=bool)
+        self.collision_speed = np.full(n, np.nan)
+        self._moved = np.zeros(n, dtype=bool)
+        self._stood = np.zeros(n, dtype=bool)
+        self._over = np.zeros(n, dtype=bool)
+
+    def judge(self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: bool) -> None:
+        """Take in one sample."""
+        for copy, collision_speed in collisions.items():
+            if self.open[copy]:
+                self.collision_speed[copy] = collision_speed
+                self.open[copy] = False
+        standing = speed <= STANDSTILL
+        self._stood |= self.open & self._moved & standing
+        self._moved |= self.open & ~standing
+        self._over |= self.open & over
+        self.open &= ~over & (not last)
+
+    def outcome(self) -> npt.NDArray[np.str_]:
+        """The outcome of every simulation, once none is open."""
+        outcome = np.full(len(self.open), Outcome.TIMEOUT.value, dtype="U16")
+        outcome[self._over] = Outcome.PASSED
+        outcome[self._stood] = Outcome.STOPPED
+        outcome[~self._moved] = Outcome.NEVER_MOVED
+        outcome[~np.isnan(self.collision_speed)] = Outcome.COLLISION
+        return outcome

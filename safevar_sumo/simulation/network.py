@@ -1,0 +1,153 @@
+"""N copies of a SUMO network and its traffic: same coordinates, no connection between them.
+
+They are built from the folder's plain-XML sources by netconvert, once, and kept in the user's cache
+folder by the content that they are made of.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import platformdirs
+
+from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.shipped import NETWORKS
+
+SOURCES = ("network.nod.xml", "network.edg.xml", "network.con.xml")
+TRAFFIC = "traffic.rou.xml"
+OPTIONS = "scenario.sumocfg"
+
+# Attributes that hold ids, by element; an attribute may hold several, separated by spaces.
+_IDS = {
+    "node": ("id",), "edge": ("id", "from", "to"), "connection": ("from", "to"), "crossing": ("node", "edges"),
+    "walkingArea": ("node", "edges"), "vType": ("id",), "person": ("id", "type"), "walk": ("edges", "from", "to"),
+    "vehicle": ("id", "type"), "route": ("id", "edges"), "stop": ("lane", "edge"),
+}
+
+
+class CopiedNetwork(NamedTuple):
+    """Files of N copies, and the options that SUMO runs them with."""
+
+    network: Path
+    traffic: Path
+    options: Path
+
+
+def copied_id(copy: int, name: str) -> str:
+    """Id of `name` in a copy; internal edges keep their colon in front."""
+    return f":{copy}.{name[1:]}" if name.startswith(":") else f"{copy}.{name}"
+
+
+def copied_network(folder: str, n: int) -> CopiedNetwork:
+    """At least `n` copies of a network of `sumo_nets/` (or of a folder given by path) with traffic in `n` of them.
+
+    Raises
+    ------
+    InputError
+        If the folder or one of its sources is missing or is not XML.
+    SimulationError
+        If netconvert refuses the sources or the cache cannot be written.
+    """
+    place = _folder(folder)
+    roads = _cached(place, _round_up(n), SOURCES, "network.net.xml", _build_network)
+    traffic = _cached(place, n, (TRAFFIC,), TRAFFIC, _write_traffic)
+    return CopiedNetwork(roads, traffic, place / OPTIONS)
+
+
+def netconvert_version() -> str:
+    """Version of the SUMO that builds and simulates."""
+    from importlib.metadata import version
+
+    return version("eclipse-sumo")
+
+
+def _folder(folder: str) -> Path:
+    for place in (NETWORKS / folder, Path(folder)):
+        if place.is_dir():
+            for name in (*SOURCES, TRAFFIC, OPTIONS):
+                if not (place / name).is_file():
+                    raise InputError(place, f"{name} is missing", f"a folder with {', '.join((*SOURCES, TRAFFIC, OPTIONS))}")
+            return place
+    names = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
+    raise InputError("scenario.parameters.network", f"there is no network {folder!r}", f"one of {', '.join(names)}, or a folder")
+
+
+def _round_up(n: int) -> int:
+    """1, 2, 5, 10, 20, 50, ...: a few sizes of network serve every batch."""
+    size = 1
+    while True:
+        for factor in (1, 2, 5):
+            if n <= size * factor:
+                return size * factor
+        size *= 10
+
+
+def _cached(place: Path, n: int, sources: tuple[str, ...], name: str, build) -> Path:  # type: ignore[no-untyped-def]
+    contents = tuple((place / source).read_bytes() for source in sources)
+    digest = _digest(contents, n)
+    target = platformdirs.user_cache_path("safevar_sumo") / "networks" / f"{place.name}-{n}-{digest}" / name
+    if not target.is_file():
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+                build(place, n, Path(folder))
+                os.replace(Path(folder) / name, target)
+        except OSError as error:
+            raise SimulationError(f"{target}: cannot write the cache of networks: {error.strerror}") from None
+    return target
+
+
+@cache
+def _digest(contents: tuple[bytes, ...], n: int) -> str:
+    digest = hashlib.sha256(f"{n} {netconvert_version()}".encode())
+    for content in contents:
+        digest.update(len(content).to_bytes(8, "big") + content)
+    return digest.hexdigest()[:16]
+
+
+def _copies(source: Path, n: int) -> ElementTree.ElementTree:
+    """The file's root with its children n times, every id prefixed with the copy's number."""
+    try:
+        original = ElementTree.parse(source).getroot()
+    except ElementTree.ParseError as error:
+        raise InputError(source, f"is not XML: {error}") from None
+    root = ElementTree.Element(original.tag, original.attrib)
+    for copy in range(n):
+        for child in original:
+            root.append(_prefixed(child, copy))
+    return ElementTree.ElementTree(root)
+
+
+def _prefixed(element: ElementTree.Element, copy: int) -> ElementTree.Element:
+    attributes = {
+        name: " ".join(copied_id(copy, one) for one in value.split()) if name in _IDS.get(element.tag, ()) else value
+        for name, value in element.attrib.items()}
+    result = ElementTree.Element(element.tag, attributes)
+    result.extend(_prefixed(child, copy) for child in element)
+    return result
+
+
+def _write_traffic(place: Path, n: int, into: Path) -> None:
+    _copies(place / TRAFFIC, n).write(into / TRAFFIC, encoding="utf-8", xml_declaration=True)
+
+
+def _build_network(place: Path, n: int, into: Path) -> None:
+    import sumo
+
+    for source in SOURCES:
+        _copies(place / source, n).write(into / source, encoding="utf-8", xml_declaration=True)
+    nodes, edges, connections = (str(into / source) for source in SOURCES)
+    done = subprocess.run(
+        [str(Path(sumo.SUMO_HOME) / "bin" / "netconvert"), "-n", nodes, "-e", edges, "-x", connections,
+         "-o", str(into / "network.net.xml"), "--precision", "4", "--xml-validation", "never"],
+        capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        told = (done.stderr.strip() or "no message").splitlines()[0]
+        raise SimulationError(f"{place}: netconvert refuses the network: {told}")

@@ -1,0 +1,171 @@
+"""SUMO behind one seam: the only module that imports libsumo or traci.
+
+The two share their API; libsumo runs in this process, traci talks to `sumo` or `sumo-gui` through a socket.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from safevar_sumo.errors import SimulationError
+from safevar_sumo.records import FloatArray
+from safevar_sumo.scenarios import VUT
+from safevar_sumo.simulation.network import CopiedNetwork, copied_id
+from safevar_sumo.vehicles import SumoType
+
+# Speed mode: SUMO obeys every speed that is set and yields to nobody on a junction (TraCI "set speed mode", bit 5).
+OBEY = 32
+# Lane change mode: none at all (TraCI "set lane change mode").
+KEEP_LANE = 0
+
+
+class Engine(StrEnum):
+    """Which SUMO simulates: in this process, or another process without or with a window."""
+
+    LIBSUMO = "libsumo"
+    TRACI = "traci"
+    GUI = "gui"
+
+
+class SumoWorld:
+    """N copies of a network under simulation; made by `open_world`. Shapes: (N,) or (N, 2)."""
+
+    def __init__(self, api: Any, n: int) -> None:
+        self._api, self.n = api, n
+        self._ids: dict[str, list[str]] = {}
+        self._positions: dict[str, FloatArray] = {}
+        self._copy_of = {name: copy for copy, name in enumerate(self.ids(VUT))}
+        self.step_length: float = api.simulation.getDeltaT()
+
+    def ids(self, name: str) -> list[str]:
+        """The ids of an actor in its copies."""
+        if name not in self._ids:
+            self._ids[name] = [copied_id(copy, name) for copy in range(self.n)]
+        return self._ids[name]
+
+    def set_types(self, types: SumoType) -> None:
+        """Make the vehicles under test the SUMO vehicle types that their settings say."""
+        vehicletype = self._api.vehicletype
+        for name, mass, accel, decel, max_speed, tau in zip(self.ids(VUT), *(values.tolist() for values in types), strict=True):
+            vehicletype.setMass(name, mass)
+            vehicletype.setAccel(name, accel)
+            vehicletype.setDecel(name, decel)
+            vehicletype.setEmergencyDecel(name, decel)
+            vehicletype.setMaxSpeed(name, max_speed)
+            vehicletype.setTau(name, tau)
+
+    def depart(self) -> None:
+        """Insert everybody, and take the vehicles under test into our hands.
+
+        Raises
+        ------
+        SimulationError
+            If a vehicle under test found no place.
+        """
+        self._api.simulationStep()
+        departed = set(self._api.vehicle.getIDList())
+        for name in self.ids(VUT):
+            if name not in departed:
+                raise SimulationError(f"SUMO found no place for vehicle {name!r}: look at the network's traffic file")
+            self._api.vehicle.setSpeedMode(name, OBEY)
+            self._api.vehicle.setLaneChangeMode(name, KEEP_LANE)
+
+    def advance(self, speeds: FloatArray) -> None:
+        """One simulation step in which the vehicles under test reach `speeds` [m/s]."""
+        set_speed = self._api.vehicle.setSpeed
+        for name, speed in zip(self.ids(VUT), speeds.tolist(), strict=True):
+            set_speed(name, speed)
+        self._api.simulationStep()
+        self._positions.clear()
+
+    def collisions(self) -> dict[int, float]:
+        """Copies whose vehicle under test collides in this step, and its speed [m/s]."""
+        return {
+            self._copy_of[collision.collider]: collision.colliderSpeed
+            for collision in self._api.simulation.getCollisions() if collision.collider in self._copy_of}
+
+    def speeds(self) -> FloatArray:
+        """Speeds of the vehicles under test as SUMO has them [m/s]."""
+        return np.array([self._api.vehicle.getSpeed(name) for name in self.ids(VUT)])
+
+    def vehicle_positions(self, actor: str) -> FloatArray:
+        return self._looked_up(actor, self._api.vehicle.getPosition)
+
+    def person_positions(self, actor: str) -> FloatArray:
+        return self._looked_up(actor, self._api.person.getPosition)
+
+    def _looked_up(self, actor: str, position: Callable[[str], tuple[float, float]]) -> FloatArray:
+        """Positions in this step; whoever asks again gets the same array."""
+        if actor not in self._positions:
+            self._positions[actor] = np.array([position(name) for name in self.ids(actor)])
+        return self._positions[actor]
+
+    def vehicle_length(self, actor: str) -> float:
+        return float(self._api.vehicle.getLength(self.ids(actor)[0]))
+
+    def lane_start(self, lane: str) -> tuple[float, float]:
+        x, y = self._api.lane.getShape(copied_id(0, lane))[0]
+        return x, y
+
+    def person_width(self, actor: str) -> float:
+        return float(self._api.person.getWidth(self.ids(actor)[0]))
+
+    def turn_back(self, person: str) -> None:
+        api = self._api.person
+        for name in self.ids(person):
+            back = [api.getRoadID(name), api.getEdges(name)[0]]
+            api.appendWalkingStage(name, back, 0.0, speed=api.getSpeed(name))
+            api.removeStage(name, 0)
+
+
+@contextmanager
+def open_world(files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, options: Sequence[str] = ()) -> Iterator[SumoWorld]:
+    """Start SUMO on `n` copies of a network, and close it whatever happens.
+
+    Raises
+    ------
+    SimulationError
+        With SUMO's own words, if it cannot load or loses a step.
+    """
+    api = _api(engine)
+    command = [
+        _binary(engine), "-c", str(files.options), "-n", str(files.network), "-r", str(files.traffic),
+        "--no-step-log", "true", "--no-warnings", "true", "--xml-validation", "never", "--xml-validation.net", "never",
+        "--xml-validation.routes", "never", *(["--start", "true"] if engine is Engine.GUI else []), *options]
+    try:
+        api.start(command)
+        yield SumoWorld(api, n)
+    except (api.TraCIException, api.FatalTraCIError) as error:
+        raise SimulationError(f"SUMO failed: {str(error).strip() or 'it closed the connection'}") from None
+    finally:
+        _close(api)
+
+
+def _api(engine: Engine) -> Any:
+    if engine is Engine.LIBSUMO:
+        import libsumo
+
+        return libsumo
+    import traci
+
+    return traci
+
+
+def _binary(engine: Engine) -> str:
+    if engine is Engine.LIBSUMO:
+        return "sumo"
+    import sumo
+
+    return str(Path(sumo.SUMO_HOME) / "bin" / ("sumo-gui" if engine is Engine.GUI else "sumo"))
+
+
+def _close(api: Any) -> None:
+    """Release SUMO; if it never started or its window was closed, there is nothing left to release."""
+    with suppress(api.TraCIException, api.FatalTraCIError):
+        api.close()

@@ -1,0 +1,115 @@
+"""A study's names turned into objects: the vehicle, the ADS and the scenario that are simulated together."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import msgspec
+
+from safevar_sumo.ads import ADS, Ads, Checked, PerVehicle, ScalarAds
+from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.records import Nominal
+from safevar_sumo.scenarios import SCENARIOS, Scenario, weather_of
+from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, invalid
+from safevar_sumo.vehicles import VEHICLES, CharacteristicSet, Vehicle
+
+
+@dataclass(frozen=True, kw_only=True)
+class System:
+    """What a simulation is made of."""
+
+    characteristics: CharacteristicSet
+    vehicle: Vehicle
+    ads: Ads
+    scenario: Scenario
+    weather: Weather
+    metrics: MetricsTable
+
+
+def assemble(study: Study) -> System:
+    """Look the study's models up and give them their parameters.
+
+    Raises
+    ------
+    InputError
+        Naming the study, the key, the value and what is legal.
+    """
+    source = f"study {study.name!r}"
+    vehicle = _model(VEHICLES, study.vehicle, "vehicle", source)
+    _check_units(study, vehicle, source)
+    return System(
+        characteristics=CharacteristicSet.of(study.vehicle.characteristics),
+        vehicle=vehicle,
+        ads=_ads(study.ads, source),
+        scenario=_model(SCENARIOS, study.scenario, "scenario", source),
+        weather=weather_of(study.weather, source),
+        metrics=study.metrics)
+
+
+def nominal(system: System, step: float) -> Nominal:
+    """The original vehicle on a dry road: what the ADS was developed for."""
+    original = {member.name: member.original + 0 * system.characteristics.original[:1] for member in system.characteristics}
+    types = system.vehicle.sumo_type(system.vehicle.prepare(original, 1.0, step))
+    return Nominal(*(float(values[0]) for values in types))
+
+
+def _check_units(study: Study, vehicle: Vehicle, source: str) -> None:
+    given, known = study.vehicle.characteristics, vehicle.UNITS
+    for name in given:
+        if name not in known:
+            raise InputError(source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", one_of(known))
+        if given[name].unit != known[name]:
+            raise InputError(source, f"vehicle.characteristics.{name}.unit = {given[name].unit!r}", repr(known[name]))
+    for name in known:
+        if name not in given:
+            raise InputError(source, f"vehicle.characteristics.{name} is missing", f"all of {', '.join(known)}")
+
+
+def _model(models: Mapping[str, Any], choice: ModelTable | VehicleTable, key: str, source: str) -> Any:
+    """An instance of one of our models or of a user's `package.module:Name`."""
+    cls = _class(models, choice.model, f"{key}.model", source)
+    if cls in models.values():
+        try:
+            return msgspec.convert(choice.parameters, cls)
+        except msgspec.ValidationError as error:
+            raise invalid(source, choice.parameters, error, f"{key}.parameters") from None
+    return _called(cls, choice, key, source)
+
+
+def _ads(choice: ModelTable, source: str) -> Ads:
+    cls = _class(ADS, choice.model, "ads.model", source)
+    if inspect.isclass(cls) and issubclass(cls, ScalarAds):
+        _called(cls, choice, "ads", source)
+        return Checked(PerVehicle(partial(cls, **choice.parameters)), source, choice.model)
+    ads = _model(ADS, choice, "ads", source)
+    return ads if cls in ADS.values() else Checked(ads, source, choice.model)
+
+
+def _called(cls: Any, choice: ModelTable | VehicleTable, key: str, source: str) -> Any:
+    try:
+        return cls(**choice.parameters)
+    except Exception as error:
+        problem = f"{key}.model = {choice.model!r} does not take parameters {choice.parameters}: {type(error).__name__}: {error}"
+        raise InputError(source, problem) from error
+
+
+def _class(models: Mapping[str, Any], name: str, key: str, source: str) -> Any:
+    if name in models:
+        return models[name]
+    legal = f"{one_of(models)}, or package.module:Name"
+    module_name, colon, attribute = name.partition(":")
+    if not colon:
+        raise InputError(source, f"{key} = {name!r}", legal)
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    try:
+        return getattr(importlib.import_module(module_name), attribute)
+    except Exception as error:
+        raise InputError(source, f"{key} = {name!r} cannot be imported: {type(error).__name__}: {error}", legal) from error

@@ -1,0 +1,191 @@
+"""A study: which vehicle, driven by which ADS, in which scenario and weather, searched how."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta, Struct
+
+from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.shipped import STUDIES
+
+Positive = Annotated[float, Meta(gt=0)]
+PositiveInt = Annotated[int, Meta(ge=1)]
+Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Parameters = dict[str, Any]
+
+
+class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One row of the characteristics table; the quantities are in `unit`."""
+
+    unit: str
+    original: float
+    lower: float
+    upper: float
+
+
+class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A model by its name, or by `package.module:Name`, and its parameters."""
+
+    model: str
+    parameters: Parameters = {}
+
+
+class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The vehicle under test: its model, the model's parameters, and what may vary."""
+
+    model: str
+    characteristics: dict[str, CharacteristicTable]
+    parameters: Parameters = {}
+
+
+class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Weather as data: what it does to the road and to the sensors.
+
+    `road_friction` and `visibility` are factors on the dry, clear case [-].
+    """
+
+    name: str
+    road_friction: Annotated[float, Meta(gt=0, le=1.5)]
+    visibility: Annotated[float, Meta(gt=0, le=1.5)]
+
+
+class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Thresholds of the safety metrics.
+
+    `ttc_threshold` is TTC* [s]; `sampling_interval` [s] is the time between two samples that
+    TET, TIT and aveDece are computed from (a whole multiple of the simulation's step; by default the step).
+    """
+
+    ttc_threshold: Positive
+    sampling_interval: Positive | None = None
+
+
+class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is searched with: `runs` runs of every algorithm, each with `evaluations` simulations."""
+
+    algorithms: Annotated[list[str], Meta(min_length=1)]
+    population: Annotated[int, Meta(ge=2)]
+    evaluations: PositiveInt
+    runs: PositiveInt
+    seed: Seed
+
+
+class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A whole study as its TOML file gives it; `load_study` reads one."""
+
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    title: str
+    scenario: ModelTable
+    weather: str | Weather
+    vehicle: VehicleTable
+    ads: ModelTable
+    metrics: MetricsTable
+    search: SearchTable
+
+
+def study_names() -> list[str]:
+    """Names of the studies that come with the package."""
+    return sorted(path.stem for path in STUDIES.glob("*.toml"))
+
+
+def study_path(study: str) -> Path:
+    """The file of a study that is given by its name or by a path.
+
+    Raises
+    ------
+    InputError
+        If there is neither such a study nor such a file.
+    """
+    if study in study_names():
+        return STUDIES / f"{study}.toml"
+    path = Path(study)
+    if path.is_file():
+        return path
+    legal = f"{one_of(study_names())}, or the path of a study file (TOML)"
+    raise InputError("study", f"there is no study or file {study!r}", legal)
+
+
+def load_study(study: str) -> Study:
+    """Read a study by its name or path, strictly.
+
+    Raises
+    ------
+    InputError
+        Naming file, key, value and what is legal.
+    """
+    path = study_path(study)
+    raw = _read(path, seen=())
+    try:
+        parsed = msgspec.convert(raw, Study)
+    except msgspec.ValidationError as error:
+        raise invalid(path, raw, error) from None
+    for name, row in parsed.vehicle.characteristics.items():
+        _check_characteristic(path, f"vehicle.characteristics.{name}", row)
+    for key, value in (("ttc_threshold", parsed.metrics.ttc_threshold),
+                       ("sampling_interval", parsed.metrics.sampling_interval)):
+        if value is not None and not math.isfinite(value):
+            raise InputError(path, f"metrics.{key} = {value}", "a finite number of seconds")
+    return parsed
+
+
+def invalid(source: object, raw: object, error: msgspec.ValidationError, prefix: str = "") -> InputError:
+    """Turn msgspec's error on `raw` into one that names the key and its value."""
+    problem, _, location = str(error).partition(" - at `$")
+    keys = [key for key in location.rstrip("`").replace("[...]", "").split(".") if key]
+    value, known = raw, True
+    for key in keys:
+        known = known and isinstance(value, dict) and key in value
+        value = value[key] if known and isinstance(value, dict) else None
+    where = ".".join([*([prefix] if prefix else []), *keys])
+    if known and keys and not isinstance(value, dict):
+        return InputError(source, f"{where} = {value!r}", problem)
+    return InputError(source, f"{where}: {problem}" if where else problem)
+
+
+def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
+    """Read a TOML file; what it `extends` comes first, its own keys override table by table."""
+    if path in seen:
+        raise InputError(path, f"extends = {path.stem!r} leads back to this file", "a study that does not extend this one")
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(path, f"is not TOML: {error}") from None
+    except UnicodeDecodeError as error:
+        raise InputError(path, f"is not UTF-8 text: {error}") from None
+    except OSError as error:
+        raise InputError(path, f"cannot be read: {error.strerror}") from None
+    if "extends" not in raw:
+        return raw
+    base = raw.pop("extends")
+    if not isinstance(base, str):
+        raise InputError(path, f"extends = {base!r}", "the name or path of a study")
+    beside = path.parent / base
+    return _merged(_read(beside if beside.is_file() else study_path(base), (*seen, path)), raw)
+
+
+def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Override `base` by `over`; a table with another `model` replaces the whole table."""
+    result = dict(base)
+    for key, value in over.items():
+        old = base.get(key)
+        same_model = isinstance(value, dict) and isinstance(old, dict) and value.get("model", old.get("model")) == old.get("model")
+        result[key] = _merged(old, value) if same_model and isinstance(old, dict) else value
+    return result
+
+
+def _check_characteristic(path: Path, key: str, row: CharacteristicTable) -> None:
+    values = {"original": row.original, "lower": row.lower, "upper": row.upper}
+    for name, value in values.items():
+        if not math.isfinite(value):
+            raise InputError(path, f"{key}.{name} = {value}", "a finite number")
+    if row.lower >= row.upper:
+        raise InputError(path, f"{key}: lower = {row.lower} and upper = {row.upper}", "lower < upper")
+    if not row.lower <= row.original <= row.upper:
+        raise InputError(path, f"{key}.original = {row.original}", f"a value in [{row.lower}, {row.upper}]")
+    if row.original == 0:
+        raise InputError(path, f"{key}.original = 0", "a value other than 0: changes are relative to it")

@@ -1,0 +1,11 @@
+"""Vehicle models by name, and what a setting of vehicle characteristics is."""
+
+from safevar_sumo.vehicles.base import SumoType, Vehicle, VehicleState
+from safevar_sumo.vehicles.carla import Carla
+from safevar_sumo.vehicles.characteristics import Characteristic, CharacteristicSet
+
+VEHICLES = {
+    "carla": Carla,
+}
+
+__all__ = ["VEHICLES", "Characteristic", "CharacteristicSet", "SumoType", "Vehicle", "VehicleState"]

@@ -1,0 +1,60 @@
+"""The contract of a vehicle model: from characteristics to motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
+
+from safevar_sumo.records import Command, FloatArray, Observation
+
+Characteristics = Mapping[str, FloatArray]
+"""Name -> values of N vehicles in the model's table units, each of shape (N,)."""
+
+
+class SumoType(NamedTuple):
+    """The attributes of N SUMO vehicle types, each of shape (N,): kg, m/s^2, m/s^2, m/s, s."""
+
+    mass: FloatArray
+    accel: FloatArray
+    decel: FloatArray
+    max_speed: FloatArray
+    tau: FloatArray
+
+
+class VehicleState(Protocol):
+    """What every model's state tells of N vehicles, each of shape (N,): m/s, -, -, -."""
+
+    @property
+    def speed(self) -> FloatArray: ...
+    @property
+    def throttle(self) -> FloatArray: ...
+    @property
+    def brake(self) -> FloatArray: ...
+    @property
+    def gear(self) -> FloatArray: ...
+
+
+class Vehicle(Protocol):
+    """A vehicle model. Its fields are the parameters that a study gives under `vehicle.parameters`.
+
+    Every method is a pure function over arrays of N vehicles: element i of a result depends on
+    element i of the arguments alone, to the bit. So methods use only + - * / and square roots,
+    comparisons, minima and maxima: those are exact on every machine and for every N.
+    """
+
+    UNITS: Mapping[str, str]
+
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> Any:
+        """Everything that stays the same in a run, `step` seconds a step, once computed."""
+
+    def sumo_type(self, prepared: Any) -> SumoType:
+        """The SUMO vehicle types that these vehicles are."""
+
+    def at_rest(self, prepared: Any) -> Any:
+        """The state at the start: standing, pedals released."""
+
+    def sense(self, prepared: Any, state: Any, seen: Observation) -> tuple[Observation, Any]:
+        """What the vehicles' own sensors leave of an observation, and the state after it."""
+
+    def advance(self, prepared: Any, state: Any, command: Command) -> Any:
+        """The state one simulation step later."""

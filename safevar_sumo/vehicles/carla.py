@@ -1,0 +1,195 @@
+"""LincolnMkz2017 of CARLA 0.9.10: NVIDIA PhysX 3.4, PxVehicleDrive4W, along its path.
+
+The equations are those of `PxVehicleUpdate.cpp` and `PxVehicleDefaultTireShader` (PhysX 3.4), with one
+equivalent wheel for the four. Engine, clutch, wheels and body are one linear system in a substep, with the
+tyre's secant stiffness; it is solved implicitly and in closed form, so that no stiffness limits the substep.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import Struct
+
+from safevar_sumo.records import Command, FloatArray, Observation
+from safevar_sumo.vehicles.base import Characteristics, SumoType
+
+GRAVITY = 9.81  # m/s^2
+RPM = 2 * math.pi / 60  # rad/s per r/min
+ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default
+# Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) r/min, N m, stretched over max_rpm.
+TORQUE_IDLE, TORQUE_PEAK, TORQUE_END = 400.0, 500.0, 400.0  # N m
+PEAK_AT = 1890 / 5730  # of the maximum speed
+GEAR_RATIOS = np.array([0.0, 2.85, 2.02, 1.35, 1.0])  # neutral first; blueprint of the LincolnMkz2017
+FINAL_RATIO = 4.0
+SHIFT_UP, SHIFT_DOWN = 0.65, 0.5  # of max_rpm
+WHEELS = 4
+WHEEL_MASS = 20.0  # kg each; PxVehicleWheelData.mMass
+AIR_DENSITY = 1.2  # kg/m^3
+FRONTAL_AREA = 1.84 * 1.46  # m^2, width times height of the chassis
+TIME_ROUNDING = 1e-9  # s; below it two sums of steps are the same time
+SUBSTEPS = 3  # CARLA 0.9.10 substeps at 1/60 s
+
+
+class _Prepared(NamedTuple):
+    """Constants of a run, SI, shape (N,)."""
+
+    step: float
+    mass: FloatArray
+    radius: FloatArray
+    wheel_inertia: FloatArray
+    wheel_damping: FloatArray
+    brake_torque: FloatArray
+    grip: FloatArray
+    clutch: FloatArray
+    engine_limit: FloatArray
+    damping_full: FloatArray
+    damping_engaged: FloatArray
+    damping_neutral: FloatArray
+    shift_time: FloatArray
+    air_drag: FloatArray
+
+
+class CarlaState(NamedTuple):
+    """State of N vehicles: m/s, rad/s, rad/s, -, -, s since a shift began, -, -."""
+
+    speed: FloatArray
+    wheel_speed: FloatArray
+    engine_speed: FloatArray
+    gear: FloatArray
+    target_gear: FloatArray
+    shifting: FloatArray
+    throttle: FloatArray
+    brake: FloatArray
+
+
+class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The vehicle of the settings sun and rain.
+
+    Parameters
+    ----------
+    friction_per_tire_fric
+        Friction coefficient of the tyre on a dry road per unit of tireFric [-].
+    longitudinal_stiffness
+        Longitudinal stiffness of the four tyres together [N per unit slip].
+    slip_floor
+        Least speed that a slip is relative to [m/s] (PxVehicle minLongSlipDenominator).
+    pedal_rise, pedal_fall
+        Rates of throttle and brake [1/s] (PxVehiclePadSmoothingData).
+    """
+
+    UNITS = {
+        "max_rpm": "r/min", "dampRateFullT": "kg m^2/s", "dampRateZeroT_CE": "kg m^2/s", "dampRateZeroT_CD": "kg m^2/s",
+        "gearSwitchTime": "s", "clutchStrength": "kg m^2/s", "mass": "kg", "dragCoeff": "-", "tireFric": "-",
+        "dampRate": "kg m^2/s", "radius": "cm", "maxBrakeTorque": "N m",
+    }
+
+    friction_per_tire_fric: float = 1.0
+    longitudinal_stiffness: float = 39240.0
+    slip_floor: float = 4.0
+    pedal_rise: float = 6.0
+    pedal_fall: float = 10.0
+
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> _Prepared:
+        c = characteristics
+        radius = c["radius"] / 100
+        return _Prepared(
+            step=step / SUBSTEPS, mass=c["mass"], radius=radius, wheel_inertia=WHEELS * 0.5 * WHEEL_MASS * radius * radius,
+            wheel_damping=WHEELS * c["dampRate"], brake_torque=WHEELS * c["maxBrakeTorque"],
+            grip=c["tireFric"] * (self.friction_per_tire_fric * road_friction) * c["mass"] * GRAVITY,
+            clutch=c["clutchStrength"], engine_limit=c["max_rpm"] * RPM, damping_full=c["dampRateFullT"],
+            damping_engaged=c["dampRateZeroT_CE"], damping_neutral=c["dampRateZeroT_CD"], shift_time=c["gearSwitchTime"],
+            air_drag=0.5 * AIR_DENSITY * FRONTAL_AREA * c["dragCoeff"])
+
+    def sumo_type(self, prepared: _Prepared) -> SumoType:
+        p = prepared
+        drive = TORQUE_PEAK * GEAR_RATIOS[1] * FINAL_RATIO / p.radius
+        return SumoType(
+            mass=p.mass,
+            accel=np.minimum(drive, p.grip) / p.mass,
+            decel=np.minimum(p.brake_torque / p.radius, p.grip) / p.mass,
+            max_speed=p.engine_limit / (GEAR_RATIOS[-1] * FINAL_RATIO) * p.radius,
+            tau=np.full_like(p.mass, p.step * SUBSTEPS + 1 / self.pedal_rise))
+
+    def at_rest(self, prepared: _Prepared) -> CarlaState:
+        nothing = np.zeros_like(prepared.mass)
+        return CarlaState(*(nothing for _ in CarlaState._fields))
+
+    def sense(self, prepared: _Prepared, state: CarlaState, seen: Observation) -> tuple[Observation, CarlaState]:
+        return seen, state
+
+    def advance(self, prepared: _Prepared, state: CarlaState, command: Command) -> CarlaState:
+        for _ in range(SUBSTEPS):
+            state = self._pedals(prepared, state, command)
+            state = _shift(prepared, state)
+            state = self._roll(prepared, state)
+        return state
+
+    def _pedals(self, p: _Prepared, s: CarlaState, command: Command) -> CarlaState:
+        """Pedals follow their commands at finite rates."""
+        rise, fall = self.pedal_rise * p.step, -self.pedal_fall * p.step
+        return s._replace(
+            throttle=s.throttle + np.minimum(np.maximum(command.throttle - s.throttle, fall), rise),
+            brake=s.brake + np.minimum(np.maximum(command.brake - s.brake, fall), rise))
+
+    def _roll(self, p: _Prepared, s: CarlaState) -> CarlaState:
+        """One implicit Euler step of engine, clutch, wheels and body, linear in the new speeds.
+
+        I_e dw_e/dt = throttle T(w_e) - c_e w_e - k_c (w_e - G w_w)
+        I_w dw_w/dt = G k_c (w_e - G w_w) - d w_w - T_brake - r K (r w_w - v)
+        m dv/dt = K (r w_w - v) - D v |v|
+        """
+        ratio = GEAR_RATIOS[s.gear.astype(np.intp)] * FINAL_RATIO
+        in_gear = s.gear > 0
+        clutch = np.where(in_gear, p.clutch, 0.0)
+        closed = np.where(in_gear, p.damping_engaged, p.damping_neutral)
+        damping = closed + (p.damping_full - closed) * s.throttle
+        stiffness = self._tyre_stiffness(p, s)
+
+        inverse = 1 / p.step
+        engine = ENGINE_INERTIA * inverse + damping + clutch
+        engine_free = (ENGINE_INERTIA * inverse * s.engine_speed + s.throttle * _torque(p, s.engine_speed)) / engine
+        body = p.mass * inverse + stiffness + p.air_drag * s.speed
+        body_free = p.mass * inverse * s.speed / body
+        through_clutch = ratio * clutch
+        wheel = (p.wheel_inertia * inverse + p.wheel_damping + through_clutch * ratio * (1 - clutch / engine)
+                 + stiffness * p.radius * p.radius * (1 - stiffness / body))
+        push = p.wheel_inertia * inverse * s.wheel_speed + through_clutch * engine_free + stiffness * p.radius * body_free
+        wheel_speed = np.maximum(push - s.brake * p.brake_torque, 0.0) / wheel
+        return s._replace(
+            speed=np.maximum(body_free + stiffness * p.radius * wheel_speed / body, 0.0),
+            wheel_speed=wheel_speed,
+            engine_speed=engine_free + through_clutch * wheel_speed / engine)
+
+    def _tyre_stiffness(self, p: _Prepared, s: CarlaState) -> FloatArray:
+        """Force per speed of slipping, F / (r w_w - v) [N s/m], of `PxVehicleComputeTireForceDefault`.
+
+        With slip = (r w_w - v) / max(v, r w_w, floor) and K = C |slip| / (mu load):
+        F = mu load (K - K^2 / 3 + K^3 / 27) up to K = 3, mu load beyond.
+        """
+        rim = p.radius * s.wheel_speed
+        stiffness = self.longitudinal_stiffness / np.maximum(np.maximum(s.speed, rim), self.slip_floor)
+        k = stiffness * np.abs(rim - s.speed) / p.grip
+        return stiffness * np.where(k < 3, 1 - k * (1 / 3) + k * k * (1 / 27), 1 / np.maximum(k, 3.0))
+
+
+def _torque(p: _Prepared, engine_speed: FloatArray) -> FloatArray:
+    """Engine torque at full throttle [N m]: linear between the points of the curve, zero above its end."""
+    x = engine_speed / p.engine_limit
+    rising = TORQUE_IDLE + (TORQUE_PEAK - TORQUE_IDLE) / PEAK_AT * x
+    falling = TORQUE_PEAK - (TORQUE_PEAK - TORQUE_END) / (1 - PEAK_AT) * (x - PEAK_AT)
+    return np.where(x <= 1, np.minimum(rising, falling), 0.0)
+
+
+def _shift(p: _Prepared, s: CarlaState) -> CarlaState:
+    """Automatic gearbox: a switch, the first one out of neutral included, takes its time, spent in neutral."""
+    settled = s.gear == s.target_gear
+    relative = s.engine_speed / p.engine_limit
+    up = np.where(s.gear > 0, (relative > SHIFT_UP) & (s.gear < len(GEAR_RATIOS) - 1), s.throttle > 0)
+    down = (relative < SHIFT_DOWN) & (s.gear > 1)
+    target = np.where(settled, s.gear + up - down, s.target_gear)
+    shifting = np.where(settled, 0.0, s.shifting + p.step)
+    gear = np.where((target == s.gear) | (shifting >= p.shift_time - TIME_ROUNDING), target, 0.0)
+    return s._replace(gear=gear, target_gear=target, shifting=shifting)

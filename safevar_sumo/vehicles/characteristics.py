@@ -1,0 +1,119 @@
+"""Vehicle characteristics: their domains, the filter of small changes, and how much a setting changes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import CharacteristicTable
+
+# beta of method section 2, by the least width of the domain that it holds for.
+FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Characteristic:
+    """One characteristic of the vehicle under test; all quantities in `unit`."""
+
+    name: str
+    unit: str
+    original: float
+    lower: float
+    upper: float
+
+    @property
+    def threshold(self) -> float:
+        """Largest change that the filter takes for noise: Th = beta (u - l) (method section 2)."""
+        width = self.upper - self.lower
+        return next(share for least, share in FILTER_SHARES if width >= least) * width
+
+    def check(self, value: float, source: object) -> None:
+        """Refuse a value outside the domain.
+
+        Raises
+        ------
+        InputError
+            If the value is not in [lower, upper] or not a number.
+        """
+        if not (math.isfinite(value) and self.lower <= value <= self.upper):
+            legal = f"a number in [{self.lower:g}, {self.upper:g}] {self.unit}"
+            raise InputError(source, f"{self.name} = {value}", legal)
+
+
+@dataclass(frozen=True)
+class CharacteristicSet:
+    """The n characteristics C_1..C_n of a study; settings of them are arrays of shape (N, n)."""
+
+    members: tuple[Characteristic, ...]
+
+    @classmethod
+    def of(cls, table: Mapping[str, CharacteristicTable]) -> CharacteristicSet:
+        """Take the characteristics of a study's table, in its order."""
+        return cls(tuple(
+            Characteristic(name=name, unit=row.unit, original=row.original, lower=row.lower, upper=row.upper)
+            for name, row in table.items()))
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+    def __iter__(self) -> Iterator[Characteristic]:
+        return iter(self.members)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(member.name for member in self.members)
+
+    @cached_property
+    def original(self) -> FloatArray:
+        return np.array([member.original for member in self.members])
+
+    @cached_property
+    def lower(self) -> FloatArray:
+        return np.array([member.lower for member in self.members])
+
+    @cached_property
+    def upper(self) -> FloatArray:
+        return np.array([member.upper for member in self.members])
+
+    @cached_property
+    def threshold(self) -> FloatArray:
+        return np.array([member.threshold for member in self.members])
+
+    def filter(self, settings: FloatArray) -> FloatArray:
+        """Put back to the original what changes by no more than its threshold (method section 2)."""
+        return np.where(np.abs(self.original - settings) > self.threshold, settings, self.original)
+
+    def changed(self, filtered: FloatArray) -> BoolArray:
+        """Which characteristics differ from the original; bool, shape (N, n)."""
+        return np.asarray(filtered != self.original)
+
+    def largest_change(self, filtered: FloatArray) -> FloatArray:
+        """f_diff = max_i |v_i - v''_i| / v_i, a fraction, shape (N,) (method section 3)."""
+        return np.asarray(np.max(np.abs(self.original - filtered) / np.abs(self.original), axis=1))
+
+    def number_changed(self, filtered: FloatArray) -> FloatArray:
+        """f_numDiff, the number of characteristics changed, shape (N,) (method section 3)."""
+        return np.asarray(np.count_nonzero(self.changed(filtered), axis=1), dtype=float)
+
+    def setting(self, values: Mapping[str, float], source: object) -> FloatArray:
+        """The original setting with some values replaced, checked; shape (n,).
+
+        Raises
+        ------
+        InputError
+            If a name is unknown or a value is outside its domain.
+        """
+        setting = self.original.copy()
+        for name, value in values.items():
+            if name not in self.names:
+                raise InputError(source, f"there is no characteristic {name!r}", one_of(self.names))
+            column = self.names.index(name)
+            self.members[column].check(value, source)
+            setting[column] = value
+        return setting
