@@ -1,9 +1,11 @@
 """Automated driving systems by name."""
 
 from safevar_sumo.ads.base import Ads, Checked, PerVehicle, ScalarAds
+from safevar_sumo.ads.krauss import Krauss
 from safevar_sumo.ads.world_on_rails import WorldOnRails
 
 ADS = {
+    "krauss": Krauss,
     "world_on_rails": WorldOnRails,
 }
 

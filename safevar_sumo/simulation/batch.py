@@ -12,6 +12,8 @@ from safevar_sumo.simulation.network import copied_network
 from safevar_sumo.simulation.sumo import Engine, SumoWorld, open_world
 from safevar_sumo.simulation.system import System, nominal
 
+TIME_DECIMALS = 9
+"""The third step of 0.05 s comes at 0.15 s, not at 0.15000000000000002 s."""
 STANDSTILL = 1e-3
 """Below this speed a vehicle counts as standing [m/s]."""
 
@@ -47,10 +49,11 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSU
     """
     n = len(settings)
     with open_world(copied_network(system.scenario.network, n), n, engine, options) as world:
-        return _drive(system, settings, world)
+        return drive(system, settings, world)
 
 
-def _drive(system: System, settings: FloatArray, world: SumoWorld) -> Run:
+def drive(system: System, settings: FloatArray, world: SumoWorld) -> Run:
+    """Drive the vehicles of an open world that nobody has stepped yet; see `simulate`."""
     vehicle, scenario, step, n = system.vehicle, system.scenario, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = vehicle.prepare(characteristics, system.weather.road_friction, step)
@@ -95,7 +98,7 @@ class _Log:
 
     def trace(self, length: int, step: float, vehicle_length: float) -> Trace:
         rows = {name: values[:length] for name, values in self._rows.items()}
-        return Trace(step=step, vehicle_length=vehicle_length, time=np.arange(length, dtype=float) * step, **rows)
+        return Trace(step=step, vehicle_length=vehicle_length, time=np.round(np.arange(length) * step, TIME_DECIMALS), **rows)
 
 
 class _Verdict:

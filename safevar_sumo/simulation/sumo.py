@@ -134,12 +134,8 @@ def open_world(files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, op
         With SUMO's own words, if it cannot load or loses a step.
     """
     api = _api(engine)
-    command = [
-        _binary(engine), "-c", str(files.options), "-n", str(files.network), "-r", str(files.traffic),
-        "--no-step-log", "true", "--no-warnings", "true", "--xml-validation", "never", "--xml-validation.net", "never",
-        "--xml-validation.routes", "never", *(["--start", "true"] if engine is Engine.GUI else []), *options]
     try:
-        api.start(command)
+        api.start([*sumo_command(engine, files), *options])
         yield SumoWorld(api, n)
     except (api.TraCIException, api.FatalTraCIError) as error:
         raise SimulationError(f"SUMO failed: {str(error).strip() or 'it closed the connection'}") from None
@@ -155,6 +151,14 @@ def _api(engine: Engine) -> Any:
     import traci
 
     return traci
+
+
+def sumo_command(engine: Engine, files: CopiedNetwork) -> list[str]:
+    """The command line that starts SUMO on copies of a network."""
+    return [
+        _binary(engine), "-c", str(files.options), "-n", str(files.network), "-r", str(files.traffic),
+        "--no-step-log", "true", "--no-warnings", "true", "--xml-validation", "never", "--xml-validation.net", "never",
+        "--xml-validation.routes", "never", *(["--start", "true"] if engine is Engine.GUI else [])]
 
 
 def _binary(engine: Engine) -> str:

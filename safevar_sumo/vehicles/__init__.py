@@ -3,9 +3,11 @@
 from safevar_sumo.vehicles.base import SumoType, Vehicle, VehicleState
 from safevar_sumo.vehicles.carla import Carla
 from safevar_sumo.vehicles.characteristics import Characteristic, CharacteristicSet
+from safevar_sumo.vehicles.sumo import SumoVehicle
 
 VEHICLES = {
     "carla": Carla,
+    "sumo": SumoVehicle,
 }
 
 __all__ = ["VEHICLES", "Characteristic", "CharacteristicSet", "SumoType", "Vehicle", "VehicleState"]

@@ -1,0 +1,53 @@
+"""SUMO's default car-following model as an ADS (Krauss 1998; SUMO `MSCFModel_Krauss`)."""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.records import Command, Nominal, Observation
+
+
+class _Memory(NamedTuple):
+    """What is known of the original vehicle."""
+
+    nominal: Nominal
+    step: float
+
+
+class Krauss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Never faster than allows the original vehicle to stop behind the obstacle, after a reaction time.
+
+    Parameters
+    ----------
+    cruise_speed
+        Desired speed [m/s].
+    standing_gap
+        Gap at which it means to stand [m].
+    braking_share
+        Share of the original's greatest deceleration that it plans with [-].
+    reaction_time
+        Time that it plans to lose before it brakes [s].
+    """
+
+    cruise_speed: Annotated[float, Meta(gt=0)] = 13.89
+    standing_gap: Annotated[float, Meta(ge=0)] = 2.5
+    braking_share: Annotated[float, Meta(gt=0, le=1)] = 0.6
+    reaction_time: Annotated[float, Meta(ge=0)] = 1.0
+
+    def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
+        return _Memory(nominal, step)
+
+    def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
+        """Aim at v_safe = -b tau + sqrt((b tau)^2 + 2 b gap), at rest behind a standing obstacle."""
+        nominal = memory.nominal
+        planned = self.braking_share * nominal.decel
+        lost = planned * self.reaction_time
+        gap = np.minimum(np.maximum(seen.gap - self.standing_gap, 0.0), 1e6)
+        safe = np.sqrt(lost * lost + 2 * planned * gap) - lost
+        acceleration = (np.minimum(safe, self.cruise_speed) - seen.speed) / (memory.step + nominal.tau)
+        throttle = np.minimum(np.maximum(acceleration / nominal.accel, 0.0), 1.0)
+        brake = np.minimum(np.maximum(-acceleration / nominal.decel, 0.0), 1.0)
+        return Command(throttle, brake), memory

@@ -1,0 +1,105 @@
+"""SUMO's own vehicle type as a vehicle, with the sensors and actuators that its ADS relies on."""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.records import Command, FloatArray, Observation
+from safevar_sumo.vehicles.base import Characteristics, SumoType
+from safevar_sumo.vehicles.delay import delayed, history, remembered
+
+GRAVITY = 9.81  # m/s^2
+
+
+class _Prepared(NamedTuple):
+    """Constants of a run, SI, shape (N,)."""
+
+    step: float
+    mass: FloatArray
+    accel: FloatArray
+    decel: FloatArray
+    grip: float
+    max_speed: FloatArray
+    tau: FloatArray
+    sensor_range: FloatArray
+    reaction_time: FloatArray
+    brake_delay: FloatArray
+    brake_gain: FloatArray
+
+
+class SumoState(NamedTuple):
+    """State of N vehicles: m/s, m/s^2, pedals as the actuators have them, and what is still under way."""
+
+    speed: FloatArray
+    acceleration: FloatArray
+    throttle: FloatArray
+    brake: FloatArray
+    gear: FloatArray
+    seen: FloatArray | None
+    brake_commands: FloatArray
+
+
+class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A SUMO vehicle type: greatest accelerations, top speed, and delays on the way from sensor to road.
+
+    Parameters
+    ----------
+    reference_mass
+        Mass at which accel and decel hold [kg]; at another mass the same forces accelerate another mass.
+    tyre_friction
+        Friction coefficient of the tyres on a dry road, the limit of every acceleration over g [-].
+    """
+
+    UNITS = {
+        "mass": "kg", "accel": "m/s^2", "decel": "m/s^2", "maxSpeed": "m/s", "tau": "s",
+        "sensorRange": "m", "reactionTime": "s", "brakeDelay": "s", "brakeGain": "-",
+    }
+
+    reference_mass: Annotated[float, Meta(gt=0)] = 1500.0
+    tyre_friction: Annotated[float, Meta(gt=0)] = 0.9
+
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> _Prepared:
+        c = characteristics
+        load = self.reference_mass / c["mass"]
+        return _Prepared(
+            step=step, mass=c["mass"], accel=c["accel"] * load, decel=c["decel"] * load,
+            grip=self.tyre_friction * road_friction * GRAVITY, max_speed=c["maxSpeed"], tau=c["tau"], sensor_range=c["sensorRange"],
+            reaction_time=c["reactionTime"], brake_delay=c["brakeDelay"], brake_gain=c["brakeGain"])
+
+    def sumo_type(self, prepared: _Prepared) -> SumoType:
+        p = prepared
+        return SumoType(mass=p.mass, accel=np.minimum(p.accel, p.grip), decel=np.minimum(p.decel, p.grip), max_speed=p.max_speed, tau=p.tau)
+
+    def at_rest(self, prepared: _Prepared) -> SumoState:
+        nothing = np.zeros_like(prepared.mass)
+        commands = history(float(np.max(prepared.brake_delay)), prepared.step, nothing)
+        return SumoState(nothing, nothing, nothing, nothing, nothing + 1, None, commands)
+
+    def sense(self, prepared: _Prepared, state: SumoState, seen: Observation) -> tuple[Observation, SumoState]:
+        """Sensors report what was `reactionTime` ago, and nothing beyond `sensorRange` times the visibility."""
+        p = prepared
+        now = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed])
+        past = history(float(np.max(p.reaction_time)), p.step, now) if state.seen is None else remembered(state.seen, now)
+        gap, closing_speed, lateral, lateral_speed = delayed(past, p.reaction_time, p.step)
+        detected = gap <= p.sensor_range * seen.visibility
+        late = seen._replace(
+            gap=np.where(detected, gap, np.inf), closing_speed=closing_speed, lateral=lateral, lateral_speed=lateral_speed)
+        return late, state._replace(seen=past)
+
+    def advance(self, prepared: _Prepared, state: SumoState, command: Command) -> SumoState:
+        """Acceleration follows the pedals with time constant tau; dv/dt = a, da/dt = (wanted - a) / tau."""
+        p = prepared
+        commands = remembered(state.brake_commands, command.brake)
+        brake = delayed(commands, p.brake_delay, p.step)
+        wanted = np.where(brake > 0, -brake * p.brake_gain * p.decel, command.throttle * p.accel)
+        wanted = np.minimum(np.maximum(wanted, -p.grip), p.grip)
+        acceleration = state.acceleration + (wanted - state.acceleration) * (p.step / (p.tau + p.step))
+        speed = np.minimum(np.maximum(state.speed + acceleration * p.step, 0.0), np.maximum(p.max_speed, state.speed))
+        # Whoever brakes is not driven on by what is left of the last acceleration.
+        speed = np.where(brake > 0, np.minimum(speed, state.speed), speed)
+        return state._replace(
+            speed=speed, acceleration=(speed - state.speed) / p.step, throttle=np.where(brake > 0, 0.0, command.throttle),
+            brake=brake, brake_commands=commands)
