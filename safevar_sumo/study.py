@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -17,6 +17,7 @@ Positive = Annotated[float, Meta(gt=0)]
 PositiveInt = Annotated[int, Meta(ge=1)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
+T = TypeVar("T")
 
 
 class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -120,10 +121,9 @@ def load_study(study: str) -> Study:
     """
     path = study_path(study)
     raw = _read(path, seen=())
-    try:
-        parsed = msgspec.convert(raw, Study)
-    except msgspec.ValidationError as error:
-        raise invalid(path, raw, error) from None
+    for key, row in _characteristic_rows(raw):
+        _converted(path, row, CharacteristicTable, key)  # before the whole: msgspec does not tell which row of a table is wrong
+    parsed = _converted(path, raw, Study)
     for name, row in parsed.vehicle.characteristics.items():
         _check_characteristic(path, f"vehicle.characteristics.{name}", row)
     for key, value in (("ttc_threshold", parsed.metrics.ttc_threshold),
@@ -131,6 +131,19 @@ def load_study(study: str) -> Study:
         if value is not None and not math.isfinite(value):
             raise InputError(path, f"metrics.{key} = {value}", "a finite number of seconds")
     return parsed
+
+
+def _converted(source: object, raw: object, table: type[T], prefix: str = "") -> T:
+    try:
+        return msgspec.convert(raw, table)
+    except msgspec.ValidationError as error:
+        raise invalid(source, raw, error, prefix) from None
+
+
+def _characteristic_rows(raw: dict[str, Any]) -> list[tuple[str, object]]:
+    vehicle = raw.get("vehicle")
+    rows = vehicle.get("characteristics") if isinstance(vehicle, dict) else None
+    return [(f"vehicle.characteristics.{name}", row) for name, row in rows.items()] if isinstance(rows, dict) else []
 
 
 def invalid(source: object, raw: object, error: msgspec.ValidationError, prefix: str = "") -> InputError:
@@ -142,7 +155,7 @@ def invalid(source: object, raw: object, error: msgspec.ValidationError, prefix:
         known = known and isinstance(value, dict) and key in value
         value = value[key] if known and isinstance(value, dict) else None
     where = ".".join([*([prefix] if prefix else []), *keys])
-    if known and keys and not isinstance(value, dict):
+    if known and where and not isinstance(value, dict):
         return InputError(source, f"{where} = {value!r}", problem)
     return InputError(source, f"{where}: {problem}" if where else problem)
 

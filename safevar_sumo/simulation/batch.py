@@ -68,8 +68,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld) -> Run:
     for sample in range(log.length):
         speed = world.speeds()
         scene, memory = scenario.observe(world, step, memory)
-        active = verdict.open & ~scene.over
-        verdict.judge(speed, scene.over, world.collisions(), last=sample == log.length - 1)
+        active = verdict.judge(speed, scene.over, world.collisions(), last=sample == log.length - 1)
         seen = Observation(sample * step, speed, scene.gap, speed, scene.lateral, scene.lateral_speed, system.weather.visibility)
         seen, state = vehicle.sense(prepared, state, seen)
         command, driver = system.ads.drive(seen, driver)
@@ -111,17 +110,19 @@ class _Verdict:
         self._stood = np.zeros(n, dtype=bool)
         self._over = np.zeros(n, dtype=bool)
 
-    def judge(self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: bool) -> None:
-        """Take in one sample."""
+    def judge(self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: bool) -> BoolArray:
+        """Take in one sample; returns for which vehicles it still belongs to the run."""
+        active = self.open & ~over
         for copy, collision_speed in collisions.items():
             if self.open[copy]:
                 self.collision_speed[copy] = collision_speed
-                self.open[copy] = False
+                active[copy], self.open[copy] = True, False
         standing = speed <= STANDSTILL
         self._stood |= self.open & self._moved & standing
         self._moved |= self.open & ~standing
         self._over |= self.open & over
         self.open &= ~over & (not last)
+        return active
 
     def outcome(self) -> npt.NDArray[np.str_]:
         """The outcome of every simulation, once none is open."""

@@ -1,0 +1,80 @@
+"""Copies of a network: as many as asked for, all alike, none connected with another."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+import sumo
+
+from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.simulation.network import copied_network
+
+FOLDERS = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
+BINARIES = Path(sumo.SUMO_HOME) / "bin"
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_the_recipe_builds_the_network_that_is_kept(folder: str, tmp_path: Path) -> None:
+    shutil.copytree(NETWORKS / folder, tmp_path / folder)
+    subprocess.run([str(BINARIES / "netconvert"), "-c", "network.netccfg"], cwd=tmp_path / folder, check=True, capture_output=True)
+
+    def without_head(path: Path) -> list[str]:
+        lines = path.read_text().splitlines()
+        return lines[next(i for i, line in enumerate(lines) if line.startswith("<net ")):]
+
+    assert without_head(tmp_path / folder / "network.net.xml") == without_head(NETWORKS / folder / "network.net.xml")
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_plain_sumo_runs_the_folder_as_it_is(folder: str) -> None:
+    done = subprocess.run([str(BINARIES / "sumo"), "-c", "scenario.sumocfg", "--end", "10", "--no-step-log", "true"],
+                          cwd=NETWORKS / folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_copies_share_coordinates_and_nothing_else() -> None:
+    text = copied_network("pedestrian_crossing", 2).network.read_text()
+    shapes = {copy: [line.split('shape="')[1].split('"')[0] for line in text.splitlines() if f'lane id="{copy}.approach_0"' in line]
+              for copy in (0, 1)}
+    assert shapes[0] == shapes[1] != []
+    for line in text.splitlines():
+        if "<connection " in line:
+            assert "0." not in line or "1." not in line.replace('"1.', "") or line.count('"0.') + line.count('":0.') in (0, 2, 3)
+
+
+def test_a_network_is_built_once() -> None:
+    first = copied_network("lead_vehicle_stopped", 3)
+    written = first.network.stat().st_mtime_ns
+    assert copied_network("lead_vehicle_stopped", 3) == first
+    assert first.network.stat().st_mtime_ns == written
+
+
+def test_a_users_folder_serves_as_well_and_its_content_counts(tmp_path: Path) -> None:
+    mine = tmp_path / "mine"
+    shutil.copytree(NETWORKS / "lead_vehicle_stopped", mine)
+    before = copied_network(str(mine), 1).traffic
+    traffic = mine / "traffic.rou.xml"
+    traffic.write_text(traffic.read_text().replace('departPos="85"', 'departPos="90"').replace('endPos="85"', 'endPos="90"'))
+    assert copied_network(str(mine), 1).traffic != before
+
+
+def test_a_folder_with_a_file_missing_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"network\.nod\.xml is missing"):
+        copied_network(str(tmp_path), 1)
+    with pytest.raises(InputError, match="pedestrian_crossing"):
+        copied_network("nowhere", 1)
+
+
+def test_sources_that_netconvert_refuses_are_an_error(tmp_path: Path) -> None:
+    mine = tmp_path / "mine"
+    shutil.copytree(NETWORKS / "lead_vehicle_stopped", mine)
+    (mine / "network.edg.xml").write_text('<edges><edge id="road" from="west" to="nowhere"/></edges>')
+    with pytest.raises(SimulationError, match="netconvert refuses"):
+        copied_network(str(mine), 1)
+    (mine / "network.edg.xml").write_text("<edges>")
+    with pytest.raises(InputError, match="is not XML"):
+        copied_network(str(mine), 1)
