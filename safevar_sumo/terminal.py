@@ -14,13 +14,12 @@ from rich.table import Table
 from rich.text import Text
 
 from safevar_sumo.campaign import Campaign, RunKey
-from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
-METRIC_HEADS = {"safety_degree": "SD", "tet": "TET s", "tit": "TIT s^2", "ave_dece": "aveDece m/s^2"}
-SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s. TET, TIT: over solutions without collision."
+METRIC_HEADS = {"safety_degree": "SD", "tet": "TET, s", "tit": "TIT, s^2", "ave_dece": "aveDece, m/s^2"}
+SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\nTET, TIT: over solutions without collision."
 SECONDS_BETWEEN_LINES = 30.0
 
 
@@ -84,24 +83,19 @@ class _Rate(ProgressColumn):
 
 def print_summary(console: Console, study: Study, campaign: Campaign) -> None:
     """Per algorithm what was found, beside the original vehicle; then the most critical setting."""
-    table = Table(title=study.title, caption=SAFETY_NOTE, caption_justify="left")
-    table.add_column("")
-    for head in ("solutions", "collisions", *(f"mean {METRIC_HEADS.get(name, name)}" for name in METRICS)):
-        table.add_column(head, justify="right")
-    table.add_row("original vehicle", "", _count(campaign.original.collided), *_means(campaign.original))
+    found = {"original vehicle": campaign.original}
     for algorithm in study.search.algorithms:
-        found = Evaluations.concatenate([one for key, one in campaign.solutions.items() if key.algorithm == algorithm])
-        table.add_row(algorithm, str(len(found)), _count(found.collided), *_means(found))
+        found[algorithm] = Evaluations.concatenate([one for key, one in campaign.solutions.items() if key.algorithm == algorithm])
+    table = Table("", title=study.title, title_justify="left")
+    for head in found:
+        table.add_column(head, justify="right")
+    table.add_row("solutions", "-", *(str(len(found[algorithm])) for algorithm in study.search.algorithms))
+    table.add_row("collisions", *(str(int(np.count_nonzero(one.collided))) for one in found.values()))
+    for name, head in METRIC_HEADS.items():
+        table.add_row(f"mean {head}", *(_mean(one.metrics[name]) for one in found.values()))
     console.print(table)
+    console.print(SAFETY_NOTE)
     _print_most_critical(console, study, campaign)
-
-
-def _count(flags: BoolArray) -> str:
-    return str(int(np.count_nonzero(flags)))
-
-
-def _means(evaluations: Evaluations) -> list[str]:
-    return [_mean(values) for values in evaluations.metrics.values()]
 
 
 def _mean(values: FloatArray) -> str:

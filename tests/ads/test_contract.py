@@ -1,0 +1,118 @@
+"""Every ADS: element by element, pedals in range, and whatever a foreign one does wrong is told with its name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from safevar_sumo.ads import ADS, Ads, Checked, PerVehicle, ScalarAds
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import Command, Nominal, Observation
+from safevar_sumo.simulation import assemble, nominal
+from safevar_sumo.study import load_study, study_names
+
+STEP = 0.05
+SYSTEMS = {load_study(name).ads.model: assemble(load_study(name)) for name in study_names()}
+
+
+@pytest.fixture(params=sorted(ADS))
+def name(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def observation(time: float, speed: np.ndarray, gap: np.ndarray, lateral: np.ndarray) -> Observation:
+    return Observation(time, speed, gap, speed, lateral, np.full_like(speed, 1.8), 1.0)
+
+
+def approach(ads: Ads, known: Nominal, speed: np.ndarray, gap: np.ndarray) -> np.ndarray:
+    """Pedals over time, shape (T, 2, N), of vehicles that go on at constant speed whatever they command."""
+    memory, pedals = ads.start(len(speed), known, STEP), []
+    for step in range(60):
+        seen = observation(step * STEP, speed, gap - speed * step * STEP, np.full_like(speed, -1.0))
+        command, memory = ads.drive(seen, memory)
+        pedals.append(np.stack(command))
+    return np.stack(pedals)
+
+
+def test_every_ads_is_used_by_a_shipped_study(name: str) -> None:
+    assert name in SYSTEMS
+
+
+@given(speed=arrays(float, 6, elements=st.floats(0, 15)), gap=arrays(float, 6, elements=st.floats(0.5, 80)))
+def test_pedals_stay_in_range_and_no_vehicle_knows_of_another(speed: np.ndarray, gap: np.ndarray) -> None:
+    for system in SYSTEMS.values():
+        known = nominal(system, STEP)
+        together = approach(system.ads, known, speed, gap)
+        assert np.all((together >= 0) & (together <= 1))
+        assert not np.any((together[:, 0] > 0) & (together[:, 1] > 0)), "nobody drives and brakes at once"
+        assert approach(system.ads, known, speed[2:3], gap[2:3])[..., 0].tobytes() == together[..., 2].tobytes()
+
+
+def test_a_standing_obstacle_close_ahead_makes_it_brake(name: str) -> None:
+    system = SYSTEMS[name]
+    pedals = approach(system.ads, nominal(system, STEP), np.array([8.0]), np.array([14.0]))
+    assert pedals[:, 1, 0].max() > 0.3
+
+
+def test_an_open_road_makes_it_drive(name: str) -> None:
+    system = SYSTEMS[name]
+    pedals = approach(system.ads, nominal(system, STEP), np.array([0.0]), np.array([1e3]))
+    assert pedals[-1, 0, 0] > 0.1
+    assert pedals[:, 1].max() == 0
+
+
+class Timid(ScalarAds):
+    """Brakes in front of everything, and counts how often it was asked."""
+
+    def __init__(self, distance: float = 10.0) -> None:
+        self.distance, self.asked = distance, 0
+
+    def drive(self, seen: Observation) -> tuple[float, float]:
+        self.asked += 1
+        return (0.0, 1.0) if seen.gap < self.distance else (0.1 * self.asked, 0.0)
+
+
+KNOWN = Nominal(mass=1500, accel=3, decel=8, max_speed=50, tau=0.1)
+
+
+def test_a_scalar_ads_drives_every_vehicle_with_an_instance_of_its_own() -> None:
+    ads = PerVehicle(Timid)
+    memory = ads.start(3, KNOWN, STEP)
+    gap = np.array([5.0, 50.0, 50.0])
+    for expected in ([0.0, 0.1, 0.1], [0.0, 0.2, 0.2]):
+        command, memory = ads.drive(observation(0.0, np.zeros(3), gap, np.zeros(3)), memory)
+        assert command.throttle.tolist() == pytest.approx(expected)
+        assert command.brake.tolist() == [1.0, 0.0, 0.0]
+    assert memory[0].nominal == KNOWN
+    assert memory[0].step == STEP
+
+
+class Wrong:
+    """An ADS from outside that does what it is told to do wrong."""
+
+    def __init__(self, throttle: object) -> None:
+        self._throttle = throttle
+
+    def start(self, n: int, nominal: Nominal, step: float) -> None:
+        if self._throttle == "start":
+            raise KeyError("lost")
+
+    def drive(self, seen: Observation, memory: None) -> tuple[Command, None]:
+        if self._throttle == "drive":
+            raise ZeroDivisionError("division by zero")
+        return Command(self._throttle, 0.0), None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("throttle", "told"), [
+    ("start", "raised in start: KeyError"), ("drive", "raised in drive: ZeroDivisionError"), (1.5, "throttle = 1.5"),
+    (float("nan"), "throttle = nan"), (-0.1, "throttle = -0.1"), ("much", "raised in drive"), ([0.1, 0.2, 0.3], "raised in drive"),
+])
+def test_what_a_foreign_ads_does_wrong_is_told_with_its_name(throttle: object, told: str) -> None:
+    ads = Checked(Wrong(throttle), "study 'mine'", "my_module:Wrong")
+    with pytest.raises(InputError) as caught:
+        ads.drive(observation(0.0, np.zeros(2), np.zeros(2), np.zeros(2)), ads.start(2, KNOWN, STEP))
+    assert told in str(caught.value)
+    assert "my_module:Wrong" in str(caught.value)

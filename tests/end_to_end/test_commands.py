@@ -1,0 +1,197 @@
+"""The commands as a user types them, in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from safevar_sumo.shipped import STUDIES
+
+SAFEVAR = [sys.executable, "-m", "safevar_sumo"]
+SMALL = ["--runs", "1", "--evaluations", "40"]
+
+
+def run(*arguments: str, expect: int = 0, **options: object) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run([*SAFEVAR, *arguments], capture_output=True, text=True, check=False, **options)  # type: ignore[call-overload]
+    assert done.returncode == expect, f"{done.returncode}\n{done.stdout}\n{done.stderr}"
+    assert "Traceback" not in done.stdout + done.stderr
+    return done  # type: ignore[no-any-return]
+
+
+def refused(*arguments: str, told: tuple[str, ...]) -> None:
+    done = run(*arguments, expect=2)
+    for part in told:
+        assert part in done.stderr, done.stderr
+    assert len(done.stderr.strip().splitlines()) <= 2 or done.stderr.startswith("Usage:"), done.stderr
+
+
+def test_study_leaves_manifest_and_solutions_and_nothing_else(in_tmp: Path) -> None:
+    done = run("study", "smoke")
+    assert sorted(str(path.relative_to(in_tmp)) for path in in_tmp.rglob("*")) == [
+        "results", "results/smoke", "results/smoke/manifest.json", "results/smoke/solutions.csv"]
+    frame = pd.read_csv(in_tmp / "results/smoke/solutions.csv")
+    characteristics = list(json.loads((in_tmp / "results/smoke/manifest.json").read_text())["study"]["vehicle"]["characteristics"])
+    assert list(frame.columns) == ["algorithm", "run", *characteristics, "f_safe", "f_diff", "f_num_diff", "safety_degree", "tet", "tit",
+                                   "ave_dece", "outcome"]
+    assert set(frame["run"]) == {0, 1}
+    for word in ("original vehicle", "nsga2", "Most critical setting", "results/smoke"):
+        assert word in done.stdout
+
+
+@pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
+def test_the_same_bytes_for_every_batch_size_and_from_run_to_run(study: str, in_tmp: Path) -> None:
+    contents = set()
+    for out, batch in (("a", "1"), ("b", "7"), ("c", "50"), ("d", "50")):
+        run("study", study, "--runs", "1", "--evaluations", "110", "--batch", batch, "--out", out)
+        contents.add(((in_tmp / out / "solutions.csv").read_bytes(), (in_tmp / out / "manifest.json").read_bytes()))
+    assert len(contents) == 1
+
+
+def test_another_seed_is_another_study(in_tmp: Path) -> None:
+    run("study", "smoke", *SMALL, "--out", "a", "--seed", "1")
+    run("study", "smoke", *SMALL, "--out", "b", "--seed", "2")
+    assert (in_tmp / "a/solutions.csv").read_bytes() != (in_tmp / "b/solutions.csv").read_bytes()
+    refused("study", "smoke", *SMALL, "--out", "a", "--seed", "2", told=("holds results of another study", "search.seed"))
+
+
+def test_simulate_prints_the_promised_json() -> None:
+    result = json.loads(run("simulate", "rain", "--set", "tireFric=1.5", "--set", "mass=2410", "--json").stdout)
+    assert list(result) == ["study", "vcs", "outcome", "collision", "collision_speed", "safety_degree", "tet", "tit", "ave_dece",
+                            "f_safe", "f_diff", "f_num_diff"]
+    assert result["study"] == "rain"
+    assert result["vcs"]["tireFric"] == 1.5
+    assert result["vcs"]["mass"] == 2404, "a change below the threshold is filtered"
+    assert result["f_num_diff"] == 1
+    unfiltered = json.loads(run("simulate", "rain", "--set", "tireFric=1.5", "--set", "mass=2410", "--no-filter", "--json").stdout)
+    assert unfiltered["vcs"]["mass"] == 2410
+    assert unfiltered["f_num_diff"] == 2
+
+
+def test_simulate_agrees_with_the_study_that_found_the_setting(in_tmp: Path) -> None:
+    run("study", "native", *SMALL, "--out", "out")
+    row = pd.read_csv("out/solutions.csv").iloc[0]
+    names = list(json.loads(Path("out/manifest.json").read_text())["study"]["vehicle"]["characteristics"])
+    changes = [argument for name in names for argument in ("--set", f"{name}={float(row[name])!r}")]
+    result = json.loads(run("simulate", "native", *changes, "--json").stdout)
+    assert result["f_safe"] == row["f_safe"]
+    assert result["outcome"] == row["outcome"]
+
+
+@pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
+def test_trace_has_every_quantity_with_its_unit(study: str, in_tmp: Path) -> None:
+    run("simulate", study, "--trace", "trace.csv")
+    frame = pd.read_csv("trace.csv")
+    assert list(frame.columns) == ["time [s]", "position [m]", "speed [m/s]", "acceleration [m/s^2]", "gap [m]", "ttc [s]", "throttle [-]",
+                                   "brake [-]", "gear [-]"]
+    step = np.diff(frame["time [s]"])
+    assert np.allclose(step, step[0])
+    assert np.allclose(np.diff(frame["speed [m/s]"]) / step, frame["acceleration [m/s^2]"][1:])
+
+
+def test_list_names_everything_in_text_and_json() -> None:
+    catalogue = json.loads(run("list", "--json").stdout)
+    assert set(catalogue) == {"studies", "vehicles", "ads", "scenarios", "weathers", "algorithms", "metrics"}
+    assert {row["name"] for row in catalogue["studies"]} >= {"sun", "rain", "lgsvl", "native", "smoke"}
+    carla = next(row for row in catalogue["vehicles"] if row["name"] == "carla")
+    mass = next(row for row in carla["characteristics"] if row["name"] == "mass")
+    assert mass == {"name": "mass", "unit": "kg", "original": 2404, "lower": 2040, "upper": 2700, "threshold": pytest.approx(13.2)}
+    text = run("list").stdout
+    for rows in catalogue.values():
+        for row in rows:
+            assert row["name"] in text
+
+
+def test_version_and_help_say_what_this_is() -> None:
+    assert "0.1.0" in run("--version").stdout
+    assert "automated driving" in run("--help").stdout
+
+
+def test_a_users_scalar_ads_is_named_in_a_study(in_tmp: Path) -> None:
+    Path("my_ads.py").write_text(
+        "from safevar_sumo.ads import ScalarAds\n\n\n"
+        "class Careful(ScalarAds):\n"
+        "    def __init__(self, margin):\n        self.margin = margin\n\n"
+        "    def drive(self, seen):\n"
+        "        stopping = seen.speed**2 / (2 * 0.5 * self.nominal.decel)\n"
+        "        return (0.0, 1.0) if seen.gap < stopping + self.margin else (0.3, 0.0)\n")
+    Path("mine.toml").write_text(
+        'extends = "sun"\nname = "mine"\n[ads]\nmodel = "my_ads:Careful"\nparameters = { margin = 2.0 }\n'
+        "[search]\nruns = 1\nevaluations = 60\n")
+    for command in ([*SAFEVAR], [str(Path(sys.executable).parent / "safevar-sumo")]):
+        done = subprocess.run([*command, "simulate", "mine.toml", "--json"], capture_output=True, text=True, check=True)
+        assert json.loads(done.stdout)["outcome"] in ("stopped", "passed")
+    run("study", "mine.toml")
+    assert Path("results/mine/solutions.csv").is_file()
+
+
+@pytest.mark.parametrize(("body", "told"), [
+    (None, ("my_ads:Careful", "ModuleNotFoundError")),
+    ("class Other: pass\n", ("my_ads:Careful", "AttributeError")),
+    ("raise RuntimeError('boom')\n", ("my_ads:Careful", "RuntimeError: boom")),
+    ("from safevar_sumo.ads import ScalarAds\nclass Careful(ScalarAds):\n    def drive(self, seen):\n        return 1 / 0\n",
+     ("my_ads:Careful", "raised in drive: ZeroDivisionError")),
+    ("from safevar_sumo.ads import ScalarAds\nclass Careful(ScalarAds):\n    pass\n", ("my_ads:Careful", "TypeError")),
+])
+def test_a_users_ads_that_fails_is_told_by_name(in_tmp: Path, body: str | None, told: tuple[str, ...]) -> None:
+    if body is not None:
+        Path("my_ads.py").write_text(body)
+    Path("mine.toml").write_text('extends = "sun"\nname = "mine"\n[ads]\nmodel = "my_ads:Careful"\n')
+    refused("simulate", "mine.toml", told=told)
+
+
+@pytest.mark.parametrize(("arguments", "told"), [
+    (["study", "sum"], ("sum", "rain")),
+    (["study", "sun", "--algorithms", "nsga3"], ("nsga3", "nsga2")),
+    (["study", "sun", "--runs", "0"], ("--runs", "0")),
+    (["study", "sun", "--batch", "many"], ("--batch", "many")),
+    (["study", "sun", "--out", "/proc/nowhere"], ("--out", "/proc/nowhere")),
+    (["simulate", "sun", "--set", "mass=5000"], ("mass = 5000", "[2040, 2700] kg")),
+    (["simulate", "sun", "--set", "mass=nan"], ("mass = nan",)),
+    (["simulate", "sun", "--set", "mass"], ("--set", "NAME=VALUE")),
+    (["simulate", "sun", "--set", "weight=1"], ("weight", "mass")),
+    (["simulate", "sun", "--trace", "/proc/nowhere/trace.csv"], ("--trace", "/proc/nowhere/trace.csv")),
+    (["simulate", "/"], ("/",)),
+])
+def test_bad_input_ends_with_code_2_and_says_what_is_legal(arguments: list[str], told: tuple[str, ...], in_tmp: Path) -> None:
+    refused(*arguments, told=told)
+    assert not list(in_tmp.rglob("*.csv"))
+
+
+@pytest.mark.parametrize(("old", "new", "told"), [
+    ('model = "carla"', 'model = "carl"', ("vehicle.model", "carl", "lgsvl")),
+    ('model = "world_on_rails"', 'model = "wor"', ("ads.model", "wor", "apollo")),
+    ('model = "pedestrian_crossing"', 'model = "crossing"', ("scenario.model", "crossing", "lead_vehicle_stopped")),
+    ('weather = "clear"', 'weather = "hail"', ("weather", "hail", "hard_rain")),
+    ("tireFric         =", "tyreFric         =", ("tyreFric", "tireFric")),
+    ('unit = "kg", ', 'unit = "t", ', ("vehicle.characteristics.mass.unit", "'t'", "kg")),
+    ("lower = 2040, upper = 2700", "lower = 2700, upper = 2040", ("vehicle.characteristics.mass", "lower < upper")),
+])
+def test_a_bad_study_file_ends_with_code_2(old: str, new: str, told: tuple[str, ...], in_tmp: Path) -> None:
+    text = (STUDIES / "sun.toml").read_text()
+    assert old in text
+    Path("mine.toml").write_text(text.replace(old, new))
+    refused("simulate", "mine.toml", told=told)
+
+
+def test_a_study_file_with_an_unknown_algorithm_ends_with_code_2(in_tmp: Path) -> None:
+    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n[search]\nalgorithms = ["moea"]\n')
+    refused("study", "mine.toml", told=("moea", "nsga2"))
+
+
+def test_ctrl_c_ends_with_code_130(in_tmp: Path) -> None:
+    process = subprocess.Popen([*SAFEVAR, "study", "rain", "--out", "out"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    time.sleep(4)
+    os.kill(process.pid, signal.SIGINT)
+    output, errors = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert "Traceback" not in output + errors
+    assert "interrupted" in errors
