@@ -1,18 +1,37 @@
-"""A study carried out: every run of every algorithm, its evaluations computed in batches, its results collected."""
+"""A study carried out: many runs at once, their batches computed elsewhere, their journals kept.
+
+A search is a generator that knows nothing of this. A run answers it from its journal and its memory, hands what is
+new to a pool in batches, journals the answers and sends them in: so a resumed run is a replayed one, a lost worker
+costs a batch, and no result depends on who computed what.
+"""
 
 from __future__ import annotations
 
+import time
 import zlib
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from safevar_sumo.computing import PersistentPool, Pool, packed
 from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.search import ALGORITHMS, Algorithm
-from safevar_sumo.simulation import System, assemble, evaluate
+from safevar_sumo.results import Journal, JournalBusy, ResultsDirectory
+from safevar_sumo.search import ALGORITHMS, Algorithm, Problem, Search
 from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
+
+RUNS_PER_WORKER = 2
+"""How many runs are under way for each worker: one is computed while another is searched and journalled."""
+
+PROBE_BATCHES = 4
+"""Batches on every worker that a forecast is measured with."""
+NUMBERS_BESIDE_METRICS = 4
+"""A journal keeps f_diff, f_num_diff, the collision's speed and a position and outcome with the metrics of a setting."""
 
 
 class RunKey(NamedTuple):
@@ -21,47 +40,54 @@ class RunKey(NamedTuple):
     algorithm: str
     run: int
 
+    def __str__(self) -> str:
+        return f"{self.algorithm}-{self.run:02d}"
+
 
 class Campaign(NamedTuple):
-    """What a study found: the original vehicle's evaluation, and the solutions of every run."""
+    """What runs of a study found: the original vehicle's evaluation and the solutions of every finished run.
+
+    `failures` settings could not be simulated; `busy` runs are in the hands of another process.
+    """
 
     original: Evaluations
     solutions: dict[RunKey, Evaluations]
+    failures: int
+    busy: list[RunKey]
+
+
+class Forecast(NamedTuple):
+    """Evaluations, evaluations per second, seconds and bytes that a campaign takes at the most."""
+
+    evaluations: int
+    rate: float
+    seconds: float
+    size: int
 
 
 class Observer(Protocol):
     """Is told how a campaign goes on."""
 
-    def evaluated(self, key: RunKey, evaluations: Evaluations) -> None:
-        """A population of a run is evaluated."""
+    def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
+        """A population of a run is evaluated, `simulated` of it now, the others from journal or memory."""
 
-    def finished(self, key: RunKey) -> None:
-        """A run is over."""
+    def finished(self, key: RunKey, asked: int) -> None:
+        """A run is over, after `asked` evaluations."""
+
+    def warned(self, message: str) -> None:
+        """Something happened that the user should know."""
 
 
-def carry_out(study: Study, observer: Observer, batch: int | None = None) -> Campaign:
-    """Carry out every run of a study, `batch` settings per SUMO simulation (the population's size by default).
-
-    Raises
-    ------
-    InputError
-        If the study names an algorithm or model that does not exist.
-    SimulationError
-        If SUMO fails.
-    """
-    system = assemble(study)
-    algorithms = {name: algorithm_of(name, study) for name in study.search.algorithms}
-    size = batch or study.search.population
-    original = evaluate(system, system.characteristics.original[np.newaxis])
-    keys = [RunKey(name, run) for name in algorithms for run in range(study.search.runs)]
-    return Campaign(original, {key: _run(key, algorithms[key.algorithm], study, system, observer, size) for key in keys})
+def all_runs(study: Study) -> list[RunKey]:
+    """Every run of a study."""
+    return [RunKey(name, run) for name in study.search.algorithms for run in range(study.search.runs)]
 
 
 def algorithm_of(name: str, study: Study) -> Algorithm:
     """An algorithm by name, set as the study says."""
     if name not in ALGORITHMS:
         raise InputError(f"study {study.name!r}", f"search.algorithms: there is no algorithm {name!r}", one_of(ALGORITHMS))
-    return ALGORITHMS[name](population=study.search.population)
+    return ALGORITHMS[name].of(study.search)
 
 
 def run_generator(study: Study, key: RunKey) -> np.random.Generator:
@@ -70,37 +96,166 @@ def run_generator(study: Study, key: RunKey) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(sequence))
 
 
-def _run(key: RunKey, algorithm: Algorithm, study: Study, system: System, observer: Observer, batch: int) -> Evaluations:
-    search = algorithm.search(system.characteristics, study.search.evaluations, run_generator(study, key))
-    memory = _Memory(system, batch)
-    settings = next(search)
-    while True:
-        evaluations = memory.evaluations(settings)
-        observer.evaluated(key, evaluations)
-        try:
-            settings = search.send(evaluations)
-        except StopIteration as end:
-            observer.finished(key)
-            result: Evaluations = end.value
-            return result
+def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, pool: Pool, observer: Observer,
+              batch: int | None = None) -> Campaign:
+    """Carry out runs of a study, or finish what of them is unfinished.
+
+    Parameters
+    ----------
+    keys
+        Which runs.
+    results
+        Where their journals are kept.
+    pool
+        Computes batches.
+    batch
+        Settings per SUMO simulation, the population's size by default.
+
+    Raises
+    ------
+    SafevarError
+        If a journal cannot be written or the study itself is at fault.
+    """
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    persistent, work = PersistentPool(pool, characteristics), packed(study)
+    original = _original(work, characteristics, results, persistent)
+    results.begin(original)
+    problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations)
+    campaign = Campaign(original, {}, 0, [])
+    waiting, active = deque(keys), dict[Future[Evaluations], _Run]()
+    runs: set[_Run] = set()
+
+    def go_on(run: _Run) -> None:
+        """Let a run go as far as it can, then have computed what it misses."""
+        nonlocal campaign
+        if run.advance():
+            campaign.solutions[run.key] = run.result
+            campaign = campaign._replace(failures=campaign.failures + run.failures)
+            runs.discard(run)
+            run.close()
+        else:
+            for settings in _batches(run.missing, batch or study.search.population):
+                active[persistent.submit(work, settings)] = run
+
+    try:
+        while waiting or active:
+            while waiting and len(runs) < RUNS_PER_WORKER * persistent.workers:
+                key = waiting.popleft()
+                try:
+                    journal = results.journal(str(key))
+                except JournalBusy:
+                    campaign.busy.append(key)
+                    continue
+                runs.add(run := _Run(key, algorithm_of(key.algorithm, study).search(problem, run_generator(study, key)), journal, observer))
+                go_on(run)
+            for future in wait(active, return_when=FIRST_COMPLETED).done if active else ():
+                run = active.pop(future)
+                if run.take(future.result()):
+                    go_on(run)
+    finally:
+        for run in runs:
+            run.close()
+    return campaign._replace(solutions={key: campaign.solutions[key] for key in sorted(campaign.solutions)})
 
 
-class _Memory:
-    """Evaluates settings in batches; a setting that was simulated before is answered from memory."""
+def forecast(study: Study, runs: int, pool: Pool, batch: int | None = None) -> Forecast:
+    """What carrying out `runs` runs takes at the most, after a short probe of the pool that will do it."""
+    characteristics, size = CharacteristicSet.of(study.vehicle.characteristics), batch or study.search.population
+    persistent, work, rng = PersistentPool(pool, characteristics), packed(study), np.random.default_rng(study.search.seed)
 
-    def __init__(self, system: System, batch: int) -> None:
-        self._system, self._batch = system, batch
-        self._known: dict[bytes, Evaluations] = {}
+    def probe(number: int) -> float:
+        """Seconds that `number` batches on every worker take."""
+        start = time.perf_counter()
+        drawn = [characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (size, len(characteristics))))
+                 for _ in range(number * pool.workers)]
+        wait([persistent.submit(work, settings) for settings in drawn])
+        return time.perf_counter() - start
 
-    def evaluations(self, settings: FloatArray) -> Evaluations:
-        """The evaluations of `settings`, row by row."""
-        keys = [row.tobytes() for row in settings]
-        new = {key: row for key, row in zip(keys, settings, strict=True) if key not in self._known}
-        for batch in _batches(np.array(list(new.values())), self._batch):
-            evaluated = evaluate(self._system, batch)
-            for i, row in enumerate(batch):
-                self._known[row.tobytes()] = evaluated.take([i])
-        return Evaluations.concatenate([self._known[key] for key in keys])
+    probe(1)  # starts the workers and builds the network
+    rate = PROBE_BATCHES * pool.workers * size / probe(PROBE_BATCHES)
+    evaluations = runs * study.search.evaluations
+    row = 8 * (len(characteristics) + len(METRICS) + NUMBERS_BESIDE_METRICS)
+    return Forecast(evaluations, rate, evaluations / rate, evaluations * row)
+
+
+def _original(work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: PersistentPool) -> Evaluations:
+    """The original vehicle's evaluation, simulated once; where it fails, the study is at fault."""
+    journal = results.journal("original")
+    try:
+        if journal.evaluations is None:
+            evaluations = pool.submit(work, characteristics.original[np.newaxis], must_succeed=True).result()
+            journal.append([0], evaluations)
+            return evaluations
+        return journal.evaluations
+    finally:
+        journal.close()
+
+
+class _Run:
+    """A search, what it asks for, and what of that is known."""
+
+    def __init__(self, key: RunKey, search: Search, journal: Journal, observer: Observer) -> None:
+        self.key, self._search, self._journal, self._observer = key, search, journal, observer
+        self._known: dict[bytes, tuple[int, Evaluations]] = {}
+        self.failures = self._asked = 0
+        self._settings: FloatArray | None = None
+        self._fresh = 0
+        self.result: Evaluations
+        if journal.cut:
+            observer.warned(f"{journal.path}: the last {journal.cut} bytes were torn; what they held is simulated again")
+        if journal.evaluations is not None:
+            self._learn(journal.positions, journal.evaluations)
+
+    @property
+    def missing(self) -> FloatArray:
+        """What the search asks for and nobody knows yet, each once; shape (k, n)."""
+        assert self._settings is not None
+        return np.array(list({row.tobytes(): row for row in self._settings if row.tobytes() not in self._known}.values()))
+
+    def advance(self) -> bool:
+        """Answer the search as long as everything it asks for is known; whether it has ended."""
+        if self._journal.result is not None:
+            self.result = self._by_position(self._journal.result)
+            self._observer.finished(self.key, self._journal.asked)
+            return True
+        if self._settings is None:
+            self._settings = next(self._search)
+        while not len(self.missing):
+            evaluations = Evaluations.concatenate([self._known[row.tobytes()][1] for row in self._settings])
+            self._observer.evaluated(self.key, evaluations, self._fresh)
+            self._asked, self._fresh = self._asked + len(evaluations), 0
+            try:
+                self._settings = self._search.send(evaluations)
+            except StopIteration as end:
+                self.result = end.value
+                self._journal.finish([self._known[row.tobytes()][0] for row in self.result.settings], self._asked)
+                self._observer.finished(self.key, self._asked)
+                return True
+        return False
+
+    def take(self, evaluations: Evaluations) -> bool:
+        """Journal and learn a computed batch; whether that was all that was missing."""
+        assert self._settings is not None
+        places = {row.tobytes(): self._asked + i for i, row in reversed(list(enumerate(self._settings)))}
+        positions = [places[row.tobytes()] for row in evaluations.settings]
+        self._journal.append(positions, evaluations)
+        self._learn(positions, evaluations)
+        self._fresh += len(evaluations)
+        return not len(self.missing)
+
+    def close(self) -> None:
+        """Give the journal back."""
+        self._journal.close()
+
+    def _learn(self, positions: list[int], evaluations: Evaluations) -> None:
+        self.failures += int(np.count_nonzero(~evaluations.valid))
+        for i, position in enumerate(positions):
+            self._known[evaluations.settings[i].tobytes()] = (position, evaluations.take([i]))
+
+    def _by_position(self, positions: list[int]) -> Evaluations:
+        assert self._journal.evaluations is not None
+        row_of = {position: row for row, position in enumerate(self._journal.positions)}
+        return self._journal.evaluations.take([row_of[position] for position in positions])
 
 
 def _batches(settings: FloatArray, size: int) -> Iterator[FloatArray]:

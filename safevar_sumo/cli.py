@@ -17,11 +17,12 @@ from rich.console import Console
 
 from safevar_sumo import terminal
 from safevar_sumo.ads import ADS
-from safevar_sumo.campaign import algorithm_of, carry_out
+from safevar_sumo.campaign import RunKey, algorithm_of, all_runs, carry_out, forecast
+from safevar_sumo.computing import available_cores, cluster_pool, local_pool
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS, time_to_collision
 from safevar_sumo.records import FloatArray, Run
-from safevar_sumo.results import ResultsDirectory, record, solutions_frame
+from safevar_sumo.results import ResultsDirectory, record
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.simulation import Engine, assemble, score, simulate
@@ -49,19 +50,34 @@ def commands() -> None:
 @click.option("--batch", type=click.IntRange(min=1),
               help="Settings per SUMO simulation; never changes a result.  [default: the population's size]")
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the results.  [default: results/STUDY]")
-def study(study: str, batch: int | None, out: Path | None, **options: Any) -> None:
-    """Search STUDY, and leave manifest.json and solutions.csv in a directory."""
+@click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
+@click.option("--cluster", metavar="ADDRESS", help="Compute on the workers of this Dask scheduler instead.")
+@click.option("--only", metavar="ALGORITHM:RUN", help="This run alone, the first run is 0.")
+@click.option("--shard", metavar="K/N", help="Every N-th run, from the K-th (1..N): for job arrays that share --out.")
+@click.option("--quiet", is_flag=True, help="Print errors and warnings alone.")
+@click.option("--dry-run", is_flag=True, help="Tell what would run, how long and how much disk it would take.")
+def study(study: str, batch: int | None, out: Path | None, jobs: int | None, cluster: str | None, only: str | None, shard: str | None,
+          quiet: bool, dry_run: bool, **options: Any) -> None:
+    """Search STUDY; the same command again goes on where it was stopped."""
     chosen = _with_options(load_study(study), **options)
-    system = assemble(chosen)
+    assemble(chosen)
     for name in chosen.search.algorithms:
         algorithm_of(name, chosen)
-    results = ResultsDirectory(out or Path("results") / chosen.name, chosen)
-    console = Console()
-    with terminal.CampaignProgress(Console(stderr=True), chosen) as progress:
-        campaign = carry_out(chosen, progress, batch)
-    results.write(campaign.original, solutions_frame(system.characteristics.names, campaign.solutions.items()))
-    terminal.print_summary(console, chosen, campaign)
-    console.print(f"Results: {results.path}", soft_wrap=True)
+    keys = _selected(all_runs(chosen), only, shard)
+    with cluster_pool(cluster) if cluster else local_pool(jobs or available_cores(), chosen.search.time_limit) as pool:
+        if dry_run:
+            terminal.print_forecast(Console(), chosen, len(keys), forecast(chosen, len(keys), pool, batch))
+            return
+        results = ResultsDirectory(out or Path("results") / chosen.name, chosen)
+        with terminal.CampaignProgress(Console(stderr=True), chosen, keys, quiet) as progress:
+            campaign = carry_out(chosen, keys, results, pool, progress, batch)
+    if campaign.busy:
+        raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: the same command later finishes the study")
+    if keys == all_runs(chosen):
+        results.finish(campaign.solutions)
+    if not quiet:
+        terminal.print_summary(Console(), chosen, campaign)
+        Console().print(f"Results: {results.path}", soft_wrap=True)
 
 
 @commands.command(name="simulate")
@@ -130,6 +146,21 @@ def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -
     if algorithms is not None:
         changes["algorithms"] = list(dict.fromkeys(name.strip() for name in algorithms.split(",")))
     return msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, **changes))
+
+
+def _selected(keys: list[RunKey], only: str | None, shard: str | None) -> list[RunKey]:
+    """The runs that a command asks for."""
+    if only is not None:
+        algorithm, _, run = only.rpartition(":")
+        keys = [key for key in keys if key.algorithm == algorithm and str(key.run) == run]
+        if not keys:
+            raise InputError("--only", repr(only), "ALGORITHM:RUN, an algorithm of the study and a run from 0 to less than --runs")
+    if shard is not None:
+        first, _, number = shard.partition("/")
+        if not (first.isdecimal() and number.isdecimal() and 1 <= int(first) <= int(number)):
+            raise InputError("--shard", repr(shard), "K/N, with K in 1..N")
+        keys = keys[int(first) - 1::int(number)]
+    return keys
 
 
 def _assignments(changes: tuple[str, ...]) -> dict[str, float]:

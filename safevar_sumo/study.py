@@ -67,13 +67,17 @@ class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is searched with: `runs` runs of every algorithm, each with `evaluations` simulations."""
+    """What is searched with: `runs` runs of every algorithm, each with `evaluations` simulations.
+
+    A batch of simulations that takes longer than `time_limit` [s] is taken for hung.
+    """
 
     algorithms: Annotated[list[str], Meta(min_length=1)]
     population: Annotated[int, Meta(ge=2)]
     evaluations: PositiveInt
     runs: PositiveInt
     seed: Seed
+    time_limit: Positive = 300.0
 
 
 class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
-from rich.text import Text
 
-from safevar_sumo.campaign import Campaign, RunKey
+from safevar_sumo.campaign import Campaign, Forecast, RunKey
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -24,20 +23,22 @@ SECONDS_BETWEEN_LINES = 30.0
 
 
 class CampaignProgress:
-    """A bar on a terminal, a line now and then elsewhere: what is done, how fast, how long yet, what was found."""
+    """Bars on a terminal, a line now and then elsewhere: what is done, how fast, how long yet, what was found."""
 
-    def __init__(self, console: Console, study: Study) -> None:
-        search = study.search
-        self._console, self._runs = console, len(search.algorithms) * search.runs
-        self._total = self._runs * search.evaluations
-        self._done = self._finished = self._collisions = 0
-        self._asked: dict[RunKey, int] = {}
-        self._best = np.inf
-        self._started = self._spoke = time.monotonic()
+    def __init__(self, console: Console, study: Study, keys: list[RunKey], quiet: bool) -> None:
+        self._console, self._quiet = console, quiet
+        shown = console.is_terminal and not quiet
         self._bar = Progress(
-            TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn(), _Rate(), TimeRemainingColumn(),
-            TextColumn("{task.fields[found]}"), console=console, disable=not console.is_terminal)
-        self._task = self._bar.add_task(self._runs_told(), total=self._total, found="")
+            TextColumn("{task.description}"), BarColumn(bar_width=20), TextColumn("{task.fields[told]}"), TimeRemainingColumn(),
+            console=console, disable=not shown)
+        self._lines = {}
+        for name in study.search.algorithms:
+            runs = sum(key.algorithm == name for key in keys)
+            if runs:
+                task = self._bar.add_task(name, total=runs * study.search.evaluations, told="")
+                self._lines[name] = _Line(name, runs, study.search.evaluations, task)
+        self._asked: dict[RunKey, int] = {}
+        self._spoke = time.monotonic()
 
     def __enter__(self) -> CampaignProgress:
         self._bar.start()
@@ -46,55 +47,94 @@ class CampaignProgress:
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def evaluated(self, key: RunKey, evaluations: Evaluations) -> None:
+    def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
         self._asked[key] = self._asked.get(key, 0) + len(evaluations)
-        self._done += len(evaluations)
+        self._lines[key.algorithm].take_in(evaluations, simulated)
+        self._tell(self._lines[key.algorithm])
+
+    def finished(self, key: RunKey, asked: int) -> None:
+        self._lines[key.algorithm].close_run(asked, self._asked.pop(key, 0))
+        self._tell(self._lines[key.algorithm])
+
+    def warned(self, message: str) -> None:
+        self._console.print(f"warning: {message}", soft_wrap=True, markup=False, highlight=False)
+
+    def _tell(self, line: _Line) -> None:
+        self._bar.update(line.task, completed=line.done, total=line.total, told=line.told())
+        now = time.monotonic()
+        if not self._console.is_terminal and not self._quiet and now - self._spoke >= SECONDS_BETWEEN_LINES:
+            self._spoke = now
+            for one in self._lines.values():
+                self._console.print(f"{one.name}: {one.told()}, {one.left()}", soft_wrap=True, highlight=False)
+
+
+class _Line:
+    """How far the runs of one algorithm are."""
+
+    def __init__(self, name: str, runs: int, evaluations: int, task: TaskID) -> None:
+        self.name, self.task = name, task
+        self.done, self.total = 0, runs * evaluations
+        self._evaluations, self._runs = evaluations, runs
+        self._finished = self._collisions = self._simulated = 0
+        self._best = np.inf
+        self._first: float | None = None
+
+    def take_in(self, evaluations: Evaluations, simulated: int) -> None:
+        self._first = self._first or time.monotonic()
+        self.done += len(evaluations)
+        self._simulated += simulated
         self._collisions += int(np.count_nonzero(evaluations.collided))
         if evaluations.valid.any():
             self._best = min(self._best, float(np.min(evaluations.f_safe[evaluations.valid])))
-        self._tell()
 
-    def finished(self, key: RunKey) -> None:
+    def close_run(self, asked: int, seen: int) -> None:
+        """A run that ends early asks for less than its budget; one from a finished journal was never seen."""
         self._finished += 1
-        self._total -= self._total // self._runs - self._asked.pop(key)
-        self._tell()
+        self.done += asked - seen
+        self.total -= self._evaluations - asked
 
-    def _runs_told(self) -> str:
-        return f"runs {self._finished}/{self._runs}"
+    def told(self) -> str:
+        found = "" if np.isinf(self._best) else f", best SD {self._best:.2f}, collisions {self._collisions}"
+        return f"runs {self._finished}/{self._runs}, {self._rate():.0f} evaluations/s{found}"
 
-    def _tell(self) -> None:
-        found = f"best SD {self._best:.2f}, collisions {self._collisions}"
-        self._bar.update(self._task, completed=self._done, total=self._total, description=self._runs_told(), found=found)
-        now = time.monotonic()
-        if not self._console.is_terminal and now - self._spoke >= SECONDS_BETWEEN_LINES:
-            rate = self._done / (now - self._started)
-            left = (self._total - self._done) / rate
-            self._spoke = now
-            self._console.print(
-                f"{self._runs_told()}, {self._done} of {self._total} evaluations, {rate:.0f}/s, {left:.0f} s left, {found}")
+    def left(self) -> str:
+        rate = self._rate()
+        return f"{(self.total - self.done) / rate:.0f} s left" if rate else "time left not known yet"
+
+    def _rate(self) -> float:
+        return self._simulated / max(time.monotonic() - self._first, 1e-3) if self._first else 0.0
 
 
-class _Rate(ProgressColumn):
-    """Evaluations per second."""
-
-    def render(self, task: Task) -> Text:
-        return Text("- evaluations/s" if task.speed is None else f"{task.speed:.0f} evaluations/s")
+def print_forecast(console: Console, study: Study, runs: int, told: Forecast) -> None:
+    """What a campaign would take."""
+    table = Table(title=study.title, title_justify="left", show_header=False)
+    table.add_row("algorithms", ", ".join(study.search.algorithms))
+    table.add_row("runs", str(runs))
+    table.add_row("evaluations, at the most", str(told.evaluations))
+    table.add_row("evaluations/s, measured by a short probe", f"{told.rate:.0f}")
+    table.add_row("time, at the most", f"{told.seconds / 60:.1f} min")
+    table.add_row("disk, at the most", f"{told.size / 1e6:.0f} MB")
+    console.print(table)
 
 
 def print_summary(console: Console, study: Study, campaign: Campaign) -> None:
     """Per algorithm what was found, beside the original vehicle; then the most critical setting."""
     found = {"original vehicle": campaign.original}
     for algorithm in study.search.algorithms:
-        found[algorithm] = Evaluations.concatenate([one for key, one in campaign.solutions.items() if key.algorithm == algorithm])
+        of_it = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]
+        if of_it:
+            found[algorithm] = Evaluations.concatenate(of_it)
     table = Table("", title=study.title, title_justify="left")
     for head in found:
         table.add_column(head, justify="right")
-    table.add_row("solutions", "-", *(str(len(found[algorithm])) for algorithm in study.search.algorithms))
+    table.add_row("solutions", "-", *(str(len(one)) for one in list(found.values())[1:]))
     table.add_row("collisions", *(str(int(np.count_nonzero(one.collided))) for one in found.values()))
     for name, head in METRIC_HEADS.items():
         table.add_row(f"mean {head}", *(_mean(one.metrics[name]) for one in found.values()))
     console.print(table)
     console.print(SAFETY_NOTE)
+    if campaign.failures:
+        console.print(f"{campaign.failures} settings could not be simulated (simulator-error); they are in no result.")
     _print_most_critical(console, study, campaign)
 
 

@@ -1,10 +1,13 @@
 """Automated driving systems by name."""
 
+from collections.abc import Mapping
+from typing import Any
+
 from safevar_sumo.ads.base import Ads, Checked, PerVehicle, ScalarAds
 from safevar_sumo.ads.krauss import Krauss
 from safevar_sumo.ads.world_on_rails import WorldOnRails
 
-ADS = {
+ADS: Mapping[str, type[Any]] = {
     "krauss": Krauss,
     "world_on_rails": WorldOnRails,
 }

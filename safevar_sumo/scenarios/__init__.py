@@ -1,11 +1,14 @@
 """Scenarios by name."""
 
+from collections.abc import Mapping
+from typing import Any
+
 from safevar_sumo.scenarios.base import VUT, Scenario, Scene, World
 from safevar_sumo.scenarios.lead_vehicle_stopped import LeadVehicleStopped
 from safevar_sumo.scenarios.pedestrian_crossing import PedestrianCrossing
 from safevar_sumo.scenarios.weather import WEATHERS, weather_of
 
-SCENARIOS = {
+SCENARIOS: Mapping[str, type[Any]] = {
     "pedestrian_crossing": PedestrianCrossing,
     "lead_vehicle_stopped": LeadVehicleStopped,
 }

@@ -1,10 +1,16 @@
-"""Search algorithms by name; each is made with the population's size."""
+"""Search algorithms by name."""
 
-from safevar_sumo.search.base import Algorithm, Search
+from collections.abc import Mapping
+
+from safevar_sumo.search.base import Algorithm, Problem, Search
 from safevar_sumo.search.nsga2 import Nsga2
+from safevar_sumo.search.random_search import RandomSearch
+from safevar_sumo.search.safe_fuzzer import SafeFuzzer
 
-ALGORITHMS = {
+ALGORITHMS: Mapping[str, type[Algorithm]] = {
     "nsga2": Nsga2,
+    "rs": RandomSearch,
+    "safe_fuzzer": SafeFuzzer,
 }
 
-__all__ = ["ALGORITHMS", "Algorithm", "Search"]
+__all__ = ["ALGORITHMS", "Algorithm", "Problem", "Search"]

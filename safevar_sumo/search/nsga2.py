@@ -5,13 +5,15 @@ from __future__ import annotations
 import random
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Self
 
 import numpy as np
 from deap import base, tools
 from msgspec import Struct
 
 from safevar_sumo.records import Evaluations
-from safevar_sumo.search.base import Search
+from safevar_sumo.search.base import Problem, Search
+from safevar_sumo.study import SearchTable
 from safevar_sumo.vehicles import CharacteristicSet
 
 
@@ -20,12 +22,14 @@ class _Fitness(base.Fitness):  # type: ignore[misc]
 
 
 class _Individual(list[float]):
-    """Unfiltered values of a setting, its rank in the population, and where its evaluation stands."""
+    """Unfiltered values of a setting, its evaluation (of one row), and its rank in the population."""
+
+    evaluation: Evaluations
+    rank: int
 
     def __init__(self, values: list[float]) -> None:
         super().__init__(values)
         self.fitness = _Fitness()
-        self.evaluation = self.rank = -1
 
 
 class Nsga2(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -41,26 +45,27 @@ class Nsga2(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     crossover_index: float = 20.0
     mutation_index: float = 20.0
 
-    def search(self, characteristics: CharacteristicSet, evaluations: int, rng: np.random.Generator) -> Search:
+    @classmethod
+    def of(cls, table: SearchTable) -> Self:
+        return cls(population=table.population)
+
+    def search(self, problem: Problem, rng: np.random.Generator) -> Search:
+        characteristics = problem.characteristics
         variation = _Variation(self, characteristics, random.Random(int(rng.integers(2**63))))
-        archive: list[Evaluations] = []
-        size = min(self.population, evaluations)
-        initial = rng.uniform(characteristics.lower, characteristics.upper, (size, len(characteristics)))
+        initial = problem.uniform(min(self.population, problem.evaluations), rng)
         brood = [_Individual(values) for values in initial.tolist()]
         population: list[_Individual] = []
-        done = 0
+        asked = 0
         while brood:
-            filtered = characteristics.filter(np.array(brood))
-            evaluated = yield filtered
-            for i, individual in enumerate(brood):
-                individual.evaluation = done + i
-                individual.fitness.values = tuple(evaluated.objectives[i].tolist())
-            archive.append(evaluated)
-            done += len(brood)
-            population += [individual for individual, valid in zip(brood, evaluated.valid, strict=True) if valid]
-            population = _survivors(population, self.population)
-            brood = variation.offspring(population, min(self.population, evaluations - done))
-        return Evaluations.concatenate(archive).take([one.evaluation for one in population if one.rank == 0])
+            evaluated = yield characteristics.filter(np.array(brood))
+            for i, (individual, objectives) in enumerate(zip(brood, evaluated.objectives.tolist(), strict=True)):
+                individual.evaluation = evaluated.take([i])
+                individual.fitness.values = tuple(objectives)
+            asked += len(brood)
+            population = _survivors(population + [one for one in brood if one.evaluation.valid[0]], self.population)
+            brood = variation.offspring(population, min(self.population, problem.evaluations - asked))
+        front = [one.evaluation for one in population if one.rank == 0]
+        return Evaluations.concatenate(front) if front else evaluated.take([])
 
 
 class _Variation:

@@ -1,11 +1,14 @@
 """Vehicle models by name, and what a setting of vehicle characteristics is."""
 
+from collections.abc import Mapping
+from typing import Any
+
 from safevar_sumo.vehicles.base import SumoType, Vehicle, VehicleState
 from safevar_sumo.vehicles.carla import Carla
 from safevar_sumo.vehicles.characteristics import Characteristic, CharacteristicSet
 from safevar_sumo.vehicles.sumo import SumoVehicle
 
-VEHICLES = {
+VEHICLES: Mapping[str, type[Any]] = {
     "carla": Carla,
     "sumo": SumoVehicle,
 }

@@ -91,7 +91,8 @@ def test_average_deceleration_is_that_of_the_braking_cycle() -> None:
 def test_a_vehicle_that_never_brakes_has_no_average_deceleration() -> None:
     run = braking_run(10, 5, 12)
     coasting = Trace(**{**{name: getattr(run.trace, name) for name in run.trace.__dataclass_fields__}, "brake": run.trace.throttle})
-    assert np.isnan(value("ave_dece", Run(trace=coasting, encounter=run.encounter, outcome=run.outcome, collision_speed=run.collision_speed)))
+    never = Run(trace=coasting, encounter=run.encounter, outcome=run.outcome, collision_speed=run.collision_speed)
+    assert np.isnan(value("ave_dece", never))
 
 
 def test_samples_after_a_vehicles_end_do_not_count() -> None:

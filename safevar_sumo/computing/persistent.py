@@ -1,0 +1,86 @@
+"""A pool that does not give up because a worker did: again, then one setting at a time, then without that setting."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+
+import numpy as np
+
+from safevar_sumo.computing.base import Pool
+from safevar_sumo.errors import SafevarError
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.vehicles import CharacteristicSet
+
+ATTEMPTS = 2
+"""How often a batch is tried as a whole."""
+FAILURES_IN_A_ROW = 20
+"""So many settings that fail one after the other are a fault of the study, not of the settings."""
+
+
+class PersistentPool:
+    """Settings that fail alone are evaluated as `simulator-error`; too many of them in a row are an error."""
+
+    def __init__(self, pool: Pool, characteristics: CharacteristicSet) -> None:
+        self._pool, self._characteristics, self._in_a_row = pool, characteristics, 0
+
+    @property
+    def workers(self) -> int:
+        """How many batches are computed at the same time."""
+        return self._pool.workers
+
+    def submit(self, study: bytes, settings: FloatArray, *, must_succeed: bool = False) -> Future[Evaluations]:
+        """Evaluate filtered settings, shape (k, n); with `must_succeed` a failure is an error, not an outcome."""
+        result: Future[Evaluations] = Future()
+        self._attempt(study, settings, ATTEMPTS, result, must_succeed)
+        return result
+
+    def _attempt(self, study: bytes, settings: FloatArray, attempts: int, into: Future[Evaluations], must_succeed: bool) -> None:
+        def done(attempt: Future[Evaluations]) -> None:
+            error = attempt.exception()
+            if error is None:
+                self._in_a_row = 0
+                into.set_result(attempt.result())
+            elif not isinstance(error, SafevarError):
+                into.set_exception(error)
+            elif attempts > 1:
+                self._attempt(study, settings, attempts - 1, into, must_succeed)
+            elif len(settings) > 1:
+                self._one_by_one(study, settings, into)
+            else:
+                self._give_up(settings, error, into, must_succeed)
+
+        self._pool.submit(study, settings).add_done_callback(done)
+
+    def _one_by_one(self, study: bytes, settings: FloatArray, into: Future[Evaluations]) -> None:
+        def done(row: int, single: Future[Evaluations]) -> None:
+            if single.exception() is not None:
+                into.set_exception(single.exception())
+                return
+            rows.append(single.result())
+            if row + 1 < len(settings):
+                alone(row + 1)
+            else:
+                into.set_result(Evaluations.concatenate(rows))
+
+        def alone(row: int) -> None:
+            single: Future[Evaluations] = Future()
+            single.add_done_callback(lambda future: done(row, future))
+            self._attempt(study, settings[row:row + 1], 1, single, must_succeed=False)
+
+        rows: list[Evaluations] = []
+        alone(0)
+
+    def _give_up(self, setting: FloatArray, error: SafevarError, into: Future[Evaluations], must_succeed: bool) -> None:
+        self._in_a_row += 1
+        if must_succeed or self._in_a_row >= FAILURES_IN_A_ROW:
+            into.set_exception(error)
+        else:
+            into.set_result(self._failed(setting))
+
+    def _failed(self, setting: FloatArray) -> Evaluations:
+        undefined = np.full(1, np.nan)
+        return Evaluations(
+            settings=setting, outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"), collision_speed=undefined,
+            metrics=dict.fromkeys(METRICS, undefined), f_diff=self._characteristics.largest_change(setting),
+            f_num_diff=self._characteristics.number_changed(setting))

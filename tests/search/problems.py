@@ -1,0 +1,49 @@
+"""Problems whose answer is known, and a way to run an algorithm on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from safevar_sumo.records import Evaluations, Outcome
+from safevar_sumo.search import ALGORITHMS, Problem, Search
+from safevar_sumo.study import SearchTable, load_study
+from safevar_sumo.vehicles import CharacteristicSet
+
+SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+POPULATION = 20
+Evaluate = Callable[[CharacteristicSet, np.ndarray], Evaluations]
+
+
+def evaluated(characteristics: CharacteristicSet, settings: np.ndarray, safety: np.ndarray) -> Evaluations:
+    nothing = np.full(len(settings), np.nan)
+    return Evaluations(
+        settings=settings, outcome=np.full(len(settings), Outcome.STOPPED.value, dtype="U16"), collision_speed=nothing,
+        metrics={"safety_degree": safety}, f_diff=characteristics.largest_change(settings),
+        f_num_diff=characteristics.number_changed(settings))
+
+
+def sphere(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
+    """The safer, the nearer to the lower ends of the domains."""
+    share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
+    return evaluated(characteristics, settings, np.add.accumulate(share**2, axis=1)[:, -1])
+
+
+def begun(name: str, seed: int, evaluations: int, characteristics: CharacteristicSet = SUN) -> Search:
+    table = SearchTable(algorithms=[name], population=POPULATION, evaluations=evaluations, runs=1, seed=seed)
+    original = sphere(characteristics, characteristics.original[np.newaxis])
+    problem = Problem(characteristics=characteristics, original=original, evaluations=evaluations)
+    return ALGORITHMS[name].of(table).search(problem, np.random.default_rng(seed))
+
+
+def searched(name: str, seed: int, evaluations: int, characteristics: CharacteristicSet = SUN,
+             evaluate: Evaluate = sphere) -> tuple[Evaluations, list[np.ndarray]]:
+    """Run an algorithm to its end; returns its result and all populations that it asked for."""
+    search = begun(name, seed, evaluations, characteristics)
+    asked = [next(search)]
+    while True:
+        try:
+            asked.append(search.send(evaluate(characteristics, asked[-1])))
+        except StopIteration as end:
+            return end.value, asked
