@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
@@ -50,9 +50,11 @@ class Command(NamedTuple):
 
 
 class Nominal(NamedTuple):
-    """The original vehicle as its SUMO type describes it: all that an ADS knows of the vehicle.
+    """The original vehicle on a dry road: all that an ADS knows of the vehicle.
 
-    Mass [kg], accel and decel [m/s^2], max_speed [m/s], tau [s].
+    `mass` [kg], `accel`, `decel` [m/s^2], `max_speed` [m/s] and `tau` [s] are those of its SUMO type. The tables hold
+    at `speeds` [m/s]: what it gains at `full_throttle` and what it loses `coasting` [m/s^2]; `braking` is what the
+    brake adds per unit of pedal, far from the limit of the tyres [m/s^2].
     """
 
     mass: float
@@ -60,6 +62,10 @@ class Nominal(NamedTuple):
     decel: float
     max_speed: float
     tau: float
+    speeds: FloatArray
+    full_throttle: FloatArray
+    coasting: FloatArray
+    braking: float
 
 
 class Encounter(NamedTuple):
@@ -151,6 +157,13 @@ class Evaluations:
             settings=self.settings[rows], outcome=self.outcome[rows], collision_speed=self.collision_speed[rows],
             metrics={name: values[rows] for name, values in self.metrics.items()},
             f_diff=self.f_diff[rows], f_num_diff=self.f_num_diff[rows])
+
+    @classmethod
+    def none(cls, n: int, metrics: Iterable[str]) -> Evaluations:
+        """No evaluation of settings of `n` characteristics."""
+        empty = np.zeros(0)
+        return cls(settings=np.zeros((0, n)), outcome=np.zeros(0, dtype="U16"), collision_speed=empty,
+                   metrics=dict.fromkeys(metrics, empty), f_diff=empty, f_num_diff=empty)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Evaluations]) -> Evaluations:

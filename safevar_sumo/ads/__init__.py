@@ -3,11 +3,13 @@
 from collections.abc import Mapping
 from typing import Any
 
+from safevar_sumo.ads.apollo import Apollo
 from safevar_sumo.ads.base import Ads, Checked, PerVehicle, ScalarAds
 from safevar_sumo.ads.krauss import Krauss
 from safevar_sumo.ads.world_on_rails import WorldOnRails
 
 ADS: Mapping[str, type[Any]] = {
+    "apollo": Apollo,
     "krauss": Krauss,
     "world_on_rails": WorldOnRails,
 }

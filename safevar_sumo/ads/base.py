@@ -41,7 +41,7 @@ class ScalarAds(ABC):
         Parameters
         ----------
         nominal
-            The original vehicle: mass [kg], accel, decel [m/s^2], max_speed [m/s], tau [s].
+            What is known of the original vehicle.
         step
             Time between two calls of `drive` [s].
         """

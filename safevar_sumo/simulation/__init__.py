@@ -2,6 +2,6 @@
 
 from safevar_sumo.simulation.batch import evaluate, score, simulate
 from safevar_sumo.simulation.sumo import Engine
-from safevar_sumo.simulation.system import System, assemble, nominal
+from safevar_sumo.simulation.system import System, assemble
 
-__all__ = ["Engine", "System", "assemble", "evaluate", "nominal", "score", "simulate"]
+__all__ = ["Engine", "System", "assemble", "evaluate", "score", "simulate"]

@@ -10,7 +10,7 @@ from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Observation
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.simulation.network import copied_network
 from safevar_sumo.simulation.sumo import Engine, SumoWorld, open_world
-from safevar_sumo.simulation.system import System, nominal
+from safevar_sumo.simulation.system import System
 
 TIME_DECIMALS = 9
 """The third step of 0.05 s comes at 0.15 s, not at 0.15000000000000002 s."""
@@ -61,7 +61,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld) -> Run:
     world.depart()
 
     state = vehicle.at_rest(prepared)
-    driver = system.ads.start(n, nominal(system, step), step)
+    driver = system.ads.start(n, system.nominal, step)
     memory = scenario.begin(world)
     log = _Log(n, round(scenario.duration / step) + 1)
     verdict = _Verdict(n)

@@ -18,7 +18,7 @@ from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import SCENARIOS, Scenario, weather_of
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, invalid
-from safevar_sumo.vehicles import VEHICLES, CharacteristicSet, Vehicle
+from safevar_sumo.vehicles import VEHICLES, CharacteristicSet, Vehicle, calibration_drive
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +31,7 @@ class System:
     scenario: Scenario
     weather: Weather
     metrics: MetricsTable
+    nominal: Nominal
 
 
 def assemble(study: Study) -> System:
@@ -44,20 +45,15 @@ def assemble(study: Study) -> System:
     source = f"study {study.name!r}"
     vehicle = _model(VEHICLES, study.vehicle, "vehicle", source)
     _check_units(study, vehicle, source)
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     return System(
-        characteristics=CharacteristicSet.of(study.vehicle.characteristics),
+        characteristics=characteristics,
         vehicle=vehicle,
         ads=_ads(study.ads, source),
         scenario=_model(SCENARIOS, study.scenario, "scenario", source),
         weather=weather_of(study.weather, source),
-        metrics=study.metrics)
-
-
-def nominal(system: System, step: float) -> Nominal:
-    """The original vehicle on a dry road: what the ADS was developed for."""
-    original = {member.name: member.original + 0 * system.characteristics.original[:1] for member in system.characteristics}
-    types = system.vehicle.sumo_type(system.vehicle.prepare(original, 1.0, step))
-    return Nominal(*(float(values[0]) for values in types))
+        metrics=study.metrics,
+        nominal=calibration_drive(vehicle, characteristics))
 
 
 def _check_units(study: Study, vehicle: Vehicle, source: str) -> None:

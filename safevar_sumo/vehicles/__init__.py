@@ -4,13 +4,16 @@ from collections.abc import Mapping
 from typing import Any
 
 from safevar_sumo.vehicles.base import SumoType, Vehicle, VehicleState
+from safevar_sumo.vehicles.calibration_drive import calibration_drive
 from safevar_sumo.vehicles.carla import Carla
 from safevar_sumo.vehicles.characteristics import Characteristic, CharacteristicSet
+from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.sumo import SumoVehicle
 
 VEHICLES: Mapping[str, type[Any]] = {
     "carla": Carla,
+    "lgsvl": Lgsvl,
     "sumo": SumoVehicle,
 }
 
-__all__ = ["VEHICLES", "Characteristic", "CharacteristicSet", "SumoType", "Vehicle", "VehicleState"]
+__all__ = ["VEHICLES", "Characteristic", "CharacteristicSet", "SumoType", "Vehicle", "VehicleState", "calibration_drive"]

@@ -25,7 +25,7 @@ def same_bits(one: Evaluations, other: Evaluations) -> bool:
     return bool(np.array_equal(one.outcome, other.outcome)) and all(a.tobytes() == b.tobytes() for a, b in numbers)
 
 
-@pytest.mark.parametrize("study", ["rain", "native"])
+@pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
 @settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 23), data=st.data())
 def test_a_result_depends_neither_on_the_batch_nor_on_its_size(study: str, seed: int, n: int, data: st.DataObject) -> None:
@@ -82,7 +82,7 @@ def test_the_sumo_type_is_that_of_the_setting() -> None:
     from safevar_sumo.simulation.network import copied_network
     from safevar_sumo.simulation.sumo import open_world
 
-    for name in ("sun", "native"):
+    for name in ("sun", "lgsvl", "native"):
         system = assemble(load_study(name))
         population = drawn(system, 4, 3)
         values = dict(zip(system.characteristics.names, np.ascontiguousarray(population.T), strict=True))

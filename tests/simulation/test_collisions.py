@@ -37,7 +37,7 @@ def driven(study: str, n: int) -> tuple[System, Run]:
     return system, simulate(system, np.repeat(system.characteristics.original[np.newaxis], n, axis=0))
 
 
-@pytest.mark.parametrize("study", ["sun", "native"])
+@pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
 def test_sumo_reports_a_collision_just_where_bodies_overlap(study: str) -> None:
     _, run = driven(study, 120)
     trace, collided = run.trace, run.outcome == Outcome.COLLISION
@@ -52,7 +52,7 @@ def test_sumo_reports_a_collision_just_where_bodies_overlap(study: str) -> None:
     assert np.all(touches[collided])
 
 
-@pytest.mark.parametrize("study", ["sun", "native"])
+@pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
 def test_collision_speed_is_the_speed_at_contact(study: str) -> None:
     _, run = driven(study, 60)
     for vehicle in np.flatnonzero(run.outcome == Outcome.COLLISION):

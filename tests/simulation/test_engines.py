@@ -18,7 +18,7 @@ from safevar_sumo.simulation.sumo import open_world
 from safevar_sumo.study import load_study
 
 
-@pytest.mark.parametrize("study", ["rain", "native"])
+@pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
 def test_libsumo_and_traci_give_the_same_trace(study: str) -> None:
     system = assemble(load_study(study))
     settings = np.stack([system.characteristics.original, system.characteristics.upper])
@@ -30,7 +30,7 @@ def test_libsumo_and_traci_give_the_same_trace(study: str) -> None:
 
 def test_ttc_is_that_of_sumos_ssm_device(tmp_path: Path) -> None:
     """SUMO's surrogate safety measures device logs TTC between the vehicle and the parked one; both see the same gap and speed."""
-    system = assemble(load_study("native"))
+    system = assemble(load_study("lgsvl"))
     log = tmp_path / "ssm.xml"
     options = ("--device.ssm.explicit", "0.vut", "--device.ssm.measures", "TTC", "--device.ssm.thresholds", "1000",
                "--device.ssm.range", "200", "--device.ssm.extratime", "100", "--device.ssm.trajectories", "true",

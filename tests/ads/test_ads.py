@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from safevar_sumo.ads import ADS, Ads, Checked, PerVehicle, ScalarAds
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Command, Nominal, Observation
-from safevar_sumo.simulation import assemble, nominal
+from safevar_sumo.simulation import assemble
 from safevar_sumo.study import load_study, study_names
 
 STEP = 0.05
@@ -30,7 +30,7 @@ def observation(time: float, speed: np.ndarray, gap: np.ndarray, lateral: np.nda
 def approach(ads: Ads, known: Nominal, speed: np.ndarray, gap: np.ndarray) -> np.ndarray:
     """Pedals over time, shape (T, 2, N), of vehicles that go on at constant speed whatever they command."""
     memory, pedals = ads.start(len(speed), known, STEP), []
-    for step in range(60):
+    for step in range(80):
         seen = observation(step * STEP, speed, gap - speed * step * STEP, np.full_like(speed, -1.0))
         command, memory = ads.drive(seen, memory)
         pedals.append(np.stack(command))
@@ -44,7 +44,7 @@ def test_every_ads_is_used_by_a_shipped_study(name: str) -> None:
 @given(speed=arrays(float, 6, elements=st.floats(0, 15)), gap=arrays(float, 6, elements=st.floats(0.5, 80)))
 def test_pedals_stay_in_range_and_no_vehicle_knows_of_another(speed: np.ndarray, gap: np.ndarray) -> None:
     for system in SYSTEMS.values():
-        known = nominal(system, STEP)
+        known = system.nominal
         together = approach(system.ads, known, speed, gap)
         assert np.all((together >= 0) & (together <= 1))
         assert not np.any((together[:, 0] > 0) & (together[:, 1] > 0)), "nobody drives and brakes at once"
@@ -53,13 +53,13 @@ def test_pedals_stay_in_range_and_no_vehicle_knows_of_another(speed: np.ndarray,
 
 def test_a_standing_obstacle_close_ahead_makes_it_brake(name: str) -> None:
     system = SYSTEMS[name]
-    pedals = approach(system.ads, nominal(system, STEP), np.array([8.0]), np.array([14.0]))
-    assert pedals[:, 1, 0].max() > 0.3
+    pedals = approach(system.ads, system.nominal, np.array([5.0]), np.array([25.0]))
+    assert pedals[:, 1, 0].max() > 0.1
 
 
 def test_an_open_road_makes_it_drive(name: str) -> None:
     system = SYSTEMS[name]
-    pedals = approach(system.ads, nominal(system, STEP), np.array([0.0]), np.array([1e3]))
+    pedals = approach(system.ads, system.nominal, np.array([0.0]), np.array([1e3]))
     assert pedals[-1, 0, 0] > 0.1
     assert pedals[:, 1].max() == 0
 
@@ -75,7 +75,7 @@ class Timid(ScalarAds):
         return (0.0, 1.0) if seen.gap < self.distance else (0.1 * self.asked, 0.0)
 
 
-KNOWN = Nominal(mass=1500, accel=3, decel=8, max_speed=50, tau=0.1)
+KNOWN = assemble(load_study("sun")).nominal
 
 
 def test_a_scalar_ads_drives_every_vehicle_with_an_instance_of_its_own() -> None:
@@ -86,7 +86,7 @@ def test_a_scalar_ads_drives_every_vehicle_with_an_instance_of_its_own() -> None
         command, memory = ads.drive(observation(0.0, np.zeros(3), gap, np.zeros(3)), memory)
         assert command.throttle.tolist() == pytest.approx(expected)
         assert command.brake.tolist() == [1.0, 0.0, 0.0]
-    assert memory[0].nominal == KNOWN
+    assert memory[0].nominal is KNOWN
     assert memory[0].step == STEP
 
 

@@ -1,0 +1,122 @@
+"""Apollo (Baidu): a modular driving system that plans its stop and follows it through a calibration table."""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
+
+Positive = Annotated[float, Meta(gt=0)]
+HOLDING_DECELERATION = 2.0  # m/s^2, asked for to stand and to stay
+TAPER_TIME = 0.3  # s, over which the deceleration fades into the creep
+CREEP_MARGIN = 0.1  # m/s, above the creep's speed where the creep begins
+LEAST_DISTANCE = 0.05  # m, least distance that a deceleration is planned over
+FIRST_COMMAND_ROUNDING = 1e-9  # s
+
+
+class _Memory(NamedTuple):
+    """The original vehicle, time between calls [s]; whether it stops, planned and asked accelerations [m/s^2], time crept [s]."""
+
+    nominal: Nominal
+    step: float
+    stops: BoolArray
+    planned: FloatArray
+    asked: FloatArray
+    crept: FloatArray
+
+
+class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Cruises, plans a comfortable stop before the obstacle, creeps to the end of it and holds.
+
+    Parameters
+    ----------
+    first_command
+        Time from the run's start to the first command [s].
+    perception_range
+        It knows of obstacles up to this gap, times the visibility [m].
+    cruise_speed, cruise_gain, cruise_acceleration
+        Speed that it accelerates to [m/s], acceleration per error of that speed [1/s], and the largest one [m/s^2].
+    jerk
+        Limit on the change of the acceleration that it asks for [m/s^3].
+    stop_gap
+        Gap at which the planned deceleration ends [m].
+    comfortable_deceleration
+        Deceleration needed to stand there at which it begins to brake [m/s^2].
+    least_deceleration, largest_deceleration
+        Bounds of what it asks for while it brakes [m/s^2].
+    creep_speed, creep_time
+        Speed and duration of the last creep, a soft stop with the brake released [m/s, s].
+    pedal_lag
+        Lag of the pedals that it allows for [s].
+    """
+
+    first_command: Annotated[float, Meta(ge=0)]
+    cruise_speed: Positive
+    cruise_gain: Positive
+    cruise_acceleration: Positive
+    jerk: Positive
+    stop_gap: Annotated[float, Meta(ge=0)]
+    comfortable_deceleration: Positive
+    least_deceleration: Annotated[float, Meta(ge=0)]
+    largest_deceleration: Positive
+    creep_speed: Annotated[float, Meta(ge=0)]
+    creep_time: Annotated[float, Meta(ge=0)]
+    pedal_lag: Annotated[float, Meta(ge=0)]
+    perception_range: Positive = 100.0
+
+    def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
+        nothing = np.zeros(n)
+        return _Memory(nominal, step, nothing > 0, nothing, nothing, nothing)
+
+    def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
+        if seen.time < self.first_command - FIRST_COMMAND_ROUNDING:
+            return Command(np.zeros_like(seen.speed), np.zeros_like(seen.speed)), memory
+        memory = self._plan(seen, memory)
+        return self._pedals(seen, memory), memory
+
+    def _plan(self, seen: Observation, memory: _Memory) -> _Memory:
+        """The acceleration to ask for: cruise, or v^2 / (2 d) to stand before the obstacle; then creep and hold."""
+        v = seen.speed
+        detected = seen.gap <= self.perception_range * seen.visibility
+        distance = np.where(detected, np.minimum(seen.gap, self.perception_range) - self.stop_gap, np.inf)
+        needed = v * v / (2 * np.maximum(distance, LEAST_DISTANCE))
+        # The way lost in the pedals, and while the deceleration rises at the jerk limit, counts for the onset.
+        lost = v * (self.pedal_lag + 0.5 * self.comfortable_deceleration / self.jerk)
+        planned = v * v / (2 * np.maximum(distance - lost, LEAST_DISTANCE))
+        begins = (planned > self.comfortable_deceleration) & ~memory.stops
+        stops = memory.stops | begins
+        # A plan is continuous in time: it began within the last step, when the needed deceleration passed the limit.
+        rise = np.maximum(planned - memory.planned, 1e-9)
+        part = np.where(begins, np.minimum((planned - self.comfortable_deceleration) / rise, 1.0), 1.0)
+
+        braking = np.minimum(np.maximum(needed, self.least_deceleration), self.largest_deceleration)
+        braking = np.minimum(braking, np.maximum(v - self.creep_speed, 0.0) / TAPER_TIME)
+        cruising = np.minimum(self.cruise_gain * (self.cruise_speed - v), self.cruise_acceleration)
+        base = np.where(begins, np.minimum(memory.asked, 0.0), memory.asked)
+        change = np.maximum(np.where(stops, -braking, cruising) - base, -self.jerk * memory.step * part)
+        asked = base + np.minimum(change, self.jerk * memory.step * part)
+
+        creeps = stops & (v < self.creep_speed + CREEP_MARGIN)
+        crept = memory.crept + np.where(creeps, memory.step, 0.0)
+        asked = np.where(crept > self.creep_time, -HOLDING_DECELERATION, np.where(creeps, 0.0, asked))
+        return memory._replace(stops=stops, planned=planned, asked=asked, crept=crept)
+
+    def _pedals(self, seen: Observation, memory: _Memory) -> Command:
+        """Through the calibration table of the original vehicle."""
+        nominal = memory.nominal
+        coasting = _looked_up(nominal.coasting, nominal.speeds, seen.speed)
+        full = _looked_up(nominal.full_throttle, nominal.speeds, seen.speed)
+        beyond = memory.asked + coasting
+        throttle = np.minimum(np.maximum(beyond / (full + coasting), 0.0), 1.0)
+        brake = np.minimum(np.maximum(-beyond / nominal.braking, 0.0), 1.0)
+        return Command(np.where(memory.stops, 0.0, throttle), np.where(memory.stops, brake, 0.0))
+
+
+def _looked_up(table: FloatArray, speeds: FloatArray, speed: FloatArray) -> FloatArray:
+    """Linear between the rows of a table over equally spaced speeds."""
+    place = np.minimum(speed / speeds[1], len(speeds) - 1.001)
+    row = place.astype(np.intp)
+    return np.asarray(table[row] + (table[row + 1] - table[row]) * (place - row))

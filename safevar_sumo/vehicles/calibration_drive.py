@@ -1,0 +1,54 @@
+"""What an ADS learns about its vehicle by driving it: the tables behind a throttle and brake controller."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from safevar_sumo.records import Command, FloatArray, Nominal
+from safevar_sumo.vehicles.base import Vehicle
+from safevar_sumo.vehicles.characteristics import CharacteristicSet
+
+STEP = 0.05  # s
+SPEEDS = np.arange(0.0, 20.5, 0.5)  # m/s, at which the tables hold
+LONGEST = 60.0  # s that a drive may take
+LIGHT_BRAKE = 0.1  # pedal at which the brake is tried: far from the limit of the tyres
+
+
+def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> Nominal:
+    """Drive the original vehicle on a dry road: full throttle up, coasting down, braking lightly down."""
+    original = {member.name: np.full(1, float(member.original)) for member in characteristics}
+    prepared = vehicle.prepare(original, 1.0, STEP)
+    types = vehicle.sumo_type(prepared)
+    rest = vehicle.at_rest(prepared)
+
+    def drive(state: object, throttle: float, brake: float) -> tuple[list[float], object]:
+        """Speeds until the grid's end or standstill, and the last state."""
+        speeds = [float(state.speed[0])]  # type: ignore[attr-defined]
+        command = Command(np.full(1, throttle), np.full(1, brake))
+        for _ in range(round(LONGEST / STEP)):
+            state = vehicle.advance(prepared, state, command)
+            speeds.append(float(state.speed[0]))  # type: ignore[attr-defined]
+            if speeds[-1] >= SPEEDS[-1] + 1 if throttle else speeds[-1] <= 0:
+                break
+        return speeds, state
+
+    up, fast = drive(rest, 1.0, 0.0)
+    coasting = _changes(drive(fast, 0.0, 0.0)[0][::-1])
+    braking = _changes(drive(fast, 0.0, LIGHT_BRAKE)[0][::-1])
+    return Nominal(
+        **{name: float(values[0]) for name, values in types._asdict().items()}, speeds=SPEEDS, full_throttle=_changes(up),
+        coasting=coasting, braking=float(np.median(braking - coasting)) / LIGHT_BRAKE)
+
+
+def _changes(speeds: list[float]) -> FloatArray:
+    """Speed gained per time between one grid speed and the next, of a drive that gains speed [m/s^2].
+
+    Where the drive did not get to, the last that it got to; zero for a drive that keeps its speed.
+    """
+    highest = np.maximum.accumulate(np.array(speeds))
+    reached, first = np.unique(highest, return_index=True)
+    inside = SPEEDS[(reached[0] <= SPEEDS) & (reached[-1] >= SPEEDS)]
+    if len(inside) < 2:
+        return np.zeros(len(SPEEDS))
+    gains = np.diff(inside) / np.diff(np.interp(inside, reached, first * STEP))
+    return np.asarray(gains[np.clip(np.arange(len(SPEEDS)) - round(inside[0] / SPEEDS[1]), 0, len(gains) - 1)])

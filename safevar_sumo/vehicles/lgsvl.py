@@ -1,0 +1,221 @@
+"""Lincoln2017MKZ of LGSVL 2021.1: VehicleSMI on Unity's WheelColliders, along its path.
+
+The equations are those of the simulator's `VehicleSMI.cs` and of Unity's WheelCollider friction, with one equivalent
+wheel for the four. Wheel and body are one linear system in a substep, with the tyre's secant stiffness; it is solved
+implicitly and in closed form.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.records import Command, FloatArray, Observation
+from safevar_sumo.vehicles.base import Characteristics, SumoType
+
+GRAVITY = 9.81  # m/s^2
+RPM = 30 / math.pi  # r/min per rad/s
+RADIANS = math.pi / 180  # rad per degree
+WHEELS = 4
+GEAR_RATIOS = np.array([4.17, 3.14, 2.11, 1.67, 1.28, 1.0, 0.84, 0.67])  # VehicleSMI
+FINAL_RATIO = 2.56  # VehicleSMI
+SHIFT_DELAY = 0.7  # s, least time between two changes of gear; VehicleSMI
+SHIFT_DOWN = 0.4  # of the engine speed at which it shifts up
+RPM_RATE = 20.0  # 1/s, the engine speed follows the wheels with a lag of 1/20 s; VehicleSMI
+TRACTION_START = 1 - 0.675  # of maxMotorTorque, the traction control's torque at the start; VehicleSMI
+TRACTION_RATE = 6.75 / 0.02  # N m/s, by which it rises and falls; VehicleSMI, at 50 Hz
+AIR_DRAG, DOWNFORCE = 1.0, 2.0  # N s^2/m^2; VehicleSMI
+# Unity's WheelCollider: forward friction rises to its extremum and falls to its asymptote.
+PEAK_SLIP, SLIDING_SLIP, SLIDING_FRICTION = 0.4, 0.8, 0.5
+FRICTION = 1.0  # at the extremum
+SLIP_FLOOR = 1.0  # m/s, least speed that a slip is relative to
+DAMPING_SHARE = 0.1  # of wheelDamping that acts on a rolling wheel; the published data shows next to none
+WHEELBASE = 2.85  # m
+# The lane keeping has an error to correct: assumption, so that the steering angle has something to act on.
+LATERAL_ERROR, HEADING_ERROR = 0.10, 0.01  # m, rad
+LATERAL_GAIN, HEADING_GAIN = 0.02, 0.35  # rad/m, rad/rad
+SUBSTEPS = 2
+
+
+class _Prepared(NamedTuple):
+    """Constants of a run, SI but engine speeds in r/min, shape (N,)."""
+
+    step: float
+    substep: float
+    mass: FloatArray
+    body: FloatArray
+    radius: FloatArray
+    inertia: FloatArray
+    damping: FloatArray
+    brake_torque: FloatArray
+    motor_torque: FloatArray
+    least_rpm: FloatArray
+    largest_rpm: FloatArray
+    steering: FloatArray
+    rolling_drag: FloatArray
+    shift_time: FloatArray
+    slip_limit: FloatArray
+    friction: float
+
+
+class LgsvlState(NamedTuple):
+    """State of N vehicles: m/s, rad/s, r/min, -, -, -, s since the last shift, N m, m, rad, -, -."""
+
+    speed: FloatArray
+    wheel_speed: FloatArray
+    engine_rpm: FloatArray
+    gear: FloatArray
+    old_ratio: FloatArray
+    new_ratio: FloatArray
+    since_shift: FloatArray
+    traction_torque: FloatArray
+    lateral: FloatArray
+    heading: FloatArray
+    throttle: FloatArray
+    brake: FloatArray
+
+
+class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The vehicle of the setting lgsvl.
+
+    Parameters
+    ----------
+    pedal_lag
+        Time constant with which pedals follow their commands [s].
+    wheel_mass_share
+        Share of the four wheels' mass that the body carries beside its own [-].
+    shift_up
+        Share of maxRpm above which the gearbox shifts up [-].
+    steering_design_angle
+        maxSteeringAngle of the vehicle that the lane keeping was made for [deg].
+    """
+
+    UNITS = {
+        "mass": "kg", "wheelMass": "kg", "radius": "m", "maxRpm": "r/min", "minRpm": "r/min", "maxBrakeTorque": "N m",
+        "maxMotorTorque": "N m", "maxSteeringAngle": "deg", "tireDragCoeff": "-", "wheelDamping": "kg m^2/s", "shiftTime": "s",
+        "tractionControlSlipLimit": "-",
+    }
+
+    pedal_lag: Annotated[float, Meta(ge=0)]
+    wheel_mass_share: Annotated[float, Meta(ge=0, le=1)]
+    shift_up: Annotated[float, Meta(gt=0, lt=1)]
+    steering_design_angle: Annotated[float, Meta(gt=0, lt=90)] = 39.4
+
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> _Prepared:
+        c = characteristics
+        return _Prepared(
+            step=step, substep=step / SUBSTEPS, mass=c["mass"], body=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"],
+            radius=c["radius"], inertia=WHEELS * 0.5 * c["wheelMass"] * c["radius"] * c["radius"],
+            damping=WHEELS * DAMPING_SHARE * c["wheelDamping"], brake_torque=WHEELS * c["maxBrakeTorque"],
+            motor_torque=c["maxMotorTorque"], least_rpm=c["minRpm"], largest_rpm=c["maxRpm"],
+            steering=c["maxSteeringAngle"] * RADIANS, rolling_drag=c["tireDragCoeff"], shift_time=c["shiftTime"],
+            slip_limit=c["tractionControlSlipLimit"], friction=FRICTION * road_friction)
+
+    def sumo_type(self, prepared: _Prepared) -> SumoType:
+        p = prepared
+        grip = p.friction * p.mass * GRAVITY
+        drive = p.motor_torque * (GEAR_RATIOS[0] * FINAL_RATIO) / p.radius
+        return SumoType(
+            mass=p.mass,
+            accel=np.minimum(drive, grip) / p.mass,
+            decel=np.minimum(p.brake_torque / p.radius, grip) / p.mass,
+            max_speed=p.largest_rpm / RPM / (GEAR_RATIOS[-1] * FINAL_RATIO) * p.radius,
+            tau=np.full_like(p.mass, p.step + self.pedal_lag))
+
+    def at_rest(self, prepared: _Prepared) -> LgsvlState:
+        p, nothing = prepared, np.zeros_like(prepared.mass)
+        first = nothing + GEAR_RATIOS[0]
+        return LgsvlState(
+            speed=nothing, wheel_speed=nothing, engine_rpm=p.least_rpm, gear=nothing + 1, old_ratio=first, new_ratio=first,
+            since_shift=nothing + SHIFT_DELAY, traction_torque=TRACTION_START * p.motor_torque, lateral=nothing + LATERAL_ERROR,
+            heading=nothing + HEADING_ERROR, throttle=nothing, brake=nothing)
+
+    def sense(self, prepared: _Prepared, state: LgsvlState, seen: Observation) -> tuple[Observation, LgsvlState]:
+        return seen, state
+
+    def advance(self, prepared: _Prepared, state: LgsvlState, command: Command) -> LgsvlState:
+        follows = prepared.step / (prepared.step + self.pedal_lag)
+        state = state._replace(
+            throttle=state.throttle + (command.throttle - state.throttle) * follows,
+            brake=state.brake + (command.brake - state.brake) * follows)
+        state, cornering_drag = self._steer(prepared, state)
+        state = self._shift(prepared, state)
+        for _ in range(SUBSTEPS):
+            state = _roll(prepared, state, cornering_drag)
+        return state
+
+    def _steer(self, p: _Prepared, s: LgsvlState) -> tuple[LgsvlState, FloatArray]:
+        """Lane keeping, a kinematic bicycle at small angles; returns the cornering drag too [N s/m].
+
+        The lane keeping commands a share of the full angle that is right for the vehicle that it was made for.
+        """
+        share = -(LATERAL_GAIN * s.lateral + HEADING_GAIN * s.heading) / (self.steering_design_angle * RADIANS)
+        angle = np.minimum(np.maximum(share, -1.0), 1.0) * p.steering
+        curvature = angle / WHEELBASE
+        heading = s.heading + s.speed * curvature * p.step
+        lateral = s.lateral + s.speed * p.step * 0.5 * (s.heading + heading)
+        return s._replace(heading=heading, lateral=lateral), p.mass * np.abs(curvature * angle) * s.speed
+
+    def _shift(self, p: _Prepared, s: LgsvlState) -> LgsvlState:
+        """Automatic gearbox by engine speed; during shiftTime the ratio goes over from the old one to the new."""
+        share = s.engine_rpm / p.largest_rpm
+        free = s.since_shift >= SHIFT_DELAY
+        up = free & (share > self.shift_up) & (s.gear < len(GEAR_RATIOS))
+        down = free & (share < SHIFT_DOWN * self.shift_up) & (s.gear > 1)
+        changes = up | down
+        gear = s.gear + up - down
+        return s._replace(
+            gear=gear, old_ratio=np.where(changes, _ratio(p, s), s.old_ratio),
+            new_ratio=np.where(changes, GEAR_RATIOS[gear.astype(np.intp) - 1], s.new_ratio),
+            since_shift=np.where(changes, 0.0, s.since_shift))
+
+
+def _ratio(p: _Prepared, s: LgsvlState) -> FloatArray:
+    """The gear ratio in use."""
+    return np.asarray(s.old_ratio + (s.new_ratio - s.old_ratio) * np.minimum(s.since_shift / p.shift_time, 1.0))
+
+
+def _roll(p: _Prepared, s: LgsvlState, cornering_drag: FloatArray) -> LgsvlState:
+    """One implicit Euler step of engine speed, wheel and body, linear in the new speeds.
+
+    I dw/dt = T_drive - T_brake - d w - r K (r w - v)
+    m dv/dt = K (r w - v) - (D_air v + D_tyre + D_corner) v
+    """
+    h, r = p.substep, p.radius
+    gearing = _ratio(p, s) * FINAL_RATIO
+    wanted = p.least_rpm + s.wheel_speed * gearing * RPM
+    engine_rpm = s.engine_rpm + (wanted - s.engine_rpm) * (RPM_RATE * h / (1 + RPM_RATE * h))
+    drive = _torque_share(engine_rpm / p.largest_rpm) * gearing * s.traction_torque * s.throttle
+
+    rim = r * s.wheel_speed
+    slipping = rim - s.speed
+    spins = slipping > p.slip_limit * np.maximum(rim, 1e-3)
+    traction = s.traction_torque + np.where(spins, -TRACTION_RATE * h, TRACTION_RATE * h)
+
+    stiffness = _tyre_stiffness(p, s.speed, rim, slipping)
+    pull = h * r * stiffness
+    body = p.body + h * (stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag)
+    push = p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body * s.speed / body
+    wheel_speed = np.maximum(push, 0.0) / (p.inertia + h * p.damping + pull * r - pull * pull / body)
+    return s._replace(
+        speed=(p.body * s.speed + pull * wheel_speed) / body, wheel_speed=wheel_speed, engine_rpm=engine_rpm,
+        traction_torque=np.minimum(np.maximum(traction, 0.0), p.motor_torque), since_shift=s.since_shift + h)
+
+
+def _torque_share(share: FloatArray) -> FloatArray:
+    """Engine torque over the largest one, at a share of maxRpm: a parabola, zero above the end (assumption)."""
+    return np.where(share < 1, 0.4 + 2.4 * share * (1 - share), 0.0)
+
+
+def _tyre_stiffness(p: _Prepared, speed: FloatArray, rim: FloatArray, slipping: FloatArray) -> FloatArray:
+    """Force per speed of slipping [N s/m] of Unity's WheelCollider: a parabola to the extremum, then down to the asymptote."""
+    denominator = np.maximum(np.maximum(speed, rim), SLIP_FLOOR)
+    slip = np.abs(slipping) / denominator
+    rising = (2 - slip / PEAK_SLIP) / PEAK_SLIP
+    beyond = np.minimum((slip - PEAK_SLIP) / (SLIDING_SLIP - PEAK_SLIP), 1.0)
+    falling = (1 - (1 - SLIDING_FRICTION) * beyond) / np.maximum(slip, PEAK_SLIP)
+    load = p.mass * GRAVITY + DOWNFORCE * speed * speed
+    return np.asarray(p.friction * load * np.where(slip < PEAK_SLIP, rising, falling) / denominator)
