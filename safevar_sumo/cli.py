@@ -17,6 +17,7 @@ from rich.console import Console
 
 from safevar_sumo import terminal
 from safevar_sumo.ads import ADS
+from safevar_sumo.analysis import agreement, plot_agreement, read_reference
 from safevar_sumo.campaign import RunKey, algorithm_of, all_runs, carry_out, forecast
 from safevar_sumo.computing import available_cores, cluster_pool, local_pool
 from safevar_sumo.errors import InputError, SafevarError
@@ -27,6 +28,7 @@ from safevar_sumo.scenarios import SCENARIOS, WEATHERS
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.simulation import Engine, assemble, score, simulate
 from safevar_sumo.study import Study, load_study, study_names
+from safevar_sumo.validation import evaluate_all
 from safevar_sumo.vehicles import VEHICLES, CharacteristicSet
 
 INTERRUPTED = 130
@@ -103,6 +105,33 @@ def simulate_command(study: str, changes: tuple[str, ...], no_filter: bool, trac
         click.echo(json.dumps(result, indent=2, allow_nan=False))
     else:
         terminal.print_evaluation(Console(), chosen, result, system.characteristics)
+
+
+@commands.command()
+@click.argument("study")
+@click.argument("reference", type=click.Path(path_type=Path), metavar="REFERENCE.csv")
+@click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
+@click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw here against reference.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, as_json: bool) -> None:
+    """Compare STUDY with settings and metrics in the published package's CSV format."""
+    chosen = load_study(study)
+    system = assemble(chosen)
+    data = read_reference(reference, system.characteristics)
+    if data.skipped:
+        click.echo(f"warning: {reference}: {data.skipped} rows with values outside the domains are left out", err=True)
+    settings = np.concatenate([system.characteristics.original[np.newaxis], data.settings])
+    with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
+          terminal.counted(Console(stderr=True), "settings", len(np.unique(settings, axis=0))) as done):
+        evaluations = evaluate_all(chosen, settings, pool, done)
+    here = evaluations.take(np.arange(1, len(settings)))
+    result = agreement(data, here, chosen.published, evaluations.take([0]))
+    if plot is not None:
+        plot_agreement(plot, f"{chosen.title}\nagainst {reference.name}", system.characteristics, data, here)
+    if as_json:
+        click.echo(json.dumps(result.to_dict(), indent=2, allow_nan=False))
+    else:
+        terminal.print_agreement(Console(), chosen, result)
 
 
 @commands.command(name="list")

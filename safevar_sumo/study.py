@@ -81,7 +81,10 @@ class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A whole study as its TOML file gives it; `load_study` reads one."""
+    """A whole study as its TOML file gives it; `load_study` reads one.
+
+    `published` are the original vehicle's metrics in the published study, by name, as far as there are any.
+    """
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
     title: str
@@ -91,6 +94,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     ads: ModelTable
     metrics: MetricsTable
     search: SearchTable
+    published: dict[str, float] = {}
 
 
 def study_names() -> list[str]:

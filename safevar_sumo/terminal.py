@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from safevar_sumo.analysis import Agreement
 from safevar_sumo.campaign import Campaign, Forecast, RunKey
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
@@ -176,6 +178,29 @@ def print_evaluation(console: Console, study: Study, record: Mapping[str, Any], 
         value = record[name]
         results.add_row(name, "undefined" if value is None else f"{value:.4g}", unit)
     console.print(results)
+
+
+@contextmanager
+def counted(console: Console, what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A bar that counts up to `total`; yields what to call with every number that is done."""
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    bar = Progress(*columns, console=console, disable=not console.is_terminal)
+    with bar:
+        task = bar.add_task(what, total=total)
+        yield lambda number: bar.update(task, advance=number)
+
+
+def print_agreement(console: Console, study: Study, told: Agreement) -> None:
+    """Comparison with reference data, metric by metric."""
+    table = Table("", title=f"{study.title}: {told.rows} rows", title_justify="left")
+    for head in ("Spearman's rho", "mean abs. error", "bias", "original there", "original here"):
+        table.add_column(head, justify="right")
+    for name, head in METRIC_HEADS.items():
+        numbers = (told.spearman[name], told.mean_absolute_error[name], told.bias[name], *told.original[name].values())
+        table.add_row(head, *("-" if number is None else f"{number:.3f}" for number in numbers))
+    console.print(table)
+    collisions = told.collisions
+    console.print(f"Collisions: {collisions['reference']} in the reference, {collisions['here']} here, {collisions['both']} in both.")
 
 
 def print_names(console: Console, title: str, rows: Iterable[tuple[str, ...]], heads: tuple[str, ...]) -> None:

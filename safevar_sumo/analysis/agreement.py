@@ -1,0 +1,165 @@
+"""How well simulated settings agree with reference data, in numbers and as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from safevar_sumo.analysis.reference import ReferenceData
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.vehicles import CharacteristicSet
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+UNITS = {"safety_degree": "safety degree [m, -m/s]", "tet": "TET [s]", "tit": "TIT [s$^2$]", "ave_dece": "aveDece [m/s$^2$]"}
+BINS = 8
+"""Into so many equally full bins a characteristic's values are put in the picture."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Agreement:
+    """Comparison of simulated with reference values; None where there is nothing to compare.
+
+    Attributes
+    ----------
+    rows
+        How many settings.
+    spearman, mean_absolute_error, bias
+        By metric: rank correlation; mean |here - reference| and mean here - reference in the metric's unit.
+        TET and TIT over settings without collision on either side.
+    collisions
+        How many the reference has, how many are here, how many both have.
+    original
+        By metric: the original vehicle's value there and here.
+    """
+
+    rows: int
+    spearman: dict[str, float | None]
+    mean_absolute_error: dict[str, float | None]
+    bias: dict[str, float | None]
+    collisions: dict[str, int]
+    original: dict[str, dict[str, float | None]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain values, under the attributes' names."""
+        return asdict(self)
+
+
+def agreement(reference: ReferenceData, here: Evaluations, published: Mapping[str, float], original: Evaluations) -> Agreement:
+    """Compare row by row; `published` are the original vehicle's reference values, as far as there are any."""
+    both = {name: _both(reference, here, name) for name in reference.metrics}
+    differences = {name: here.metrics[name][rows] - reference.metrics[name][rows] for name, rows in both.items()}
+    return Agreement(
+        rows=len(here),
+        spearman={name: rank_correlation(reference.metrics[name][rows], here.metrics[name][rows]) for name, rows in both.items()},
+        mean_absolute_error={name: _mean(np.abs(values)) for name, values in differences.items()},
+        bias={name: _mean(values) for name, values in differences.items()},
+        collisions={
+            "reference": int(np.count_nonzero(reference.collided)), "here": int(np.count_nonzero(here.collided)),
+            "both": int(np.count_nonzero(reference.collided & here.collided))},
+        original={name: {"reference": published.get(name), "here": _defined(values[0])} for name, values in original.metrics.items()})
+
+
+def rank_correlation(one: FloatArray, other: FloatArray) -> float | None:
+    """Spearman's rho; None for fewer than two rows or where one side is constant."""
+    if len(one) < 2 or np.ptp(one) == 0 or np.ptp(other) == 0:
+        return None
+    return float(spearmanr(one, other).statistic)
+
+
+def _both(reference: ReferenceData, here: Evaluations, metric: str) -> BoolArray:
+    """Where a metric is defined on both sides."""
+    return np.asarray(~np.isnan(reference.metrics[metric]) & ~np.isnan(here.metrics[metric]))
+
+
+def _mean(values: FloatArray) -> float | None:
+    return float(np.mean(values)) if values.size else None
+
+
+def _defined(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)
+
+
+def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, reference: ReferenceData, here: Evaluations) -> None:
+    """Draw here against reference for every metric, and the safety degree's mean error against each characteristic.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written or its ending names no picture format.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    import seaborn as sns
+
+    with sns.axes_style("whitegrid"), plt.rc_context({"font.size": 9}):
+        columns = 4
+        rows = 1 + -(-len(characteristics) // columns)
+        figure, axes = plt.subplots(rows, columns, figsize=(12, 2.4 * rows + 0.8), layout="constrained",
+                                    gridspec_kw={"height_ratios": [1.5] + [1] * (rows - 1)})
+        for axis, metric in zip(axes[0], reference.metrics, strict=False):
+            _scatter(axis, metric, reference, here)
+        error = here.metrics["safety_degree"] - reference.metrics["safety_degree"]
+        lowest, highest = [], []
+        for i, axis in enumerate(axes[1:].flat):
+            if i >= len(characteristics):
+                axis.set_axis_off()
+                continue
+            low, high = _error_by(axis, here.settings[:, i], error)
+            lowest.append(low)
+            highest.append(high)
+            member = characteristics.members[i]
+            axis.set_xlabel(member.name + ("" if member.unit == "-" else f" [{member.unit}]"))
+        margin = 0.1 * (max(highest) - min(lowest)) + 1e-6
+        for i, axis in enumerate(axes[1:].flat):
+            axis.set_ylim(min(lowest) - margin, max(highest) + margin)
+            if i % columns == 0:
+                axis.set_ylabel("error of SD\n(here - reference)")
+        figure.suptitle(title)
+        try:
+            figure.savefig(path, dpi=150)
+        except (OSError, ValueError) as error_written:
+            raise InputError("--plot", f"cannot write {path}: {error_written}", "a file that ends in .png, .pdf or .svg") from None
+        finally:
+            plt.close(figure)
+
+
+def _scatter(axis: Axes, metric: str, reference: ReferenceData, here: Evaluations) -> None:
+    rows = _both(reference, here, metric)
+    collided = (reference.collided | here.collided)[rows]
+    x, y = reference.metrics[metric][rows], here.metrics[metric][rows]
+    axis.scatter(x[~collided], y[~collided], s=6, alpha=0.35, color="#0072b2", linewidths=0, label="no collision")
+    if collided.any():
+        axis.scatter(x[collided], y[collided], s=14, alpha=0.7, color="#d55e00", marker="x", linewidths=0.8, label="collision on a side")
+        axis.legend(loc="upper left", fontsize=7, frameon=True)
+    if x.size:
+        ends = [min(x.min(), y.min()), max(x.max(), y.max())]
+        axis.plot(ends, ends, color="black", linewidth=0.8, linestyle="--")
+    rho = rank_correlation(x, y)
+    axis.set_title(f"rho = {'-' if rho is None else f'{rho:.3f}'}, {x.size} rows")
+    axis.set_xlabel(f"reference: {UNITS[metric]}")
+    axis.set_ylabel(f"here: {UNITS[metric]}")
+
+
+def _error_by(axis: Axes, values: FloatArray, error: FloatArray) -> tuple[float, float]:
+    """Mean error and its quartiles over bins of a characteristic; returns the lowest and highest value drawn."""
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, BINS + 1)))
+    bin_of = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0))
+    filled = [np.flatnonzero(bin_of == i) for i in range(max(len(edges) - 1, 1))]
+    filled = [rows for rows in filled if rows.size]
+    centres = np.array([values[rows].mean() for rows in filled])
+    means = np.array([error[rows].mean() for rows in filled])
+    quartiles = np.array([np.quantile(error[rows], [0.25, 0.75]) for rows in filled])
+    axis.fill_between(centres, quartiles[:, 0], quartiles[:, 1], color="#0072b2", alpha=0.2, linewidth=0)
+    axis.plot(centres, means, marker="o", markersize=3, color="#0072b2")
+    axis.axhline(0, color="black", linewidth=0.8, linestyle="--")
+    return float(min(quartiles.min(), means.min())), float(max(quartiles.max(), means.max()))

@@ -1,0 +1,32 @@
+"""A study held against reference data: every row simulated, then compared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import as_completed
+
+import numpy as np
+
+from safevar_sumo.computing import PersistentPool, Pool, packed
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
+
+BATCH = 100
+"""Settings per SUMO simulation."""
+
+
+def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[[int], None] = lambda number: None) -> Evaluations:
+    """Evaluate many filtered settings, shape (M, n), row by row; equal rows are simulated once.
+
+    `done` is called with the number of settings of every batch that is finished.
+    """
+    persistent, work = PersistentPool(pool, CharacteristicSet.of(study.vehicle.characteristics)), packed(study)
+    unique, row_of = np.unique(settings, axis=0, return_inverse=True)
+    starts = range(0, len(unique), BATCH)
+    futures = {persistent.submit(work, unique[start:start + BATCH]): start for start in starts}
+    parts: dict[int, Evaluations] = {}
+    for future in as_completed(futures):
+        parts[futures[future]] = future.result()
+        done(len(parts[futures[future]]))
+    return Evaluations.concatenate([parts[start] for start in starts]).take(row_of.ravel())
