@@ -2,45 +2,84 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Meta, Struct
 
-from safevar_sumo.records import Command, FloatArray, Nominal, Observation
+from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
+NotNegative = Annotated[float, Meta(ge=0)]
+Throttle = Annotated[float, Meta(ge=0, le=1)]
 SPEED_LIMIT = 20 / 3.6
 """Above this speed the agent releases the throttle [m/s] (its source, 20 km/h)."""
+SPEED_LEVELS = (0.0, 8 / 3, 16 / 3)
+"""Speeds that the policy is interpolated over, as far as the limit lets it [m/s] (its source: four in 0..8 m/s)."""
+RELEASE_MARGIN = 0.5
+"""Somebody that it brakes for leaves the corridor this much later than he entered it [m]."""
+PASSED = -0.5
+"""Gap at which somebody is beside it rather than ahead [m]."""
 
 
 class _Memory(NamedTuple):
-    nothing: FloatArray
+    """Whether it brakes, and the commands on their way; newest last."""
+
+    brakes: BoolArray
+    under_way: tuple[Command, ...]
+    step: float
 
 
 class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Full brake when it sees somebody in its corridor and near, else throttle.
+    """Full brake for somebody in its corridor and near, else throttle up to its speed limit.
 
     Parameters
     ----------
+    first_command
+        Time from the run's start to the first throttle [s].
+    latency
+        Time from an image to its command [s], in whole steps.
     corridor
         Half the width of what it takes for its way [m].
-    gap_standing, gap_time
-        It brakes at gaps up to `gap_standing` + `gap_time` * speed [m, s], in clear weather.
+    brake_gap, brake_gap_per_speed
+        It brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s], times the visibility.
+    brake_gap_past, past
+        That gap shrinks by `brake_gap_past` for every metre that the pedestrian is beyond the place `past`, measured
+        from the lane's middle towards where he came from: somebody about to leave the way is braked for later [-, m].
     throttle
-        What it commands below its speed limit, else 0.
+        Throttle at the policy's speed levels 0, 2.7 and 5.3 m/s.
     """
 
-    corridor: float = 2.0
-    gap_standing: float = 4.0
-    gap_time: float = 0.7
-    throttle: float = 0.7
+    first_command: NotNegative
+    latency: NotNegative
+    corridor: NotNegative
+    brake_gap: float
+    brake_gap_per_speed: float
+    brake_gap_past: float
+    past: float
+    throttle: Annotated[tuple[Throttle, Throttle, Throttle], Meta()]
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        return _Memory(np.zeros(n))
+        idle = Command(np.zeros(n), np.zeros(n))
+        return _Memory(np.zeros(n, dtype=bool), (idle,) * round(self.latency / step), step)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        near = seen.gap <= seen.visibility * (self.gap_standing + self.gap_time * seen.speed)
-        brakes = near & (np.abs(seen.lateral) <= self.corridor) & (seen.gap > -1)
-        brake = np.where(brakes, 1.0, memory.nothing)
-        throttle = np.where(brakes | (seen.speed > SPEED_LIMIT), 0.0, self.throttle)
-        return Command(throttle, brake), memory
+        brakes = self._brakes(seen, memory.brakes)
+        released = brakes | (seen.speed > SPEED_LIMIT)
+        throttle = np.where(released, 0.0, self._throttle(seen.speed) if seen.time >= self.first_command else 0.0)
+        command, *under_way = (*memory.under_way, Command(throttle, np.where(brakes, 1.0, 0.0)))
+        return command, memory._replace(brakes=brakes, under_way=tuple(under_way))
+
+    def _brakes(self, seen: Observation, braked: BoolArray) -> BoolArray:
+        """Whether the brake probability exceeds one half: somebody is in the corridor and near enough."""
+        beyond = np.maximum(seen.lateral + self.past, 0.0)
+        near = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - self.brake_gap_past * beyond)
+        aside = np.abs(seen.lateral)
+        begins = (aside <= self.corridor) & (seen.gap <= near) & (seen.gap > PASSED)
+        goes_on = braked & (aside <= self.corridor + RELEASE_MARGIN) & (seen.gap > 2 * PASSED)
+        return np.asarray(begins | goes_on)
+
+    def _throttle(self, speed: FloatArray) -> FloatArray:
+        low, middle, high = self.throttle
+        level = speed / SPEED_LEVELS[1]
+        upper = middle + (high - middle) * np.minimum(np.maximum(level - 1, 0.0), 1.0)
+        return np.asarray(np.where(level < 1, low + (middle - low) * level, upper))

@@ -43,7 +43,7 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
     network: str = "pedestrian_crossing"
     duration: float = 9.5
     turns_after: float | None = 0.7
-    lane_width: float = 4.0
+    lane_width: float = 3.5
 
     def begin(self, world: World) -> _Memory:
         lateral = world.person_positions(PEDESTRIAN)[:, 1] - world.vehicle_positions(VUT)[:, 1]
@@ -70,7 +70,7 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
         half_length = trace.vehicle_length / 2
         ahead = trace.gap + half_length
         centre_distance = np.sqrt(ahead * ahead + trace.lateral * trace.lateral)
-        nearing = trace.speed * ahead - trace.lateral_speed * trace.lateral
+        nearing = trace.speed * ahead + np.abs(trace.lateral_speed * trace.lateral)
         return Encounter(
             separation=trace.gap,
             distance=centre_distance - half_length,

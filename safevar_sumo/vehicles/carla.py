@@ -8,14 +8,15 @@ tyre's secant stiffness; it is solved implicitly and in closed form, so that no 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
 
+Positive = Annotated[float, Meta(gt=0)]
 GRAVITY = 9.81  # m/s^2
 RPM = 2 * math.pi / 60  # rad/s per r/min
 ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default
@@ -28,8 +29,9 @@ SHIFT_UP, SHIFT_DOWN = 0.65, 0.5  # of max_rpm
 WHEELS = 4
 WHEEL_MASS = 20.0  # kg each; PxVehicleWheelData.mMass
 AIR_DENSITY = 1.2  # kg/m^3
-FRONTAL_AREA = 1.84 * 1.46  # m^2, width times height of the chassis
+FRONTAL_AREA = 2.2  # m^2, of the LincolnMkz2017
 TIME_ROUNDING = 1e-9  # s; below it two sums of steps are the same time
+STANDSTILL = 0.03  # m/s, below which a braked vehicle is held by its tyres (PxVehicle sticky tires)
 SUBSTEPS = 3  # CARLA 0.9.10 substeps at 1/60 s
 
 
@@ -50,6 +52,7 @@ class _Prepared(NamedTuple):
     damping_neutral: FloatArray
     shift_time: FloatArray
     air_drag: FloatArray
+    assumed_height: FloatArray
 
 
 class CarlaState(NamedTuple):
@@ -70,14 +73,19 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     Parameters
     ----------
-    friction_per_tire_fric
-        Friction coefficient of the tyre on a dry road per unit of tireFric [-].
+    tyre_friction
+        Friction coefficient of a tyre on a dry road per unit of tireFric [-].
     longitudinal_stiffness
-        Longitudinal stiffness of the four tyres together [N per unit slip].
+        Of a tyre, over gravity [N s^2/m per unit slip] (PxVehicleTireData.mLongitudinalStiffnessPerUnitGravity).
     slip_floor
         Least speed that a slip is relative to [m/s] (PxVehicle minLongSlipDenominator).
-    pedal_rise, pedal_fall
-        Rates of throttle and brake [1/s] (PxVehiclePadSmoothingData).
+    engine_torque
+        Engine torque over that of CARLA's default car [-].
+    throttle_rise, throttle_fall, brake_rise, brake_fall
+        Rates of the pedals [1/s] (PxVehiclePadSmoothingData: 6 up, 10 down).
+    camera_height, camera_design_radius
+        Height of the camera above the road on wheels of the radius that its model was made for [m, m]: on another
+        radius a gap that is measured down to the road comes out in proportion to the height that is assumed.
     """
 
     UNITS = {
@@ -86,11 +94,16 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         "dampRate": "kg m^2/s", "radius": "cm", "maxBrakeTorque": "N m",
     }
 
-    friction_per_tire_fric: float = 1.0
-    longitudinal_stiffness: float = 39240.0
-    slip_floor: float = 4.0
-    pedal_rise: float = 6.0
-    pedal_fall: float = 10.0
+    tyre_friction: Positive
+    longitudinal_stiffness: Positive
+    slip_floor: Positive
+    engine_torque: Positive
+    throttle_rise: Positive = 6.0
+    throttle_fall: Positive = 10.0
+    brake_rise: Positive = 6.0
+    brake_fall: Positive = 10.0
+    camera_height: Positive
+    camera_design_radius: Positive = 0.355
 
     def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> _Prepared:
         c = characteristics
@@ -98,41 +111,44 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return _Prepared(
             step=step / SUBSTEPS, mass=c["mass"], radius=radius, wheel_inertia=WHEELS * 0.5 * WHEEL_MASS * radius * radius,
             wheel_damping=WHEELS * c["dampRate"], brake_torque=WHEELS * c["maxBrakeTorque"],
-            grip=c["tireFric"] * (self.friction_per_tire_fric * road_friction) * c["mass"] * GRAVITY,
+            grip=c["tireFric"] * (self.tyre_friction * road_friction) * c["mass"] * GRAVITY,
             clutch=c["clutchStrength"], engine_limit=c["max_rpm"] * RPM, damping_full=c["dampRateFullT"],
             damping_engaged=c["dampRateZeroT_CE"], damping_neutral=c["dampRateZeroT_CD"], shift_time=c["gearSwitchTime"],
-            air_drag=0.5 * AIR_DENSITY * FRONTAL_AREA * c["dragCoeff"])
+            air_drag=0.5 * AIR_DENSITY * FRONTAL_AREA * c["dragCoeff"],
+            assumed_height=self.camera_height / (self.camera_height + (radius - self.camera_design_radius)))
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
-        drive = TORQUE_PEAK * GEAR_RATIOS[1] * FINAL_RATIO / p.radius
+        drive = self.engine_torque * TORQUE_PEAK * (GEAR_RATIOS[1] * FINAL_RATIO) / p.radius
         return SumoType(
             mass=p.mass,
             accel=np.minimum(drive, p.grip) / p.mass,
             decel=np.minimum(p.brake_torque / p.radius, p.grip) / p.mass,
             max_speed=p.engine_limit / (GEAR_RATIOS[-1] * FINAL_RATIO) * p.radius,
-            tau=np.full_like(p.mass, p.step * SUBSTEPS + 1 / self.pedal_rise))
+            tau=np.full_like(p.mass, p.step * SUBSTEPS + 1 / self.brake_rise))
 
     def at_rest(self, prepared: _Prepared) -> CarlaState:
         nothing = np.zeros_like(prepared.mass)
         return CarlaState(*(nothing for _ in CarlaState._fields))
 
     def sense(self, prepared: _Prepared, state: CarlaState, seen: Observation) -> tuple[Observation, CarlaState]:
-        return seen, state
+        """The camera stands where the wheels put it."""
+        return seen._replace(gap=seen.gap * prepared.assumed_height), state
 
     def advance(self, prepared: _Prepared, state: CarlaState, command: Command) -> CarlaState:
         for _ in range(SUBSTEPS):
             state = self._pedals(prepared, state, command)
             state = _shift(prepared, state)
             state = self._roll(prepared, state)
-        return state
+        moves = (state.brake <= 0) | (state.speed >= STANDSTILL)
+        return state._replace(speed=np.where(moves, state.speed, 0.0), wheel_speed=np.where(moves, state.wheel_speed, 0.0))
 
     def _pedals(self, p: _Prepared, s: CarlaState, command: Command) -> CarlaState:
         """Pedals follow their commands at finite rates."""
-        rise, fall = self.pedal_rise * p.step, -self.pedal_fall * p.step
+        throttle, brake, h = command.throttle - s.throttle, command.brake - s.brake, p.step
         return s._replace(
-            throttle=s.throttle + np.minimum(np.maximum(command.throttle - s.throttle, fall), rise),
-            brake=s.brake + np.minimum(np.maximum(command.brake - s.brake, fall), rise))
+            throttle=s.throttle + np.minimum(np.maximum(throttle, -self.throttle_fall * h), self.throttle_rise * h),
+            brake=s.brake + np.minimum(np.maximum(brake, -self.brake_fall * h), self.brake_rise * h))
 
     def _roll(self, p: _Prepared, s: CarlaState) -> CarlaState:
         """One implicit Euler step of engine, clutch, wheels and body, linear in the new speeds.
@@ -150,7 +166,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
         inverse = 1 / p.step
         engine = ENGINE_INERTIA * inverse + damping + clutch
-        engine_free = (ENGINE_INERTIA * inverse * s.engine_speed + s.throttle * _torque(p, s.engine_speed)) / engine
+        engine_free = (ENGINE_INERTIA * inverse * s.engine_speed + s.throttle * self._torque(p, s)) / engine
         body = p.mass * inverse + stiffness + p.air_drag * s.speed
         body_free = p.mass * inverse * s.speed / body
         through_clutch = ratio * clutch
@@ -161,7 +177,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return s._replace(
             speed=np.maximum(body_free + stiffness * p.radius * wheel_speed / body, 0.0),
             wheel_speed=wheel_speed,
-            engine_speed=engine_free + through_clutch * wheel_speed / engine)
+            engine_speed=np.minimum(engine_free + through_clutch * wheel_speed / engine, p.engine_limit))
 
     def _tyre_stiffness(self, p: _Prepared, s: CarlaState) -> FloatArray:
         """Force per speed of slipping, F / (r w_w - v) [N s/m], of `PxVehicleComputeTireForceDefault`.
@@ -170,17 +186,16 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         F = mu load (K - K^2 / 3 + K^3 / 27) up to K = 3, mu load beyond.
         """
         rim = p.radius * s.wheel_speed
-        stiffness = self.longitudinal_stiffness / np.maximum(np.maximum(s.speed, rim), self.slip_floor)
+        stiffness = WHEELS * GRAVITY * self.longitudinal_stiffness / np.maximum(np.maximum(s.speed, rim), self.slip_floor)
         k = stiffness * np.abs(rim - s.speed) / p.grip
         return stiffness * np.where(k < 3, 1 - k * (1 / 3) + k * k * (1 / 27), 1 / np.maximum(k, 3.0))
 
-
-def _torque(p: _Prepared, engine_speed: FloatArray) -> FloatArray:
-    """Engine torque at full throttle [N m]: linear between the points of the curve, zero above its end."""
-    x = engine_speed / p.engine_limit
-    rising = TORQUE_IDLE + (TORQUE_PEAK - TORQUE_IDLE) / PEAK_AT * x
-    falling = TORQUE_PEAK - (TORQUE_PEAK - TORQUE_END) / (1 - PEAK_AT) * (x - PEAK_AT)
-    return np.where(x <= 1, np.minimum(rising, falling), 0.0)
+    def _torque(self, p: _Prepared, s: CarlaState) -> FloatArray:
+        """Engine torque at full throttle [N m]: linear between the points of the curve, zero above its end."""
+        x = s.engine_speed / p.engine_limit
+        rising = TORQUE_IDLE + (TORQUE_PEAK - TORQUE_IDLE) / PEAK_AT * x
+        falling = TORQUE_PEAK - (TORQUE_PEAK - TORQUE_END) / (1 - PEAK_AT) * (x - PEAK_AT)
+        return self.engine_torque * np.where(x <= 1, np.minimum(rising, falling), 0.0)
 
 
 def _shift(p: _Prepared, s: CarlaState) -> CarlaState:
