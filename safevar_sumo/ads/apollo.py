@@ -45,8 +45,8 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Gap at which the planned deceleration ends [m].
     comfortable_deceleration
         Deceleration needed to stand there at which it begins to brake [m/s^2].
-    least_deceleration, largest_deceleration
-        Bounds of what it asks for while it brakes [m/s^2].
+    largest_deceleration
+        What it asks for at the most while it brakes [m/s^2].
     creep_speed, creep_time
         Speed and duration of the last creep, a soft stop with the brake released [m/s, s].
     pedal_lag
@@ -60,7 +60,6 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     jerk: Positive
     stop_gap: Annotated[float, Meta(ge=0)]
     comfortable_deceleration: Positive
-    least_deceleration: Annotated[float, Meta(ge=0)]
     largest_deceleration: Positive
     creep_speed: Annotated[float, Meta(ge=0)]
     creep_time: Annotated[float, Meta(ge=0)]
@@ -92,7 +91,7 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         rise = np.maximum(planned - memory.planned, 1e-9)
         part = np.where(begins, np.minimum((planned - self.comfortable_deceleration) / rise, 1.0), 1.0)
 
-        braking = np.minimum(np.maximum(needed, self.least_deceleration), self.largest_deceleration)
+        braking = np.minimum(needed, self.largest_deceleration)
         braking = np.minimum(braking, np.maximum(v - self.creep_speed, 0.0) / TAPER_TIME)
         cruising = np.minimum(self.cruise_gain * (self.cruise_speed - v), self.cruise_acceleration)
         base = np.where(begins, np.minimum(memory.asked, 0.0), memory.asked)

@@ -23,7 +23,7 @@ WHEELS = 4
 GEAR_RATIOS = np.array([4.17, 3.14, 2.11, 1.67, 1.28, 1.0, 0.84, 0.67])  # VehicleSMI
 FINAL_RATIO = 2.56  # VehicleSMI
 SHIFT_DELAY = 0.7  # s, least time between two changes of gear; VehicleSMI
-SHIFT_DOWN = 0.4  # of the engine speed at which it shifts up
+SHIFT_UP, SHIFT_DOWN = 0.33, 0.13  # of maxRpm (assumption)
 RPM_RATE = 20.0  # 1/s, the engine speed follows the wheels with a lag of 1/20 s; VehicleSMI
 TRACTION_START = 1 - 0.675  # of maxMotorTorque, the traction control's torque at the start; VehicleSMI
 TRACTION_RATE = 6.75 / 0.02  # N m/s, by which it rises and falls; VehicleSMI, at 50 Hz
@@ -31,13 +31,14 @@ AIR_DRAG, DOWNFORCE = 1.0, 2.0  # N s^2/m^2; VehicleSMI
 # Unity's WheelCollider: forward friction rises to its extremum and falls to its asymptote.
 PEAK_SLIP, SLIDING_SLIP, SLIDING_FRICTION = 0.4, 0.8, 0.5
 FRICTION = 1.0  # at the extremum
-SLIP_FLOOR = 1.0  # m/s, least speed that a slip is relative to
+SLIP_FLOOR = 4.0  # m/s, least speed that a slip is relative to (assumption, as PhysX has it)
+STANDSTILL = 0.05  # m/s, below which locked wheels hold the vehicle (assumption)
 DAMPING_SHARE = 0.1  # of wheelDamping that acts on a rolling wheel; the published data shows next to none
 WHEELBASE = 2.85  # m
 # The lane keeping has an error to correct: assumption, so that the steering angle has something to act on.
 LATERAL_ERROR, HEADING_ERROR = 0.10, 0.01  # m, rad
 LATERAL_GAIN, HEADING_GAIN = 0.02, 0.35  # rad/m, rad/rad
-SUBSTEPS = 2
+SUBSTEPS = 4
 
 
 class _Prepared(NamedTuple):
@@ -87,8 +88,6 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Time constant with which pedals follow their commands [s].
     wheel_mass_share
         Share of the four wheels' mass that the body carries beside its own [-].
-    shift_up
-        Share of maxRpm above which the gearbox shifts up [-].
     steering_design_angle
         maxSteeringAngle of the vehicle that the lane keeping was made for [deg].
     """
@@ -101,7 +100,6 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     pedal_lag: Annotated[float, Meta(ge=0)]
     wheel_mass_share: Annotated[float, Meta(ge=0, le=1)]
-    shift_up: Annotated[float, Meta(gt=0, lt=1)]
     steering_design_angle: Annotated[float, Meta(gt=0, lt=90)] = 39.4
 
     def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> _Prepared:
@@ -142,7 +140,7 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             throttle=state.throttle + (command.throttle - state.throttle) * follows,
             brake=state.brake + (command.brake - state.brake) * follows)
         state, cornering_drag = self._steer(prepared, state)
-        state = self._shift(prepared, state)
+        state = _shift(prepared, state)
         for _ in range(SUBSTEPS):
             state = _roll(prepared, state, cornering_drag)
         return state
@@ -159,18 +157,19 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         lateral = s.lateral + s.speed * p.step * 0.5 * (s.heading + heading)
         return s._replace(heading=heading, lateral=lateral), p.mass * np.abs(curvature * angle) * s.speed
 
-    def _shift(self, p: _Prepared, s: LgsvlState) -> LgsvlState:
-        """Automatic gearbox by engine speed; during shiftTime the ratio goes over from the old one to the new."""
-        share = s.engine_rpm / p.largest_rpm
-        free = s.since_shift >= SHIFT_DELAY
-        up = free & (share > self.shift_up) & (s.gear < len(GEAR_RATIOS))
-        down = free & (share < SHIFT_DOWN * self.shift_up) & (s.gear > 1)
-        changes = up | down
-        gear = s.gear + up - down
-        return s._replace(
-            gear=gear, old_ratio=np.where(changes, _ratio(p, s), s.old_ratio),
-            new_ratio=np.where(changes, GEAR_RATIOS[gear.astype(np.intp) - 1], s.new_ratio),
-            since_shift=np.where(changes, 0.0, s.since_shift))
+
+def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
+    """Automatic gearbox by engine speed; during shiftTime the ratio goes over from the old one to the new."""
+    share = s.engine_rpm / p.largest_rpm
+    free = s.since_shift >= SHIFT_DELAY
+    up = free & (share > SHIFT_UP) & (s.gear < len(GEAR_RATIOS))
+    down = free & (share < SHIFT_DOWN) & (s.gear > 1)
+    changes = up | down
+    gear = s.gear + up - down
+    return s._replace(
+        gear=gear, old_ratio=np.where(changes, _ratio(p, s), s.old_ratio),
+        new_ratio=np.where(changes, GEAR_RATIOS[gear.astype(np.intp) - 1], s.new_ratio),
+        since_shift=np.where(changes, 0.0, s.since_shift))
 
 
 def _ratio(p: _Prepared, s: LgsvlState) -> FloatArray:
@@ -200,8 +199,9 @@ def _roll(p: _Prepared, s: LgsvlState, cornering_drag: FloatArray) -> LgsvlState
     body = p.body + h * (stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag)
     push = p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body * s.speed / body
     wheel_speed = np.maximum(push, 0.0) / (p.inertia + h * p.damping + pull * r - pull * pull / body)
+    speed = (p.body * s.speed + pull * wheel_speed) / body
     return s._replace(
-        speed=(p.body * s.speed + pull * wheel_speed) / body, wheel_speed=wheel_speed, engine_rpm=engine_rpm,
+        speed=np.where((wheel_speed <= 0) & (speed < STANDSTILL), 0.0, speed), wheel_speed=wheel_speed, engine_rpm=engine_rpm,
         traction_torque=np.minimum(np.maximum(traction, 0.0), p.motor_torque), since_shift=s.since_shift + h)
 
 

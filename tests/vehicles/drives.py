@@ -1,0 +1,90 @@
+"""Vehicles driven open loop: pedals over time in, states out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safevar_sumo.records import Command
+from safevar_sumo.simulation import System, assemble
+from safevar_sumo.study import load_study
+
+STEP = 0.05
+STUDY_OF = {"carla": "sun", "lgsvl": "lgsvl", "sumo": "native"}
+SYSTEMS: dict[str, System] = {model: assemble(load_study(study)) for model, study in STUDY_OF.items()}
+Pedals = Callable[[float], tuple[Any, Any]]
+
+
+class Drive(NamedTuple):
+    """States of N vehicles at times 0, step, 2 step, ...; speeds (T, N) and travelled distances (T, N)."""
+
+    prepared: Any
+    states: list[Any]
+    step: float
+
+    @property
+    def speed(self) -> np.ndarray:
+        return np.stack([state.speed for state in self.states])
+
+    @property
+    def distance(self) -> np.ndarray:
+        speed = self.speed
+        return np.concatenate([np.zeros((1, speed.shape[1])), np.cumsum((speed[1:] + speed[:-1]) / 2 * self.step, axis=0)])
+
+    def at(self, time: float) -> int:
+        return round(time / self.step)
+
+
+def drive(model: str, settings: np.ndarray, pedals: Pedals, duration: float, step: float = STEP, road: float = 1.0,
+          rolling: float = 0.0) -> Drive:
+    """Drive settings, shape (N, n); pedals(t) -> (throttle, brake), for all or by vehicle. `rolling` is the speed at the start."""
+    system = SYSTEMS[model]
+    values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
+    prepared = system.vehicle.prepare(values, road, step)
+    states = [_rolling(system.vehicle.at_rest(prepared), prepared, rolling)]
+    for k in range(round(duration / step)):
+        throttle, brake = pedals(round(k * step, 9))
+        command = Command(np.zeros(len(settings)) + throttle, np.zeros(len(settings)) + brake)
+        states.append(system.vehicle.advance(prepared, states[-1], command))
+    return Drive(prepared, states, step)
+
+
+def _rolling(state: Any, prepared: Any, speed: float) -> Any:
+    """The vehicle at rest, set rolling without slip; its gear stays what it was."""
+    wheels = {"wheel_speed": speed / prepared.radius} if hasattr(state, "wheel_speed") else {}
+    return state._replace(speed=state.speed + speed, **wheels)
+
+
+def original(model: str, n: int = 1) -> np.ndarray:
+    return np.repeat(SYSTEMS[model].characteristics.original[np.newaxis], n, axis=0)
+
+
+def ends(model: str, name: str, points: int = 5) -> np.ndarray:
+    """The original vehicle with one characteristic moved across its domain, in `points` settings."""
+    characteristics = SYSTEMS[model].characteristics
+    settings, column = original(model, points), characteristics.names.index(name)
+    settings[:, column] = np.linspace(characteristics.lower[column], characteristics.upper[column], points)
+    return settings
+
+
+def drawn(model: str, n: int, seed: int) -> np.ndarray:
+    characteristics = SYSTEMS[model].characteristics
+    return np.random.default_rng(seed).uniform(characteristics.lower, characteristics.upper, (n, len(characteristics)))
+
+
+def full_throttle(time: float) -> tuple[float, float]:
+    return 1.0, 0.0
+
+
+def half_throttle(time: float) -> tuple[float, float]:
+    return 0.5, 0.0
+
+
+def coasting_after(start: float) -> Pedals:
+    return lambda time: (1.0, 0.0) if time < start else (0.0, 0.0)
+
+
+def braking_after(start: float, coasting: float = 0.0) -> Pedals:
+    return lambda time: (1.0, 0.0) if time < start else (0.0, 1.0 if time >= start + coasting else 0.0)

@@ -1,0 +1,263 @@
+"""Every vehicle model: physics that no parameter may break, and every characteristic acting as physics says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from drives import (
+    STEP,
+    SYSTEMS,
+    Drive,
+    braking_after,
+    coasting_after,
+    drawn,
+    drive,
+    ends,
+    full_throttle,
+    half_throttle,
+    original,
+)
+
+from safevar_sumo.records import Command, Observation
+from safevar_sumo.vehicles import VEHICLES
+from safevar_sumo.vehicles.carla import ENGINE_INERTIA, FINAL_RATIO, GEAR_RATIOS, Carla
+from safevar_sumo.vehicles.lgsvl import Lgsvl
+
+MODELS = sorted(VEHICLES)
+
+
+def kinetic_energy(model: str, run: Drive) -> np.ndarray:
+    """Of everything that moves [J], shape (T, N)."""
+    p, states = run.prepared, run.states
+    if isinstance(SYSTEMS[model].vehicle, Carla):
+        wheels_and_engine = [p.wheel_inertia * s.wheel_speed**2 + ENGINE_INERTIA * s.engine_speed**2 for s in states]
+        return np.stack([(p.mass * s.speed**2 + spins) / 2 for s, spins in zip(states, wheels_and_engine, strict=True)])
+    if isinstance(SYSTEMS[model].vehicle, Lgsvl):
+        return np.stack([(p.body * s.speed**2 + p.inertia * s.wheel_speed**2) / 2 for s in states])
+    return np.stack([p.mass * s.speed**2 / 2 for s in states])
+
+
+def at_random(model: str, then_brake: float | None = None) -> Drive:
+    """Many settings with pedals that change at random every second; after four, if so asked, the throttle closed and one brake."""
+    n, rng = 300, np.random.default_rng(12)
+    throttle, brake = rng.choice([0.0, 0.4, 1.0], (8, n)), rng.choice([0.0, 0.0, 0.3, 1.0], (8, n))
+
+    def pedals(time: float) -> tuple[object, object]:
+        if then_brake is not None and time >= 4:
+            return 0.0, then_brake
+        return throttle[int(time)], brake[int(time)]
+
+    return drive(model, drawn(model, n, 13), pedals, 8)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_energy_is_never_created(model: str) -> None:
+    """No more energy comes in than the engine can give; with the throttle closed none does."""
+    run = at_random(model)
+    energy = kinetic_energy(model, run)
+    gained = np.diff(energy, axis=0)
+    throttle = np.stack([state.throttle for state in run.states])
+    closed = (throttle[1:] == 0) & (throttle[:-1] == 0)
+    if model == "sumo":  # its actuator is a lag of the acceleration: the throttle is closed when that has died away
+        closed &= np.stack([state.acceleration for state in run.states[1:]]) <= 0
+    assert np.count_nonzero(closed) > 1000
+    assert np.all(gained[closed] <= 1e-9 * (1 + energy[:-1][closed]))
+    strongest = {"carla": 2 * 500 * 7000 * np.pi / 30, "lgsvl": 550 * 13000 * np.pi / 30, "sumo": 3.2 * 2100 * 60}[model]
+    assert np.all(gained <= strongest * STEP)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_braking_never_raises_speed(model: str) -> None:
+    """Whatever was done before: who brakes is never faster than who only releases the throttle, and slows down.
+
+    An engine that turns faster than its wheels ask gives its momentum away through the clutch first.
+    """
+    coasting, braking = at_random(model, 0.0), at_random(model, 1.0)
+    assert np.all(braking.speed <= coasting.speed + 1e-9)
+    since = braking.at(4.5)
+    slows = np.diff(braking.speed[since:], axis=0) <= 1e-12
+    if model == "carla":
+        states = braking.states[since:-1]
+        ratio = np.stack([GEAR_RATIOS[state.gear.astype(int)] * FINAL_RATIO for state in states])
+        shifting = np.stack([state.gear != state.target_gear for state in braking.states])
+        shifting = shifting[since:-1] | shifting[since + 1:]
+        slows |= shifting | (np.stack([s.engine_speed for s in states]) > ratio * np.stack([s.wheel_speed for s in states]))
+    assert np.all(slows)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_vehicle_at_rest_stays_at_rest(model: str) -> None:
+    for brake in (0.0, 1.0):
+        assert np.all(drive(model, drawn(model, 5, 1), lambda time, brake=brake: (0.0, brake), 3).speed == 0)  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_full_braking_ends_in_standstill(model: str) -> None:
+    run = drive(model, drawn(model, 20, 2), braking_after(3.0), 20)
+    assert np.all(run.speed[-1] < 1e-3)
+    assert np.all(run.speed >= 0)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_halving_the_time_step_changes_a_trajectory_by_little(model: str) -> None:
+    """Stated bound: 2 % of the distance and 0.3 m/s while driving up, coasting and braking to a stop."""
+    def pedals(time: float) -> tuple[float, float]:
+        return (0.8, 0.0) if time < 3 else (0.0, 0.0) if time < 4 else (0.0, 0.6)
+
+    coarse, fine = (drive(model, original(model), pedals, 8, step) for step in (STEP, STEP / 2))
+    assert np.abs(coarse.speed - fine.speed[::2]).max() < 0.3
+    assert coarse.distance[-1, 0] == pytest.approx(fine.distance[-1, 0], rel=0.02)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_no_vehicle_knows_of_another(model: str) -> None:
+    population = drawn(model, 9, 3)
+    together = drive(model, population, braking_after(3.0, 0.5), 8).speed
+    alone = drive(model, population[4:5], braking_after(3.0, 0.5), 8).speed
+    assert together[:, 4].tobytes() == alone[:, 0].tobytes()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_wet_road_makes_for_a_longer_way_to_stop(model: str) -> None:
+    worn = drawn(model, 6, 4)
+    dry, wet = (drive(model, worn, lambda time: (0.0, 1.0), 25, road=road, rolling=10.0).distance[-1] for road in (1.0, 0.15))
+    assert np.all(wet > 1.5 * dry)
+
+
+# Situations in which a characteristic acts: what is measured, at the end of its domain or of a fine grid over it.
+def speed_at(time: float, pedals: Callable[[float], tuple[float, float]] = full_throttle, road: float = 1.0) -> Callable[..., np.ndarray]:
+    return lambda model, population: drive(model, population, pedals, time, road=road).speed[-1]
+
+
+def stopping_distance(brake: float) -> Callable[..., np.ndarray]:
+    return lambda model, population: drive(model, population, lambda time: (0.0, brake), 15, rolling=8.0).distance[-1]
+
+
+def coasting_loss(start: float, duration: float) -> Callable[..., np.ndarray]:
+    def measured(model: str, population: np.ndarray) -> np.ndarray:
+        run = drive(model, population, coasting_after(start), start + duration + 0.5)
+        before, after = run.speed[run.at(start + 0.5)], run.speed[-1]
+        return np.asarray((before - after) / before)
+
+    return measured
+
+
+def lateral_error(model: str, population: np.ndarray) -> np.ndarray:
+    return np.abs(drive(model, population, half_throttle, 3).states[-1].lateral)
+
+
+ACTS = {
+    "carla": {
+        "max_rpm": (speed_at(30), +1), "dampRateFullT": (speed_at(1), -1), "dampRateZeroT_CE": (coasting_loss(3, 2), +1),
+        "dampRateZeroT_CD": (speed_at(0.8, half_throttle), -1), "gearSwitchTime": (speed_at(1.5), -1),
+        "clutchStrength": (speed_at(0.65), +1), "mass": (speed_at(3), -1), "dragCoeff": (speed_at(1.5), -1),
+        "tireFric": (stopping_distance(1.0), -1), "dampRate": (coasting_loss(3, 2), +1), "radius": (speed_at(1), -1),
+        "maxBrakeTorque": (stopping_distance(1.0), -1),
+    },
+    "lgsvl": {
+        "mass": (speed_at(3), -1), "wheelMass": (speed_at(3), -1), "radius": (speed_at(2), -1), "maxRpm": (speed_at(60), +1),
+        "minRpm": (speed_at(0.5), +1), "maxBrakeTorque": (stopping_distance(0.2), -1), "maxMotorTorque": (speed_at(3), +1),
+        "maxSteeringAngle": (lateral_error, -1), "tireDragCoeff": (coasting_loss(3, 5), +1), "wheelDamping": (coasting_loss(3, 5), +1),
+        "shiftTime": (speed_at(5), +1), "tractionControlSlipLimit": (speed_at(6, road=0.1), -1),
+    },
+    "sumo": {
+        "mass": (speed_at(3), -1), "accel": (speed_at(3), +1), "decel": (stopping_distance(0.6), -1), "maxSpeed": (speed_at(60), +1),
+        "tau": (speed_at(1), -1), "brakeDelay": (stopping_distance(0.6), +1), "brakeGain": (stopping_distance(0.6), -1),
+    },
+}
+SENSED = {"sumo": {"sensorRange", "reactionTime"}}
+
+
+@pytest.mark.parametrize(("model", "name"), [(model, name) for model, acting in ACTS.items() for name in acting])
+def test_a_characteristic_acts_in_the_direction_that_physics_says(model: str, name: str) -> None:
+    measure, direction = ACTS[model][name]
+    measured = direction * measure(model, ends(model, name))
+    assert measured[-1] > measured[0]
+    assert np.all(np.diff(measured) >= -1e-3 * np.abs(measured[1:]))
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_every_characteristic_is_tested_to_act(model: str) -> None:
+    assert set(ACTS[model]) | SENSED.get(model, set()) == set(SYSTEMS[model].characteristics.names)
+
+
+def sensed_gaps(name: str) -> np.ndarray:
+    """Gap that a vehicle reports while an obstacle comes nearer at 10 m/s; shape (T, 5)."""
+    vehicle, population = SYSTEMS["sumo"].vehicle, ends("sumo", name)
+    values = dict(zip(SYSTEMS["sumo"].characteristics.names, np.ascontiguousarray(population.T), strict=True))
+    prepared = vehicle.prepare(values, 1.0, STEP)
+    state, gaps, nothing = vehicle.at_rest(prepared), [], np.zeros(5)
+    for k in range(240):
+        gap = np.full(5, 130.0 - 10 * k * STEP)
+        seen, state = vehicle.sense(prepared, state, Observation(k * STEP, nothing, gap, nothing, nothing, nothing, 1.0))
+        gaps.append(seen.gap)
+    return np.stack(gaps)
+
+
+def test_a_sensor_sees_nothing_beyond_its_range() -> None:
+    detected = np.where(np.isfinite(sensed_gaps("sensorRange")), sensed_gaps("sensorRange"), 0).max(axis=0)
+    assert np.allclose(detected, np.linspace(20, 120, 5), atol=0.6)
+
+
+def test_a_slow_sensor_reports_the_past() -> None:
+    gaps = sensed_gaps("reactionTime")[200]
+    now = 130.0 - 10 * 200 * STEP
+    assert np.allclose(gaps, now + 10 * np.linspace(0.1, 0.8, 5))
+
+
+def test_a_brake_command_waits_for_the_delay() -> None:
+    run = drive("sumo", ends("sumo", "brakeDelay"), lambda time: (0.0, 1.0), 1.0)
+    brake = np.stack([state.brake for state in run.states])
+    assert np.allclose([np.argmax(brake[:, i] > 0.5) * STEP for i in range(5)], np.linspace(0.05, 0.5, 5) + STEP, atol=STEP)
+
+
+def test_a_camera_on_smaller_wheels_overestimates_the_gap() -> None:
+    vehicle, population = SYSTEMS["carla"].vehicle, ends("carla", "radius")
+    values = dict(zip(SYSTEMS["carla"].characteristics.names, np.ascontiguousarray(population.T), strict=True))
+    prepared = vehicle.prepare(values, 1.0, STEP)
+    nothing = np.zeros(5)
+    seen, _ = vehicle.sense(prepared, vehicle.at_rest(prepared), Observation(0.0, nothing, nothing + 8, nothing, nothing, nothing, 1.0))
+    assert np.all(np.diff(seen.gap) < 0)
+    assert np.interp(35.5, population[:, 10], seen.gap) == pytest.approx(8.0, rel=1e-3)
+
+
+def test_carla_waits_in_neutral_for_its_first_gear() -> None:
+    """A switch takes gearSwitchTime, counted in substeps of 1/60 s: 33 of them for 0.55 s, 34 for anything above."""
+    settings_ = original("carla", 2)
+    settings_[:, 4] = [0.55, 0.5501]
+    gears = np.stack([state.gear for state in drive("carla", settings_, full_throttle, 0.7).states])
+    assert np.argmax(gears[:, 0] > 0) == 12  # substep 33 lies in the frame that ends at 0.6 s
+    assert np.argmax(gears[:, 1] > 0) == 12
+    speeds = drive("carla", settings_, full_throttle, 0.6).speed[-1]
+    assert speeds[0] > speeds[1]
+
+
+def test_carlas_braked_deceleration_is_torque_over_radius_and_mass_where_tyres_hold() -> None:
+    """Neutral of the textbook: F = T / r as long as the slip is small; engine braking comes on top."""
+    run = drive("carla", original("carla"), braking_after(1.4), 3.0)
+    speed = run.speed[:, 0]
+    middle = (speed[1:] < 4) & (speed[1:] > 1) & (np.arange(1, len(speed)) > run.at(1.8))
+    deceleration = -np.diff(speed)[middle] / STEP
+    floor = 4 * 1500 / 0.355 / 2404
+    assert np.all(deceleration > 0.9 * floor)
+    assert np.all(deceleration < 1.8 * floor)
+
+
+def test_pedals_follow_at_their_rates() -> None:
+    vehicle = SYSTEMS["carla"].vehicle
+    run = drive("carla", original("carla"), full_throttle, 0.3)
+    throttle = [float(state.throttle[0]) for state in run.states]
+    assert throttle[:4] == pytest.approx([min(1.0, vehicle.throttle_rise * k * STEP) for k in range(4)])
+
+
+def test_commands_are_not_changed_in_place() -> None:
+    for model in MODELS:
+        population = original(model)
+        values = dict(zip(SYSTEMS[model].characteristics.names, np.ascontiguousarray(population.T), strict=True))
+        prepared = SYSTEMS[model].vehicle.prepare(values, 1.0, STEP)
+        state = SYSTEMS[model].vehicle.at_rest(prepared)
+        before = [np.copy(value) for value in state if isinstance(value, np.ndarray)]
+        SYSTEMS[model].vehicle.advance(prepared, state, Command(np.ones(1), np.zeros(1)))
+        assert all(np.array_equal(a, b) for a, b in zip(before, (v for v in state if isinstance(v, np.ndarray)), strict=True))
