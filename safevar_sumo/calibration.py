@@ -87,7 +87,7 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
             told.append(cost)
         return np.array(told)
 
-    size = min(max(5, 2 * len(names)), trials)
+    size = max(5, min(2 * len(names), trials))
     start = _first_generation(first, bounds, size, np.random.default_rng(seed))
     found = differential_evolution(
         costs, bounds, init=start, maxiter=max(trials // size - 1, 0), tol=0, atol=0, polish=False, vectorized=True,

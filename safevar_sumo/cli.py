@@ -138,7 +138,7 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
 @commands.command(name="calibrate")
 @click.argument("study")
 @click.argument("references", type=click.Path(path_type=Path), nargs=-1, metavar="[REFERENCE.csv]...")
-@click.option("--trials", type=click.IntRange(min=1), default=400, show_default=True, help="How many sets of parameters are tried.")
+@click.option("--trials", type=click.IntRange(min=5), default=400, show_default=True, help="How many sets of parameters are tried.")
 @click.option("--seed", type=click.IntRange(min=0, max=2**63 - 1), default=1, show_default=True, help="Seed of the search.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE.toml", help="Study file to write.  [default: STUDY-calibrated.toml]")
