@@ -30,7 +30,7 @@ WEIGHTS = {"safety_degree": 1.0, "tet": 0.3, "tit": 0.3, "ave_dece": 0.5}
 """What a metric's disagreement counts for."""
 TOLERANCE = 0.05
 """Share of the published value of the original vehicle by which it may be missed at a cost of its weight."""
-COLLISION_WEIGHT = 2.0
+COLLISION_WEIGHT = 10.0
 """What the difference between the shares of collisions counts for."""
 LOST = 1e3
 """Cost of a trial in which something could not be simulated."""

@@ -53,11 +53,12 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
         vehicle = world.vehicle_positions(VUT)
         lateral = world.person_positions(PEDESTRIAN)[:, 1] - vehicle[:, 1]
-        if self.turns_after is not None and not memory.turned and lateral[0] >= self.turns_after:
+        lateral_speed = (lateral - memory.place) / step
+        goes_past = self.turns_after is not None and lateral[0] + step * lateral_speed[0] > self.turns_after
+        if goes_past and not memory.turned:
             world.turn_back(PEDESTRIAN)
             memory = memory._replace(turned=True)
         front = vehicle[:, 0]
-        lateral_speed = (lateral - memory.place) / step
         left = (np.abs(lateral) > self.lane_width / 2) & (lateral * lateral_speed > 0)
         passed = front > memory.clear_point
         return Scene(memory.conflict_point - front, lateral, lateral_speed, left | passed), memory._replace(place=lateral)

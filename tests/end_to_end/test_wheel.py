@@ -19,8 +19,11 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel, unpacked into a directory of its own; its dependencies are those of the tests."""
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
-    ignored = shutil.ignore_patterns(".venv", ".git", "*.egg-info", ".*_cache", "__pycache__")
-    shutil.copytree(ROOT, source, ignore=ignored)
+    source.mkdir()
+    for name in ("safevar_sumo", "studies", "sumo_nets"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("setup.cfg", "pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
     subprocess.run([sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(source)], check=True, capture_output=True)
     wheel = next(folder.glob("*.whl"))
     subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(folder / "site"), str(wheel)],
