@@ -12,9 +12,9 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cma
 import msgspec
 import numpy as np
-from scipy.optimize import differential_evolution
 
 from safevar_sumo.analysis import Agreement, ReferenceData, agreement
 from safevar_sumo.computing import PersistentPool, Pool, packed
@@ -32,6 +32,10 @@ TOLERANCE = 0.05
 """Share of the published value of the original vehicle by which it may be missed at a cost of its weight."""
 COLLISION_WEIGHT = 10.0
 """What the difference between the shares of collisions counts for."""
+SPREAD = 0.05
+"""Standard deviation of the first trials, as a share of a parameter's bounds."""
+POPULATION = 12
+"""Trials of a generation."""
 LOST = 1e3
 """Cost of a trial in which something could not be simulated."""
 FITTED = ("vehicle.parameters.", "ads.parameters.", "weather.")
@@ -49,7 +53,7 @@ class Calibration(NamedTuple):
 
 def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool, trials: int, seed: int,
               done: Callable[[float], None] = lambda best: None) -> Calibration:
-    """Fit by differential evolution, the study's own values among the first trials.
+    """Fit by CMA-ES (Hansen 2016), which starts from the study's own values.
 
     Parameters
     ----------
@@ -72,29 +76,26 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
         raise InputError(f"study {study.name!r}", "has no table [published] and there is no reference file", "something to fit to")
     names = list(parameters)
     first = np.array([_value(study, name) for name in names])
-    bounds = [(row.lower, row.upper) for row in parameters.values()]
     halves = {name: _half(data, 0) for name, data in references.items()}
     trial = _Trial(study, names, halves, pool)
-    best = np.inf
-
-    def costs(candidates: FloatArray) -> FloatArray:
-        """Costs of candidates, shape (parameters, S); the pool computes all of them at once."""
-        nonlocal best
-        told = []
-        for cost in trial.costs(np.atleast_2d(candidates.T)):
-            best = min(best, cost)
-            done(best)
-            told.append(cost)
-        return np.array(told)
-
-    size = max(5, min(2 * len(names), trials))
-    start = _first_generation(first, bounds, size, np.random.default_rng(seed))
-    found = differential_evolution(
-        costs, bounds, init=start, maxiter=max(trials // size - 1, 0), tol=0, atol=0, polish=False, vectorized=True,
-        updating="deferred", mutation=(0.3, 0.9), recombination=0.8, rng=np.random.default_rng(seed))
-    values = dict(zip(names, found.x.tolist(), strict=True))
+    lower, upper = np.array([(row.lower, row.upper) for row in parameters.values()]).T
+    strategy = cma.CMAEvolutionStrategy(np.clip((first - lower) / (upper - lower), 0, 1), SPREAD, {
+        "bounds": [0, 1], "seed": seed + 1, "verbose": -9, "popsize": min(POPULATION, trials)})
+    best, cost = first, trial.costs(first[np.newaxis])[0]
+    done(cost)
+    for start in range(1, trials, strategy.popsize):
+        shares = strategy.ask()
+        candidates = lower + np.array(shares)[:trials - start] * (upper - lower)
+        costs = trial.costs(candidates)
+        for candidate, its_cost in zip(candidates, costs, strict=True):
+            if its_cost < cost:
+                best, cost = candidate, its_cost
+            done(cost)
+        if len(costs) == len(shares):
+            strategy.tell(shares, costs)
+    values = dict(zip(names, best.tolist(), strict=True))
     fitted = with_values(study, values)
-    return Calibration(values, fitted, float(found.fun), _told(fitted, halves, pool),
+    return Calibration(values, fitted, cost, _told(fitted, halves, pool),
                        _told(fitted, {name: _half(data, 1) for name, data in references.items()}, pool))
 
 
@@ -151,16 +152,6 @@ def _half(data: ReferenceData, first: int) -> ReferenceData:
     return ReferenceData(data.settings[first::2], metrics, data.skipped)
 
 
-def _first_generation(first: FloatArray, bounds: Sequence[tuple[float, float]], size: int, rng: np.random.Generator) -> FloatArray:
-    """The study's own values, half of the others near them, half anywhere in the bounds; shape (size, parameters)."""
-    lower, upper = np.array(bounds).T
-    anywhere = rng.uniform(lower, upper, (size, len(first)))
-    near = first + rng.normal(0.0, 0.05, anywhere.shape) * (upper - lower)
-    start = np.where((np.arange(size) % 2 == 0)[:, np.newaxis], near, anywhere)
-    start[0] = first
-    return np.asarray(np.clip(start, lower, upper))
-
-
 def calibration_comment(found: Calibration, study: Study, references: Sequence[Path], trials: int, seed: int) -> str:
     """How the values of a calibrated study were found: for the head of its file."""
     data = [f"  {path.name}, SHA-256 {sha256(path.read_bytes()).hexdigest()}" for path in references]
@@ -168,7 +159,7 @@ def calibration_comment(found: Calibration, study: Study, references: Sequence[P
         f"  {name}: rho of the safety degree {found.used[name].spearman['safety_degree']:.3f} on the used half,"
         f" {found.held_back[name].spearman['safety_degree']:.3f} on the other" for name in found.used]
     return "\n".join([
-        f"Study {study.name!r}, calibrated by differential evolution ({trials} trials, seed {seed}) to the original vehicle's",
+        f"Study {study.name!r}, calibrated by CMA-ES ({trials} trials, seed {seed}) to the original vehicle's",
         "published values" + (" and to every second row of" if data else "."), *data, f"Cost {found.cost:.4f}.", *halves])
 
 

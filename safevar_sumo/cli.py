@@ -28,7 +28,7 @@ from safevar_sumo.results import ResultsDirectory, record
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.simulation import Engine, assemble, score, simulate
-from safevar_sumo.study import Study, load_study, study_names, write_study
+from safevar_sumo.study import Study, check_writable, load_study, study_names, write_study
 from safevar_sumo.validation import evaluate_all
 from safevar_sumo.vehicles import VEHICLES, CharacteristicSet
 
@@ -138,7 +138,7 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
 @commands.command(name="calibrate")
 @click.argument("study")
 @click.argument("references", type=click.Path(path_type=Path), nargs=-1, metavar="[REFERENCE.csv]...")
-@click.option("--trials", type=click.IntRange(min=5), default=400, show_default=True, help="How many sets of parameters are tried.")
+@click.option("--trials", type=click.IntRange(min=1), default=400, show_default=True, help="How many sets of parameters are tried.")
 @click.option("--seed", type=click.IntRange(min=0, max=2**63 - 1), default=1, show_default=True, help="Seed of the search.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE.toml", help="Study file to write.  [default: STUDY-calibrated.toml]")
@@ -147,7 +147,7 @@ def calibrate_command(study: str, references: tuple[Path, ...], trials: int, see
     chosen = load_study(study)
     system = assemble(chosen)
     target = out or Path(f"{chosen.name}-calibrated.toml")
-    write_study(target, chosen, "Calibration under way: these are the values that it starts from.")
+    check_writable(target)
     data = {path.name: read_reference(path, system.characteristics) for path in references}
     with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
           terminal.trials(Console(stderr=True), trials) as done):

@@ -219,6 +219,24 @@ def write_study(path: Path, study: Study, comment: str) -> None:
         raise InputError("--out", f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
 
 
+def check_writable(path: Path) -> None:
+    """Refuse a file that cannot be written before the work whose result it is to take.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    is_new = not path.exists()
+    try:
+        with path.open("a"):
+            pass
+        if is_new:
+            path.unlink()
+    except OSError as error:
+        raise InputError("--out", f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
+
+
 def _without_nothing(raw: Any) -> Any:
     """TOML has no null: what is not given is left out."""
     return {key: _without_nothing(value) for key, value in raw.items() if value is not None} if isinstance(raw, dict) else raw
