@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from safevar_sumo.records import Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import VUT, Scene, World
 
+Positive = Annotated[float, Meta(gt=0)]
 PEDESTRIAN = "pedestrian"
 CROSSING_LANE = ":crossing_c0_0"
 
@@ -41,9 +42,9 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
     """
 
     network: str = "pedestrian_crossing"
-    duration: float = 9.5
+    duration: Positive = 9.5
     turns_after: float | None = 0.7
-    lane_width: float = 3.5
+    lane_width: Positive = 3.5
 
     def begin(self, world: World) -> _Memory:
         lateral = world.person_positions(PEDESTRIAN)[:, 1] - world.vehicle_positions(VUT)[:, 1]
