@@ -168,9 +168,11 @@ def forecast(study: Study, runs: int, pool: Pool, batch: int | None = None) -> F
         start = time.perf_counter()
         drawn = [characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (size, len(characteristics))))
                  for _ in range(number * pool.workers)]
-        wait([persistent.submit(work, settings) for settings in drawn])
+        for future in [persistent.submit(work, settings) for settings in drawn]:
+            future.result()
         return time.perf_counter() - start
 
+    persistent.submit(work, characteristics.original[np.newaxis], must_succeed=True).result()
     probe(1)  # starts the workers and builds the network
     rate = PROBE_BATCHES * pool.workers * size / probe(PROBE_BATCHES)
     evaluations = runs * study.search.evaluations
@@ -180,10 +182,16 @@ def forecast(study: Study, runs: int, pool: Pool, batch: int | None = None) -> F
 
 def _original(work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: PersistentPool) -> Evaluations:
     """The original vehicle's evaluation, simulated once; where it fails, the study is at fault."""
-    journal = results.journal("original")
+    def simulated() -> Evaluations:
+        return pool.submit(work, characteristics.original[np.newaxis], must_succeed=True).result()
+
+    try:
+        journal = results.journal("original")
+    except JournalBusy:  # another process, of a job array say, is about to write the same
+        return simulated()
     try:
         if journal.evaluations is None:
-            evaluations = pool.submit(work, characteristics.original[np.newaxis], must_succeed=True).result()
+            evaluations = simulated()
             journal.append([0], evaluations)
             return evaluations
         return journal.evaluations
@@ -196,7 +204,7 @@ class _Run:
 
     def __init__(self, key: RunKey, search: Search, journal: Journal, observer: Observer) -> None:
         self.key, self._search, self._journal, self._observer = key, search, journal, observer
-        self._known: dict[bytes, tuple[int, Evaluations]] = {}
+        self._known: dict[bytes, tuple[int, Evaluations, int]] = {}
         self.failures = self._asked = 0
         self._settings: FloatArray | None = None
         self._fresh = 0
@@ -221,7 +229,7 @@ class _Run:
         if self._settings is None:
             self._settings = next(self._search)
         while not len(self.missing):
-            evaluations = Evaluations.concatenate([self._known[row.tobytes()][1] for row in self._settings])
+            evaluations = self._recalled(self._settings)
             self._observer.evaluated(self.key, evaluations, self._fresh)
             self._asked, self._fresh = self._asked + len(evaluations), 0
             try:
@@ -249,8 +257,14 @@ class _Run:
 
     def _learn(self, positions: list[int], evaluations: Evaluations) -> None:
         self.failures += int(np.count_nonzero(~evaluations.valid))
-        for i, position in enumerate(positions):
-            self._known[evaluations.settings[i].tobytes()] = (position, evaluations.take([i]))
+        if self._journal.result is None:
+            for i, position in enumerate(positions):
+                self._known[evaluations.settings[i].tobytes()] = (position, evaluations, i)
+
+    def _recalled(self, settings: FloatArray) -> Evaluations:
+        """The evaluations of known settings, in their order."""
+        found = [self._known[row.tobytes()] for row in settings]
+        return Evaluations.concatenate([evaluations.take([i]) for _, evaluations, i in found])
 
     def _by_position(self, positions: list[int]) -> Evaluations:
         assert self._journal.evaluations is not None

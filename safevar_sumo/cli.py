@@ -67,7 +67,8 @@ def study(study: str, batch: int | None, out: Path | None, jobs: int | None, clu
     for name in chosen.search.algorithms:
         algorithm_of(name, chosen)
     keys = _selected(all_runs(chosen), only, shard)
-    with cluster_pool(cluster) if cluster else local_pool(jobs or available_cores(), chosen.search.time_limit) as pool:
+    limit = chosen.search.time_limit
+    with cluster_pool(cluster, limit) if cluster is not None else local_pool(jobs or available_cores(), limit) as pool:
         if dry_run:
             terminal.print_forecast(Console(), chosen, len(keys), forecast(chosen, len(keys), pool, batch))
             return

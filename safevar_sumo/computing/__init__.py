@@ -1,8 +1,9 @@
 """Where batches are computed: processes of this machine, or a cluster."""
 
-from safevar_sumo.computing.base import Pool, WorkerLostError, evaluate_batch, packed
+from safevar_sumo.computing.base import Pool, PoolLostError, WorkerLostError, evaluate_batch, packed
 from safevar_sumo.computing.cluster import cluster_pool
 from safevar_sumo.computing.local import available_cores, local_pool
 from safevar_sumo.computing.persistent import PersistentPool
 
-__all__ = ["PersistentPool", "Pool", "WorkerLostError", "available_cores", "cluster_pool", "evaluate_batch", "local_pool", "packed"]
+__all__ = ["PersistentPool", "Pool", "PoolLostError", "WorkerLostError", "available_cores", "cluster_pool", "evaluate_batch", "local_pool",
+           "packed"]

@@ -18,8 +18,12 @@ class WorkerLostError(SafevarError):
     """The process that computed a batch died or was stopped for taking too long."""
 
 
+class PoolLostError(SafevarError):
+    """Nothing can be computed any more: whatever is tried again will fail again."""
+
+
 class Pool(Protocol):
-    """Computes batches somewhere; futures fail with `WorkerLostError` or with what the batch itself raised."""
+    """Computes batches somewhere; futures fail with `WorkerLostError`, `PoolLostError` or what the batch itself raised."""
 
     @property
     def workers(self) -> int:

@@ -2,24 +2,36 @@
 
 from __future__ import annotations
 
+import faulthandler
+import logging
+import os
 import re
+import threading
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
 from typing import Any
 
-from safevar_sumo.computing.base import WorkerLostError, evaluate_batch
+from safevar_sumo.computing.base import PoolLostError, WorkerLostError, evaluate_batch
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray
 
 ADDRESS = re.compile(r"[a-z]+://[^\s/]+:\d+/?")
 CONNECT_TIMEOUT = 10.0
 """How long an address may take to answer [s]."""
+_one_at_a_time = threading.Lock()
 
 
 @contextmanager
-def cluster_pool(address: str) -> Iterator[ClusterPool]:
+def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
     """Connect to a scheduler.
+
+    Parameters
+    ----------
+    address
+        Of the scheduler.
+    time_limit
+        The worker of a batch that takes longer is stopped [s].
 
     Raises
     ------
@@ -33,12 +45,13 @@ def cluster_pool(address: str) -> Iterator[ClusterPool]:
     legal = "the address of a Dask scheduler, such as tcp://host:8786"
     if not ADDRESS.fullmatch(address):
         raise InputError("--cluster", repr(address), legal)
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what goes wrong is told by us
     try:
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise InputError("--cluster", f"nobody answers at {address!r}: {error}", legal) from None
     try:
-        yield ClusterPool(client)
+        yield ClusterPool(client, time_limit)
     finally:
         client.close()
 
@@ -46,9 +59,9 @@ def cluster_pool(address: str) -> Iterator[ClusterPool]:
 class ClusterPool:
     """Computes batches on a Dask cluster, which itself tries a batch again when a worker dies."""
 
-    def __init__(self, client: Any) -> None:
+    def __init__(self, client: Any, time_limit: float) -> None:
         self._executor = client.get_executor(pure=False)
-        self._client = client
+        self._client, self._time_limit = client, time_limit
 
     @property
     def workers(self) -> int:
@@ -56,15 +69,29 @@ class ClusterPool:
 
     def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
         outer: Future[Evaluations] = Future()
-        self._executor.submit(evaluate_batch, study, settings).add_done_callback(lambda done: _hand_on(done, outer))
+        try:
+            inner = self._executor.submit(_evaluate_within, self._time_limit, study, settings)
+        except RuntimeError as error:
+            raise PoolLostError(f"the cluster does not answer any more: {error}") from None
+        inner.add_done_callback(lambda done: _hand_on(done, outer))
         return outer
+
+
+def _evaluate_within(time_limit: float, study: bytes, settings: FloatArray) -> Evaluations:
+    """What a worker of the cluster does: one batch at a time, for libsumo exists once in a process; if it hangs, the worker ends."""
+    with _one_at_a_time, open(os.devnull, "w") as nowhere:
+        faulthandler.dump_traceback_later(time_limit, exit=True, file=nowhere)
+        try:
+            return evaluate_batch(study, settings)
+        finally:
+            faulthandler.cancel_dump_traceback_later()
 
 
 def _hand_on(done: Future[Evaluations], outer: Future[Evaluations]) -> None:
     from distributed import KilledWorker
 
     if done.cancelled():
-        outer.cancel()
+        outer.set_exception(PoolLostError("the cluster does not answer any more"))
         return
     error = done.exception()
     if isinstance(error, KilledWorker):

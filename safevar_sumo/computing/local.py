@@ -5,14 +5,20 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
+import traceback
 from collections.abc import Iterator
-from concurrent.futures import Future, TimeoutError
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from multiprocessing import connection, resource_tracker
+from typing import Any
 
-from pebble import ProcessExpired, ProcessPool
-
-from safevar_sumo.computing.base import WorkerLostError, evaluate_batch
+from safevar_sumo.computing.base import PoolLostError, WorkerLostError, evaluate_batch
+from safevar_sumo.errors import SafevarError
 from safevar_sumo.records import Evaluations, FloatArray
+
+START_LIMIT = 120.0
+"""How long a worker process may take until it is ready for its first batch [s]."""
 
 
 def available_cores() -> int:
@@ -22,7 +28,7 @@ def available_cores() -> int:
 
 @contextmanager
 def local_pool(jobs: int, time_limit: float) -> Iterator[LocalPool]:
-    """Worker processes, spawned: libsumo must not be forked. They end with the block.
+    """Worker processes, started when they are needed first. They end with the block.
 
     Parameters
     ----------
@@ -31,41 +37,136 @@ def local_pool(jobs: int, time_limit: float) -> Iterator[LocalPool]:
     time_limit
         A batch that takes longer is stopped [s].
     """
-    pool = ProcessPool(max_workers=jobs, context=multiprocessing.get_context("spawn"), initializer=_leave_interrupts_to_the_caller)
+    pool = LocalPool(jobs, time_limit)
     try:
-        yield LocalPool(pool, jobs, time_limit)
-        pool.close()
+        yield pool
     finally:
-        pool.stop()
-        pool.join()
+        pool.close()
 
 
 class LocalPool:
-    """Computes batches in the processes of a Pebble pool, which outlives its workers' deaths."""
+    """Computes batches in processes, each with a thread of this process that waits for it.
 
-    def __init__(self, pool: ProcessPool, jobs: int, time_limit: float) -> None:
-        self._pool, self.workers, self._time_limit = pool, jobs, time_limit
+    Workers share nothing, no queue and no lock: so one may die or be killed at any moment without harm to another.
+    """
+
+    def __init__(self, jobs: int, time_limit: float) -> None:
+        self.workers, self._time_limit = jobs, time_limit
+        self._threads = ThreadPoolExecutor(jobs, thread_name_prefix="worker", initializer=_leave_interrupts_to_the_caller)
+        self._of_thread = threading.local()
+        self._living: set[_Worker] = set()
+        self._closed = False
 
     def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
-        inner = self._pool.schedule(evaluate_batch, args=(study, settings), timeout=self._time_limit)
-        outer: Future[Evaluations] = Future()
-        inner.add_done_callback(lambda done: self._hand_on(done, outer))
-        return outer
+        try:
+            return self._threads.submit(self._compute, study, settings)
+        except RuntimeError:
+            raise PoolLostError("the worker processes are closed down") from None
 
-    def _hand_on(self, done: Future[Evaluations], outer: Future[Evaluations]) -> None:
-        if done.cancelled():
-            outer.cancel()
-            return
-        error = done.exception()
-        if isinstance(error, ProcessExpired):
-            outer.set_exception(WorkerLostError(f"the worker process died (exit code {error.exitcode})"))
-        elif isinstance(error, TimeoutError):
-            outer.set_exception(WorkerLostError(f"the simulation took longer than {self._time_limit:g} s"))
-        elif error is not None:
-            outer.set_exception(error)
-        else:
-            outer.set_result(done.result())
+    def close(self) -> None:
+        """Drop what is not computed yet and end all workers."""
+        self._closed = True
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        while self._living:
+            for worker in list(self._living):
+                worker.end()
+                self._living.discard(worker)
+        self._threads.shutdown()
+
+    def _compute(self, study: bytes, settings: FloatArray) -> Evaluations:
+        worker: _Worker | None = getattr(self._of_thread, "worker", None)
+        if worker is None or not worker.alive:
+            worker = self._of_thread.worker = _Worker()
+            self._living.add(worker)
+            if self._closed:
+                worker.end()
+        try:
+            return worker.compute(study, settings, self._time_limit)
+        except WorkerLostError:
+            worker.end()
+            self._living.discard(worker)
+            self._of_thread.worker = None
+            raise
+
+
+class _Worker:
+    """A process and the pipe to it. It is spawned: libsumo must not be forked."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        try:
+            self._pipe, theirs = context.Pipe()
+            self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
+            self._process.start()
+        except OSError as error:
+            raise PoolLostError(f"no worker process can be started: {error.strerror}") from None
+        theirs.close()
+        self._ready = False
+
+    @property
+    def alive(self) -> bool:
+        return self._process.is_alive()
+
+    def compute(self, study: bytes, settings: FloatArray, time_limit: float) -> Evaluations:
+        """Have a batch computed; raises what it raised, or WorkerLostError."""
+        try:
+            if not self._ready:
+                self._receive(START_LIMIT)
+                self._ready = True
+            self._pipe.send((study, settings))
+            answer = self._receive(time_limit)
+        except (EOFError, OSError):
+            self._process.join()
+            raise WorkerLostError(f"the worker process died (exit code {self._process.exitcode})") from None
+        if isinstance(answer, Exception):
+            raise answer
+        return answer  # type: ignore[no-any-return]
+
+    def _receive(self, time_limit: float) -> Any:
+        ready = connection.wait([self._pipe, self._process.sentinel], time_limit)
+        if not ready:
+            raise WorkerLostError(f"the simulation took longer than {time_limit:g} s")
+        if self._pipe not in ready:
+            raise EOFError
+        return self._pipe.recv()
+
+    def end(self) -> None:
+        """Kill the process; whoever waits for its answer learns that it died."""
+        self._process.kill()
+        self._process.join()
+
+
+def _serve(pipe: connection.Connection[Any, Any]) -> None:
+    """What a worker process does: answer batches until the other end of the pipe is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_the_caller, daemon=True).start()
+    try:
+        pipe.send(None)
+        while True:
+            pipe.send(_answer(*pipe.recv()))
+    except (EOFError, OSError):
+        return
+
+
+def _answer(study: bytes, settings: FloatArray) -> Evaluations | Exception:
+    try:
+        return evaluate_batch(study, settings)
+    except SafevarError as error:
+        return error
+    except Exception:
+        return RuntimeError(f"in a worker process\n{traceback.format_exc()}")  # not every exception survives the pipe
+
+
+def _end_with_the_caller() -> None:
+    """A worker that hangs in a simulation would outlive a killed caller."""
+    caller = multiprocessing.parent_process()
+    assert caller is not None
+    caller.join()
+    os._exit(1)
 
 
 def _leave_interrupts_to_the_caller() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Ctrl-C reaches all processes of a terminal: block it in this thread, whose processes then never see it, however young."""
+    resource_tracker.ensure_running()  # its start would unblock interrupts
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -6,14 +6,14 @@ from concurrent.futures import Future
 
 import numpy as np
 
-from safevar_sumo.computing.base import Pool
+from safevar_sumo.computing.base import Pool, PoolLostError
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.vehicles import CharacteristicSet
 
 ATTEMPTS = 2
-"""How often a batch is tried as a whole."""
+"""How often a batch is tried as a whole, and a setting alone: somebody else may have killed the worker."""
 FAILURES_IN_A_ROW = 20
 """So many settings that fail one after the other are a fault of the study, not of the settings."""
 
@@ -37,11 +37,11 @@ class PersistentPool:
 
     def _attempt(self, study: bytes, settings: FloatArray, attempts: int, into: Future[Evaluations], must_succeed: bool) -> None:
         def done(attempt: Future[Evaluations]) -> None:
-            error = attempt.exception()
+            error = PoolLostError("the batch was cancelled") if attempt.cancelled() else attempt.exception()
             if error is None:
                 self._in_a_row = 0
                 into.set_result(attempt.result())
-            elif not isinstance(error, SafevarError):
+            elif isinstance(error, PoolLostError) or not isinstance(error, SafevarError):
                 into.set_exception(error)
             elif attempts > 1:
                 self._attempt(study, settings, attempts - 1, into, must_succeed)
@@ -50,7 +50,12 @@ class PersistentPool:
             else:
                 self._give_up(settings, error, into, must_succeed)
 
-        self._pool.submit(study, settings).add_done_callback(done)
+        try:
+            attempt = self._pool.submit(study, settings)
+        except PoolLostError as error:
+            into.set_exception(error)
+        else:
+            attempt.add_done_callback(done)
 
     def _one_by_one(self, study: bytes, settings: FloatArray, into: Future[Evaluations]) -> None:
         def done(row: int, single: Future[Evaluations]) -> None:
@@ -66,7 +71,7 @@ class PersistentPool:
         def alone(row: int) -> None:
             single: Future[Evaluations] = Future()
             single.add_done_callback(lambda future: done(row, future))
-            self._attempt(study, settings[row:row + 1], 1, single, must_succeed=False)
+            self._attempt(study, settings[row:row + 1], ATTEMPTS, single, must_succeed=False)
 
         rows: list[Evaluations] = []
         alone(0)

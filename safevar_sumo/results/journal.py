@@ -124,7 +124,7 @@ class Journal:
         if not frames:
             self._write(_Owner(format=FORMAT, study=study, run=run))
         elif frames[0] != _Owner(format=FORMAT, study=study, run=run):
-            raise InputError(self.path, f"belongs to another study, run or version: {frames[0]}", "another --out")
+            raise InputError(self.path, "belongs to another study, run or version", "another --out")
         positions, evaluations = merged(frames)
         result = next((frame for frame in frames if isinstance(frame, _Result)), None)
         return positions, evaluations, result.positions if result else None, result.asked if result else 0
@@ -173,9 +173,9 @@ def read_frames(data: bytes, path: Path) -> tuple[list[_Frame], int]:
     frames: list[_Frame] = []
     offset = 0
     while offset < len(data):
-        frame, end = _frame_at(data, offset)
+        frame, end = _frame_at(data, offset, path)
         if frame is None:
-            if any(_frame_at(data, later)[0] is not None for later in _occurrences(data, offset + 1)):
+            if any(_frame_at(data, later, path)[0] is not None for later in _occurrences(data, offset + 1)):
                 raise InputError(path, f"is damaged at byte {offset}, and intact frames follow",
                                  "restore the file, or remove it to simulate the run again")
             break
@@ -206,14 +206,17 @@ def _opened(path: Path) -> IO[bytes]:
     return file
 
 
-def _frame_at(data: bytes, offset: int) -> tuple[_Frame | None, int]:
+def _frame_at(data: bytes, offset: int, path: Path) -> tuple[_Frame | None, int]:
     if offset + HEAD.size > len(data):
         return None, offset
     magic, length, checksum = HEAD.unpack_from(data, offset)
     payload = data[offset + HEAD.size:offset + HEAD.size + length]
     if magic != MAGIC or len(payload) != length or zlib.crc32(payload) != checksum:
         return None, offset
-    return msgspec.msgpack.decode(payload, type=_Frame), offset + HEAD.size + length
+    try:
+        return msgspec.msgpack.decode(payload, type=_Frame), offset + HEAD.size + length
+    except msgspec.DecodeError as error:
+        raise InputError(path, f"holds at byte {offset} what this version does not know: {error}", "the version that wrote it") from None
 
 
 def _occurrences(data: bytes, start: int) -> Iterator[int]:
