@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from concurrent.futures import Future
+from functools import partial
 
 import numpy as np
 
@@ -58,23 +60,25 @@ class PersistentPool:
             attempt.add_done_callback(done)
 
     def _one_by_one(self, study: bytes, settings: FloatArray, into: Future[Evaluations]) -> None:
+        found: dict[int, Evaluations] = {}
+        lock = threading.Lock()
+
         def done(row: int, single: Future[Evaluations]) -> None:
-            if single.exception() is not None:
-                into.set_exception(single.exception())
-                return
-            rows.append(single.result())
-            if row + 1 < len(settings):
-                alone(row + 1)
-            else:
-                into.set_result(Evaluations.concatenate(rows))
+            with lock:
+                if into.done():
+                    return
+                if single.exception() is not None:
+                    into.set_exception(single.exception())
+                    return
+                found[row] = single.result()
+                if len(found) == len(settings):
+                    into.set_result(Evaluations.concatenate([found[row] for row in range(len(settings))]))
 
-        def alone(row: int) -> None:
-            single: Future[Evaluations] = Future()
-            single.add_done_callback(lambda future: done(row, future))
-            self._attempt(study, settings[row:row + 1], ATTEMPTS, single, must_succeed=False)
-
-        rows: list[Evaluations] = []
-        alone(0)
+        for row in range(len(settings)):
+            if not into.done():
+                single: Future[Evaluations] = Future()
+                single.add_done_callback(partial(done, row))
+                self._attempt(study, settings[row:row + 1], ATTEMPTS, single, must_succeed=False)
 
     def _give_up(self, setting: FloatArray, error: SafevarError, into: Future[Evaluations], must_succeed: bool) -> None:
         self._in_a_row += 1

@@ -1,0 +1,136 @@
+"""What becomes of batches whose worker died: pools that fail as they are told to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future
+
+import numpy as np
+import pytest
+
+from safevar_sumo.computing import PersistentPool, PoolLostError, WorkerLostError
+from safevar_sumo.computing.persistent import ATTEMPTS, FAILURES_IN_A_ROW
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.records import Evaluations, Outcome
+from safevar_sumo.study import load_study
+from safevar_sumo.vehicles import CharacteristicSet
+
+SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+
+
+def settings(number: int) -> np.ndarray:
+    """Settings whose first value tells which it is."""
+    rows = np.repeat(SUN.original[np.newaxis], number, axis=0)
+    rows[:, 0] = 4300 + np.arange(number)
+    return rows
+
+
+def evaluated(rows: np.ndarray) -> Evaluations:
+    return Evaluations(
+        settings=rows, outcome=np.full(len(rows), "stopped", dtype="U16"), collision_speed=np.full(len(rows), np.nan),
+        metrics={name: rows[:, 0] / 3 for name in METRICS}, f_diff=SUN.largest_change(rows), f_num_diff=SUN.number_changed(rows))
+
+
+class ToldPool:
+    """Fails with what `fault` answers to (settings, how often they were tried before)."""
+
+    workers = 1
+
+    def __init__(self, fault: Callable[[np.ndarray, int], Exception | None]) -> None:
+        self.fault = fault
+        self.tried: list[int] = []
+        self._times: dict[bytes, int] = {}
+
+    def submit(self, study: bytes, settings: np.ndarray) -> Future[Evaluations]:
+        before = self._times.get(settings.tobytes(), 0)
+        self._times[settings.tobytes()] = before + 1
+        self.tried.append(len(settings))
+        error = self.fault(settings, before)
+        future: Future[Evaluations] = Future()
+        if error is None:
+            future.set_result(evaluated(settings))
+        else:
+            future.set_exception(error)
+        return future
+
+
+def died() -> WorkerLostError:
+    return WorkerLostError("the worker process died (exit code -9)")
+
+
+def deadly(*values: float) -> Callable[[np.ndarray, int], Exception | None]:
+    return lambda rows, before: died() if np.isin(rows[:, 0], values).any() else None
+
+
+def test_a_batch_that_lost_its_worker_once_is_tried_again() -> None:
+    pool = ToldPool(lambda rows, before: None if before else died())
+    found = PersistentPool(pool, SUN).submit(b"", settings(8)).result(timeout=5)
+    assert pool.tried == [8, 8]
+    assert found.valid.all()
+
+
+def test_the_setting_that_kills_its_worker_alone_is_told_from_the_others() -> None:
+    pool = ToldPool(deadly(4302, 4305))
+    found = PersistentPool(pool, SUN).submit(b"", settings(8)).result(timeout=5)
+    assert np.array_equal(found.settings, settings(8))
+    assert np.array_equal(found.valid, ~np.isin(settings(8)[:, 0], (4302, 4305)))
+    assert found.outcome[2] == Outcome.SIMULATOR_ERROR
+    assert np.isnan(found.objectives[2, 0])
+    assert np.array_equal(found.f_safe[found.valid], settings(8)[found.valid, 0] / 3)
+    assert np.array_equal(found.f_num_diff, SUN.number_changed(settings(8)))
+    assert pool.tried.count(1) == 6 + 2 * ATTEMPTS
+
+
+def test_a_setting_alone_gets_a_second_chance_too() -> None:
+    pool = ToldPool(lambda rows, before: died() if len(rows) > 1 or not before else None)
+    assert PersistentPool(pool, SUN).submit(b"", settings(3)).result(timeout=5).valid.all()
+
+
+def test_what_the_study_is_at_fault_for_ends_early_with_that_fault() -> None:
+    pool = ToldPool(lambda rows, before: InputError("study", "ads.model = 'x' raised"))
+    with pytest.raises(InputError, match="raised"):
+        PersistentPool(pool, SUN).submit(b"", settings(1000)).result(timeout=5)
+    assert len(pool.tried) <= ATTEMPTS * (1 + FAILURES_IN_A_ROW)
+
+
+def test_failures_between_successes_are_no_fault_of_the_study() -> None:
+    every_second = 4300 + np.arange(0, 200, 2)
+    found = PersistentPool(ToldPool(deadly(*every_second)), SUN).submit(b"", settings(200)).result(timeout=5)
+    assert np.count_nonzero(~found.valid) == 100
+
+
+def test_the_original_vehicle_must_succeed() -> None:
+    with pytest.raises(WorkerLostError):
+        PersistentPool(ToldPool(deadly(4300)), SUN).submit(b"", settings(1), must_succeed=True).result(timeout=5)
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError("a bug"), PoolLostError("gone")])
+def test_a_bug_and_a_lost_pool_are_not_tried_again(error: Exception) -> None:
+    pool = ToldPool(lambda rows, before: error)
+    with pytest.raises(type(error), match=str(error)):
+        PersistentPool(pool, SUN).submit(b"", settings(5)).result(timeout=5)
+    assert pool.tried == [5]
+
+
+def test_a_pool_that_takes_nothing_any_more_ends_the_wait() -> None:
+    class Closed(ToldPool):
+        def submit(self, study: bytes, settings: np.ndarray) -> Future[Evaluations]:
+            if self.tried:
+                raise PoolLostError("closed")
+            return super().submit(study, settings)
+
+    with pytest.raises(PoolLostError, match="closed"):
+        PersistentPool(Closed(lambda rows, before: died()), SUN).submit(b"", settings(5)).result(timeout=5)
+
+
+def test_a_cancelled_batch_ends_the_wait() -> None:
+    class Cancelling(ToldPool):
+        def submit(self, study: bytes, settings: np.ndarray) -> Future[Evaluations]:
+            future: Future[Evaluations] = Future()
+            future.cancel()
+            future.set_running_or_notify_cancel()
+            return future
+
+    with pytest.raises(PoolLostError, match="cancelled"):
+        PersistentPool(Cancelling(died), SUN).submit(b"", settings(5)).result(timeout=5)  # type: ignore[arg-type]

@@ -1,0 +1,207 @@
+"""A run's journal: what it gives back after whatever happened to it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.records import Evaluations
+from safevar_sumo.results import Journal, JournalBusy
+from safevar_sumo.results.journal import HEAD, MAGIC, read_journal
+
+BATCHES = 4
+ROWS = 3
+RESULT = [1, 5]
+in_one_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=100)
+
+
+def batch(number: int) -> Evaluations:
+    """Rows that tell by their values which they are; one is a collision, one failed."""
+    values = np.arange(ROWS) + 10.0 * number
+    outcome = np.array(["stopped", "collision", "simulator-error"])
+    metrics = {name: np.where(outcome == "simulator-error", np.nan, values + i / 7) for i, name in enumerate(("safety_degree", "tet"))}
+    return Evaluations(settings=np.stack([values, values + 0.1], axis=1), outcome=outcome, metrics=metrics, f_diff=values / 3,
+                       collision_speed=np.where(outcome == "collision", values, np.nan), f_num_diff=np.ones(ROWS))
+
+
+def places(number: int) -> list[int]:
+    return [ROWS * number + row for row in range(ROWS)]
+
+
+def write(path: Path, batches: int = BATCHES, finished: bool = True) -> list[int]:
+    """Write a journal; returns where its frames end."""
+    ends = []
+    journal = Journal(path, "study", "nsga2-00")
+    ends.append(path.stat().st_size)
+    for number in range(batches):
+        journal.append(places(number), batch(number))
+        ends.append(path.stat().st_size)
+    if finished:
+        journal.finish(RESULT, 99)
+        ends.append(path.stat().st_size)
+    journal.close()
+    return ends
+
+
+def same(one: Evaluations, other: Evaluations) -> bool:
+    numbers = [(getattr(one, name), getattr(other, name)) for name in ("settings", "collision_speed", "f_diff", "f_num_diff")]
+    numbers += [(one.metrics[name], other.metrics[name]) for name in other.metrics]
+    return bool(all(np.array_equal(a, b, equal_nan=True) for a, b in numbers) and np.array_equal(one.outcome, other.outcome))
+
+
+def holds_the_first(batches: int, positions: list[int], evaluations: Evaluations | None) -> bool:
+    """Whether exactly what was written first is there."""
+    if not batches:
+        return positions == [] and evaluations is None
+    expected = Evaluations.concatenate([batch(number) for number in range(batches)])
+    return evaluations is not None and positions == list(range(ROWS * batches)) and same(evaluations, expected)
+
+
+def test_what_was_written_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "runs" / "a.journal"
+    write(path)
+    journal = Journal(path, "study", "nsga2-00")
+    assert holds_the_first(BATCHES, journal.positions, journal.evaluations)
+    assert (journal.result, journal.asked, journal.cut) == (RESULT, 99, 0)
+    journal.close()
+    positions, evaluations, result = read_journal(path)
+    assert holds_the_first(BATCHES, positions, evaluations)
+    assert result == RESULT
+
+
+@in_one_folder
+@given(st.data())
+def test_any_truncation_loads_what_was_whole_and_goes_on(tmp_path: Path, data: st.DataObject) -> None:
+    path = tmp_path / "a.journal"
+    path.unlink(missing_ok=True)
+    ends = write(path)
+    left = data.draw(st.integers(0, ends[-1] - 1))
+    os.truncate(path, left)
+    whole = sum(end <= left for end in ends)
+    journal = Journal(path, "study", "nsga2-00")
+    assert holds_the_first(max(0, whole - 1), journal.positions, journal.evaluations)
+    assert journal.result is None
+    assert journal.cut == left - max([0, *(end for end in ends if end <= left)])
+    for number in range(max(0, whole - 1), BATCHES):
+        journal.append(places(number), batch(number))
+    journal.close()
+    positions, evaluations, _ = read_journal(path)
+    assert holds_the_first(BATCHES, positions, evaluations)
+
+
+@in_one_folder
+@given(st.data())
+def test_any_changed_byte_is_a_cut_tail_or_an_error_that_tells_where(tmp_path: Path, data: st.DataObject) -> None:
+    path = tmp_path / "a.journal"
+    path.unlink(missing_ok=True)
+    ends = write(path)
+    content = bytearray(path.read_bytes())
+    place, change = data.draw(st.integers(0, len(content) - 1)), data.draw(st.integers(1, 255))
+    content[place] ^= change
+    path.write_bytes(content)
+    start = max([0, *(end for end in ends if end <= place)])
+    if start == ends[-2]:
+        positions, evaluations, result = read_journal(path)
+        assert holds_the_first(BATCHES, positions, evaluations)
+        assert result is None
+    else:
+        with pytest.raises(InputError) as told:
+            Journal(path, "study", "nsga2-00")
+        assert str(path) in str(told.value)
+        assert f"byte {start}" in str(told.value)
+        assert path.read_bytes() == content, "a damaged file is left as it is"
+
+
+def test_a_tail_of_zeros_as_a_power_cut_leaves_it_is_cut_off(tmp_path: Path) -> None:
+    path = tmp_path / "a.journal"
+    write(path, finished=False)
+    with path.open("ab") as file:
+        file.write(bytes(5000))
+    journal = Journal(path, "study", "nsga2-00")
+    assert journal.cut == 5000
+    assert holds_the_first(BATCHES, journal.positions, journal.evaluations)
+    journal.close()
+
+
+def test_a_frame_of_a_later_version_is_an_error(tmp_path: Path) -> None:
+    import zlib
+
+    path = tmp_path / "a.journal"
+    ends = write(path)
+    payload = b"\x81\xa4type\xa6future"
+    with path.open("ab") as file:
+        file.write(HEAD.pack(MAGIC, len(payload), zlib.crc32(payload)) + payload)
+    with pytest.raises(InputError, match=f"byte {ends[-1]}"):
+        read_journal(path)
+
+
+@pytest.mark.parametrize(("study", "run"), [("other", "nsga2-00"), ("study", "nsga2-01")])
+def test_a_journal_of_another_study_or_run_is_refused(tmp_path: Path, study: str, run: str) -> None:
+    write(tmp_path / "a.journal")
+    with pytest.raises(InputError, match="another study"):
+        Journal(tmp_path / "a.journal", study, run)
+
+
+def test_a_run_has_one_owner_and_a_dead_ones_lock_is_gone(tmp_path: Path) -> None:
+    path = tmp_path / "a.journal"
+    code = f"from safevar_sumo.results import Journal\nfrom pathlib import Path\nJ = Journal(Path({str(path)!r}), 'study', 'nsga2-00')\n"
+    code += "print('locked', flush=True)\nimport time\ntime.sleep(60)\n"
+    other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert other.stdout is not None
+    assert other.stdout.readline() == "locked\n"
+    with pytest.raises(JournalBusy):
+        Journal(path, "study", "nsga2-00")
+    other.kill()
+    other.communicate()
+    Journal(path, "study", "nsga2-00").close()
+
+
+@pytest.mark.parametrize("written", [0, 7, 40])
+def test_a_full_disk_leaves_what_was_there_and_can_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int) -> None:
+    path = tmp_path / "a.journal"
+    end = write(path, batches=2, finished=False)[-1]
+    journal = Journal(path, "study", "nsga2-00")
+
+    class Full:
+        """A file that takes `written` more bytes."""
+
+        room = written
+
+        def write(self, content: memoryview) -> int:
+            taken = content[:self.room]
+            if not len(taken):
+                raise OSError(28, "No space left on device")
+            self.room -= len(taken)
+            return int(file.write(taken))
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(file, name)
+
+    file = journal._file
+    journal._file = Full()  # type: ignore[assignment]
+    with pytest.raises(SafevarError, match="No space left on device") as told:
+        journal.append(places(2), batch(2))
+    assert told.value.exit_code == 1
+    assert path.stat().st_size == end
+    journal._file = file
+    journal.append(places(2), batch(2))
+    journal.close()
+    positions, evaluations, _ = read_journal(path)
+    assert holds_the_first(3, positions, evaluations)
+
+
+def test_a_journal_that_somebody_removed_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "a.journal"
+    journal = Journal(path, "study", "nsga2-00")
+    path.unlink()
+    with pytest.raises(SafevarError, match="the file is gone"):
+        journal.append(places(0), batch(0))
+    journal.close()
