@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -189,6 +190,7 @@ def main() -> None:
 
 
 def _fail(message: str, code: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is over: another Ctrl-C changes neither code nor message
     click.echo(f"safevar-sumo: {message}", err=True)
     sys.exit(code)
 

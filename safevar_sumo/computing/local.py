@@ -9,7 +9,7 @@ import threading
 import traceback
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import connection, resource_tracker
 from typing import Any
 
@@ -19,6 +19,8 @@ from safevar_sumo.records import Evaluations, FloatArray
 
 START_LIMIT = 120.0
 """How long a worker process may take until it is ready for its first batch [s]."""
+STARTS = 5
+"""How many workers in a row may die before they are ready; no batch is to blame for that."""
 
 
 def available_cores() -> int:
@@ -69,24 +71,38 @@ class LocalPool:
         self._threads.shutdown(wait=False, cancel_futures=True)
         while self._living:
             for worker in list(self._living):
-                worker.end()
-                self._living.discard(worker)
+                self._end(worker)
         self._threads.shutdown()
 
     def _compute(self, study: bytes, settings: FloatArray) -> Evaluations:
         worker: _Worker | None = getattr(self._of_thread, "worker", None)
         if worker is None or not worker.alive:
-            worker = self._of_thread.worker = _Worker()
-            self._living.add(worker)
-            if self._closed:
-                worker.end()
+            worker = self._of_thread.worker = self._started()
         try:
             return worker.compute(study, settings, self._time_limit)
         except WorkerLostError:
-            worker.end()
-            self._living.discard(worker)
+            self._end(worker)
             self._of_thread.worker = None
             raise
+
+    def _started(self) -> _Worker:
+        for _ in range(STARTS):
+            worker = _Worker()
+            self._living.add(worker)
+            if self._closed:
+                worker.end()
+            try:
+                worker.wait_until_ready()
+            except WorkerLostError as error:
+                self._end(worker)
+                lost = error
+            else:
+                return worker
+        raise PoolLostError(f"no worker process starts: {lost}")
+
+    def _end(self, worker: _Worker) -> None:
+        worker.end()
+        self._living.discard(worker)
 
 
 class _Worker:
@@ -101,34 +117,33 @@ class _Worker:
         except OSError as error:
             raise PoolLostError(f"no worker process can be started: {error.strerror}") from None
         theirs.close()
-        self._ready = False
 
     @property
     def alive(self) -> bool:
         return self._process.is_alive()
 
+    def wait_until_ready(self) -> None:
+        """Raises WorkerLostError if that never comes."""
+        self._receive(START_LIMIT, "start")
+
     def compute(self, study: bytes, settings: FloatArray, time_limit: float) -> Evaluations:
         """Have a batch computed; raises what it raised, or WorkerLostError."""
-        try:
-            if not self._ready:
-                self._receive(START_LIMIT)
-                self._ready = True
+        with suppress(OSError):  # a dead worker is told by the answer that does not come
             self._pipe.send((study, settings))
-            answer = self._receive(time_limit)
-        except (EOFError, OSError):
-            self._process.join()
-            raise WorkerLostError(f"the worker process died (exit code {self._process.exitcode})") from None
+        answer = self._receive(time_limit, "simulation")
         if isinstance(answer, Exception):
             raise answer
         return answer  # type: ignore[no-any-return]
 
-    def _receive(self, time_limit: float) -> Any:
+    def _receive(self, time_limit: float, what: str) -> Any:
         ready = connection.wait([self._pipe, self._process.sentinel], time_limit)
         if not ready:
-            raise WorkerLostError(f"the simulation took longer than {time_limit:g} s")
-        if self._pipe not in ready:
-            raise EOFError
-        return self._pipe.recv()
+            raise WorkerLostError(f"the {what} took longer than {time_limit:g} s")
+        with suppress(EOFError, OSError):
+            if self._pipe in ready:
+                return self._pipe.recv()
+        self._process.join()
+        raise WorkerLostError(f"the worker process died (exit code {self._process.exitcode})")
 
     def end(self) -> None:
         """Kill the process; whoever waits for its answer learns that it died."""

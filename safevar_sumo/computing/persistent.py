@@ -34,7 +34,8 @@ class PersistentPool:
     def submit(self, study: bytes, settings: FloatArray, *, must_succeed: bool = False) -> Future[Evaluations]:
         """Evaluate filtered settings, shape (k, n); with `must_succeed` a failure is an error, not an outcome."""
         result: Future[Evaluations] = Future()
-        self._attempt(study, settings, ATTEMPTS, result, must_succeed)
+        alone = len(settings) == 1 and not must_succeed
+        self._attempt(study, settings, 2 * ATTEMPTS if alone else ATTEMPTS, result, must_succeed)
         return result
 
     def _attempt(self, study: bytes, settings: FloatArray, attempts: int, into: Future[Evaluations], must_succeed: bool) -> None:

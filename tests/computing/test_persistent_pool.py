@@ -105,6 +105,12 @@ def test_the_original_vehicle_must_succeed() -> None:
         PersistentPool(ToldPool(deadly(4300)), SUN).submit(b"", settings(1), must_succeed=True).result(timeout=5)
 
 
+def test_a_batch_of_one_has_as_many_chances_as_a_setting_of_a_larger_one() -> None:
+    pool = ToldPool(lambda rows, before: died() if before < 2 * ATTEMPTS - 1 else None)
+    assert PersistentPool(pool, SUN).submit(b"", settings(1)).result(timeout=5).valid.all()
+    assert not PersistentPool(ToldPool(deadly(4300)), SUN).submit(b"", settings(1)).result(timeout=5).valid.any()
+
+
 @pytest.mark.parametrize("error", [ZeroDivisionError("a bug"), PoolLostError("gone")])
 def test_a_bug_and_a_lost_pool_are_not_tried_again(error: Exception) -> None:
     pool = ToldPool(lambda rows, before: error)
