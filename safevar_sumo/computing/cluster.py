@@ -10,6 +10,8 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
+from functools import cache
+from importlib.metadata import version
 from typing import Any
 
 from safevar_sumo.computing.base import PoolLostError, WorkerLostError, evaluate_batch
@@ -19,6 +21,8 @@ from safevar_sumo.records import Evaluations, FloatArray
 ADDRESS = re.compile(r"[a-z]+://[^\s/]+:\d+/?")
 CONNECT_TIMEOUT = 10.0
 """How long an address may take to answer [s]."""
+VERSIONED = ("safevar_sumo", "libsumo", "numpy")
+"""What results depend on: the same version here and on every worker."""
 _one_at_a_time = threading.Lock()
 
 
@@ -45,7 +49,8 @@ def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
     legal = "the address of a Dask scheduler, such as tcp://host:8786"
     if not ADDRESS.fullmatch(address):
         raise InputError("--cluster", repr(address), legal)
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what goes wrong is told by us
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is told by us
     try:
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
@@ -70,21 +75,28 @@ class ClusterPool:
     def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
         outer: Future[Evaluations] = Future()
         try:
-            inner = self._executor.submit(_evaluate_within, self._time_limit, study, settings)
+            inner = self._executor.submit(_evaluate_within, self._time_limit, _versions(), study, settings)
         except RuntimeError as error:
             raise PoolLostError(f"the cluster does not answer any more: {error}") from None
         inner.add_done_callback(lambda done: _hand_on(done, outer))
         return outer
 
 
-def _evaluate_within(time_limit: float, study: bytes, settings: FloatArray) -> Evaluations:
+def _evaluate_within(time_limit: float, versions: dict[str, str], study: bytes, settings: FloatArray) -> Evaluations:
     """What a worker of the cluster does: one batch at a time, for libsumo exists once in a process; if it hangs, the worker ends."""
+    if _versions() != versions:
+        raise PoolLostError(f"a worker of the cluster has other versions: {_versions()} there, {versions} here")
     with _one_at_a_time, open(os.devnull, "w") as nowhere:
         faulthandler.dump_traceback_later(time_limit, exit=True, file=nowhere)
         try:
             return evaluate_batch(study, settings)
         finally:
             faulthandler.cancel_dump_traceback_later()
+
+
+@cache
+def _versions() -> dict[str, str]:
+    return {name: version(name) for name in VERSIONED}
 
 
 def _hand_on(done: Future[Evaluations], outer: Future[Evaluations]) -> None:
