@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from datetime import timedelta
 from typing import Any
 
 import numpy as np
@@ -26,19 +27,19 @@ SECONDS_BETWEEN_LINES = 30.0
 
 
 class CampaignProgress:
-    """Bars on a terminal, a line now and then elsewhere: what is done, how fast, how long yet, what was found."""
+    """Bars on a terminal, a line now and then elsewhere: what is done, how fast, what was found, how long yet."""
 
     def __init__(self, console: Console, study: Study, keys: list[RunKey], quiet: bool) -> None:
         self._console, self._quiet = console, quiet
         shown = console.is_terminal and not quiet
         self._bar = Progress(
-            TextColumn("{task.description}"), BarColumn(bar_width=20), TextColumn("{task.fields[told]}"), TimeRemainingColumn(),
+            TextColumn("{task.description}"), BarColumn(bar_width=8), TextColumn("{task.fields[told]}"), TextColumn("{task.fields[left]}"),
             console=console, disable=not shown)
         self._lines = {}
         for name in study.search.algorithms:
             runs = sum(key.algorithm == name for key in keys)
             if runs:
-                task = self._bar.add_task(name, total=runs * study.search.evaluations, told="")
+                task = self._bar.add_task(name, total=runs * study.search.evaluations, told=f"runs 0/{runs}", left="")
                 self._lines[name] = _Line(name, runs, study.search.evaluations, task)
         self._asked: dict[RunKey, int] = {}
         self._spoke = time.monotonic()
@@ -63,12 +64,12 @@ class CampaignProgress:
         self._console.print(f"warning: {message}", soft_wrap=True, markup=False, highlight=False)
 
     def _tell(self, line: _Line) -> None:
-        self._bar.update(line.task, completed=line.done, total=line.total, told=line.told())
+        self._bar.update(line.task, completed=line.done, total=line.total, told=line.told(), left=line.left())
         now = time.monotonic()
         if not self._console.is_terminal and not self._quiet and now - self._spoke >= SECONDS_BETWEEN_LINES:
             self._spoke = now
             for one in self._lines.values():
-                self._console.print(f"{one.name}: {one.told()}, {one.left()}", soft_wrap=True, highlight=False)
+                self._console.print(f"{one.name}: {one.told()}, {one.left() or 'not begun'}", soft_wrap=True, highlight=False)
 
 
 class _Line:
@@ -78,15 +79,17 @@ class _Line:
         self.name, self.task = name, task
         self.done, self.total = 0, runs * evaluations
         self._evaluations, self._runs = evaluations, runs
-        self._finished = self._collisions = self._simulated = 0
+        self._finished = self._simulated = 0
         self._best = np.inf
-        self._first: float | None = None
+        self._first = self._last = 0.0
 
     def take_in(self, evaluations: Evaluations, simulated: int) -> None:
-        self._first = self._first or time.monotonic()
+        self._last = time.monotonic()
+        if self._first:
+            self._simulated += simulated
+        else:
+            self._first = self._last  # what came first took nobody knows how long
         self.done += len(evaluations)
-        self._simulated += simulated
-        self._collisions += int(np.count_nonzero(evaluations.collided))
         if evaluations.valid.any():
             self._best = min(self._best, float(np.min(evaluations.f_safe[evaluations.valid])))
 
@@ -97,20 +100,25 @@ class _Line:
         self.total -= self._evaluations - asked
 
     def told(self) -> str:
-        found = "" if np.isinf(self._best) else f", best SD {self._best:.2f}, collisions {self._collisions}"
+        found = "" if np.isinf(self._best) else f", best SD {self._best:.2f}"
         return f"runs {self._finished}/{self._runs}, {self._rate():.0f} evaluations/s{found}"
 
     def left(self) -> str:
+        """Hours, minutes and seconds; nothing while there is no telling."""
         rate = self._rate()
-        return f"{(self.total - self.done) / rate:.0f} s left" if rate else "time left not known yet"
+        if not rate and self.done < self.total:
+            return ""
+        return f"{timedelta(seconds=round((self.total - self.done) / rate) if rate else 0)} left"
 
     def _rate(self) -> float:
-        return self._simulated / max(time.monotonic() - self._first, 1e-3) if self._first else 0.0
+        """Evaluations per second while this algorithm's runs are under way."""
+        return self._simulated / (self._last - self._first) if self._last > self._first else 0.0
 
 
 def print_forecast(console: Console, study: Study, runs: int, told: Forecast) -> None:
     """What a campaign would take."""
-    table = Table(title=study.title, title_justify="left", show_header=False)
+    console.print(study.title, soft_wrap=True, highlight=False)
+    table = Table(show_header=False)
     table.add_row("algorithms", ", ".join(study.search.algorithms))
     table.add_row("runs", str(runs))
     table.add_row("evaluations, at the most", str(told.evaluations))
