@@ -17,6 +17,7 @@ lint: .venv/installed
 
 benchmark: .venv/installed
 	$(RUN) benchmarks/evaluation.py
+	$(RUN) benchmarks/campaign.py
 
 .venv/installed: setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
