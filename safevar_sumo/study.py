@@ -80,7 +80,7 @@ class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     evaluations: PositiveInt
     runs: PositiveInt
     seed: Seed
-    time_limit: Positive = 300.0
+    time_limit: Annotated[float, Meta(gt=0, le=86400)] = 300.0
 
 
 class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

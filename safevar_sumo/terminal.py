@@ -155,10 +155,10 @@ def _mean(values: FloatArray) -> str:
 
 
 def _print_most_critical(console: Console, study: Study, campaign: Campaign) -> None:
-    pooled = Evaluations.concatenate(list(campaign.solutions.values()))
-    if not len(pooled):
+    if not any(map(len, campaign.solutions.values())):
         console.print("No solution.")
         return
+    pooled = Evaluations.concatenate(list(campaign.solutions.values()))
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     worst = pooled.take([int(np.lexsort((pooled.f_diff, pooled.f_num_diff, pooled.f_safe))[0])])
     changes = [

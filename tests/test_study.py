@@ -43,6 +43,8 @@ def variant(tmp_path: Path, old: str, new: str) -> str:
 
 
 @pytest.mark.parametrize(("old", "new", "told"), [
+    ("runs = 30", "runs = 30\ntime_limit = inf", "search.time_limit = inf"),
+    ("runs = 30", "runs = 30\ntime_limit = 0", "search.time_limit = 0"),
     ("ttc_threshold = 1.5", "ttc_threshold = 1.5\nttc = 2", "metrics: Object contains unknown field `ttc`"),
     ("ttc_threshold = 1.5", "ttc_threshold = '1.5'", "metrics.ttc_threshold = '1.5'"),
     ("ttc_threshold = 1.5", "ttc_threshold = nan", "metrics.ttc_threshold = nan"),

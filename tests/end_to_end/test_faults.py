@@ -111,6 +111,13 @@ def test_shards_one_after_the_other_and_the_rest(whole: Path) -> None:
     assert solutions("out") == solutions(whole)
 
 
+def test_a_shard_without_a_run_has_nothing_to_do() -> None:
+    process = started("study", "small.toml", "--out", "out", "--shard", "9/9", "--jobs", "1")
+    output, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (0, "")
+    assert "No solution." in output
+
+
 def test_one_run_alone_is_the_same_as_in_the_whole(whole: Path) -> None:
     study("--out", "out", "--only", "nsga2:1", "--jobs", "1")
     assert [path.name for path in Path("out/runs").glob("*-*")] == ["nsga2-01.journal"]
