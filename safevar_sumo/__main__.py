@@ -10,6 +10,7 @@ def main() -> None:
     try:
         from safevar_sumo import cli
     except KeyboardInterrupt:
+        print("safevar-sumo: interrupted", file=sys.stderr)
         sys.exit(130)
     cli.main()
 

@@ -217,10 +217,12 @@ def test_a_directory_that_is_taken_away_is_told() -> None:
     assert "cannot be" in told
 
 
-@pytest.mark.parametrize("when", [0.0, 0.15, 0.4, "mid-run", "twice"])
+@pytest.mark.parametrize("when", ["loading", 0.0, 0.15, 0.4, "mid-run", "twice"])
 def test_ctrl_c_ends_everything_with_code_130(when: float | str) -> None:
     process = started("study", "rain", "--out", "out")
-    if isinstance(when, str):
+    if when == "loading":
+        time.sleep(0.5)
+    elif isinstance(when, str):
         until(lambda: written(Path("out")) > 0, process)
     else:
         until(lambda: len(workers_of(process)) > 0, process)
