@@ -243,6 +243,17 @@ def test_sigterm_leaves_no_worker_behind() -> None:
     until(lambda: not left_of_group(process))
 
 
+def test_a_worker_that_hangs_does_not_outlive_a_killed_study() -> None:
+    Path("my_ads.py").write_text(
+        "import time\nfrom pathlib import Path\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Dozing(ScalarAds):\n"
+        "    def drive(self, seen):\n        Path('dozing').touch()\n        time.sleep(1000)\n")
+    Path("dozing.toml").write_text('extends = "small.toml"\nname = "dozing"\n[ads]\nmodel = "my_ads:Dozing"\n')
+    process = started("study", "dozing.toml", "--out", "out")
+    until(Path("dozing").exists, process)
+    killed(process)
+    until(lambda: not left_of_group(process))
+
+
 DEADLY = """
 import os
 import signal
