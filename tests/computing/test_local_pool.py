@@ -6,7 +6,6 @@ import os
 import signal
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import psutil
@@ -35,13 +34,6 @@ def pool() -> Iterator[LocalPool]:
 def test_a_worker_computes_what_this_process_would(pool: LocalPool) -> None:
     found = pool.submit(SMOKE, ORIGINAL).result(timeout=30)
     assert found.f_safe == evaluate_batch(SMOKE, ORIGINAL).f_safe
-
-
-def test_a_worker_loads_neither_frames_nor_the_terminal(pool: LocalPool) -> None:
-    pool.submit(SMOKE, ORIGINAL).result(timeout=30)
-    (worker,) = processes()
-    loaded = {Path(one.path).parts[-3] for one in worker.memory_maps() if "site-packages" in one.path}
-    assert not any("pandas" in one.path or "pyarrow" in one.path or "matplotlib" in one.path for one in worker.memory_maps()), loaded
 
 
 def test_workers_start_when_they_are_needed_and_end_with_the_block() -> None:

@@ -235,6 +235,17 @@ def test_ctrl_c_ends_everything_with_code_130(when: float | str) -> None:
     assert "interrupted" in ended(process, 130)
 
 
+def test_workers_load_sumo_and_neither_frames_nor_figures() -> None:
+    process = started("study", "rain", "--out", "out", "--jobs", "1")
+    until(lambda: written(Path("out")) > 0, process)
+    (worker,) = workers_of(process)
+    loaded = " ".join(one.path for one in worker.memory_maps())
+    process.terminate()
+    process.communicate(timeout=20)
+    assert "libsumo" in loaded
+    assert not any(name in loaded for name in ("pandas", "pyarrow", "matplotlib"))
+
+
 def test_sigterm_leaves_no_worker_behind() -> None:
     process = started("study", "rain", "--out", "out")
     until(lambda: written(Path("out")) > 0, process)
