@@ -12,7 +12,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cma
 import msgspec
 import numpy as np
 
@@ -77,6 +76,8 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
     names = list(parameters)
     first = np.array([_value(study, name) for name in names])
     halves = {name: _half(data, 0) for name, data in references.items()}
+    import cma  # only here: it takes longer to load than all the rest
+
     trial = _Trial(study, names, halves, pool)
     lower, upper = np.array([(row.lower, row.upper) for row in parameters.values()]).T
     strategy = cma.CMAEvolutionStrategy(np.clip((first - lower) / (upper - lower), 0, 1), SPREAD, {

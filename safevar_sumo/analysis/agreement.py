@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.stats import spearmanr
 
 from safevar_sumo.analysis.reference import ReferenceData
 from safevar_sumo.errors import InputError
@@ -71,6 +70,8 @@ def rank_correlation(one: FloatArray, other: FloatArray) -> float | None:
     """Spearman's rho; None for fewer than two rows or where one side is constant."""
     if len(one) < 2 or np.ptp(one) == 0 or np.ptp(other) == 0:
         return None
+    from scipy.stats import spearmanr  # only here: it takes long to load
+
     return float(spearmanr(one, other).statistic)
 
 

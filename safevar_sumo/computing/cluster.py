@@ -7,12 +7,15 @@ import logging
 import os
 import re
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import version
 from typing import Any
+
+import numpy as np
 
 from safevar_sumo.computing.base import PoolLostError, WorkerLostError, evaluate_batch
 from safevar_sumo.errors import InputError
@@ -21,6 +24,7 @@ from safevar_sumo.records import Evaluations, FloatArray
 ADDRESS = re.compile(r"[a-z]+://[^\s/]+:\d+/?")
 CONNECT_TIMEOUT = 10.0
 """How long an address may take to answer [s]."""
+SECONDS_BETWEEN_COUNTS = 5.0
 VERSIONED = ("safevar_sumo", "libsumo", "numpy")
 """What results depend on: the same version here and on every worker."""
 _one_at_a_time = threading.Lock()
@@ -67,10 +71,19 @@ class ClusterPool:
     def __init__(self, client: Any, time_limit: float) -> None:
         self._executor = client.get_executor(pure=False)
         self._client, self._time_limit = client, time_limit
+        self._workers, self._counted = 1, -np.inf
 
     @property
     def workers(self) -> int:
-        return max(1, int(sum(self._client.nthreads().values())))
+        """Workers come and go; the scheduler is asked now and then."""
+        now = time.monotonic()
+        if now - self._counted > SECONDS_BETWEEN_COUNTS:
+            try:
+                self._workers = max(1, sum(self._client.nthreads().values()))
+            except (OSError, TimeoutError) as error:
+                raise PoolLostError(f"the cluster does not answer any more: {error}") from None
+            self._counted = now
+        return self._workers
 
     def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
         outer: Future[Evaluations] = Future()
