@@ -1,0 +1,58 @@
+"""Results read back as tidy frames, without SUMO."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from safevar_sumo.results.journal import read_journal
+from safevar_sumo.results.store import RUNS, evaluations_frame, read_manifest, solutions_frame
+
+
+class Results(NamedTuple):
+    """What a results directory holds.
+
+    Attributes
+    ----------
+    manifest
+        The study as run, versions, seed, the original vehicle's evaluation.
+    evaluations
+        One row per simulated setting of every run, in the order in which the run asked for it first; columns of
+        `safevar_sumo.results.evaluations_frame`, and `evaluation`, its place in that order from 0.
+    solutions
+        One row per solution of every finished run; the same columns but `evaluation`.
+    """
+
+    manifest: dict[str, Any]
+    evaluations: pd.DataFrame
+    solutions: pd.DataFrame
+
+
+def load(directory: str | Path) -> Results:
+    """Read a results directory, finished or not.
+
+    Raises
+    ------
+    InputError
+        If it is none, or a file in it is damaged.
+    """
+    place = Path(directory)
+    manifest = read_manifest(place)
+    characteristics = tuple(manifest["study"]["vehicle"]["characteristics"])
+    everything, solved, positions = [], [], []
+    for path in sorted((place / RUNS).glob("*-*.journal")):
+        algorithm, _, run = path.stem.rpartition("-")
+        places, evaluations, result = read_journal(path)
+        if evaluations is None:
+            continue
+        order = sorted(range(len(places)), key=places.__getitem__)
+        everything.append(((algorithm, int(run)), evaluations.take(order)))
+        positions += [places[row] for row in order]
+        if result is not None:
+            row_of = {position: row for row, position in enumerate(places)}
+            solved.append(((algorithm, int(run)), evaluations.take([row_of[position] for position in result])))
+    frame = evaluations_frame(characteristics, everything)
+    frame.insert(2, "evaluation", positions)
+    return Results(manifest, frame, solutions_frame(characteristics, solved))

@@ -1,0 +1,118 @@
+"""A results directory: its bytes, its columns, and what it refuses."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pandas as pd
+import pytest
+
+from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.records import Evaluations
+from safevar_sumo.results import ResultsDirectory, record, solutions_frame
+from safevar_sumo.study import Study, load_study
+
+NAMES = ("a", "b")
+
+
+def evaluations(*safety: float) -> Evaluations:
+    values = np.array(safety)
+    collided = values <= 0
+    metrics = {"safety_degree": values, "tet": np.where(collided, np.nan, 0.2), "tit": np.where(collided, np.nan, 0.1),
+               "ave_dece": np.full(len(values), 5.0)}
+    return Evaluations(settings=np.arange(2.0 * len(values)).reshape(-1, 2), outcome=np.where(collided, "collision", "stopped"),
+                       collision_speed=np.where(collided, -values, np.nan), metrics=metrics, f_diff=values * 0 + 0.5,
+                       f_num_diff=values * 0 + 2)
+
+
+def written(path: Path, study: Study) -> ResultsDirectory:
+    directory = ResultsDirectory(path, study)
+    directory.begin(evaluations(2.5))
+    directory.finish({("nsga2", 0): wide(study)})
+    return directory
+
+
+def wide(study: Study) -> Evaluations:
+    """One evaluation with as many characteristics as the study has."""
+    one = evaluations(1.0)
+    return dataclasses.replace(one, settings=np.ones((1, len(study.vehicle.characteristics))))
+
+
+@pytest.fixture
+def study() -> Study:
+    return load_study("smoke")
+
+
+def with_search(study: Study, **changes: int) -> Study:
+    return msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, **changes))
+
+
+def test_solutions_have_the_promised_columns_in_a_fixed_order() -> None:
+    found = {("nsga2", 1): evaluations(2.0, -1.0), ("nsga2", 0): evaluations(3.0)}
+    frame = solutions_frame(NAMES, found.items())
+    assert list(frame.columns) == ["algorithm", "run", "a", "b", "f_safe", "f_diff", "f_num_diff", "safety_degree", "tet", "tit",
+                                   "ave_dece", "outcome"]
+    assert frame["run"].tolist() == [0, 1, 1]
+    assert frame["f_safe"].tolist() == [3.0, -1.0, 2.0]
+    pd.testing.assert_frame_equal(frame, solutions_frame(NAMES, reversed(found.items())))
+
+
+def test_what_is_undefined_stays_undefined() -> None:
+    assert record(evaluations(-1.5), 0) == {
+        "outcome": "collision", "collision": True, "collision_speed": 1.5, "safety_degree": -1.5, "tet": None, "tit": None,
+        "ave_dece": 5.0, "f_safe": -1.5, "f_diff": 0.5, "f_num_diff": 2}
+    assert "nan" not in solutions_frame(NAMES, [(("nsga2", 0), evaluations(-1.5))]).to_csv()
+
+
+def test_the_manifest_tells_study_versions_and_original(tmp_path: Path, study: Study) -> None:
+    written(tmp_path / "new" / "out", study)
+    manifest = json.loads((tmp_path / "new" / "out" / "manifest.json").read_text())
+    assert manifest["study"] == msgspec.to_builtins(study)
+    assert manifest["seed"] == study.search.seed
+    assert manifest["original"]["safety_degree"] == 2.5
+    assert manifest["versions"]["libsumo"] == "1.28.0"
+    assert sorted(path.name for path in (tmp_path / "new" / "out").iterdir()) == ["manifest.json", "solutions.csv"]
+
+
+def test_results_of_another_study_are_not_overwritten(tmp_path: Path, study: Study) -> None:
+    written(tmp_path, study)
+    ResultsDirectory(tmp_path, study)
+    ResultsDirectory(tmp_path, with_search(study, runs=7))
+    with pytest.raises(InputError, match=r"search\.seed is 1 there and 2 here"):
+        ResultsDirectory(tmp_path, with_search(study, seed=2))
+    with pytest.raises(InputError, match="holds results of another study"):
+        ResultsDirectory(tmp_path, load_study("native"))
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", "null", "{\"study\": 3", "\x00"])
+def test_a_file_that_is_no_manifest_is_refused(tmp_path: Path, study: Study, text: str) -> None:
+    (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(InputError, match=r"manifest\.json"):
+        ResultsDirectory(tmp_path, study)
+
+
+def test_a_place_that_cannot_be_written_is_refused(tmp_path: Path, study: Study) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot write"):
+        ResultsDirectory(tmp_path / "file", study)
+    with pytest.raises(InputError, match="cannot write"):
+        ResultsDirectory(Path("/proc/nowhere"), study)
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path: Path, study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+    directory = written(tmp_path, study)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(SafevarError, match="No space left"):
+        directory.begin(evaluations(9.9))
+    with pytest.raises(SafevarError, match="No space left"):
+        directory.finish({})
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
