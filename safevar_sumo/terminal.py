@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,9 +15,10 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from safevar_sumo.analysis import Agreement
+from safevar_sumo.analysis import Agreement, brief, setting_of
 from safevar_sumo.campaign import Campaign, Forecast, RunKey
 from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -119,8 +122,8 @@ def print_forecast(console: Console, study: Study, runs: int, told: Forecast) ->
     console.print(table)
 
 
-def print_summary(console: Console, study: Study, campaign: Campaign) -> None:
-    """Per algorithm what was found, beside the original vehicle; then the most critical setting."""
+def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path) -> None:
+    """Per algorithm what was found, beside the original vehicle; the most critical setting; what RQ1 and RQ2 say of it."""
     found = {"original vehicle": campaign.original}
     for algorithm in study.search.algorithms:
         of_it = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]
@@ -138,6 +141,11 @@ def print_summary(console: Console, study: Study, campaign: Campaign) -> None:
     if campaign.failures:
         console.print(f"{campaign.failures} settings could not be simulated (simulator-error); they are in no result.")
     _print_most_critical(console, study, campaign)
+    names = tuple(study.vehicle.characteristics)
+    solutions = solutions_frame(names, campaign.solutions.items())
+    for line in brief(setting_of(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions))):
+        console.print(line, soft_wrap=True, markup=False, highlight=False)
+    console.print(f"All tables: python -m safevar_sumo tables {shlex.quote(str(directory))}", soft_wrap=True, markup=False, highlight=False)
 
 
 def _mean(values: FloatArray) -> str:
