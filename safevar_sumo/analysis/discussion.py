@@ -33,24 +33,23 @@ def collisions(setting: Setting) -> pd.DataFrame:
         found = setting.solutions_of(algorithm)
         crashes = int(collided(found).sum())
         rows.append((setting.name, algorithm, len(found), crashes, crashes / len(found) if len(found) else None))
-    return pd.DataFrame(rows, columns=["setting", "algorithm", "solutions", "collisions", "share"]).astype({"share": object})
+    return pd.DataFrame(rows, columns=["setting", "algorithm", "solutions", "collisions", "share"], dtype=object)
 
 
 def combinations(setting: Setting) -> pd.DataFrame:
     """The most frequent combinations among the critical solutions with exactly four characteristics changed.
 
-    Columns setting, rank (ties share the better one), characteristics (a list), percent of those solutions. Of
-    combinations that are equally frequent, those whose characteristics stand earlier in the study come first.
+    Columns setting, rank (ties share the better one), characteristics (a list), percent of those solutions; no row
+    where there is no such solution. Of combinations that are equally frequent, those whose characteristics stand
+    earlier in the study come first.
 
     Raises
     ------
     Unanswerable
-        As `critical`, or if no critical solution has four changed.
+        As `critical`.
     """
     changed = changes(setting, critical(setting)) != 0
     of_four = changed[np.count_nonzero(changed, axis=1) == COMBINED]
-    if not len(of_four):
-        raise Unanswerable(setting.name, "has no critical solution with four characteristics changed", "results that have")
     counted = Counter(tuple(np.flatnonzero(row).tolist()) for row in of_four)
     ordered = sorted(counted.items(), key=lambda item: (-item[1], item[0]))[:SHOWN]
     names = setting.characteristics.names
@@ -95,7 +94,7 @@ def weather(clear: Setting, wet: Setting) -> pd.DataFrame:
             of_it = size[(size["j"] == ANY) & (size["direction"] == direction)]
             side[direction] = of_it.set_index("characteristic")["delta"]
         sides.append(side)
-    both = sides[0].join(sides[1], rsuffix="_other")
+    both = sides[0].join(sides[1].add_suffix("_other"))
     difference = [None if a is None or b is None else b - a for a, b in zip(both["percent"], both["percent_other"], strict=True)]
     both.insert(0, "difference", pd.Series(difference, index=both.index, dtype=object))
     both.insert(0, "other", wet.name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -16,6 +17,7 @@ from safevar_sumo.analysis.setting import ALGORITHM_TITLES, Setting, Unanswerabl
 from safevar_sumo.errors import InputError
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 FORMATS = ("png", "pdf", "svg")
@@ -26,6 +28,9 @@ INCREASE, DECREASE = COLOURS[1], COLOURS[0]
 OBJECTIVE_TITLES = {"f_safe": "f_safe: safety degree [m, -m/s]", "f_diff": "f_diff: largest change [% of the original]",
                     "f_num_diff": "f_numDiff: characteristics changed"}
 DPI = 200
+FONT = 8
+BINS = 24
+"""Bins over a characteristic's domain."""
 
 
 def number_of_changes(setting: Setting) -> Figure:
@@ -45,13 +50,18 @@ def changed_characteristics(setting: Setting) -> Figure:
     """RQ3.2: in which share of the critical solutions with j changed each characteristic is changed, as a heat map."""
     import seaborn as sns
 
+    _some_critical(setting)
     shares = rq32(setting)
     order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
     grid = shares.pivot(index="characteristic", columns="j", values="percent").astype(float)
-    grid = grid.loc[order, list(dict.fromkeys(shares["j"]))]
+    grid = grid.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=_plain)
     figure, ((axis,),) = _figure(setting, "characteristics changed in critical solutions", 1, 1, (7.6, 1.4 + 0.3 * len(grid)))
     sns.heatmap(grid, ax=axis, cmap="cividis", vmin=0, vmax=100, annot=True, fmt=".0f", annot_kws={"fontsize": 7}, linewidths=0.5,
                 cbar_kws={"label": "critical solutions\nin which it is changed [%]"})
+    axis.grid(visible=False)
+    colours = axis.collections[0].colorbar.ax
+    colours.tick_params(labelsize=FONT)
+    colours.yaxis.label.set_size(FONT)
     axis.set_xlabel("number of characteristics changed (empty: no such solution)")
     axis.set_ylabel("characteristic, most frequent first")
     axis.tick_params(axis="both", length=0, rotation=0)
@@ -62,30 +72,33 @@ def sizes_of_changes(setting: Setting) -> Figure:
     """How each characteristic is changed in the critical solutions: the distribution of its signed changes."""
     import seaborn as sns
 
+    total = _some_critical(setting)
     found = effects(setting)
     members = setting.characteristics.members
     columns = min(4, len(members))
     rows = -(-len(members) // columns)
     figure, axes = _figure(setting, "changes in critical solutions", rows, columns, (9.0, 1.0 + 1.75 * rows))
-    total = len(critical(setting))
     for axis, member in zip(axes.flat, members, strict=False):
         change = found.loc[found["characteristic"] == member.name, "change"]
         low, high = member.lower - member.original, member.upper - member.original
         sides = {INCREASE: change[change > 0], DECREASE: change[change < 0]}
         for colour, side in sides.items():
             if len(side):
-                sns.histplot(x=side, ax=axis, bins=np.linspace(low, high, 25), color=colour, edgecolor="white", linewidth=0.3, alpha=1)
+                end = high if colour == INCREASE else low
+                edges = np.sort(np.linspace(0, end, 1 + max(1, round(BINS * abs(end) / (high - low)))))
+                sns.histplot(x=side, ax=axis, bins=edges, color=colour, edgecolor="white", linewidth=0.3, alpha=1)
         axis.axvline(0, color="black", linewidth=0.8)
         axis.set_xlim(low, high)
-        axis.set_title(f"{member.name}: +{len(sides[INCREASE])}, -{len(sides[DECREASE])}", fontsize=8)
-        axis.set_xlabel(f"change [{member.unit}]", fontsize=8)
+        axis.set_title(f"{_plain(member.name)}: +{len(sides[INCREASE])}, -{len(sides[DECREASE])}", fontsize=FONT)
+        axis.set_xlabel(f"change [{_unit(member.unit)}]", fontsize=FONT)
         axis.set_ylabel("")
-        axis.locator_params(axis="x", nbins=4)
+        axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
         _whole_numbers(axis.yaxis, 4)
     for axis in list(axes.flat)[len(members):]:
         axis.set_axis_off()
-    figure.supylabel(f"changes, of {total} critical solutions", fontsize=9)
-    figure.supxlabel("increases: orange, right of 0; decreases: blue, left of 0; each axis spans the characteristic's domain", fontsize=8)
+    figure.supylabel(f"how many of {total} critical solutions", fontsize=9)
+    figure.supxlabel("orange, right of 0: increases; blue, left of 0: decreases; titles tell how many of each;\n"
+                     "each axis spans the characteristic's domain", fontsize=FONT)
     return figure
 
 
@@ -112,7 +125,7 @@ def pareto_fronts(setting: Setting) -> Figure:
                       markeredgewidth=0, color=COLOURS[i % len(COLOURS)], label=f"{_title(algorithm)} ({len(points)})")
         axis.set_xlabel(OBJECTIVE_TITLES[names[first]])
         axis.set_ylabel(OBJECTIVE_TITLES[names[second]])
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(fronts), frameon=False)
+    _legend_below(figure, axes[0])
     return figure
 
 
@@ -123,12 +136,14 @@ def hypervolume_growth(setting: Setting) -> Figure:
     for i, (algorithm, of_it) in enumerate(growth.groupby("algorithm", sort=False)):
         over = of_it.groupby("evaluations")["hypervolume"].agg(["min", "median", "max"])
         colour = COLOURS[i % len(COLOURS)]
-        axis.fill_between(over.index, over["min"], over["max"], color=colour, alpha=0.18, linewidth=0)
-        axis.plot(over.index, over["median"], color=colour, linestyle=DASHES[i % len(DASHES)],
+        axis.fill_between(over.index, over["min"], over["max"], color=colour, alpha=0.12, linewidth=0)
+        for edge in ("min", "max"):
+            axis.plot(over.index, over[edge], color=colour, linestyle=DASHES[i % len(DASHES)], linewidth=0.6)
+        axis.plot(over.index, over["median"], color=colour, linestyle=DASHES[i % len(DASHES)], linewidth=1.8,
                   label=f"{_title(str(algorithm))} ({of_it['run'].nunique()} runs)")
     axis.set_xlabel("evaluations")
-    axis.set_ylabel(f"hypervolume of all found, normalised\n(median and range over runs; reference point {WORST:g})")
-    axis.legend(loc="lower right", frameon=True)
+    axis.set_ylabel(f"hypervolume of all found, normalised\n(thick: median, thin: range over runs; reference point {WORST:g})")
+    _legend_below(figure, axis)
     return figure
 
 
@@ -173,12 +188,26 @@ def _figure(setting: Setting, what: str, rows: int, columns: int, size: tuple[fl
     """A figure with its axes, shape (rows, columns), that no global state knows of."""
     import matplotlib.style
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": 8, "axes.labelsize": 8, "axes.titlesize": 9}]):
-        figure = Figure(figsize=size, layout="constrained")
+    with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT, "axes.labelsize": FONT, "axes.titlesize": FONT}]):
+        figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.1))
         axes = figure.subplots(rows, columns, squeeze=False)
-    figure.suptitle(f"{setting.name}: {what}", fontsize=10)
+    figure.suptitle(f"{_plain(setting.name)}: {what}", fontsize=FONT + 2)
     return figure, axes
+
+
+def _legend_below(figure: Figure, axis: Axes) -> None:
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3), frameon=False, fontsize=FONT)
+
+
+def _some_critical(setting: Setting) -> int:
+    """How many critical solutions there are; without any there is nothing to draw."""
+    number = len(critical(setting))
+    if not number:
+        raise Unanswerable(setting.name, "has no critical solution", "results with solutions that are more unsafe than the original")
+    return number
 
 
 def _whole_numbers(axis: object, steps: int = 6) -> None:
@@ -188,7 +217,17 @@ def _whole_numbers(axis: object, steps: int = 6) -> None:
 
 
 def _title(algorithm: str) -> str:
-    return ALGORITHM_TITLES.get(algorithm, algorithm)
+    return _plain(ALGORITHM_TITLES.get(algorithm, algorithm))
+
+
+def _plain(name: str) -> str:
+    """A name in which matplotlib sees no formula."""
+    return name.replace("$", r"\$")
+
+
+def _unit(unit: str) -> str:
+    """A unit with its powers raised."""
+    return re.sub(r"\^(-?\d+)", r"$^{\1}$", _plain(unit))
 
 
 def _file_name(name: str) -> str:

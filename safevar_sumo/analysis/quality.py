@@ -115,6 +115,8 @@ def convergence(setting: Setting, points: int = 50) -> pd.DataFrame:
     by_run = dict(list(setting.evaluations.groupby(["algorithm", "run"])))
     parts = [pd.DataFrame({"algorithm": key[0], "run": key[1], "evaluations": grid, "hypervolume": _growth(by_run[key], scale, grid)})
              for key in keys if key in by_run]
+    if not parts:
+        raise Unanswerable(setting.name, "has no evaluations", "results with the journals of their runs")
     return pd.concat(parts, ignore_index=True)
 
 

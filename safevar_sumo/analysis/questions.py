@@ -8,6 +8,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from safevar_sumo.analysis import discussion
+from safevar_sumo.analysis.discussion import combinations
 from safevar_sumo.analysis.rq1 import rq1
 from safevar_sumo.analysis.rq2 import rq2
 from safevar_sumo.analysis.rq3 import critical, rq31, rq32, rq33, rq33_safety
@@ -25,7 +26,7 @@ OF_A_SETTING: Mapping[str, Callable[[Setting], Frames]] = {
     "rq3.2": lambda setting: {"rq3.2": rq32(setting)},
     "rq3.3": lambda setting: {"rq3.3": rq33(setting), SAFETY: rq33_safety(setting)},
     "collisions": lambda setting: {"collisions": discussion.collisions(setting)},
-    "combinations": lambda setting: {"combinations": discussion.combinations(setting)},
+    "combinations": lambda setting: {"combinations": combinations(setting)},
 }
 WEATHER = "weather"
 QUESTIONS = (*OF_A_SETTING, WEATHER)
@@ -49,7 +50,7 @@ def answer(settings: Sequence[Setting], question: str | None = None) -> list[Ans
     """
     if question is not None and question not in QUESTIONS:
         raise InputError("--rq", f"there is no question {question!r}", one_of(QUESTIONS))
-    answers, refusals = [], []
+    answers, refusals, names = [], [], [setting.name for setting in settings]
     for name in QUESTIONS if question is None else (question,):
         frames, refused = _asked(name, settings)
         refusals += refused
@@ -57,9 +58,11 @@ def answer(settings: Sequence[Setting], question: str | None = None) -> list[Ans
         if not frames:
             answers.append(Answer(name, pd.DataFrame(), tuple(notes)))
         for part, found in frames.items():
-            about = [note for setting in settings for note in _notes(name, setting)]
-            answers.append(Answer(part, pd.concat(found, ignore_index=True), tuple(dict.fromkeys([*notes, *about]))))
-    if all(one.frame.empty for one in answers):
+            frame = pd.concat(found, ignore_index=True)
+            inside = {*frame["setting"], *frame["other"]} if name == WEATHER else set(names) - {error.source for error in refused}
+            about = [note for setting in settings if setting.name in inside for note in _notes(name, setting)]
+            answers.append(Answer(part, frame, tuple(dict.fromkeys([*notes, *about]))))
+    if refusals and all(one.frame.empty for one in answers):
         raise refusals[0]
     return answers
 
@@ -100,9 +103,11 @@ def _notes(question: str, setting: Setting) -> list[str]:
                                                                              strict=True)})
         if empty:
             notes.append(f"{setting.name}: {empty} finished runs found no solution; they have no igd, igd_plus and hypervolume.")
-    if (question.startswith("rq3") or question == WEATHER) and NSGA2 in setting.algorithms:
+    if question.startswith("rq3") or question in ("combinations", WEATHER):
         number = len(critical(setting))
         notes.append(f"{setting.name}: {number} critical solutions of {len(setting.solutions_of(NSGA2))} of {NSGA2}.")
+    if question == "combinations" and combinations(setting).empty:
+        notes.append(f"{setting.name}: no critical solution has exactly four characteristics changed.")
     return notes
 
 

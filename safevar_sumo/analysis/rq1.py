@@ -32,7 +32,7 @@ def rq1(setting: Setting) -> pd.DataFrame:
             told = against(sample, original, MORE_IS_UNSAFE[metric])
             rows.append((setting.name, algorithm, metric, *told, float(np.mean(sample)) if sample.size else None,
                          None if np.isnan(original) else original))
-    return pd.DataFrame(rows, columns=COLUMNS).astype({"mean": object, "original": object, "p_value": object, "effect_size": object})
+    return pd.DataFrame(rows, columns=COLUMNS, dtype=object)
 
 
 def against(sample: np.ndarray, original: float, more_is_unsafe: bool) -> Comparison:

@@ -40,4 +40,4 @@ def rq2(setting: Setting) -> pd.DataFrame:
         for metric, more_is_unsafe in MORE_IS_UNSAFE.items():
             told = compare(values(own, metric), values(setting.solutions_of(baseline), metric))
             rows.append((setting.name, baseline, metric, *(told if more_is_unsafe else turned(told))))
-    return pd.DataFrame(rows, columns=COLUMNS).astype({"p_value": object, "effect_size": object})
+    return pd.DataFrame(rows, columns=COLUMNS, dtype=object)

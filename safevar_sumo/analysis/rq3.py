@@ -72,7 +72,7 @@ def rq32(setting: Setting) -> pd.DataFrame:
             percent = 100 * float(np.mean(changed[chosen, i] != 0)) if chosen.any() else None
             rank = 1 + int(np.count_nonzero(times > times[i])) if j == ANY and len(changed) else None
             rows.append((setting.name, member.name, j, percent, rank))
-    return pd.DataFrame(rows, columns=["setting", "characteristic", "j", "percent", "rank"]).astype({"percent": object, "rank": object})
+    return pd.DataFrame(rows, columns=["setting", "characteristic", "j", "percent", "rank"], dtype=object)
 
 
 def rq33(setting: Setting) -> pd.DataFrame:
@@ -96,8 +96,7 @@ def rq33(setting: Setting) -> pd.DataFrame:
                 mean = float(np.mean(delta)) if delta.size else None
                 pc = None if mean is None else abs(mean / member.original)
                 rows.append((setting.name, member.name, direction, j, pc, mean, delta.size))
-    columns = ["setting", "characteristic", "direction", "j", "pc", "delta", "n"]
-    return pd.DataFrame(rows, columns=columns).astype({"pc": object, "delta": object})
+    return pd.DataFrame(rows, columns=["setting", "characteristic", "direction", "j", "pc", "delta", "n"], dtype=object)
 
 
 def rq33_safety(setting: Setting) -> pd.DataFrame:
@@ -129,4 +128,4 @@ def rq33_safety(setting: Setting) -> pd.DataFrame:
             mean = float(np.mean(counted)) if counted.size else None
             percent = None if mean is None or np.isnan(whole) or whole == 0 else 100 * mean / abs(whole)
             rows.append((setting.name, quantity, j, mean, percent, counted.size))
-    return pd.DataFrame(rows, columns=["setting", "quantity", "j", "value", "percent", "n"]).astype({"value": object, "percent": object})
+    return pd.DataFrame(rows, columns=["setting", "quantity", "j", "value", "percent", "n"], dtype=object)

@@ -150,7 +150,8 @@ def _tabular(table: Table) -> list[str]:
 def escaped(plain: str) -> str:
     """Plain text as LaTeX; a character that its fonts may lack becomes its code point."""
     powers = re.split(r"\^(\d+)", " ".join(plain.split()))
-    return "".join(rf"\textsuperscript{{{part}}}" if i % 2 else "".join(_letter(sign) for sign in part) for i, part in enumerate(powers))
+    found = "".join(rf"\textsuperscript{{{part}}}" if i % 2 else "".join(map(_letter, part)) for i, part in enumerate(powers))
+    return found.replace("--", "-{}-")
 
 
 def _letter(sign: str) -> str:

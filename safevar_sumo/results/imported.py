@@ -64,8 +64,8 @@ def read_imported(path: Path, characteristics: tuple[str, ...]) -> pd.DataFrame:
     file = path / SOLUTIONS
     numbers = [*characteristics, "f_safe", "f_diff", "f_num_diff", *METRICS]
     try:
-        frame = pd.read_csv(file, keep_default_na=False, na_values={name: [""] for name in numbers}, float_precision="round_trip")
-        found = frame[["algorithm", *numbers, "outcome"]].astype(dict.fromkeys(numbers, float))
+        frame = pd.read_csv(file, dtype=str, keep_default_na=False)[["algorithm", *numbers, "outcome"]]
+        found = frame.replace({name: {"": "nan"} for name in numbers}).astype(dict.fromkeys(numbers, float))
     except OSError as error:
         raise InputError(file, f"cannot be read: {error.strerror or error}", "what the command import has written") from None
     except (KeyError, ValueError) as error:
