@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import msgspec
+import tomli_w
 from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError, one_of
@@ -17,6 +18,8 @@ Positive = Annotated[float, Meta(gt=0)]
 PositiveInt = Annotated[int, Meta(ge=1)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
+REPLACED = ("calibration",)
+"""Tables that a study does not inherit in part from the one that it extends."""
 T = TypeVar("T")
 
 
@@ -80,10 +83,20 @@ class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     time_limit: Positive = 300.0
 
 
+class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A parameter that may be calibrated: its bounds in `unit`, and what it means."""
+
+    lower: float
+    upper: float
+    unit: str
+    meaning: str
+
+
 class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole study as its TOML file gives it; `load_study` reads one.
 
-    `published` are the original vehicle's metrics in the published study, by name, as far as there are any.
+    `published` are the original vehicle's metrics in the published study, by name, as far as there are any;
+    `calibration` tells which parameters are free, by their keys in the file, such as `ads.parameters.corridor`.
     """
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
@@ -95,6 +108,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     metrics: MetricsTable
     search: SearchTable
     published: dict[str, float] = {}
+    calibration: dict[str, FreeParameter] = {}
 
 
 def study_names() -> list[str]:
@@ -189,14 +203,58 @@ def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     return _merged(_read(beside if beside.is_file() else study_path(base), (*seen, path)), raw)
 
 
+def write_study(path: Path, study: Study, comment: str) -> None:
+    """Write a complete study file that begins with a comment.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    tables = {name: value for name, value in _without_nothing(msgspec.to_builtins(study)).items() if value != {}}
+    text = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines()) + "\n" + tomli_w.dumps(tables)
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError("--out", f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
+
+
+def check_writable(path: Path) -> None:
+    """Refuse a file that cannot be written before the work whose result it is to take.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    is_new = not path.exists()
+    try:
+        with path.open("a"):
+            pass
+        if is_new:
+            path.unlink()
+    except OSError as error:
+        raise InputError("--out", f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
+
+
+def _without_nothing(raw: Any) -> Any:
+    """TOML has no null: what is not given is left out."""
+    return {key: _without_nothing(value) for key, value in raw.items() if value is not None} if isinstance(raw, dict) else raw
+
+
 def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Override `base` by `over`; a table with another `model` replaces the whole table."""
+    """Override `base` by `over`; a table with another `model`, and what may be calibrated, replace the whole table."""
     result = dict(base)
     for key, value in over.items():
-        old = base.get(key)
-        same_model = isinstance(value, dict) and isinstance(old, dict) and value.get("model", old.get("model")) == old.get("model")
-        result[key] = _merged(old, value) if same_model and isinstance(old, dict) else value
+        result[key] = _merged(base[key], value) if _refines(key, base.get(key), value) else value
     return result
+
+
+def _refines(key: str, old: object, new: object) -> bool:
+    """Whether a new table changes single keys of the old one."""
+    if key in REPLACED or not (isinstance(old, dict) and isinstance(new, dict)):
+        return False
+    return bool(new.get("model", old.get("model")) == old.get("model"))
 
 
 def _check_characteristic(path: Path, key: str, row: CharacteristicTable) -> None:

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 
 from safevar_sumo.analysis import Agreement, brief, setting_of
+from safevar_sumo.calibration import Calibration
 from safevar_sumo.campaign import Campaign, Forecast, RunKey
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import record, solutions_frame
@@ -209,6 +210,46 @@ def print_agreement(console: Console, study: Study, told: Agreement) -> None:
     console.print(table)
     collisions = told.collisions
     console.print(f"Collisions: {collisions['reference']} in the reference, {collisions['here']} here, {collisions['both']} in both.")
+
+
+@contextmanager
+def trials(console: Console, total: int) -> Iterator[Callable[[float], None]]:
+    """A bar that counts trials; yields what to call after each with the lowest cost so far."""
+    columns = (TextColumn("trials"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.fields[told]}"))
+    spoke = time.monotonic()
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("trials", total=total, told="")
+
+        def done(best: float) -> None:
+            nonlocal spoke
+            bar.update(task, advance=1, told=f"lowest cost {best:.4f}")
+            if not console.is_terminal and time.monotonic() - spoke >= SECONDS_BETWEEN_LINES:
+                spoke = time.monotonic()
+                console.print(f"trial {bar.tasks[0].completed:.0f} of {total}, lowest cost {best:.4f}", highlight=False)
+
+        yield done
+
+
+def print_calibration(console: Console, study: Study, found: Calibration) -> None:
+    """Found values, and how well they do on both halves of the data."""
+    table = Table("parameter", "unit", title=study.title, title_justify="left")
+    for head in ("found", "lower", "upper"):
+        table.add_column(head, justify="right")
+    for name, value in found.values.items():
+        row = study.calibration[name]
+        table.add_row(name, row.unit, *(f"{number:.5g}" for number in (value, row.lower, row.upper)))
+    console.print(table)
+    for name in found.used:
+        both = Table(f"{name}: used half / held back", title_justify="left")
+        for head in ("Spearman's rho", "mean abs. error", "bias"):
+            both.add_column(head, justify="right")
+        halves = (found.used[name], found.held_back[name])
+        for metric, head in METRIC_HEADS.items():
+            both.add_row(head, *(
+                " / ".join("-" if number is None else f"{number:.3f}" for number in (getattr(half, what)[metric] for half in halves))
+                for what in ("spearman", "mean_absolute_error", "bias")))
+        console.print(both)
+    console.print(f"Cost {found.cost:.4f}")
 
 
 def print_names(console: Console, title: str, rows: Iterable[tuple[str, ...]], heads: tuple[str, ...]) -> None:

@@ -29,7 +29,9 @@ def test_the_published_settings_are_searched_as_published() -> None:
 def test_rain_differs_from_sun_in_weather_alone() -> None:
     sun, rain = load_study("sun"), load_study("rain")
     assert rain.weather != sun.weather
-    assert msgspec.structs.replace(rain, name=sun.name, title=sun.title, weather=sun.weather) == sun
+    same = {"name": sun.name, "title": sun.title, "published": sun.published, "calibration": sun.calibration}
+    assert msgspec.structs.replace(rain, weather=sun.weather, **same) == sun
+    assert set(rain.calibration) == {"weather.road_friction", "weather.visibility"}
 
 
 def variant(tmp_path: Path, old: str, new: str) -> str:

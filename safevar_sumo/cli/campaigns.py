@@ -16,6 +16,7 @@ from rich.console import Console
 from safevar_sumo import terminal
 from safevar_sumo.ads import ADS
 from safevar_sumo.analysis import agreement, plot_agreement, read_reference
+from safevar_sumo.calibration import calibrate, calibration_comment
 from safevar_sumo.campaign import RunKey, algorithm_of, all_runs, carry_out, forecast
 from safevar_sumo.cli.program import commands
 from safevar_sumo.computing import available_cores, cluster_pool, local_pool
@@ -26,7 +27,7 @@ from safevar_sumo.results import ResultsDirectory, record
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.simulation import Engine, assemble, score, simulate
-from safevar_sumo.study import Study, load_study, study_names
+from safevar_sumo.study import Study, check_writable, load_study, study_names, write_study
 from safevar_sumo.validation import evaluate_all
 from safevar_sumo.vehicles import VEHICLES, CharacteristicSet
 
@@ -120,6 +121,28 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
         click.echo(json.dumps(result.to_dict(), indent=2, allow_nan=False))
     else:
         terminal.print_agreement(Console(), chosen, result)
+
+
+@commands.command(name="calibrate")
+@click.argument("study")
+@click.argument("references", type=click.Path(path_type=Path), nargs=-1, metavar="[REFERENCE.csv]...")
+@click.option("--trials", type=click.IntRange(min=1), default=400, show_default=True, help="How many sets of parameters are tried.")
+@click.option("--seed", type=click.IntRange(min=0, max=2**63 - 1), default=1, show_default=True, help="Seed of the search.")
+@click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
+@click.option("--out", type=click.Path(path_type=Path), metavar="FILE.toml", help="Study file to write.  [default: STUDY-calibrated.toml]")
+def calibrate_command(study: str, references: tuple[Path, ...], trials: int, seed: int, jobs: int | None, out: Path | None) -> None:
+    """Fit what STUDY declares under [calibration] to the published values and to half of the rows of reference files."""
+    chosen = load_study(study)
+    system = assemble(chosen)
+    target = out or Path(f"{chosen.name}-calibrated.toml")
+    check_writable(target)
+    data = {path.name: read_reference(path, system.characteristics) for path in references}
+    with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
+          terminal.trials(Console(stderr=True), trials) as done):
+        found = calibrate(chosen, data, pool, trials, seed, done)
+    write_study(target, found.study, calibration_comment(found, chosen, references, trials, seed))
+    terminal.print_calibration(Console(), chosen, found)
+    Console().print(f"Study file: {target}", soft_wrap=True)
 
 
 @commands.command(name="list")

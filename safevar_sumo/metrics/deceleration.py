@@ -20,9 +20,9 @@ def average_deceleration(run: Run, thresholds: MetricsTable) -> FloatArray:
     stride = every(run.trace.step, thresholds.sampling_interval)
     interval = stride * run.trace.step
     speed, active = run.trace.speed[::stride], run.trace.active[::stride]
-    braking = (run.trace.brake[::stride] > 0) & (np.abs(speed) > STILL)
+    braking = active & (run.trace.brake[::stride] > 0) & (np.abs(speed) > STILL)
     lost = (speed[:-1] - speed[1:]) / interval
-    counts = braking[:-1] & active[1:]
+    counts = braking[1:]
     number = np.count_nonzero(counts, axis=0)
     summed = total(np.where(counts, lost, 0.0))
     return np.asarray(np.divide(summed, number, out=np.full_like(summed, np.nan), where=number > 0))

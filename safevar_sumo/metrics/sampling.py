@@ -4,12 +4,27 @@ from __future__ import annotations
 
 import numpy as np
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
+
+ROUNDING = 1e-6
+"""Two times that differ by less are the same [s]."""
 
 
 def every(step: float, interval: float | None) -> int:
-    """How many simulation steps lie between two samples that are `interval` seconds apart."""
-    return 1 if interval is None else max(1, round(interval / step))
+    """How many simulation steps lie between two samples that are `interval` seconds apart.
+
+    Raises
+    ------
+    InputError
+        If that is no whole number.
+    """
+    if interval is None:
+        return 1
+    steps = round(interval / step)
+    if steps < 1 or abs(steps * step - interval) > ROUNDING:
+        raise InputError("study", f"metrics.sampling_interval = {interval}", f"a whole multiple of the simulation's step, {step:g} s")
+    return steps
 
 
 def total(samples: FloatArray) -> FloatArray:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from safevar_sumo.records import Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import VUT, Scene, World
@@ -34,7 +34,7 @@ class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_field
     """
 
     network: str = "lead_vehicle_stopped"
-    duration: float = 16.0
+    duration: Annotated[float, Meta(gt=0)] = 16.0
 
     def begin(self, world: World) -> _Memory:
         rear = world.vehicle_positions(PARKED)[:, 0] - world.vehicle_length(PARKED)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from safevar_sumo.records import Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import VUT, Scene, World
 
+Positive = Annotated[float, Meta(gt=0)]
 PEDESTRIAN = "pedestrian"
 CROSSING_LANE = ":crossing_c0_0"
 
@@ -41,9 +42,9 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
     """
 
     network: str = "pedestrian_crossing"
-    duration: float = 9.5
+    duration: Positive = 9.5
     turns_after: float | None = 0.7
-    lane_width: float = 3.5
+    lane_width: Positive = 3.5
 
     def begin(self, world: World) -> _Memory:
         lateral = world.person_positions(PEDESTRIAN)[:, 1] - world.vehicle_positions(VUT)[:, 1]
@@ -53,11 +54,12 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
         vehicle = world.vehicle_positions(VUT)
         lateral = world.person_positions(PEDESTRIAN)[:, 1] - vehicle[:, 1]
-        if self.turns_after is not None and not memory.turned and lateral[0] >= self.turns_after:
+        lateral_speed = (lateral - memory.place) / step
+        goes_past = self.turns_after is not None and lateral[0] + step * lateral_speed[0] > self.turns_after
+        if goes_past and not memory.turned:
             world.turn_back(PEDESTRIAN)
             memory = memory._replace(turned=True)
         front = vehicle[:, 0]
-        lateral_speed = (lateral - memory.place) / step
         left = (np.abs(lateral) > self.lane_width / 2) & (lateral * lateral_speed > 0)
         passed = front > memory.clear_point
         return Scene(memory.conflict_point - front, lateral, lateral_speed, left | passed), memory._replace(place=lateral)

@@ -5,15 +5,20 @@ The two share their API; libsumo runs in this process, traci talks to `sumo` or 
 
 from __future__ import annotations
 
+import os
+import sys
+import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from enum import StrEnum
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from safevar_sumo.errors import SimulationError
+from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.simulation.network import CopiedNetwork, copied_id
@@ -21,6 +26,8 @@ from safevar_sumo.vehicles import SumoType
 
 # Speed mode: SUMO obeys every speed that is set and yields to nobody on a junction (TraCI "set speed mode", bit 5).
 OBEY = 32
+CONNECTION_ATTEMPTS = 15
+"""How often, a second apart, traci tries to reach a SUMO that it has started."""
 # Lane change mode: none at all (TraCI "set lane change mode").
 KEEP_LANE = 0
 
@@ -36,12 +43,13 @@ class Engine(StrEnum):
 class SumoWorld:
     """N copies of a network under simulation; made by `open_world`. Shapes: (N,) or (N, 2)."""
 
-    def __init__(self, api: Any, n: int) -> None:
+    def __init__(self, api: Any, n: int, *, watched: bool = False) -> None:
         self._api, self.n = api, n
         self._ids: dict[str, list[str]] = {}
         self._positions: dict[str, FloatArray] = {}
         self._copy_of = {name: copy for copy, name in enumerate(self.ids(VUT))}
         self.step_length: float = api.simulation.getDeltaT()
+        self._pause = self.step_length if watched else 0.0
 
     def ids(self, name: str) -> list[str]:
         """The ids of an actor in its copies."""
@@ -83,6 +91,8 @@ class SumoWorld:
             set_speed(name, speed)
         self._api.simulationStep()
         self._positions.clear()
+        if self._pause:
+            time.sleep(self._pause)
 
     def collisions(self) -> dict[int, float]:
         """Copies whose vehicle under test collides in this step, and its speed [m/s]."""
@@ -135,8 +145,8 @@ def open_world(files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, op
     """
     api = _api(engine)
     try:
-        api.start([*sumo_command(engine, files), *options])
-        yield SumoWorld(api, n)
+        _start(api, engine, [*sumo_command(engine, files), *options])
+        yield SumoWorld(api, n, watched=engine is Engine.GUI)
     except (api.TraCIException, api.FatalTraCIError) as error:
         raise SimulationError(f"SUMO failed: {str(error).strip() or 'it closed the connection'}") from None
     finally:
@@ -155,10 +165,22 @@ def _api(engine: Engine) -> Any:
 
 def sumo_command(engine: Engine, files: CopiedNetwork) -> list[str]:
     """The command line that starts SUMO on copies of a network."""
+    window = ["--start", "true", "--quit-on-end", "true", "--window-size", "1200,700"] if engine is Engine.GUI else []
     return [
         _binary(engine), "-c", str(files.options), "-n", str(files.network), "-r", str(files.traffic),
         "--no-step-log", "true", "--no-warnings", "true", "--xml-validation", "never", "--xml-validation.net", "never",
-        "--xml-validation.routes", "never", *(["--start", "true"] if engine is Engine.GUI else [])]
+        "--xml-validation.routes", "never", *window]
+
+
+def _start(api: Any, engine: Engine, command: list[str]) -> None:
+    if engine is Engine.LIBSUMO:
+        api.start(command)
+        return
+    if engine is Engine.GUI and sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise InputError("--gui", "sumo-gui has no display to open its window on", "a desktop session, or DISPLAY in the environment")
+    with redirect_stdout(StringIO()), warnings.catch_warnings():  # traci tells how it waits for SUMO
+        warnings.simplefilter("ignore")
+        api.start(command, numRetries=CONNECTION_ATTEMPTS)
 
 
 def _binary(engine: Engine) -> str:

@@ -6,7 +6,7 @@ import importlib
 import inspect
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from safevar_sumo.ads import ADS, Ads, Checked, PerVehicle, ScalarAds
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import InputError, SafevarError, one_of
 from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import SCENARIOS, Scenario, weather_of
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, invalid
@@ -76,7 +76,29 @@ def _model(models: Mapping[str, Any], choice: ModelTable | VehicleTable, key: st
             return msgspec.convert(choice.parameters, cls)
         except msgspec.ValidationError as error:
             raise invalid(source, choice.parameters, error, f"{key}.parameters") from None
-    return _called(cls, choice, key, source)
+    return _Guarded(_called(cls, choice, key, source), f"{key}.model = {choice.model!r}", source)
+
+
+class _Guarded:
+    """A model from outside the package: whatever it lacks or does wrong is told with its name."""
+
+    def __init__(self, inner: Any, name: str, source: str) -> None:
+        self._inner, self._name, self._source = inner, name, source
+
+    def __getattr__(self, attribute: str) -> Any:
+        try:
+            value = getattr(self._inner, attribute)
+        except AttributeError as error:
+            raise InputError(self._source, f"{self._name} lacks {attribute!r}: {error}") from error
+        return partial(self._call, attribute, value) if callable(value) else value
+
+    def _call(self, attribute: str, method: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return method(*arguments)
+        except SafevarError:
+            raise
+        except Exception as error:
+            raise InputError(self._source, f"{self._name} raised in {attribute}: {type(error).__name__}: {error}") from error
 
 
 def _ads(choice: ModelTable, source: str) -> Ads:

@@ -16,4 +16,4 @@ VEHICLES: Mapping[str, type[Any]] = {
     "sumo": SumoVehicle,
 }
 
-__all__ = ["VEHICLES", "Characteristic", "CharacteristicSet", "SumoType", "Vehicle", "VehicleState", "calibration_drive"]
+__all__ = ["VEHICLES", "Carla", "Characteristic", "CharacteristicSet", "SumoType", "Vehicle", "VehicleState", "calibration_drive"]

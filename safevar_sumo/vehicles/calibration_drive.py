@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from safevar_sumo.records import Command, FloatArray, Nominal
 from safevar_sumo.vehicles.base import Vehicle
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
-STEP = 0.05  # s
+STEP = 0.1  # s
 SPEEDS = np.arange(0.0, 20.5, 0.5)  # m/s, at which the tables hold
 LONGEST = 60.0  # s that a drive may take
 LIGHT_BRAKE = 0.1  # pedal at which the brake is tried: far from the limit of the tyres
 
 
+@lru_cache(maxsize=4)
 def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> Nominal:
     """Drive the original vehicle on a dry road: full throttle up, coasting down, braking lightly down."""
     original = {member.name: np.full(1, float(member.original)) for member in characteristics}
@@ -22,13 +25,13 @@ def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> N
     rest = vehicle.at_rest(prepared)
 
     def drive(state: object, throttle: float, brake: float) -> tuple[list[float], object]:
-        """Speeds until the grid's end or standstill, and the last state."""
+        """Speeds until the tables' end, and the last state."""
         speeds = [float(state.speed[0])]  # type: ignore[attr-defined]
         command = Command(np.full(1, throttle), np.full(1, brake))
         for _ in range(round(LONGEST / STEP)):
             state = vehicle.advance(prepared, state, command)
             speeds.append(float(state.speed[0]))  # type: ignore[attr-defined]
-            if speeds[-1] >= SPEEDS[-1] + 1 if throttle else speeds[-1] <= 0:
+            if speeds[-1] >= SPEEDS[-1] + 1 if throttle else speeds[-1] < SPEEDS[1]:
                 break
         return speeds, state
 

@@ -22,10 +22,11 @@ RPM = 2 * math.pi / 60  # rad/s per r/min
 ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default
 # Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) r/min, N m, stretched over max_rpm.
 TORQUE_IDLE, TORQUE_PEAK, TORQUE_END = 400.0, 500.0, 400.0  # N m
-PEAK_AT = 1890 / 5730  # of the maximum speed
+PEAK_AT, END_AT = 1890 / 5800, 5730 / 5800  # of the maximum speed; the falling line goes on to it
 GEAR_RATIOS = np.array([0.0, 2.85, 2.02, 1.35, 1.0])  # neutral first; blueprint of the LincolnMkz2017
 FINAL_RATIO = 4.0
 SHIFT_UP, SHIFT_DOWN = 0.65, 0.5  # of max_rpm
+AUTOBOX_LATENCY = 2.0  # s, least time between two switches of the automatic gearbox; PxVehicleAutoBoxData
 WHEELS = 4
 WHEEL_MASS = 20.0  # kg each; PxVehicleWheelData.mMass
 AIR_DENSITY = 1.2  # kg/m^3
@@ -63,7 +64,7 @@ class CarlaState(NamedTuple):
     engine_speed: FloatArray
     gear: FloatArray
     target_gear: FloatArray
-    shifting: FloatArray
+    since_shift: FloatArray
     throttle: FloatArray
     brake: FloatArray
 
@@ -194,17 +195,18 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """Engine torque at full throttle [N m]: linear between the points of the curve, zero above its end."""
         x = s.engine_speed / p.engine_limit
         rising = TORQUE_IDLE + (TORQUE_PEAK - TORQUE_IDLE) / PEAK_AT * x
-        falling = TORQUE_PEAK - (TORQUE_PEAK - TORQUE_END) / (1 - PEAK_AT) * (x - PEAK_AT)
+        falling = TORQUE_PEAK - (TORQUE_PEAK - TORQUE_END) / (END_AT - PEAK_AT) * (x - PEAK_AT)
         return self.engine_torque * np.where(x <= 1, np.minimum(rising, falling), 0.0)
 
 
 def _shift(p: _Prepared, s: CarlaState) -> CarlaState:
     """Automatic gearbox: a switch, the first one out of neutral included, takes its time, spent in neutral."""
     settled = s.gear == s.target_gear
+    automatic = settled & (s.since_shift >= AUTOBOX_LATENCY)
     relative = s.engine_speed / p.engine_limit
-    up = np.where(s.gear > 0, (relative > SHIFT_UP) & (s.gear < len(GEAR_RATIOS) - 1), s.throttle > 0)
-    down = (relative < SHIFT_DOWN) & (s.gear > 1)
-    target = np.where(settled, s.gear + up - down, s.target_gear)
-    shifting = np.where(settled, 0.0, s.shifting + p.step)
-    gear = np.where((target == s.gear) | (shifting >= p.shift_time - TIME_ROUNDING), target, 0.0)
-    return s._replace(gear=gear, target_gear=target, shifting=shifting)
+    up = np.where(s.gear > 0, automatic & (relative > SHIFT_UP) & (s.gear < len(GEAR_RATIOS) - 1), settled & (s.throttle > 0))
+    down = automatic & (relative < SHIFT_DOWN) & (s.gear > 1)
+    target = s.target_gear + up - down
+    since_shift = np.where(target == s.target_gear, s.since_shift + p.step, 0.0)
+    gear = np.where((target == s.gear) | (since_shift >= p.shift_time - TIME_ROUNDING), target, 0.0)
+    return s._replace(gear=gear, target_gear=target, since_shift=since_shift)

@@ -38,7 +38,7 @@ WHEELBASE = 2.85  # m
 # The lane keeping has an error to correct: assumption, so that the steering angle has something to act on.
 LATERAL_ERROR, HEADING_ERROR = 0.10, 0.01  # m, rad
 LATERAL_GAIN, HEADING_GAIN = 0.02, 0.35  # rad/m, rad/rad
-SUBSTEPS = 4
+SUBSTEPS = 2
 
 
 class _Prepared(NamedTuple):
@@ -141,9 +141,10 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             brake=state.brake + (command.brake - state.brake) * follows)
         state, cornering_drag = self._steer(prepared, state)
         state = _shift(prepared, state)
+        gearing = _ratio(prepared, state) * FINAL_RATIO
         for _ in range(SUBSTEPS):
-            state = _roll(prepared, state, cornering_drag)
-        return state
+            state = _roll(prepared, state, gearing, cornering_drag)
+        return state._replace(since_shift=state.since_shift + prepared.step)
 
     def _steer(self, p: _Prepared, s: LgsvlState) -> tuple[LgsvlState, FloatArray]:
         """Lane keeping, a kinematic bicycle at small angles; returns the cornering drag too [N s/m].
@@ -177,14 +178,13 @@ def _ratio(p: _Prepared, s: LgsvlState) -> FloatArray:
     return np.asarray(s.old_ratio + (s.new_ratio - s.old_ratio) * np.minimum(s.since_shift / p.shift_time, 1.0))
 
 
-def _roll(p: _Prepared, s: LgsvlState, cornering_drag: FloatArray) -> LgsvlState:
+def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: FloatArray) -> LgsvlState:
     """One implicit Euler step of engine speed, wheel and body, linear in the new speeds.
 
     I dw/dt = T_drive - T_brake - d w - r K (r w - v)
     m dv/dt = K (r w - v) - (D_air v + D_tyre + D_corner) v
     """
     h, r = p.substep, p.radius
-    gearing = _ratio(p, s) * FINAL_RATIO
     wanted = p.least_rpm + s.wheel_speed * gearing * RPM
     engine_rpm = s.engine_rpm + (wanted - s.engine_rpm) * (RPM_RATE * h / (1 + RPM_RATE * h))
     drive = _torque_share(engine_rpm / p.largest_rpm) * gearing * s.traction_torque * s.throttle
@@ -202,7 +202,7 @@ def _roll(p: _Prepared, s: LgsvlState, cornering_drag: FloatArray) -> LgsvlState
     speed = (p.body * s.speed + pull * wheel_speed) / body
     return s._replace(
         speed=np.where((wheel_speed <= 0) & (speed < STANDSTILL), 0.0, speed), wheel_speed=wheel_speed, engine_rpm=engine_rpm,
-        traction_torque=np.minimum(np.maximum(traction, 0.0), p.motor_torque), since_shift=s.since_shift + h)
+        traction_torque=np.minimum(np.maximum(traction, 0.0), p.motor_torque))
 
 
 def _torque_share(share: FloatArray) -> FloatArray:

@@ -149,6 +149,23 @@ def test_a_users_ads_that_fails_is_told_by_name(in_tmp: Path, body: str | None, 
     refused("simulate", "mine.toml", told=told)
 
 
+@pytest.mark.parametrize(("table", "body", "told"), [
+    ("vehicle", "class Mine: pass\n", ("vehicle.model", "lacks 'UNITS'")),
+    ("vehicle", "from safevar_sumo.vehicles import Carla\nclass Mine:\n    UNITS = Carla.UNITS\n"
+     "    def prepare(self, *a):\n        return 1 / 0\n", ("vehicle.model", "raised in prepare: ZeroDivisionError")),
+    ("scenario", "class Mine:\n    network = 'pedestrian_crossing'\n    duration = 1.0\n", ("scenario.model", "lacks 'begin'")),
+])
+def test_a_users_vehicle_or_scenario_that_fails_is_told_by_name(table: str, body: str, told: tuple[str, ...], in_tmp: Path) -> None:
+    Path("mine.py").write_text(body)
+    text = (STUDIES / "sun.toml").read_text()
+    for model in ("carla", "pedestrian_crossing"):
+        text = text.replace(f'[{table}]\nmodel = "{model}"', f'[{table}]\nmodel = "mine:Mine"')
+    if table == "vehicle":
+        text = text.split("[vehicle.parameters]")[0] + "[ads]" + text.split("[ads]")[1]
+    Path("mine.toml").write_text(text)
+    refused("simulate", "mine.toml", told=told)
+
+
 @pytest.mark.parametrize(("arguments", "told"), [
     (["study", "sum"], ("sum", "rain")),
     (["study", "sun", "--algorithms", "nsga3"], ("nsga3", "nsga2")),
@@ -173,6 +190,9 @@ def test_bad_input_ends_with_code_2_and_says_what_is_legal(arguments: list[str],
     ('model = "pedestrian_crossing"', 'model = "crossing"', ("scenario.model", "crossing", "lead_vehicle_stopped")),
     ('weather = "clear"', 'weather = "hail"', ("weather", "hail", "hard_rain")),
     ("tireFric         =", "tyreFric         =", ("tyreFric", "tireFric")),
+    ("ttc_threshold = 1.5", "ttc_threshold = 1.5\nsampling_interval = 0.07", ("metrics.sampling_interval = 0.07", "0.05 s")),
+    ("[vehicle]", "parameters = { duration = 0 }\n[vehicle]", ("scenario.parameters.duration = 0",)),
+    ("[vehicle]", 'parameters = { network = "x" }\n[vehicle]', ("network 'x'", "lead_vehicle_stopped")),
     ('unit = "kg", ', 'unit = "t", ', ("vehicle.characteristics.mass.unit", "'t'", "kg")),
     ("lower = 2040, upper = 2700", "lower = 2700, upper = 2040", ("vehicle.characteristics.mass", "lower < upper")),
 ])

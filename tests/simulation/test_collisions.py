@@ -42,7 +42,7 @@ def test_sumo_reports_a_collision_just_where_bodies_overlap(study: str) -> None:
     _, run = driven(study, 120)
     trace, collided = run.trace, run.outcome == Outcome.COLLISION
     assert 10 < np.count_nonzero(collided) < 110
-    half_width, person = (1.84 / 2, 0.478) if study == "sun" else (1.85 / 2, 0.0)
+    half_width, person = (2.1284 / 2, 0.478) if study == "sun" else (1.85 / 2, 0.0)
     beside = np.abs(trace.lateral) <= half_width + 0.25 if study == "sun" else np.ones_like(trace.active)
     within = (trace.gap < -0.02) & (trace.gap > -trace.vehicle_length - person + 0.02)
     surely_beside = np.abs(trace.lateral) <= half_width - 0.25 if study == "sun" else beside

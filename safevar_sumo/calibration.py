@@ -1,0 +1,228 @@
+"""Free parameters of a study fitted to the original vehicle's published values and to reference rows.
+
+What may be fitted stands in the study file under [calibration]. Characteristics, domains and thresholds are never
+touched. Every second row is used for the fit, the others are held back and only reported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cma
+import msgspec
+import numpy as np
+
+from safevar_sumo.analysis import Agreement, ReferenceData, agreement
+from safevar_sumo.computing import PersistentPool, Pool, packed
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.scenarios import weather_of
+from safevar_sumo.study import Study, invalid
+from safevar_sumo.validation import BATCH, evaluate_all
+from safevar_sumo.vehicles import CharacteristicSet
+
+WEIGHTS = {"safety_degree": 1.0, "tet": 0.3, "tit": 0.3, "ave_dece": 0.5}
+"""What a metric's disagreement counts for."""
+TOLERANCE = 0.05
+"""Share of the published value of the original vehicle by which it may be missed at a cost of its weight."""
+COLLISION_WEIGHT = 10.0
+"""What the difference between the shares of collisions counts for."""
+SPREAD = 0.05
+"""Standard deviation of the first trials, as a share of a parameter's bounds."""
+POPULATION = 12
+"""Trials of a generation."""
+LOST = 1e3
+"""Cost of a trial in which something could not be simulated."""
+FITTED = ("vehicle.parameters.", "ads.parameters.", "weather.")
+
+
+class Calibration(NamedTuple):
+    """Found values by parameter, the study with them, its cost, and both halves of every reference by its name."""
+
+    values: dict[str, float]
+    study: Study
+    cost: float
+    used: dict[str, Agreement]
+    held_back: dict[str, Agreement]
+
+
+def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool, trials: int, seed: int,
+              done: Callable[[float], None] = lambda best: None) -> Calibration:
+    """Fit by CMA-ES (Hansen 2016), which starts from the study's own values.
+
+    Parameters
+    ----------
+    references
+        Data by name; may be empty, then only the original vehicle's values count.
+    trials
+        How many sets of parameters are tried.
+    done
+        Is called after every trial with the lowest cost so far.
+
+    Raises
+    ------
+    InputError
+        If the study declares nothing to fit, or something that cannot be, or has nothing to fit it to.
+    """
+    parameters = study.calibration
+    if not parameters:
+        raise InputError(f"study {study.name!r}", "has no table [calibration]", "the free parameters with bounds, unit and meaning")
+    if not references and not study.published:
+        raise InputError(f"study {study.name!r}", "has no table [published] and there is no reference file", "something to fit to")
+    names = list(parameters)
+    first = np.array([_value(study, name) for name in names])
+    halves = {name: _half(data, 0) for name, data in references.items()}
+    trial = _Trial(study, names, halves, pool)
+    lower, upper = np.array([(row.lower, row.upper) for row in parameters.values()]).T
+    strategy = cma.CMAEvolutionStrategy(np.clip((first - lower) / (upper - lower), 0, 1), SPREAD, {
+        "bounds": [0, 1], "seed": seed + 1, "verbose": -9, "popsize": min(POPULATION, trials)})
+    best, cost = first, trial.costs(first[np.newaxis])[0]
+    done(cost)
+    for start in range(1, trials, strategy.popsize):
+        shares = strategy.ask()
+        candidates = lower + np.array(shares)[:trials - start] * (upper - lower)
+        costs = trial.costs(candidates)
+        for candidate, its_cost in zip(candidates, costs, strict=True):
+            if its_cost < cost:
+                best, cost = candidate, its_cost
+            done(cost)
+        if len(costs) == len(shares):
+            strategy.tell(shares, costs)
+    values = dict(zip(names, best.tolist(), strict=True))
+    fitted = with_values(study, values)
+    return Calibration(values, fitted, cost, _told(fitted, halves, pool),
+                       _told(fitted, {name: _half(data, 1) for name, data in references.items()}, pool))
+
+
+def with_values(study: Study, values: Mapping[str, float]) -> Study:
+    """A study with other values of some parameters, named by their keys in the study file.
+
+    Raises
+    ------
+    InputError
+        If there is no such parameter, or it does not take the value.
+    """
+    raw = _raw(study)
+    for name, value in values.items():
+        table, key = _place(study, raw, name)
+        table[key] = value
+    try:
+        return msgspec.convert(raw, Study)
+    except msgspec.ValidationError as error:
+        raise invalid(f"study {study.name!r}", raw, error) from None
+
+
+def _raw(study: Study) -> Any:
+    """The study as tables; a weather that is given by its name as the table behind it."""
+    return msgspec.to_builtins(msgspec.structs.replace(study, weather=weather_of(study.weather, f"study {study.name!r}")))
+
+
+def _place(study: Study, raw: Any, name: str) -> tuple[Any, Any]:
+    """The table or list that a parameter stands in, and its key or index there."""
+    refused = InputError(f"study {study.name!r}", f"calibration.{name!r} is no parameter of the study",
+                         f"a number that is given under {', '.join(prefix.rstrip('.') for prefix in FITTED)}")
+    if not name.startswith(FITTED):
+        raise refused
+    *path, last = name.split(".")
+    table = raw
+    try:
+        for key in path:
+            table = table[int(key) if isinstance(table, list) else key]
+        place: int | str = int(last) if isinstance(table, list) else last
+        if not isinstance(table[place], int | float):
+            raise refused
+    except (KeyError, IndexError, ValueError, TypeError):
+        raise refused from None
+    return table, place
+
+
+def _value(study: Study, name: str) -> float:
+    table, key = _place(study, _raw(study), name)
+    return float(table[key])
+
+
+def _half(data: ReferenceData, first: int) -> ReferenceData:
+    """Every second row, from the first or the second."""
+    metrics = {name: values[first::2] for name, values in data.metrics.items()}
+    return ReferenceData(data.settings[first::2], metrics, data.skipped)
+
+
+def calibration_comment(found: Calibration, study: Study, references: Sequence[Path], trials: int, seed: int) -> str:
+    """How the values of a calibrated study were found: for the head of its file."""
+    data = [f"  {path.name}, SHA-256 {sha256(path.read_bytes()).hexdigest()}" for path in references]
+    halves = [
+        f"  {name}: rho of the safety degree {found.used[name].spearman['safety_degree']:.3f} on the used half,"
+        f" {found.held_back[name].spearman['safety_degree']:.3f} on the other" for name in found.used]
+    return "\n".join([
+        f"Study {study.name!r}, calibrated by CMA-ES ({trials} trials, seed {seed}) to the original vehicle's",
+        "published values" + (" and to every second row of" if data else "."), *data, f"Cost {found.cost:.4f}.", *halves])
+
+
+class _Trial:
+    """Costs of sets of parameters."""
+
+    def __init__(self, study: Study, names: list[str], references: Mapping[str, ReferenceData], pool: Pool) -> None:
+        self._study, self._names, self._references = study, names, references
+        self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+        self._pool = PersistentPool(pool, self._characteristics)
+        settings = [self._characteristics.original[np.newaxis], *(data.settings for data in references.values())]
+        self._settings, self._row_of = np.unique(np.concatenate(settings), axis=0, return_inverse=True)
+
+    def costs(self, candidates: FloatArray) -> list[float]:
+        """Costs of candidates, shape (S, parameters)."""
+        submitted = [self._submit(with_values(self._study, dict(zip(self._names, row, strict=True)))) for row in candidates.tolist()]
+        return [self._cost(Evaluations.concatenate([part.result() for part in parts])) for parts in submitted]
+
+    def _submit(self, study: Study) -> list[Future[Evaluations]]:
+        work = packed(study)
+        return [self._pool.submit(work, self._settings[start:start + BATCH]) for start in range(0, len(self._settings), BATCH)]
+
+    def _cost(self, unique: Evaluations) -> float:
+        if not unique.valid.all():
+            return LOST
+        evaluations = unique.take(self._row_of.ravel())
+        cost = original_cost(evaluations.take([0]), self._study.published)
+        row = 1
+        for data in self._references.values():
+            here = evaluations.take(np.arange(row, row + len(data.settings)))
+            cost += reference_cost(agreement(data, here, {}, here), data) / len(self._references)
+            row += len(data.settings)
+        return cost
+
+
+def original_cost(original: Evaluations, published: Mapping[str, float]) -> float:
+    """Squared misses of the original vehicle's values, in tolerances, weighted by metric; mean."""
+    misses = [
+        WEIGHTS[name] * min(abs(original.metrics[name][0] / value - 1) / TOLERANCE, 10.0) ** 2
+        if np.isfinite(original.metrics[name][0]) else 100.0
+        for name, value in published.items() if name in METRICS]
+    return float(np.mean(misses)) if misses else 0.0
+
+
+def reference_cost(told: Agreement, data: ReferenceData) -> float:
+    """Lost rank correlation and absolute error (in standard deviations of the reference), weighted, and collisions."""
+    cost = 0.0
+    for name, weight in WEIGHTS.items():
+        values = data.metrics[name][~np.isnan(data.metrics[name])]
+        if not values.size or np.ptp(values) == 0:
+            continue
+        rho, error = told.spearman[name], told.mean_absolute_error[name]
+        cost += weight * (5 * (1 - (rho or 0.0)) + (np.inf if error is None else error) / float(np.std(values)))
+    collisions = told.collisions
+    missed = collisions["reference"] + collisions["here"] - 2 * collisions["both"]
+    return min(cost, LOST) + COLLISION_WEIGHT * missed / max(told.rows, 1)
+
+
+def _told(study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> dict[str, Agreement]:
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    told = {}
+    for name, data in references.items():
+        evaluations = evaluate_all(study, np.concatenate([characteristics.original[np.newaxis], data.settings]), pool)
+        here = evaluations.take(np.arange(1, len(evaluations)))
+        told[name] = agreement(data, here, study.published, evaluations.take([0]))
+    return told

@@ -1,0 +1,105 @@
+"""The published CSV format: columns by name, the package's filter, and every way in which a file can be wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from safevar_sumo.analysis import package_filter, read_reference
+from safevar_sumo.errors import InputError
+from safevar_sumo.study import load_study
+from safevar_sumo.vehicles import CharacteristicSet
+
+SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+LGSVL = CharacteristicSet.of(load_study("lgsvl").vehicle.characteristics)
+SUN_COLUMNS = ["max_rpm", "dampRateFullT", "dampRateZero_CE", "dampRateZero_CD", "gearSwitchTime", "clutchStrength", "mass", "dragCoeff",
+               "tireFric", "dampRate", "radius", "maxBrakeTorque"]
+LGSVL_COLUMNS = ["mass", "wheel_mass", "wheel_radius", "MaxRPM", "MinRPM", "MaxBrakeTorque", "MaxMotorTorque", "MaxSteeringAngle",
+                 "TireDragCoeff", "WheelDamping", "ShiftTime", "TractionControlSlipLimit"]
+METRICS = {"MaxPercentage": [0.5, 0.1, 0.2], "SaftyDegree": [2.5, -1.5, 3.0], "numbers": [3, 2, 1], "TIT": [0.4, 0.0, 0.5],
+           "TET": [1.2, 0.0, 1.3], "Dece": [5.0, 3.0, 6.0]}
+
+
+def table(characteristics: CharacteristicSet, columns: list[str]) -> pd.DataFrame:
+    rows = pd.DataFrame(np.repeat(characteristics.original[np.newaxis], 3, axis=0), columns=columns)
+    return rows.assign(**METRICS)
+
+
+@pytest.mark.parametrize(("characteristics", "columns"), [(SUN, SUN_COLUMNS), (LGSVL, LGSVL_COLUMNS)])
+def test_both_published_formats_are_read(tmp_path: Path, characteristics: CharacteristicSet, columns: list[str]) -> None:
+    frame = table(characteristics, columns)
+    frame.loc[0, columns[0]] = characteristics.lower[0]
+    frame["Dece"] = -frame["Dece"]  # the lgsvl files have it negative
+    frame.to_csv(tmp_path / "data.csv", index=False)
+    data = read_reference(tmp_path / "data.csv", characteristics)
+    assert data.settings[0].tolist() == [characteristics.lower[0], *characteristics.original[1:]]
+    assert data.metrics["safety_degree"].tolist() == [2.5, -1.5, 3.0]
+    assert data.metrics["ave_dece"].tolist() == [5.0, 3.0, 6.0]
+    assert data.collided.tolist() == [False, True, False]
+    assert np.isnan(data.metrics["tet"]).tolist() == np.isnan(data.metrics["tit"]).tolist() == [False, True, False]
+    assert data.skipped == 0
+
+
+def test_columns_may_come_in_any_order_and_dece_may_be_missing(tmp_path: Path) -> None:
+    frame = table(SUN, SUN_COLUMNS).drop(columns="Dece")
+    frame[frame.columns[::-1]].to_csv(tmp_path / "data.csv", index=False)
+    data = read_reference(tmp_path / "data.csv", SUN)
+    assert np.array_equal(data.settings[0], SUN.original)
+    assert np.all(np.isnan(data.metrics["ave_dece"]))
+
+
+def test_the_packages_filter_compares_a_rounded_share_with_at_least() -> None:
+    """Mass: 660 kg wide, beta 0.02. 0.0196 of it rounds to 0.02 and stays; the paper's own filter puts it back."""
+    setting = SUN.original.copy()[np.newaxis]
+    setting[0, SUN.names.index("mass")] += 0.0196 * 660
+    assert np.array_equal(package_filter(SUN, setting), setting)
+    assert np.array_equal(SUN.filter(setting)[0], SUN.original)
+    setting[0, SUN.names.index("mass")] = 2404 + 0.0194 * 660
+    assert np.array_equal(package_filter(SUN, setting)[0], SUN.original)
+
+
+def test_rows_outside_the_domains_are_counted_and_left_out(tmp_path: Path) -> None:
+    frame = table(SUN, SUN_COLUMNS)
+    frame.loc[1, "mass"] = 5000
+    frame.to_csv(tmp_path / "data.csv", index=False)
+    data = read_reference(tmp_path / "data.csv", SUN)
+    assert data.skipped == 1
+    assert data.metrics["safety_degree"].tolist() == [2.5, 3.0]
+
+
+@pytest.mark.parametrize(("text", "told"), [
+    ("", "is empty"),
+    ("mass,radius\n", "has no rows"),
+    ("mass,radius\n1,2\n", "lacks the columns max_rpm"),
+    (",".join(SUN_COLUMNS) + "\n" + ",".join(["1"] * 12) + "\n", "lacks the columns SaftyDegree, TET, TIT"),
+    ('a,b\n"1\n', "is not CSV"),
+])
+def test_a_file_in_another_format_is_refused(tmp_path: Path, text: str, told: str) -> None:
+    (tmp_path / "data.csv").write_text(text)
+    with pytest.raises(InputError, match=told):
+        read_reference(tmp_path / "data.csv", SUN)
+
+
+@pytest.mark.parametrize("cell", ["heavy", "", "nan", "inf"])
+def test_a_cell_that_is_no_number_is_told_with_row_and_column(tmp_path: Path, cell: str) -> None:
+    frame = table(SUN, SUN_COLUMNS).astype(object)
+    frame.loc[1, "mass"] = cell
+    frame.to_csv(tmp_path / "data.csv", index=False)
+    with pytest.raises(InputError, match="row 3, column mass"):
+        read_reference(tmp_path / "data.csv", SUN)
+
+
+def test_a_file_without_any_usable_row_is_refused(tmp_path: Path) -> None:
+    frame = table(SUN, SUN_COLUMNS)
+    frame["mass"] = 1.0
+    frame.to_csv(tmp_path / "data.csv", index=False)
+    with pytest.raises(InputError, match="no row"):
+        read_reference(tmp_path / "data.csv", SUN)
+
+
+def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        read_reference(tmp_path / "nothing.csv", SUN)

@@ -1,0 +1,107 @@
+"""validate and calibrate as a user types them, on small files that are made here."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from test_commands import refused, run
+
+from safevar_sumo.simulation import assemble, evaluate
+from safevar_sumo.study import load_study
+
+COLUMNS = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Forty settings of the study sun in the published format, with the metrics that this package finds."""
+    system = assemble(load_study("sun"))
+    characteristics = system.characteristics
+    settings = np.random.default_rng(3).uniform(characteristics.lower, characteristics.upper, (40, 12))
+    filtered = np.where(np.abs(settings - characteristics.original) > 1.2 * characteristics.threshold, settings, characteristics.original)
+    found = evaluate(system, filtered)
+    frame = pd.DataFrame(filtered, columns=list(characteristics.names))
+    for name, column in COLUMNS.items():
+        frame[column] = np.nan_to_num(found.metrics[name])
+    path = tmp_path_factory.mktemp("data") / "mine.csv"
+    frame.to_csv(path, index=False)
+    return path
+
+
+def test_validate_agrees_perfectly_with_itself(data: Path, in_tmp: Path) -> None:
+    told = json.loads(run("validate", "sun", str(data), "--json", "--plot", "plot.png").stdout)
+    assert list(told) == ["rows", "spearman", "mean_absolute_error", "bias", "collisions", "original"]
+    assert told["rows"] == 40
+    for name in COLUMNS:
+        assert told["spearman"][name] == pytest.approx(1.0)
+        assert told["mean_absolute_error"][name] == pytest.approx(0.0, abs=1e-12)
+        assert set(told["original"][name]) == {"reference", "here"}
+    assert told["collisions"]["reference"] == told["collisions"]["here"] == told["collisions"]["both"]
+    assert (in_tmp / "plot.png").stat().st_size > 50_000
+
+
+def test_validate_prints_a_table(data: Path) -> None:
+    assert "rho" in run("validate", "sun", str(data)).stdout
+
+
+def test_validate_warns_of_rows_outside_the_domains(data: Path, in_tmp: Path) -> None:
+    frame = pd.read_csv(data)
+    frame.loc[:4, "tireFric"] = 9.0
+    frame.to_csv("outside.csv", index=False)
+    done = run("validate", "sun", "outside.csv", "--json")
+    assert json.loads(done.stdout)["rows"] == 35
+    assert "5 rows" in done.stderr
+
+
+def test_validate_refuses_what_is_no_reference_data(in_tmp: Path) -> None:
+    Path("text.csv").write_text("nothing\nhere\n")
+    refused("validate", "sun", "text.csv", told=("text.csv", "lacks the columns"))
+    refused("validate", "sun", "nowhere.csv", told=("nowhere.csv", "cannot be read"))
+
+
+def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None:
+    """A study that starts from another brake gap comes nearer to the one that the data was made with."""
+    Path("mine.toml").write_text(
+        'extends = "sun"\nname = "mine"\n[ads.parameters]\nbrake_gap = 6.5\n'
+        '[calibration]\n"ads.parameters.brake_gap" = { lower = 5, upper = 9, unit = "m", meaning = "gap" }\n')
+    truth = load_study("sun").ads.parameters["brake_gap"]
+    done = run("calibrate", "mine.toml", str(data), "--trials", "37", "--seed", "3", "--out", "found.toml")
+    found = tomllib.loads(Path("found.toml").read_text())
+    assert abs(found["ads"]["parameters"]["brake_gap"] - truth) < 0.5 * abs(6.5 - truth)
+    assert "held back" in done.stdout
+    head = Path("found.toml").read_text().split("\n\n")[0]
+    for word in ("CMA-ES", "seed 3", "mine.csv, SHA-256", "Cost"):
+        assert word in head
+    for name in ("characteristics",):
+        assert found["vehicle"][name] == tomllib.loads(Path("found.toml").read_text())["vehicle"][name]
+    assert load_study("found.toml").vehicle.characteristics == load_study("mine.toml").vehicle.characteristics
+    run("calibrate", "mine.toml", str(data), "--trials", "37", "--seed", "3", "--jobs", "1", "--out", "again.toml")
+    assert Path("again.toml").read_bytes() == Path("found.toml").read_bytes()
+
+
+def test_calibrate_without_data_fits_the_original_vehicle_alone(in_tmp: Path) -> None:
+    run("calibrate", "rain", "--trials", "5", "--out", "rain.toml")
+    found = tomllib.loads(Path("rain.toml").read_text())
+    assert set(found["weather"]) == {"name", "road_friction", "visibility"}
+    assert found["vehicle"]["parameters"] == load_study("sun").vehicle.parameters
+
+
+@pytest.mark.parametrize(("key", "told"), [
+    ("vehicle.characteristics.mass.original", ("vehicle.characteristics.mass.original",)),
+    ("ads.parameters.nothing", ("ads.parameters.nothing",)),
+    ("weather.name", ("weather.name",)),
+])
+def test_calibrate_touches_nothing_but_parameters(key: str, told: tuple[str, ...], in_tmp: Path) -> None:
+    Path("mine.toml").write_text(
+        f'extends = "sun"\nname = "mine"\n[calibration]\n"{key}" = {{ lower = 1, upper = 2, unit = "-", meaning = "none" }}\n')
+    refused("calibrate", "mine.toml", "--trials", "1", "--out", "x.toml", told=told)
+
+
+def test_calibrate_needs_something_to_fit(in_tmp: Path) -> None:
+    refused("calibrate", "native", "--trials", "1", told=("native", "[calibration]"))
+    refused("calibrate", "rain", "--trials", "1", "--out", "/proc/nowhere.toml", told=("--out",))
