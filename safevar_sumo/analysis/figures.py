@@ -29,6 +29,8 @@ OBJECTIVE_TITLES = {"f_safe": "f_safe: safety degree [m, -m/s]", "f_diff": "f_di
                     "f_num_diff": "f_numDiff: characteristics changed"}
 DPI = 200
 FONT = 8
+LONG_NAME = 28
+"""Letters that fit above a small axis."""
 BINS = 24
 """Bins over a characteristic's domain."""
 
@@ -77,7 +79,7 @@ def sizes_of_changes(setting: Setting) -> Figure:
     members = setting.characteristics.members
     columns = min(4, len(members))
     rows = -(-len(members) // columns)
-    figure, axes = _figure(setting, "changes in critical solutions", rows, columns, (9.0, 1.0 + 1.75 * rows))
+    figure, axes = _figure(setting, "changes in critical solutions", rows, columns, (9.0, 1.0 + 1.85 * rows))
     for axis, member in zip(axes.flat, members, strict=False):
         change = found.loc[found["characteristic"] == member.name, "change"]
         low, high = member.lower - member.original, member.upper - member.original
@@ -89,7 +91,8 @@ def sizes_of_changes(setting: Setting) -> Figure:
                 sns.histplot(x=side, ax=axis, bins=edges, color=colour, edgecolor="white", linewidth=0.3, alpha=1)
         axis.axvline(0, color="black", linewidth=0.8)
         axis.set_xlim(low, high)
-        axis.set_title(f"{_plain(member.name)}: +{len(sides[INCREASE])}, -{len(sides[DECREASE])}", fontsize=FONT)
+        size = min(FONT, FONT * LONG_NAME / len(member.name))
+        axis.set_title(f"{_plain(member.name)}\n+{len(sides[INCREASE])}, -{len(sides[DECREASE])}", fontsize=size)
         axis.set_xlabel(f"change [{_unit(member.unit)}]", fontsize=FONT)
         axis.set_ylabel("")
         axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up import made_up, made_up_study, row
+from made_up import CHARACTERISTICS, made_up, made_up_study, row
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -18,6 +19,21 @@ from safevar_sumo.analysis import FIGURES, Setting, draw_all
 from safevar_sumo.analysis.figures import hypervolume_growth, number_of_changes, pareto_fronts, sizes_of_changes
 from safevar_sumo.analysis.setting import Unanswerable
 from safevar_sumo.errors import InputError
+from safevar_sumo.study import load_study
+from safevar_sumo.vehicles import CharacteristicSet
+
+
+def random_lgsvl() -> Setting:
+    """Twelve characteristics, some with long names, three algorithms."""
+    rng, study = np.random.default_rng(4), load_study("lgsvl")
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    rows = [row(algorithm, run, sd=rng.uniform(-5, 11)) for algorithm in study.search.algorithms for run in range(3) for _ in range(100)]
+    evaluations = [{**one, "evaluation": i % 100} for i, one in enumerate(rows)]
+    base = made_up(*rows, original={"safety_degree": 10.1}, study=study, evaluations=evaluations)
+    drawn = rng.uniform(characteristics.lower, characteristics.upper, (len(rows), len(characteristics)))
+    drawn = np.where(rng.random(drawn.shape) < 0.5, drawn, characteristics.original)
+    values = {**dict(zip(characteristics.names, drawn.T, strict=True)), "f_diff": characteristics.largest_change(drawn)}
+    return dataclasses.replace(base, solutions=base.solutions.drop(columns=list(CHARACTERISTICS)).assign(**values))
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +55,10 @@ def test_there_is_a_figure_for_everything_promised() -> None:
     assert len(FIGURES) == 5
 
 
+@pytest.mark.parametrize("many", [False, True])
 @pytest.mark.parametrize("name", list(FIGURES))
-def test_axes_are_labelled_and_no_text_lies_on_another(name: str, setting: Setting) -> None:
-    figure = FIGURES[name](setting)
+def test_axes_are_labelled_and_no_text_lies_on_another(name: str, many: bool, setting: Setting) -> None:
+    figure = FIGURES[name](random_lgsvl() if many else setting)
     FigureCanvasAgg(figure).draw()
     shared = {"rq3.3-sizes-of-changes"}
     for axis in figure.axes:
@@ -86,7 +103,7 @@ def test_changes_are_counted_on_their_side_of_zero(setting: Setting) -> None:
     axis = sizes_of_changes(setting).axes[0]
     bars = [bar for bar in axis.patches if isinstance(bar, Rectangle) and bar.get_height() > 0]
     up, down = sum(bar.get_height() for bar in bars if bar.get_x() >= -1e-9), sum(bar.get_height() for bar in bars if bar.get_x() < -1e-9)
-    assert axis.get_title() == f"mass: +{up:.0f}, -{down:.0f}"
+    assert axis.get_title() == f"mass\n+{up:.0f}, -{down:.0f}"
     assert up > 0
     assert down > 0
     assert not [bar for bar in bars if bar.get_x() < -1e-9 and bar.get_x() + bar.get_width() > 1e-9]

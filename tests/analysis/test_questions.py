@@ -55,6 +55,14 @@ def test_tet_and_tit_do_not_count_collisions_and_the_others_do() -> None:
     assert frame["mean"].tolist() == [-1, 1.4, 0.7, 3]
 
 
+def test_a_tet_that_stands_at_a_collision_is_not_counted() -> None:
+    setting = made_up({**row(sd=-3), "tet": 0.0, "tit": 0.0}, row(sd=1, tet=1.4, tit=0.7), {**row("rs", sd=-3), "tet": 9.0, "tit": 9.0},
+                      row("rs", sd=1, tet=1.3, tit=0.6))
+    assert only(rq1(setting), algorithm="nsga2", metric="tet")["mean"] == 1.4
+    assert only(rq2(setting), metric="tet")["effect_size"] == 1
+    assert only(rq33_safety(setting), quantity="TIT", j="any")["value"] == pytest.approx(0.2)
+
+
 def test_rq1_of_collisions_alone_has_no_tet() -> None:
     frame = rq1(made_up(row(sd=-1), row(sd=-2)))
     assert only(frame, metric="tet")["p_value"] is None
