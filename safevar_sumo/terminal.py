@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import timedelta
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,10 +16,11 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from safevar_sumo.analysis import Agreement
+from safevar_sumo.analysis import Agreement, brief, setting_of
 from safevar_sumo.calibration import Calibration
 from safevar_sumo.campaign import Campaign, Forecast, RunKey
 from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -33,13 +36,13 @@ class CampaignProgress:
         self._console, self._quiet = console, quiet
         shown = console.is_terminal and not quiet
         self._bar = Progress(
-            TextColumn("{task.description}"), BarColumn(bar_width=8), TextColumn("{task.fields[told]}"), TextColumn("{task.fields[left]}"),
+            TextColumn("{task.description}"), BarColumn(bar_width=8), TextColumn("{task.fields[told]}"),
             console=console, disable=not shown)
         self._lines = {}
         for name in study.search.algorithms:
             runs = sum(key.algorithm == name for key in keys)
             if runs:
-                task = self._bar.add_task(name, total=runs * study.search.evaluations, told=f"runs 0/{runs}", left="")
+                task = self._bar.add_task(name, total=runs * study.search.evaluations, told=f"runs 0/{runs}")
                 self._lines[name] = _Line(name, runs, study.search.evaluations, task)
         self._asked: dict[RunKey, int] = {}
         self._spoke = time.monotonic()
@@ -64,12 +67,12 @@ class CampaignProgress:
         self._console.print(f"warning: {message}", soft_wrap=True, markup=False, highlight=False)
 
     def _tell(self, line: _Line) -> None:
-        self._bar.update(line.task, completed=line.done, total=line.total, told=line.told(), left=line.left())
+        self._bar.update(line.task, completed=line.done, total=line.total, told=line.told())
         now = time.monotonic()
         if not self._console.is_terminal and not self._quiet and now - self._spoke >= SECONDS_BETWEEN_LINES:
             self._spoke = now
             for one in self._lines.values():
-                self._console.print(f"{one.name}: {one.told()}, {one.left() or 'not begun'}", soft_wrap=True, highlight=False)
+                self._console.print(f"{one.name}: {one.told()}", soft_wrap=True, highlight=False)
 
 
 class _Line:
@@ -79,7 +82,7 @@ class _Line:
         self.name, self.task = name, task
         self.done, self.total = 0, runs * evaluations
         self._evaluations, self._runs = evaluations, runs
-        self._finished = self._simulated = 0
+        self._finished = self._simulated = self._collisions = 0
         self._best = np.inf
         self._first = self._last = 0.0
 
@@ -90,6 +93,7 @@ class _Line:
         else:
             self._first = self._last  # what came first took nobody knows how long
         self.done += len(evaluations)
+        self._collisions += int(np.count_nonzero(evaluations.collided))
         if evaluations.valid.any():
             self._best = min(self._best, float(np.min(evaluations.f_safe[evaluations.valid])))
 
@@ -100,14 +104,15 @@ class _Line:
         self.total -= self._evaluations - asked
 
     def told(self) -> str:
-        found = "" if np.isinf(self._best) else f", best SD {self._best:.2f}"
-        return f"runs {self._finished}/{self._runs}, {self._rate():.0f} evaluations/s{found}"
+        """What comes last may be cut off on a narrow terminal."""
+        found = "" if np.isinf(self._best) else f", best SD {self._best:.2f}, collisions {self._collisions}"
+        return f"runs {self._finished}/{self._runs}, {self._rate():.0f} evaluations/s, {self._left()}{found}"
 
-    def left(self) -> str:
-        """Hours, minutes and seconds; nothing while there is no telling."""
+    def _left(self) -> str:
+        """Hours, minutes and seconds, as far as there is a telling."""
         rate = self._rate()
         if not rate and self.done < self.total:
-            return ""
+            return "time left not known yet" if self.done else "not begun"
         return f"{timedelta(seconds=round((self.total - self.done) / rate) if rate else 0)} left"
 
     def _rate(self) -> float:
@@ -128,8 +133,8 @@ def print_forecast(console: Console, study: Study, runs: int, told: Forecast) ->
     console.print(table)
 
 
-def print_summary(console: Console, study: Study, campaign: Campaign) -> None:
-    """Per algorithm what was found, beside the original vehicle; then the most critical setting."""
+def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path) -> None:
+    """Per algorithm what was found, beside the original vehicle; the most critical setting; what RQ1 and RQ2 say of it."""
     found = {"original vehicle": campaign.original}
     for algorithm in study.search.algorithms:
         of_it = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]
@@ -147,6 +152,11 @@ def print_summary(console: Console, study: Study, campaign: Campaign) -> None:
     if campaign.failures:
         console.print(f"{campaign.failures} settings could not be simulated (simulator-error); they are in no result.")
     _print_most_critical(console, study, campaign)
+    names = tuple(study.vehicle.characteristics)
+    solutions = solutions_frame(names, campaign.solutions.items())
+    for line in brief(setting_of(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions))):
+        console.print(line, soft_wrap=True, markup=False, highlight=False)
+    console.print(f"All tables: python -m safevar_sumo tables {shlex.quote(str(directory))}", soft_wrap=True, markup=False, highlight=False)
 
 
 def _mean(values: FloatArray) -> str:

@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
+from safevar_sumo.errors import InputError
+from safevar_sumo.results.imported import read_imported
 from safevar_sumo.results.journal import read_journal
-from safevar_sumo.results.store import RUNS, evaluations_frame, read_manifest, solutions_frame
+from safevar_sumo.results.store import MANIFEST, RUNS, evaluations_frame, read_manifest, solutions_frame
 
 
 class Results(NamedTuple):
@@ -22,12 +24,15 @@ class Results(NamedTuple):
         One row per simulated setting of every run, in the order in which the run asked for it first; columns of
         `safevar_sumo.results.evaluations_frame`, and `evaluation`, its place in that order from 0.
     solutions
-        One row per solution of every finished run; the same columns but `evaluation`.
+        One row per solution of every finished run; the same columns but `evaluation`. Imported ones belong to no run.
+    finished
+        Algorithm and number of every finished run.
     """
 
     manifest: dict[str, Any]
     evaluations: pd.DataFrame
     solutions: pd.DataFrame
+    finished: tuple[tuple[str, int], ...] = ()
 
 
 def load(directory: str | Path) -> Results:
@@ -40,7 +45,12 @@ def load(directory: str | Path) -> Results:
     """
     place = Path(directory)
     manifest = read_manifest(place)
-    characteristics = tuple(manifest["study"]["vehicle"]["characteristics"])
+    try:
+        characteristics = tuple(manifest["study"]["vehicle"]["characteristics"])
+    except (KeyError, TypeError):
+        raise InputError(place / MANIFEST, "tells of no vehicle with characteristics", "what the command study has written") from None
+    if "imported" in manifest:
+        return Results(manifest, evaluations_frame(characteristics, []).assign(evaluation=0), read_imported(place, characteristics))
     everything, solved, positions = [], [], []
     for path in sorted((place / RUNS).glob("*-*.journal")):
         algorithm, _, run = path.stem.rpartition("-")
@@ -55,4 +65,4 @@ def load(directory: str | Path) -> Results:
             solved.append(((algorithm, int(run)), evaluations.take([row_of[position] for position in result])))
     frame = evaluations_frame(characteristics, everything)
     frame.insert(2, "evaluation", positions)
-    return Results(manifest, frame, solutions_frame(characteristics, solved))
+    return Results(manifest, frame, solutions_frame(characteristics, solved), tuple(key for key, _ in solved))

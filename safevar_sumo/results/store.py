@@ -50,12 +50,7 @@ class ResultsDirectory:
             "seed": study.search.seed,
             "versions": {name: version(name) for name in VERSIONED},
         }
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=path):
-                pass
-        except OSError as error:
-            raise InputError("--out", f"cannot write to {path}: {error.strerror}", "a directory that can be written") from None
+        make_directory(path)
         self._refuse_another_study()
 
     def journal(self, run: str) -> Journal:
@@ -67,12 +62,12 @@ class ResultsDirectory:
     def begin(self, original: Evaluations) -> None:
         """Write the manifest, with the original vehicle's evaluation."""
         manifest = {**self._manifest, "original": record(original, 0)}
-        self._replace(MANIFEST, json.dumps(manifest, indent=2, allow_nan=False) + "\n")
+        write_whole(self.path / MANIFEST, json.dumps(manifest, indent=2, allow_nan=False) + "\n")
 
     def finish(self, solutions: Mapping[Any, Evaluations]) -> None:
         """Write the solutions of every run, by (algorithm, run)."""
         frame = solutions_frame(tuple(self._study.vehicle.characteristics), solutions.items())
-        self._replace(SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
+        write_whole(self.path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
 
     def _refuse_another_study(self) -> None:
         file = self.path / MANIFEST
@@ -84,22 +79,39 @@ class ResultsDirectory:
         if differs:
             raise InputError(self.path, f"holds results of another study: {differs}", "another --out, or the same study and options")
 
-    def _replace(self, name: str, text: str) -> None:
-        """Write a file as a whole or not at all."""
+
+def make_directory(path: Path) -> None:
+    """Make a directory for results, if there is none.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise InputError("--out", f"cannot write to {path}: {error.strerror}", "a directory that can be written") from None
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file as a whole or not at all."""
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".tmp")
         try:
-            handle, temporary = tempfile.mkstemp(dir=self.path, prefix=".", suffix=".tmp")
-            try:
-                with open(handle, "w", encoding="utf-8", newline="") as file:
-                    file.write(text)
-                    file.flush()
-                    os.fsync(file.fileno())
-                os.chmod(temporary, 0o644)
-                os.replace(temporary, self.path / name)
-            except BaseException:
-                os.unlink(temporary)
-                raise
-        except OSError as error:
-            raise SafevarError(f"{self.path / name}: cannot be written: {error.strerror}; what was written before stays valid") from None
+            with open(handle, "w", encoding="utf-8", newline="") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
+        except BaseException:
+            os.unlink(temporary)
+            raise
+    except OSError as error:
+        raise SafevarError(f"{path}: cannot be written: {error.strerror}; what was written before stays valid") from None
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:

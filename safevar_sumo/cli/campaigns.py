@@ -1,11 +1,8 @@
-"""The commands: parse, call, print."""
+"""Commands that simulate, and what there is to simulate."""
 
 from __future__ import annotations
 
 import json
-import os
-import signal
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,6 +18,7 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.analysis import agreement, plot_agreement, read_reference
 from safevar_sumo.calibration import calibrate, calibration_comment
 from safevar_sumo.campaign import RunKey, algorithm_of, all_runs, carry_out, forecast
+from safevar_sumo.cli.program import commands
 from safevar_sumo.computing import available_cores, cluster_pool, local_pool
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS, time_to_collision
@@ -32,17 +30,6 @@ from safevar_sumo.simulation import Engine, assemble, score, simulate
 from safevar_sumo.study import Study, check_writable, load_study, study_names, write_study
 from safevar_sumo.validation import evaluate_all
 from safevar_sumo.vehicles import VEHICLES, CharacteristicSet
-
-INTERRUPTED = 130
-
-
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(package_name="safevar_sumo")
-def commands() -> None:
-    """Search the smallest variations of a vehicle that make its automated driving system unsafe, on SUMO.
-
-    STUDY is the name of a study (see: list) or the path of a study file.
-    """
 
 
 @commands.command()
@@ -81,7 +68,7 @@ def study(study: str, batch: int | None, out: Path | None, jobs: int | None, clu
     if keys == all_runs(chosen):
         results.finish(campaign.solutions)
     if not quiet:
-        terminal.print_summary(Console(), chosen, campaign)
+        terminal.print_summary(Console(), chosen, campaign, results.path)
         Console().print(f"Results: {results.path}", soft_wrap=True)
 
 
@@ -168,31 +155,6 @@ def list_command(as_json: bool) -> None:
         click.echo(json.dumps(_catalogue(studies), indent=2))
     else:
         _print_catalogue(Console(), studies)
-
-
-def main() -> None:
-    """Run the program; its exit code is 0, 1 (failed), 2 (bad input) or 130 (interrupted)."""
-    try:
-        code = commands.main(standalone_mode=False, prog_name="safevar-sumo")
-    except click.exceptions.Abort:
-        _fail("interrupted", INTERRUPTED)
-    except click.ClickException as error:
-        error.show()
-        sys.exit(error.exit_code)
-    except SafevarError as error:
-        _fail(str(error), error.exit_code)
-    except KeyboardInterrupt:
-        _fail("interrupted", INTERRUPTED)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
-    sys.exit(code if isinstance(code, int) else 0)
-
-
-def _fail(message: str, code: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is over: another Ctrl-C changes neither code nor message
-    click.echo(f"safevar-sumo: {message}", err=True)
-    sys.exit(code)
 
 
 def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:

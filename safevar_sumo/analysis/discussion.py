@@ -1,0 +1,123 @@
+"""What the paper discusses: collisions, combinations of changes, sun against rain, and how each characteristic is changed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from itertools import permutations
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.analysis.rq3 import ANY, changes, critical, rq32, rq33
+from safevar_sumo.analysis.setting import Setting, Unanswerable, collided
+
+COMBINED = 4
+"""How many characteristics are changed in the combinations that are counted."""
+SHOWN = 3
+"""How many of the most frequent combinations are shown."""
+
+
+def collisions(setting: Setting) -> pd.DataFrame:
+    """Per algorithm how many of its solutions are collisions; columns setting, algorithm, solutions, collisions, share [fraction].
+
+    Raises
+    ------
+    Unanswerable
+        If no run is finished.
+    """
+    if not setting.algorithms:
+        raise Unanswerable(setting.name, "has no finished run", "results with at least one finished run")
+    rows = []
+    for algorithm in setting.algorithms:
+        found = setting.solutions_of(algorithm)
+        crashes = int(collided(found).sum())
+        rows.append((setting.name, algorithm, len(found), crashes, crashes / len(found) if len(found) else None))
+    return pd.DataFrame(rows, columns=["setting", "algorithm", "solutions", "collisions", "share"], dtype=object)
+
+
+def combinations(setting: Setting) -> pd.DataFrame:
+    """The most frequent combinations among the critical solutions with exactly four characteristics changed.
+
+    Columns setting, rank (ties share the better one), characteristics (a list), percent of those solutions; no row
+    where there is no such solution. Of combinations that are equally frequent, those whose characteristics stand
+    earlier in the study come first.
+
+    Raises
+    ------
+    Unanswerable
+        As `critical`.
+    """
+    changed = changes(setting, critical(setting)) != 0
+    of_four = changed[np.count_nonzero(changed, axis=1) == COMBINED]
+    counted = Counter(tuple(np.flatnonzero(row).tolist()) for row in of_four)
+    ordered = sorted(counted.items(), key=lambda item: (-item[1], item[0]))[:SHOWN]
+    names = setting.characteristics.names
+    rows = [(setting.name, 1 + sum(other > number for other in counted.values()), [names[i] for i in members], 100 * number / len(of_four))
+            for members, number in ordered]
+    return pd.DataFrame(rows, columns=["setting", "rank", "characteristics", "percent"])
+
+
+def weather_pairs(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
+    """Settings that differ in the weather alone: the one with the better grip first.
+
+    Raises
+    ------
+    Unanswerable
+        If there is no such pair.
+    """
+    pairs = [(one, other) for one, other in permutations(settings, 2)
+             if _without_weather(one) == _without_weather(other) and one.weather.road_friction > other.weather.road_friction]
+    if not pairs:
+        raise Unanswerable(", ".join(one.name for one in settings), "two settings are needed that differ in the weather alone",
+                           "results such as those of sun and rain")
+    return pairs
+
+
+def weather(clear: Setting, wet: Setting) -> pd.DataFrame:
+    """One weather against another, characteristic by characteristic, over the critical solutions.
+
+    Columns setting, other, characteristic, percent and percent_other (in which share of the critical solutions it is
+    changed), difference (the other's minus the first's), rank and rank_other, and for increase and decrease the mean
+    signed change in its unit: increase, increase_other, decrease, decrease_other.
+
+    Raises
+    ------
+    Unanswerable
+        As `critical`.
+    """
+    sides = []
+    for setting in (clear, wet):
+        share, size = rq32(setting), rq33(setting)
+        side = share[share["j"] == ANY].set_index("characteristic")[["percent", "rank"]]
+        for direction in ("increase", "decrease"):
+            of_it = size[(size["j"] == ANY) & (size["direction"] == direction)]
+            side[direction] = of_it.set_index("characteristic")["delta"]
+        sides.append(side)
+    both = sides[0].join(sides[1].add_suffix("_other"))
+    difference = [None if a is None or b is None else b - a for a, b in zip(both["percent"], both["percent_other"], strict=True)]
+    both.insert(0, "difference", pd.Series(difference, index=both.index, dtype=object))
+    both.insert(0, "other", wet.name)
+    both.insert(0, "setting", clear.name)
+    columns = ["setting", "other", "characteristic", "percent", "percent_other", "difference", "rank", "rank_other",
+               "increase", "increase_other", "decrease", "decrease_other"]
+    return both.reset_index()[columns]
+
+
+def effects(setting: Setting) -> pd.DataFrame:
+    """Every change in every critical solution; columns setting, characteristic, change (signed, in its unit).
+
+    Raises
+    ------
+    Unanswerable
+        As `critical`.
+    """
+    changed = changes(setting, critical(setting))
+    parts = [pd.DataFrame({"setting": setting.name, "characteristic": name, "change": column[column != 0]})
+             for name, column in zip(setting.characteristics.names, changed.T, strict=True)]
+    return pd.concat(parts, ignore_index=True)
+
+
+def _without_weather(setting: Setting) -> tuple[object, ...]:
+    study = setting.study
+    return study.scenario, study.vehicle, study.ads, study.metrics

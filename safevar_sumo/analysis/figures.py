@@ -1,0 +1,238 @@
+"""Pictures of a setting's results: one function a picture, from a setting to a matplotlib figure."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from safevar_sumo.analysis.discussion import effects
+from safevar_sumo.analysis.quality import WORST, convergence, nondominated
+from safevar_sumo.analysis.rq3 import ANY, critical, rq31, rq32
+from safevar_sumo.analysis.setting import ALGORITHM_TITLES, Setting, Unanswerable
+from safevar_sumo.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FORMATS = ("png", "pdf", "svg")
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+"""Okabe and Ito's, which colour-blind readers can tell apart; markers and line styles tell the same again."""
+MARKERS, DASHES = ("o", "X", "^", "s", "D", "v"), ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
+INCREASE, DECREASE = COLOURS[1], COLOURS[0]
+OBJECTIVE_TITLES = {"f_safe": "f_safe: safety degree [m, -m/s]", "f_diff": "f_diff: largest change [% of the original]",
+                    "f_num_diff": "f_numDiff: characteristics changed"}
+DPI = 200
+FONT = 8
+LONG_NAME = 28
+"""Letters that fit above a small axis."""
+BINS = 24
+"""Bins over a characteristic's domain."""
+
+
+def number_of_changes(setting: Setting) -> Figure:
+    """RQ3.1: how many critical solutions of a run have j characteristics changed, as box plots over the runs."""
+    import seaborn as sns
+
+    counts = rq31(setting)
+    figure, ((axis,),) = _figure(setting, "number of changed characteristics", 1, 1, (6.4, 3.8))
+    sns.boxplot(counts, x="j", y="count", ax=axis, color="#56b4e9", linecolor="black", linewidth=0.8, fliersize=3)
+    axis.set_xlabel("characteristics changed")
+    axis.set_ylabel(f"critical solutions per run\n({counts['run'].nunique()} runs)")
+    _whole_numbers(axis.yaxis)
+    return figure
+
+
+def changed_characteristics(setting: Setting) -> Figure:
+    """RQ3.2: in which share of the critical solutions with j changed each characteristic is changed, as a heat map."""
+    import seaborn as sns
+
+    _some_critical(setting)
+    shares = rq32(setting)
+    order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
+    grid = shares.pivot(index="characteristic", columns="j", values="percent").astype(float)
+    grid = grid.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=_plain)
+    figure, ((axis,),) = _figure(setting, "characteristics changed in critical solutions", 1, 1, (7.6, 1.4 + 0.3 * len(grid)))
+    sns.heatmap(grid, ax=axis, cmap="cividis", vmin=0, vmax=100, annot=True, fmt=".0f", annot_kws={"fontsize": 7}, linewidths=0.5,
+                cbar_kws={"label": "critical solutions\nin which it is changed [%]"})
+    axis.grid(visible=False)
+    colours = axis.collections[0].colorbar.ax
+    colours.tick_params(labelsize=FONT)
+    colours.yaxis.label.set_size(FONT)
+    axis.set_xlabel("number of characteristics changed (empty: no such solution)")
+    axis.set_ylabel("characteristic, most frequent first")
+    axis.tick_params(axis="both", length=0, rotation=0)
+    return figure
+
+
+def sizes_of_changes(setting: Setting) -> Figure:
+    """How each characteristic is changed in the critical solutions: the distribution of its signed changes."""
+    import seaborn as sns
+
+    total = _some_critical(setting)
+    found = effects(setting)
+    members = setting.characteristics.members
+    columns = min(4, len(members))
+    rows = -(-len(members) // columns)
+    figure, axes = _figure(setting, "changes in critical solutions", rows, columns, (9.0, 1.0 + 1.85 * rows))
+    for axis, member in zip(axes.flat, members, strict=False):
+        change = found.loc[found["characteristic"] == member.name, "change"]
+        low, high = member.lower - member.original, member.upper - member.original
+        sides = {INCREASE: change[change > 0], DECREASE: change[change < 0]}
+        for colour, side in sides.items():
+            if len(side):
+                end = high if colour == INCREASE else low
+                edges = np.sort(np.linspace(0, end, 1 + max(1, round(BINS * abs(end) / (high - low)))))
+                sns.histplot(x=side, ax=axis, bins=edges, color=colour, edgecolor="white", linewidth=0.3, alpha=1)
+        axis.axvline(0, color="black", linewidth=0.8)
+        axis.set_xlim(low, high)
+        size = min(FONT, FONT * LONG_NAME / len(member.name))
+        axis.set_title(f"{_plain(member.name)}\n+{len(sides[INCREASE])}, -{len(sides[DECREASE])}", fontsize=size)
+        axis.set_xlabel(f"change [{_unit(member.unit)}]", fontsize=FONT)
+        axis.set_ylabel("")
+        axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
+        _whole_numbers(axis.yaxis, 4)
+    for axis in list(axes.flat)[len(members):]:
+        axis.set_axis_off()
+    figure.supylabel(f"how many of {total} critical solutions", fontsize=9)
+    figure.supxlabel("orange, right of 0: increases; blue, left of 0: decreases; titles tell how many of each;\n"
+                     "each axis spans the characteristic's domain", fontsize=FONT)
+    return figure
+
+
+def pareto_fronts(setting: Setting) -> Figure:
+    """The non-dominated solutions of each algorithm, all its runs together, in the three pairs of objectives.
+
+    Raises
+    ------
+    Unanswerable
+        If there is no solution.
+    """
+    names = list(OBJECTIVE_TITLES)
+    fronts = {}
+    for algorithm in setting.algorithms:
+        points = setting.solutions_of(algorithm)[names].dropna().to_numpy(dtype=float)
+        if len(points):
+            fronts[algorithm] = nondominated(points) * [1, 100, 1]
+    if not fronts:
+        raise Unanswerable(setting.name, "has no solution", "results with at least one finished run")
+    figure, (axes,) = _figure(setting, "non-dominated solutions of each algorithm, all runs together", 1, 3, (9.6, 3.7))
+    for axis, (first, second) in zip(axes, combinations(range(3), 2), strict=True):
+        for i, (algorithm, points) in enumerate(fronts.items()):
+            axis.plot(points[:, first], points[:, second], linestyle="", marker=MARKERS[i % len(MARKERS)], markersize=4, alpha=0.6,
+                      markeredgewidth=0, color=COLOURS[i % len(COLOURS)], label=f"{_title(algorithm)} ({len(points)})")
+        axis.set_xlabel(OBJECTIVE_TITLES[names[first]])
+        axis.set_ylabel(OBJECTIVE_TITLES[names[second]])
+    _legend_below(figure, axes[0])
+    return figure
+
+
+def hypervolume_growth(setting: Setting) -> Figure:
+    """Convergence: the hypervolume of what was found against evaluations, median and range over the runs."""
+    growth = convergence(setting)
+    figure, ((axis,),) = _figure(setting, "convergence", 1, 1, (6.4, 4.0))
+    for i, (algorithm, of_it) in enumerate(growth.groupby("algorithm", sort=False)):
+        over = of_it.groupby("evaluations")["hypervolume"].agg(["min", "median", "max"])
+        colour = COLOURS[i % len(COLOURS)]
+        axis.fill_between(over.index, over["min"], over["max"], color=colour, alpha=0.12, linewidth=0)
+        for edge in ("min", "max"):
+            axis.plot(over.index, over[edge], color=colour, linestyle=DASHES[i % len(DASHES)], linewidth=0.6)
+        axis.plot(over.index, over["median"], color=colour, linestyle=DASHES[i % len(DASHES)], linewidth=1.8,
+                  label=f"{_title(str(algorithm))} ({of_it['run'].nunique()} runs)")
+    axis.set_xlabel("evaluations")
+    axis.set_ylabel(f"hypervolume of all found, normalised\n(thick: median, thin: range over runs; reference point {WORST:g})")
+    _legend_below(figure, axis)
+    return figure
+
+
+FIGURES: Mapping[str, Callable[[Setting], Figure]] = {
+    "rq3.1-number-of-changes": number_of_changes,
+    "rq3.2-changed-characteristics": changed_characteristics,
+    "rq3.3-sizes-of-changes": sizes_of_changes,
+    "pareto-fronts": pareto_fronts,
+    "convergence": hypervolume_growth,
+}
+
+
+def draw_all(settings: Sequence[Setting], directory: Path, kind: str) -> tuple[list[Path], list[str]]:
+    """Draw every picture of every setting; returns the files, and why some pictures are not there.
+
+    Raises
+    ------
+    InputError
+        If the directory cannot be written, or no picture can be drawn.
+    """
+    written, refused = [], []
+    for setting in settings:
+        for name, draw in FIGURES.items():
+            try:
+                figure = draw(setting)
+            except Unanswerable as error:
+                refused.append(error)
+                continue
+            path = directory / f"{_file_name(setting.name)}-{name}.{kind}"
+            try:
+                directory.mkdir(parents=True, exist_ok=True)
+                figure.savefig(path, dpi=DPI)
+            except OSError as error:
+                raise InputError("--out", f"cannot write {path}: {error.strerror or error}", "a directory that can be written") from None
+            written.append(path)
+    if not written:
+        raise refused[0]
+    return written, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in refused))
+
+
+def _figure(setting: Setting, what: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
+    """A figure with its axes, shape (rows, columns), that no global state knows of."""
+    import matplotlib.style
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT, "axes.labelsize": FONT, "axes.titlesize": FONT}]):
+        figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.1))
+        axes = figure.subplots(rows, columns, squeeze=False)
+    figure.suptitle(f"{_plain(setting.name)}: {what}", fontsize=FONT + 2)
+    return figure, axes
+
+
+def _legend_below(figure: Figure, axis: Axes) -> None:
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3), frameon=False, fontsize=FONT)
+
+
+def _some_critical(setting: Setting) -> int:
+    """How many critical solutions there are; without any there is nothing to draw."""
+    number = len(critical(setting))
+    if not number:
+        raise Unanswerable(setting.name, "has no critical solution", "results with solutions that are more unsafe than the original")
+    return number
+
+
+def _whole_numbers(axis: object, steps: int = 6) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    axis.set_major_locator(MaxNLocator(steps, integer=True, min_n_ticks=1))  # type: ignore[attr-defined]
+
+
+def _title(algorithm: str) -> str:
+    return _plain(ALGORITHM_TITLES.get(algorithm, algorithm))
+
+
+def _plain(name: str) -> str:
+    """A name in which matplotlib sees no formula."""
+    return name.replace("$", r"\$")
+
+
+def _unit(unit: str) -> str:
+    """A unit with its powers raised."""
+    return re.sub(r"\^(-?\d+)", r"$^{\1}$", _plain(unit))
+
+
+def _file_name(name: str) -> str:
+    """A setting's name without what file systems dislike."""
+    return "".join(sign if sign.isalnum() or sign in "._-" else "-" for sign in name).strip("-")

@@ -1,0 +1,228 @@
+"""Answers laid out as the paper's tables: headings, number formats, what is bold. Still plain data; `tables` renders it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.analysis.inference import ALPHA, ASYMPTOTIC, EXACT, NOTABLE
+from safevar_sumo.analysis.questions import SAFETY, Answer
+from safevar_sumo.analysis.rq3 import ANY
+from safevar_sumo.analysis.setting import ALGORITHM_TITLES, MORE_IS_UNSAFE
+
+UNDEFINED = "-"
+METRIC_TITLES = {"igd": "IGD", "igd_plus": "IGD+", "hypervolume": "HV", "safety_degree": "SD", "tet": "TET", "tit": "TIT",
+                 "ave_dece": "aveDece"}
+SAFETY_UNITS = {"avgSD_mD": "avgSD_mD [m]", "avgSD_cS": "avgSD_cS [m/s]", "TET": "TET [s]", "TIT": "TIT [s^2]",
+                "aveDece": "aveDece [m/s^2]"}
+PAPER_NUMBERS = ("2", "3", "4", "5", "6")
+"""The numbers of changed characteristics that the paper's table of RQ3.3 has."""
+BOLD_NOTE = f"Bold (or *): p < {ALPHA:g}; an effect size of medium or large magnitude."
+UNITS_NOTE = "SD in m, or minus the collision's speed in m/s; TET in s, TIT in s^2, aveDece in m/s^2."
+NON_COLLISION_NOTE = "TET and TIT over solutions without collision, SD and aveDece over all."
+
+
+class Bold(str):
+    """A cell that stands out."""
+
+
+class Table(NamedTuple):
+    """A table ready to be rendered: `spans` are headings over several columns, the first `labels` columns are text."""
+
+    title: str
+    heads: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    labels: int
+    spans: tuple[tuple[str, int], ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def lay_out(answer: Answer) -> list[Table]:
+    """The paper's tables of an answer; without any setting that has it, one that says why."""
+    if answer.frame.empty:
+        return [Table(TITLES[answer.name], (), [], 0, (), answer.notes)]
+    tables = LAYOUTS[answer.name](answer.frame)
+    return [*tables[:-1], tables[-1]._replace(notes=(*tables[-1].notes, *answer.notes))]
+
+
+def _tests(frame: pd.DataFrame, who: str, name: str, notes: tuple[str, ...]) -> Table:
+    """p-values and effect sizes, settings side by side."""
+    settings = list(dict.fromkeys(frame["setting"]))
+    cells = {(row[who], row["metric"], row["setting"]): row for row in frame.to_dict("records")}
+    parts = ("p", "A12", "magnitude", "n1", "n2") if len(settings) == 1 else ("p", "A12", "magnitude")
+    rows = [(_algorithm(algorithm), METRIC_TITLES[metric],
+             *(cell for setting in settings for cell in _test(cells.get((algorithm, metric, setting)), len(parts))))
+            for algorithm, metric in dict.fromkeys(zip(frame[who], frame["metric"], strict=True))]
+    methods = [f"p{' with e' if method == EXACT else ''}: {method}." for method in (ASYMPTOTIC, EXACT) if method in set(frame["method"])]
+    return Table(TITLES[name], (who, "metric", *parts * len(settings)), rows, 2, tuple((setting, len(parts)) for setting in settings),
+                 (*methods, *notes, BOLD_NOTE))
+
+
+def _test(row: Mapping[Any, Any] | None, width: int) -> tuple[str, ...]:
+    if row is None or pd.isna(row["p_value"]):
+        return (UNDEFINED,) * width
+    p, effect = _p_value(row["p_value"]) + ("e" if row["method"] == EXACT else ""), f"{row['effect_size']:.3f}"
+    p, effect = Bold(p) if row["p_value"] < ALPHA else p, Bold(effect) if row["magnitude"] in NOTABLE else effect
+    return (p, effect, row["magnitude"], str(row["n1"]), str(row["n2"]))[:width]
+
+
+def _rq1(frame: pd.DataFrame) -> list[Table]:
+    test = _tests(frame, "algorithm", "rq1", (
+        "A12 below 0.5: the algorithm's solutions are more unsafe than the original vehicle,",
+        "whose value is repeated to the sample's size.", NON_COLLISION_NOTE))
+    settings = list(dict.fromkeys(frame["setting"]))
+    means = {(row["setting"], row["algorithm"], row["metric"]): row["mean"] for row in frame.to_dict("records")}
+    means |= {(row["setting"], "original", row["metric"]): row["original"] for row in frame.to_dict("records")}
+    rows = [(_algorithm(name), *(_number(means.get((setting, name, metric)), ".2f") for setting in settings for metric in MORE_IS_UNSAFE))
+            for name in ("original", *dict.fromkeys(frame["algorithm"]))]
+    heads = tuple(METRIC_TITLES[metric] for metric in MORE_IS_UNSAFE)
+    spans = tuple((setting, len(heads)) for setting in settings)
+    return [test, Table("RQ1: mean metrics", ("vehicle", *heads * len(settings)), rows, 1, spans, (UNITS_NOTE, NON_COLLISION_NOTE))]
+
+
+def _rq2(frame: pd.DataFrame) -> list[Table]:
+    return [_tests(frame, "baseline", "rq2", (
+        "A12 above 0.5: NSGA-II is better; IGD, IGD+, HV: run against run, the others: pooled solutions.",
+        NON_COLLISION_NOTE, "IGD on the objectives as they are, IGD+ and hypervolume (HV) on normalised ones."))]
+
+
+def _rq31(frame: pd.DataFrame) -> list[Table]:
+    settings = list(dict.fromkeys(frame["setting"]))
+    counts = {key: group["count"].to_numpy() for key, group in frame.groupby(["setting", "j"])}
+    heads = ("min", "Q1", "median", "Q3", "max")
+    rows = []
+    for j in _js(frame):
+        quartiles = [np.quantile(counts[setting, j], [0, 0.25, 0.5, 0.75, 1]) if (setting, j) in counts else [None] * 5
+                     for setting in settings]
+        rows.append((j, *(_number(value, "g") for of_it in quartiles for value in of_it)))
+    return [Table(TITLES["rq3.1"], ("j", *heads * len(settings)), rows, 1, tuple((setting, 5) for setting in settings),
+                  ("Critical solutions of a run with exactly j characteristics changed, over the runs.",))]
+
+
+def _rq32(frame: pd.DataFrame) -> list[Table]:
+    tables = []
+    for setting, of_it in frame.groupby("setting", sort=False):
+        percent, js = _grid(of_it, ["characteristic"], "percent"), _js(of_it)
+        overall = of_it[of_it["j"] == ANY]
+        rank: dict[str, object] = dict(zip(overall["characteristic"], overall["rank"], strict=True))
+        rows = [(name, *(_number(percent[name, j], ".1f") for j in js), _number(rank[name], "d")) for name in rank]
+        tables.append(Table(f"{TITLES['rq3.2']}: {setting}", ("characteristic", *js, "rank"), rows, 1,
+                            notes=("Columns: number of characteristics changed; ranked by 'any'.",)))
+    return [*tables, _side_by_side(frame)] if len(tables) > 1 else tables
+
+
+def _side_by_side(frame: pd.DataFrame) -> Table:
+    """Settings beside each other by their columns `any` and rank."""
+    overall = frame[frame["j"] == ANY]
+    settings = list(dict.fromkeys(overall["setting"]))
+    cells = {(row["setting"], row["characteristic"]): (_number(row["percent"], ".1f"), _number(row["rank"], "d"))
+             for row in overall.to_dict("records")}
+    rows = [(name, *(cell for setting in settings for cell in cells.get((setting, name), (UNDEFINED, UNDEFINED))))
+            for name in dict.fromkeys(overall["characteristic"])]
+    return Table("RQ3.2: % of all critical solutions, settings side by side", ("characteristic", *("any", "rank") * len(settings)), rows, 1,
+                 tuple((setting, 2) for setting in settings))
+
+
+def _rq33(frame: pd.DataFrame) -> list[Table]:
+    tables = []
+    for setting, of_it in frame.groupby("setting", sort=False):
+        of_it = of_it.assign(pc=[_number(value, ".1%") for value in of_it["pc"]],
+                             delta=[_number(value, "+.3g") for value in of_it["delta"]])
+        pc, delta, js = (*(_grid(of_it, ["characteristic", "direction"], name) for name in ("pc", "delta")), _js(of_it))
+        of_paper = [j for j in PAPER_NUMBERS if j in js]
+        labels = list(dict.fromkeys(zip(of_it["characteristic"], of_it["direction"], strict=True)))
+        note = ("PC: mean of |v - v''| / v; delta: mean signed change in the characteristic's unit.",)
+        tables += [
+            Table(f"{TITLES['rq3.3']}, 2 to 6 changed: {setting}", ("characteristic", "direction", *("PC", "delta") * len(of_paper)),
+                  [(*label, *(cell for j in of_paper for cell in (pc[*label, j], delta[*label, j]))) for label in labels], 2,
+                  tuple((f"j = {j}", 2) for j in of_paper), note),
+            *(Table(f"RQ3.3: {what}, any number changed: {setting}", ("characteristic", "direction", *js),
+                    [(*label, *(cells[*label, j] for j in js)) for label in labels], 2)
+              for what, cells in (("PC", pc), ("delta", delta)))]
+    return tables
+
+
+def _safety(frame: pd.DataFrame) -> list[Table]:
+    tables = []
+    for setting, of_it in frame.groupby("setting", sort=False):
+        value, percent, js = _grid(of_it, ["quantity"], "value"), _grid(of_it, ["quantity"], "percent"), _js(of_it)
+        rows = []
+        for name, title in SAFETY_UNITS.items():
+            rows.append((title, *(_number(value[name, j], ".2f") for j in js)))
+            if name != "avgSD_cS":
+                rows.append(("  % of the original", *(_number(percent[name, j], ".1f") for j in js)))
+        tables.append(Table(f"{TITLES[SAFETY]}: {setting}", ("mean of", *js), rows, 1, notes=(
+            "avgSD_mD: reduction of the distance; TET, TIT: increase (all three without collisions);",
+            "avgSD_cS: speed of collisions; aveDece: decrease, over all.")))
+    return tables
+
+
+def _collisions(frame: pd.DataFrame) -> list[Table]:
+    settings = list(dict.fromkeys(frame["setting"]))
+    cells = {(row["algorithm"], row["setting"]): (str(row["solutions"]), str(row["collisions"]), _number(row["share"], ".1%"))
+             for row in frame.to_dict("records")}
+    rows = [(_algorithm(name), *(cell for setting in settings for cell in cells.get((name, setting), (UNDEFINED,) * 3)))
+            for name in dict.fromkeys(frame["algorithm"])]
+    return [Table(TITLES["collisions"], ("algorithm", *("solutions", "collisions", "share") * len(settings)), rows, 1,
+                  tuple((setting, 3) for setting in settings))]
+
+
+def _combinations(frame: pd.DataFrame) -> list[Table]:
+    rows: list[tuple[str, ...]] = [(row["setting"], str(row["rank"]), ", ".join(row["characteristics"]), f"{row['percent']:.1f}")
+                                   for row in frame.to_dict("records")]
+    return [Table(TITLES["combinations"], ("setting", "rank", "characteristics", "%"), rows, 3,
+                  notes=("Percent of the critical solutions with exactly four characteristics changed.",))]
+
+
+def _weather(frame: pd.DataFrame) -> list[Table]:
+    tables = []
+    for (setting, other), of_it in frame.groupby(["setting", "other"], sort=False):
+        rows = [(row["characteristic"], *(_number(row[name], form) for name, form in WEATHER_COLUMNS.items()))
+                for row in of_it.to_dict("records")]
+        tables.append(Table(f"{TITLES['weather']}: {setting} against {other}",
+                            ("characteristic", str(setting), str(other), "diff.", *(str(setting), str(other)) * 3), rows, 1,
+                            (("% changed", 3), ("rank", 2), ("mean increase", 2), ("mean decrease", 2)),
+                            ("Over the critical solutions; increase and decrease in the characteristic's unit.",)))
+    return tables
+
+
+def _grid(frame: pd.DataFrame, labels: Sequence[str], value: str) -> dict[Any, Any]:
+    """A column by its labels and j."""
+    return dict(zip(zip(*(frame[label] for label in labels), frame["j"], strict=True), frame[value], strict=True))
+
+
+def _js(frame: pd.DataFrame) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(frame["j"]))
+
+
+def _algorithm(name: str) -> str:
+    return ALGORITHM_TITLES.get(name, name)
+
+
+def _number(value: Any, form: str) -> str:
+    return UNDEFINED if value is None or pd.isna(value) else format(int(value) if form == "d" else float(value), form)
+
+
+def _p_value(value: float) -> str:
+    return "<0.001" if value < 0.001 else f"{value:.3f}"
+
+
+WEATHER_COLUMNS = {"percent": ".1f", "percent_other": ".1f", "difference": "+.1f", "rank": "d", "rank_other": "d",
+                   "increase": "+.3g", "increase_other": "+.3g", "decrease": "+.3g", "decrease_other": "+.3g"}
+TITLES = {
+    "rq1": "RQ1: found settings against the original vehicle",
+    "rq2": "RQ2: NSGA-II against the other algorithms",
+    "rq3.1": "RQ3.1: number of changed characteristics",
+    "rq3.2": "RQ3.2: % of critical solutions in which a characteristic is changed",
+    "rq3.3": "RQ3.3: size of changes",
+    SAFETY: "RQ3.3: what the changes did to safety",
+    "collisions": "Collisions among the solutions",
+    "combinations": "The most frequent combinations of four changes",
+    "weather": "One weather against another",
+}
+LAYOUTS: Mapping[str, Callable[[pd.DataFrame], list[Table]]] = {
+    "rq1": _rq1, "rq2": _rq2, "rq3.1": _rq31, "rq3.2": _rq32, "rq3.3": _rq33, SAFETY: _safety, "collisions": _collisions,
+    "combinations": _combinations, "weather": _weather}

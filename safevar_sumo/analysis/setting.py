@@ -1,0 +1,165 @@
+"""One setting's results as the research questions need them: who found what, and what the original vehicle did."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.records import FloatArray, Outcome
+from safevar_sumo.results import load
+from safevar_sumo.scenarios import weather_of
+from safevar_sumo.study import Study, Weather, invalid
+from safevar_sumo.vehicles import CharacteristicSet
+
+NSGA2 = "nsga2"
+"""The algorithm that RQ2 asks about and whose solutions RQ3 looks at."""
+ALGORITHM_TITLES = {"nsga2": "NSGA-II", "rs": "RS", "safe_fuzzer": "SafeFuzzer"}
+OVER_NON_COLLISIONS = ("tet", "tit")
+"""Metrics that are taken over solutions without collision (method section 4)."""
+MORE_IS_UNSAFE = {"safety_degree": False, "tet": True, "tit": True, "ave_dece": False}
+"""Whether a larger value of a metric is the more unsafe one."""
+
+
+class Unanswerable(InputError):
+    """These results do not hold what a question asks for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """The results of one study.
+
+    Attributes
+    ----------
+    name
+        What tables call it.
+    study
+        As it was run.
+    original
+        The original vehicle's metrics by name; NaN where undefined.
+    solutions, evaluations
+        Frames as `safevar_sumo.results.load` gives them.
+    finished
+        Algorithm and number of every finished run.
+    has_runs
+        False for imported solutions, of which nobody knows the run.
+    """
+
+    name: str
+    study: Study
+    original: Mapping[str, float]
+    solutions: pd.DataFrame
+    evaluations: pd.DataFrame
+    finished: tuple[tuple[str, int], ...]
+    has_runs: bool
+
+    @property
+    def characteristics(self) -> CharacteristicSet:
+        return CharacteristicSet.of(self.study.vehicle.characteristics)
+
+    @property
+    def weather(self) -> Weather:
+        return weather_of(self.study.weather, self.name)
+
+    @property
+    def algorithms(self) -> tuple[str, ...]:
+        """Algorithms that have solutions or a finished run, in the study's order."""
+        there = {*self.solutions["algorithm"], *(algorithm for algorithm, _ in self.finished)}
+        return tuple(name for name in dict.fromkeys([*self.study.search.algorithms, *sorted(there)]) if name in there)
+
+    def solutions_of(self, algorithm: str) -> pd.DataFrame:
+        """Pooled solutions of all finished runs of an algorithm.
+
+        Raises
+        ------
+        Unanswerable
+            If it has no finished run.
+        """
+        if algorithm not in self.algorithms:
+            there = ", ".join(self.algorithms) or "no algorithm"
+            raise Unanswerable(self.name, f"has no finished run of {algorithm}", f"results of {algorithm} (it has those of {there})")
+        return self.solutions[self.solutions["algorithm"] == algorithm]
+
+    def runs_of(self, algorithm: str) -> list[int]:
+        """The finished runs of an algorithm.
+
+        Raises
+        ------
+        Unanswerable
+            If the solutions are imported and belong to no run.
+        """
+        if not self.has_runs:
+            raise Unanswerable(self.name, "is imported: nobody knows which run a solution belongs to", "results of the command study")
+        return sorted(run for name, run in self.finished if name == algorithm)
+
+    @property
+    def remarks(self) -> list[str]:
+        """What a reader of any table of this setting should know."""
+        told = []
+        if not self.has_runs:
+            told.append(f"{self.name}: imported solutions, without runs; the original vehicle as published or given.")
+        else:
+            done = Counter(algorithm for algorithm, _ in self.finished)
+            planned = self.study.search.runs
+            short = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.algorithms if done[name] < planned]
+            if short:
+                told.append(f"{self.name}: unfinished, {', '.join(short)}; made of what is finished.")
+        return told
+
+
+def values(solutions: pd.DataFrame, metric: str) -> FloatArray:
+    """Where a metric counts, its values: TET and TIT of solutions without collision, else of all; undefined ones left out."""
+    counted = solutions[~collided(solutions)] if metric in OVER_NON_COLLISIONS else solutions
+    found = counted[metric].to_numpy(dtype=float)
+    return np.asarray(found[~np.isnan(found)])
+
+
+def collided(solutions: pd.DataFrame) -> pd.Series[bool]:
+    """Which solutions are collisions."""
+    return solutions["outcome"] == str(Outcome.COLLISION)
+
+
+def load_settings(directories: Iterable[str | Path]) -> list[Setting]:
+    """Read results directories; settings of the same name are told apart by their directories.
+
+    Raises
+    ------
+    InputError
+        If one is no results directory, is damaged or is given twice.
+    """
+    places = [Path(directory) for directory in directories]
+    twice = [place for place, number in Counter(place.resolve() for place in places).items() if number > 1]
+    if twice:
+        raise InputError("DIR", f"{twice[0]} is given twice", "each results directory once")
+    found = [load_setting(place) for place in places]
+    names = Counter(one.name for one in found)
+    return [replace(one, name=f"{one.name} ({place})") if names[one.name] > 1 else one for one, place in zip(found, places, strict=True)]
+
+
+def load_setting(directory: Path) -> Setting:
+    """Read one results directory."""
+    manifest, evaluations, solutions, finished = load(directory)
+    try:
+        study = msgspec.convert(manifest["study"], Study)
+    except msgspec.ValidationError as error:
+        raise invalid(directory / "manifest.json", manifest["study"], error, "study") from None
+    original = manifest.get("original")
+    if not isinstance(original, dict):
+        raise InputError(directory / "manifest.json", "tells nothing of the original vehicle", "what the command study has written")
+    return setting_of(study, original, solutions, evaluations, finished, "imported" not in manifest)
+
+
+def setting_of(study: Study, original: Mapping[str, Any], solutions: pd.DataFrame, evaluations: pd.DataFrame,
+               finished: Sequence[tuple[str, int]], has_runs: bool = True) -> Setting:
+    """Put a setting together; in `original` an undefined metric is None or missing."""
+    metrics = {name: np.nan if original.get(name) is None else float(original[name]) for name in METRICS}
+    return Setting(name=study.name, study=study, original=metrics, solutions=solutions, evaluations=evaluations,
+                   finished=tuple(finished), has_runs=has_runs)

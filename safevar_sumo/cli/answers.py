@@ -1,0 +1,82 @@
+"""Commands that read results and answer the research questions; nothing here simulates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from safevar_sumo.analysis import QUESTIONS, answer, draw_all, evaluations_of, load_settings, original_metrics, read_reference
+from safevar_sumo.analysis.figures import FORMATS as PICTURES
+from safevar_sumo.analysis.tables import ENDINGS, FORMATS
+from safevar_sumo.cli.program import commands
+from safevar_sumo.results import make_directory, write_imported, write_whole
+from safevar_sumo.study import load_study
+from safevar_sumo.vehicles import CharacteristicSet
+
+WITHOUT_NOTES = ("csv", "json")
+"""Formats that hold the numbers alone; the notes go to the standard error."""
+
+
+@commands.command()
+@click.argument("directories", nargs=-1, required=True, metavar="DIR...")
+@click.option("--rq", type=click.Choice(QUESTIONS), help="This question alone.")
+@click.option("--format", "kind", type=click.Choice(list(FORMATS)), default="text", show_default=True, help="How they are written.")
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write each table to a file of this directory.")
+def tables(directories: tuple[str, ...], rq: str | None, kind: str, out: Path | None) -> None:
+    """Answer the research questions as tables, from the results directories DIR..., one for each setting."""
+    answers = answer(load_settings(directories), rq)
+    if kind in WITHOUT_NOTES:
+        _warn(list(dict.fromkeys(note for one in answers for note in one.notes)))
+    if out is not None:
+        make_directory(out)
+        for one in answers:
+            if not one.frame.empty:
+                write_whole(out / f"{one.name}.{ENDINGS[kind]}", FORMATS[kind]([one]))
+        click.echo(f"Tables: {out}")
+        return
+    shown = [one for one in answers if one.name == rq] if rq is not None and kind in WITHOUT_NOTES else answers
+    click.echo(FORMATS[kind](shown), nl=False)
+
+
+@commands.command()
+@click.argument("directories", nargs=-1, required=True, metavar="DIR...")
+@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory of the pictures.")
+@click.option("--format", "kind", type=click.Choice(PICTURES), default="png", show_default=True, help="Kind of the pictures.")
+def figures(directories: tuple[str, ...], out: Path, kind: str) -> None:
+    """Draw the figures of the results directories DIR..., one file for each figure and setting."""
+    settings = load_settings(directories)
+    make_directory(out)
+    written, lacking = draw_all(settings, out, kind)
+    _warn([*(remark for setting in settings for remark in setting.remarks), *lacking])
+    for path in written:
+        click.echo(str(path))
+
+
+@commands.command(name="import")
+@click.argument("study")
+@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory of the results.")
+@click.option("--nsga2", type=click.Path(path_type=Path), required=True, metavar="FILE.csv", help="Solutions of NSGA-II.")
+@click.option("--rs", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of random search.")
+@click.option("--safe-fuzzer", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of SafeFuzzer.")
+@click.option("--original", metavar="sd=2.7,tet=1.2,tit=0.44,ave_dece=5.97",
+              help="The original vehicle's metrics.  [default: those published for STUDY]")
+def import_command(study: str, out: Path, original: str | None, **given: Path | None) -> None:
+    """Make results of STUDY from solutions in the published package's CSV format."""
+    chosen = load_study(study)
+    files = {algorithm: path for algorithm, path in given.items() if path is not None}
+    metrics = original_metrics(original, chosen.published)
+    characteristics = CharacteristicSet.of(chosen.vehicle.characteristics)
+    solutions = {}
+    for algorithm, path in files.items():
+        data = read_reference(path, characteristics)
+        if data.skipped:
+            _warn([f"{path}: {data.skipped} rows with values outside the domains are left out"])
+        solutions[algorithm] = evaluations_of(data, characteristics)
+    write_imported(out, chosen, solutions, metrics, {algorithm: path.name for algorithm, path in files.items()})
+    click.echo(f"Results: {out}, {', '.join(f'{len(found)} solutions of {name}' for name, found in solutions.items())}")
+
+
+def _warn(messages: list[str]) -> None:
+    for message in messages:
+        click.echo(f"note: {message}", err=True)

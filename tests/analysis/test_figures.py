@@ -1,0 +1,135 @@
+"""Every picture: axes with labels, no text over another, nothing drawn of nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_up import CHARACTERISTICS, made_up, made_up_study, row
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.text import Text
+
+from safevar_sumo.analysis import FIGURES, Setting, draw_all
+from safevar_sumo.analysis.figures import hypervolume_growth, number_of_changes, pareto_fronts, sizes_of_changes
+from safevar_sumo.analysis.setting import Unanswerable
+from safevar_sumo.errors import InputError
+from safevar_sumo.study import load_study
+from safevar_sumo.vehicles import CharacteristicSet
+
+
+def random_lgsvl() -> Setting:
+    """Twelve characteristics, some with long names, three algorithms."""
+    rng, study = np.random.default_rng(4), load_study("lgsvl")
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    rows = [row(algorithm, run, sd=rng.uniform(-5, 11)) for algorithm in study.search.algorithms for run in range(3) for _ in range(100)]
+    evaluations = [{**one, "evaluation": i % 100} for i, one in enumerate(rows)]
+    base = made_up(*rows, original={"safety_degree": 10.1}, study=study, evaluations=evaluations)
+    drawn = rng.uniform(characteristics.lower, characteristics.upper, (len(rows), len(characteristics)))
+    drawn = np.where(rng.random(drawn.shape) < 0.5, drawn, characteristics.original)
+    values = {**dict(zip(characteristics.names, drawn.T, strict=True)), "f_diff": characteristics.largest_change(drawn)}
+    return dataclasses.replace(base, solutions=base.solutions.drop(columns=list(CHARACTERISTICS)).assign(**values))
+
+
+@pytest.fixture(scope="module")
+def setting() -> Setting:
+    rng = np.random.default_rng(2)
+    rows, evaluations = [], []
+    for algorithm in ("nsga2", "rs"):
+        for run in (0, 1):
+            for i in range(60):
+                values = (rng.uniform(800, 1400), rng.uniform(1, 3) if i % 2 else 2.0, rng.uniform(0.05, 0.5) if i % 3 else 0.1)
+                one = row(algorithm, run, values=values, sd=rng.uniform(-2, 3))
+                evaluations.append({**one, "evaluation": i})
+                if i % 3 == 0:
+                    rows.append(one)
+    return made_up(*rows, evaluations=evaluations)
+
+
+def test_there_is_a_figure_for_everything_promised() -> None:
+    assert len(FIGURES) == 5
+
+
+@pytest.mark.parametrize("many", [False, True])
+@pytest.mark.parametrize("name", list(FIGURES))
+def test_axes_are_labelled_and_no_text_lies_on_another(name: str, many: bool, setting: Setting) -> None:
+    figure = FIGURES[name](random_lgsvl() if many else setting)
+    FigureCanvasAgg(figure).draw()
+    shared = {"rq3.3-sizes-of-changes"}
+    for axis in figure.axes:
+        if axis.axison and axis.get_label() != "<colorbar>":
+            assert axis.get_xlabel()
+            assert axis.get_ylabel() or (name in shared and figure.get_supylabel())
+    texts = {id(one): one for one in _texts(figure) if one.get_visible() and one.get_text().strip()}
+    assert len(texts) > 10
+    boxes = [(one.get_text(), one.get_window_extent().shrunk(0.98, 0.8)) for one in texts.values()]
+    for (first, box), (second, other) in combinations(boxes, 2):
+        assert not box.overlaps(other), f"{first!r} and {second!r}"
+    for text, box in boxes:
+        assert min(box.x0, box.y0, figure.bbox.x1 - box.x1, figure.bbox.y1 - box.y1) > -1, f"{text!r} is cut off"
+
+
+def _texts(figure: Figure) -> Iterator[Text]:
+    """Every text that is drawn; ticks beyond an axis's ends exist but are not."""
+    yield from (part for part in (*figure.texts, figure._suptitle, figure._supxlabel, figure._supylabel) if part is not None)
+    for legend in figure.legends:
+        yield from legend.get_texts()
+    for axes in figure.axes:
+        if axes.axison:
+            yield from (axes.title, axes.xaxis.label, axes.yaxis.label, *axes.texts)
+            for axis in (axes.xaxis, axes.yaxis):
+                low, high = sorted(axis.get_view_interval())
+                yield from (tick.label1 for tick in axis.get_major_ticks() if low - 1e-9 <= tick.get_loc() <= high + 1e-9)
+                yield from (tick.label2 for tick in axis.get_major_ticks() if low - 1e-9 <= tick.get_loc() <= high + 1e-9)
+
+
+def test_each_algorithm_has_its_own_colour_and_marker(setting: Setting) -> None:
+    lines = pareto_fronts(setting).axes[0].lines
+    assert len({line.get_color() for line in lines}) == len({line.get_marker() for line in lines}) == 2
+
+
+def test_box_plots_are_of_the_runs(setting: Setting) -> None:
+    axis = number_of_changes(setting).axes[0]
+    assert [label.get_text() for label in axis.get_xticklabels()] == ["1", "2", "3"]
+    assert "2 runs" in axis.get_ylabel()
+
+
+def test_changes_are_counted_on_their_side_of_zero(setting: Setting) -> None:
+    axis = sizes_of_changes(setting).axes[0]
+    bars = [bar for bar in axis.patches if isinstance(bar, Rectangle) and bar.get_height() > 0]
+    up, down = sum(bar.get_height() for bar in bars if bar.get_x() >= -1e-9), sum(bar.get_height() for bar in bars if bar.get_x() < -1e-9)
+    assert axis.get_title() == f"mass\n+{up:.0f}, -{down:.0f}"
+    assert up > 0
+    assert down > 0
+    assert not [bar for bar in bars if bar.get_x() < -1e-9 and bar.get_x() + bar.get_width() > 1e-9]
+
+
+def test_convergence_shows_the_median_between_the_extremes(setting: Setting) -> None:
+    low, high, middle = (line.get_ydata() for line in hypervolume_growth(setting).axes[0].lines[:3])
+    assert (np.asarray(low) <= middle).all()
+    assert (np.asarray(middle) <= high).all()
+
+
+def test_what_cannot_be_drawn_says_why(tmp_path: Path) -> None:
+    imported = made_up(row(values=(1100, 2, 0.1)), has_runs=False)
+    written, lacking = draw_all([imported], tmp_path, "svg")
+    assert sorted(path.name for path in written) == [
+        "made-up-pareto-fronts.svg", "made-up-rq3.2-changed-characteristics.svg", "made-up-rq3.3-sizes-of-changes.svg"]
+    assert any("imported" in reason for reason in lacking)
+    for draw in (sizes_of_changes, FIGURES["rq3.2-changed-characteristics"]):
+        with pytest.raises(Unanswerable, match="no critical solution"):
+            draw(made_up(row(sd=9)))
+    with pytest.raises(InputError, match="no finished run"):
+        draw_all([made_up()], tmp_path, "png")
+
+
+def test_names_are_no_formulas(tmp_path: Path) -> None:
+    strange = made_up(row(values=(1100, 2, 0.1)), study=made_up_study())
+    object.__setattr__(strange, "name", "a$b$c ^_/é")
+    written, _ = draw_all([strange], tmp_path, "png")
+    assert all(path.parent == tmp_path for path in written)

@@ -1,0 +1,255 @@
+"""tables, figures and import as a user types them."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import subprocess
+import sys
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import pytest
+from test_commands import run as run_process
+
+from safevar_sumo.analysis import load_settings
+from safevar_sumo.cli import main
+from safevar_sumo.study import load_study
+from safevar_sumo.vehicles import CharacteristicSet
+
+QUESTIONS = ("rq1", "rq2", "rq3.1", "rq3.2", "rq3.3", "collisions")
+FORMATS = {"text": "smoke", "markdown": "| ", "latex": r"\toprule", "csv": "setting,", "json": '"setting": "smoke"'}
+
+
+class Done(NamedTuple):
+    stdout: str
+    stderr: str
+
+
+def run(*arguments: str, expect: int = 0) -> Done:
+    """The program in this process, for it starts no other and its imports take longer than all it does."""
+    out, err, code = io.StringIO(), io.StringIO(), None
+    with redirect_stdout(out), redirect_stderr(err), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["safevar-sumo", *arguments])
+        try:
+            main()
+        except SystemExit as end:
+            code = end.code
+    assert code == expect, f"{code}\n{out.getvalue()}\n{err.getvalue()}"
+    return Done(out.getvalue(), err.getvalue())
+
+
+def refused(*arguments: str, told: tuple[str, ...]) -> None:
+    done = run(*arguments, expect=2)
+    for part in told:
+        assert part in done.stderr, done.stderr
+    assert len(done.stderr.strip().splitlines()) <= 2 or done.stderr.startswith("Usage:"), done.stderr
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A study of two algorithms and two runs, as the command leaves it."""
+    place = tmp_path_factory.mktemp("study") / "small"
+    done = run_process("study", "smoke", "--out", str(place))
+    for part in ("RQ1", "RQ2", "NSGA-II: SD", "RS: IGD", f"python -m safevar_sumo tables {place}"):
+        assert part in done.stdout
+    return place
+
+
+def package_csv(path: Path, rows: int, seed: int, **constant: float) -> Path:
+    """Made-up solutions of the study sun in the published package's columns: rounded, unfiltered, radius in cm."""
+    rng = np.random.default_rng(seed)
+    characteristics = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+    settings = np.round(rng.uniform(characteristics.lower, characteristics.upper, (rows, len(characteristics))), 3)
+    settings[::2, :6] = characteristics.original[:6] + 0.001
+    sd = np.round(rng.uniform(-1, 3, rows), 3)
+    names = [name.replace("ZeroT", "Zero") for name in characteristics.names]
+    frame = pd.DataFrame(settings, columns=names).assign(
+        MaxPercentage=0.5, SaftyDegree=sd, numbers=12.0, TIT=np.where(sd > 0, 0.5, 0), TET=np.where(sd > 0, 1.5, 0), Dece=5.0)
+    frame.assign(**constant).to_csv(path, index=False)
+    return path
+
+
+@pytest.fixture
+def imported(in_tmp: Path) -> Path:
+    package_csv(in_tmp / "nsga2.csv", 40, 1)
+    package_csv(in_tmp / "rs.csv", 30, 2, SaftyDegree=2.5)
+    run("import", "sun", "--out", "imported", "--nsga2", "nsga2.csv", "--rs", "rs.csv")
+    return in_tmp / "imported"
+
+
+def test_every_question_in_every_format(results: Path) -> None:
+    for rq in QUESTIONS:
+        for kind, told in FORMATS.items():
+            done = run("tables", str(results), "--rq", rq, "--format", kind)
+            assert told in done.stdout
+            assert "nan" not in done.stdout.lower()
+
+
+def test_tables_agree_with_the_solutions_that_are_stored(results: Path) -> None:
+    solutions = pd.read_csv(results / "solutions.csv")
+    records = json.loads(run("tables", str(results), "--rq", "collisions", "--format", "json").stdout)
+    for one in records:
+        of_it = solutions[solutions["algorithm"] == one["algorithm"]]
+        assert one["solutions"] == len(of_it)
+        assert one["collisions"] == (of_it["outcome"] == "collision").sum()
+    rq1 = json.loads(run("tables", str(results), "--rq", "rq1", "--format", "json").stdout)
+    for one in rq1:
+        of_it = solutions[(solutions["algorithm"] == one["algorithm"])]
+        assert one["mean"] == pytest.approx(of_it[one["metric"]].mean())
+
+
+def test_all_tables_at_once_and_into_files(results: Path, in_tmp: Path) -> None:
+    for head in ("RQ1", "RQ2", "RQ3.1", "RQ3.2", "RQ3.3", "Collisions", "One weather against another"):
+        assert head in run("tables", str(results)).stdout
+    run("tables", str(results), "--out", "tables", "--format", "latex")
+    names = {path.name for path in Path("tables").iterdir()}
+    assert names >= {"rq1.tex", "rq2.tex", "rq3.1.tex", "rq3.2.tex", "rq3.3.tex", "rq3.3-safety.tex", "collisions.tex"}
+    assert all(path.read_text().startswith(r"\documentclass") for path in Path("tables").iterdir())
+
+
+def test_settings_stand_side_by_side(results: Path, imported: Path) -> None:
+    records = json.loads(run("tables", str(results), str(imported), "--rq", "rq1", "--format", "json").stdout)
+    assert {one["setting"] for one in records} == {"smoke", "sun"}
+    head = run("tables", str(results), str(imported), "--rq", "rq1").stdout.splitlines()[2]
+    assert head.split() == ["smoke", "sun"]
+
+
+def test_figures_are_files_of_the_kind_asked_for(results: Path, in_tmp: Path) -> None:
+    for kind, start in (("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")):
+        done = run("figures", str(results), "--out", kind, "--format", kind)
+        files = sorted(Path(kind).iterdir())
+        assert len(files) == 5
+        assert sorted(done.stdout.split()) == [str(path) for path in files]
+        assert all(path.read_bytes().startswith(start) for path in files)
+
+
+def test_imported_solutions_are_filtered_and_counted_anew(imported: Path) -> None:
+    assert sorted(path.name for path in imported.iterdir()) == ["manifest.json", "solutions.csv"]
+    manifest = json.loads((imported / "manifest.json").read_text())
+    assert manifest["imported"]["files"] == {"nsga2": "nsga2.csv", "rs": "rs.csv"}
+    assert manifest["original"] == load_study("sun").published
+    frame = pd.read_csv(imported / "solutions.csv")
+    assert "run" not in frame
+    assert len(frame) == 70
+    characteristics = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+    settings = frame[list(characteristics.names)].to_numpy()
+    assert (settings[:, :6] == characteristics.original[:6]).any(axis=0).all(), "changes below the threshold are put back"
+    assert frame["f_num_diff"].tolist() == (settings != characteristics.original).sum(axis=1).tolist()
+    assert np.allclose(frame["f_diff"], np.max(np.abs(settings / characteristics.original - 1), axis=1))
+    assert set(frame.loc[frame["safety_degree"] <= 0, "outcome"]) == {"collision"}
+    assert set(frame.loc[frame["safety_degree"] > 0, "outcome"]) == {"unknown"}
+
+
+def test_imported_settings_survive_the_file_to_the_last_bit(imported: Path) -> None:
+    setting = load_settings([imported])[0]
+    changed = setting.characteristics.number_changed(setting.solutions[list(setting.characteristics.names)].to_numpy())
+    assert changed.tolist() == setting.solutions["f_num_diff"].tolist()
+    assert 0 < (changed < 12).sum() < 70
+
+
+def test_imported_results_answer_what_needs_no_runs(imported: Path) -> None:
+    records = json.loads(run("tables", str(imported), "--rq", "rq2", "--format", "json").stdout)
+    values = {one["metric"]: one for one in records}
+    nsga2, rs = pd.read_csv("nsga2.csv")["SaftyDegree"].to_numpy(), pd.read_csv("rs.csv")["SaftyDegree"].to_numpy()
+    assert values["safety_degree"]["effect_size"] == pytest.approx(np.mean(nsga2[:, None] < rs) + 0.5 * np.mean(nsga2[:, None] == rs))
+    assert values["tet"]["n1"] == (nsga2 > 0).sum()
+    assert values["igd"]["p_value"] is None
+    told = run("tables", str(imported)).stdout
+    assert "igd, igd_plus and hypervolume need runs" in told
+    assert "sun: is imported" in told
+    refused("tables", str(imported), "--rq", "rq3.1", told=("sun", "imported"))
+    done = run("figures", str(imported), "--out", "pictures")
+    assert len(done.stdout.split()) == 3
+    assert "imported" in done.stderr
+
+
+def test_the_original_can_be_given(in_tmp: Path) -> None:
+    package_csv(in_tmp / "a.csv", 20, 3)
+    run("import", "sun", "--out", "a", "--nsga2", "a.csv", "--original", "sd=2.5,tet=1.1")
+    assert json.loads(Path("a/manifest.json").read_text())["original"] == {
+        "safety_degree": 2.5, "tet": 1.1, "tit": 0.44, "ave_dece": 5.97}
+    run("import", "sun", "--out", "a", "--nsga2", "a.csv", "--safe-fuzzer", "a.csv")
+    assert set(pd.read_csv("a/solutions.csv")["algorithm"]) == {"nsga2", "safe_fuzzer"}
+    for wrong in ("sd", "sd=x", "ttc=1", "sd=nan", ""):
+        refused("import", "sun", "--out", "b", "--nsga2", "a.csv", "--original", wrong, told=("--original", "sd=NUMBER"))
+    assert not Path("b").exists()
+
+
+def test_an_import_never_mixes_with_a_campaign(results: Path, imported: Path) -> None:
+    refused("import", "sun", "--out", str(results), "--nsga2", "nsga2.csv", told=("holds results of a campaign",))
+    assert "runs" not in [path.name for path in imported.iterdir()]
+    refused("study", "sun", "--runs", "1", "--evaluations", "50", "--out", str(imported), told=("holds results of another study",))
+
+
+def test_a_csv_that_is_not_the_packages_is_refused(in_tmp: Path) -> None:
+    frame = pd.read_csv(package_csv(in_tmp / "a.csv", 5, 1))
+    frame.drop(columns=["TET", "mass"]).to_csv("lacking.csv", index=False)
+    frame.drop(columns="TET").to_csv("tet.csv", index=False)
+    frame.astype(object).replace({5.0: "x"}).to_csv("letters.csv", index=False)
+    Path("empty.csv").write_text("")
+    for name, told in (("lacking.csv", "mass"), ("tet.csv", "TET"), ("letters.csv", "letters.csv"), ("empty.csv", "empty"),
+                       ("nothing.csv", "nothing.csv"), (".", "cannot be read")):
+        refused("import", "sun", "--out", "out", "--nsga2", name, told=(told,))
+    refused("import", "native", "--out", "out", "--nsga2", "a.csv", told=("--original",))
+    refused("import", "lgsvl", "--out", "out", "--nsga2", "a.csv", told=("lacks the columns",))
+    assert not Path("out").exists()
+
+
+def test_what_is_no_result_is_refused(results: Path, in_tmp: Path) -> None:
+    Path("empty").mkdir()
+    Path("file").write_text("{}")
+    Path("other").mkdir()
+    Path("other/manifest.json").write_text('{"study": {}, "versions": {}, "original": {}}')
+    for name in ("nowhere", "empty", "file", "other"):
+        for command in (("tables", name), ("figures", name, "--out", "pictures")):
+            refused(*command, told=(name,))
+    refused("tables", str(results), str(results), told=("given twice",))
+    refused("tables", str(results), "--rq", "rq4", told=("rq4", "rq3.1"))
+    refused("tables", str(results), "--format", "html", told=("html", "latex"))
+    refused("figures", str(results), "--out", "file", told=("--out", "file"))
+    refused("tables", str(results), "--out", "file", told=("--out", "file"))
+    refused("tables", str(results), "--rq", "weather", told=("weather",))
+    assert not Path("pictures").exists()
+
+
+def test_damaged_results_are_refused(imported: Path) -> None:
+    text = (imported / "solutions.csv").read_text()
+    for spoilt in (text.replace("f_diff", "g_diff"), text.replace(",0.", ",zero.", 1), ""):
+        (imported / "solutions.csv").write_text(spoilt)
+        refused("tables", str(imported), told=("solutions.csv",))
+    (imported / "solutions.csv").unlink()
+    refused("tables", str(imported), told=("solutions.csv",))
+
+
+def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_tmp: Path) -> None:
+    shutil.copytree(results, "part")
+    Path("part/runs/rs-01.journal").unlink()
+    Path("part/solutions.csv").unlink()
+    told = run("tables", "part").stdout
+    assert "unfinished, rs 1 of 2 runs" in told
+    records = json.loads(run("tables", "part", "--rq", "rq2", "--format", "json").stdout)
+    assert next(one for one in records if one["metric"] == "igd")["n2"] == 1
+    Path("part/runs/rs-00.journal").unlink()
+    refused("tables", "part", "--rq", "rq2", told=("nsga2 alone",))
+    for path in Path("part/runs").glob("nsga2-*"):
+        path.write_bytes(path.read_bytes()[:-20])
+    refused("tables", "part", told=("no finished run",))
+    refused("figures", "part", "--out", "pictures", told=("no finished run",))
+
+
+@pytest.mark.parametrize("command", [["tables", "{}"], ["figures", "{}", "--out", "pictures"]])
+def test_sumo_is_not_needed(command: list[str], results: Path, in_tmp: Path) -> None:
+    arguments = [part.format(results) for part in command]
+    code = ("import sys\n"
+            f"sys.argv = ['safevar-sumo', *{arguments!r}]\n"
+            "from safevar_sumo.cli import main\n"
+            "try:\n    main()\n"
+            "except SystemExit as end:\n    assert end.code == 0\n"
+            "print(sorted({name.partition('.')[0] for name in sys.modules} & {'libsumo', 'traci', 'sumo'}), file=sys.stderr)")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.splitlines()[-1] == "[]"
