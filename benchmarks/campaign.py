@@ -4,7 +4,8 @@
 
 Time outside the simulation is what a worker has over when the bare time of the same batches, computed by one process
 with nothing else to do, is taken away: search, journal and hand-over, and what two workers cost each other. Workers
-start, and build the network, before the clock does. Only an idle machine tells the truth.
+start, and build the network, before the clock does. Only an idle machine tells the truth on the clock; processor time
+says on a busy one, too, what is not simulation.
 """
 
 from __future__ import annotations
@@ -12,11 +13,14 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
+import psutil
 
 from safevar_sumo.campaign import RunKey, all_runs, carry_out
 from safevar_sumo.computing import evaluate_batch, local_pool, packed
@@ -65,25 +69,41 @@ def warm(pool: LocalPool, study: Study) -> None:
         future.result()
 
 
-def campaign(study: Study, jobs: int) -> tuple[float, float, list[FloatArray]]:
-    """Evaluations per second of a campaign, its seconds, and its batches."""
+class Cost(NamedTuple):
+    """Seconds on the clock, and of processors."""
+
+    clock: float
+    processor: float
+
+
+def processor_time() -> float:
+    """Processor seconds of this process and its workers so far."""
+    me = psutil.Process()
+    return sum(sum(one.cpu_times()[:2]) for one in (me, *me.children()))
+
+
+def cost(measured: Callable[[], object]) -> Cost:
+    """What a call costs."""
+    clock, processor = time.perf_counter(), processor_time()
+    measured()
+    return Cost(time.perf_counter() - clock, processor_time() - processor)
+
+
+def campaign(study: Study, jobs: int) -> tuple[int, Cost, list[FloatArray]]:
+    """How many settings a campaign simulates, what it costs, and its batches."""
     with tempfile.TemporaryDirectory() as folder, local_pool(jobs, study.search.time_limit) as pool:
         warm(pool, study)
         counting, recording = Counting(), Recording(pool)
-        start = time.perf_counter()
-        carry_out(study, all_runs(study), ResultsDirectory(Path(folder), study), recording, counting)
-        seconds = time.perf_counter() - start
-    return counting.simulated / seconds, seconds, recording.batches
+        results = ResultsDirectory(Path(folder), study)
+        spent = cost(lambda: carry_out(study, all_runs(study), results, recording, counting))
+    return counting.simulated, spent, recording.batches
 
 
-def simulation(study: Study, batches: list[FloatArray]) -> float:
-    """Seconds that one process needs for the same batches when there is nothing else to do."""
+def simulation(study: Study, batches: list[FloatArray]) -> Cost:
+    """What the same batches cost one process that has nothing else to do."""
     work = packed(study)
     evaluate_batch(work, batches[-1])
-    start = time.perf_counter()
-    for settings in batches:
-        evaluate_batch(work, settings)
-    return time.perf_counter() - start
+    return cost(lambda: [evaluate_batch(work, settings) for settings in batches])
 
 
 def main(name: str, evaluations: int) -> None:
@@ -92,10 +112,12 @@ def main(name: str, evaluations: int) -> None:
     study = msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, runs=RUNS, evaluations=evaluations))
     rates = []
     for jobs in (1, 2):
-        rate, seconds, batches = campaign(study, jobs)
-        outside = 1 - simulation(study, batches) / (jobs * seconds)
-        rates.append(rate)
-        print(f"{name}, {jobs} worker{'s' if jobs > 1 else ''}: {rate:.0f} evaluations/s, {outside:.0%} of the time outside the simulation")
+        simulated, spent, batches = campaign(study, jobs)
+        alone = simulation(study, batches)
+        rates.append(simulated / spent.clock)
+        print(f"{name}, {jobs} worker{'s' if jobs > 1 else ''}: {rates[-1]:.0f} evaluations/s; outside the simulation "
+              f"{1 - alone.clock / (jobs * spent.clock):.0%} of the workers' time, {1 - alone.processor / spent.processor:.0%} of all "
+              "processor time")
     print(f"2 workers against one: {rates[1] / rates[0]:.2f} times as fast")
 
 

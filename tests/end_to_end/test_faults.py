@@ -86,7 +86,7 @@ def test_workers_killed_at_random_moments(whole: Path) -> None:
     process = started("study", "small.toml", "--out", "out", "--jobs", "2", "--batch", "1")
     until(lambda: written(out) > 0, process)
     while process.poll() is None and kills < 10:
-        time.sleep(moments.uniform(0.2, 1.0))
+        time.sleep(moments.uniform(0.2, 0.8))
         for worker in moments.sample(workers := workers_of(process), k=min(1, len(workers))):
             try:
                 worker.kill()
