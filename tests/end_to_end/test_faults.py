@@ -221,7 +221,7 @@ def test_a_directory_that_is_taken_away_is_told() -> None:
 def test_ctrl_c_ends_everything_with_code_130(when: float | str) -> None:
     process = started("study", "rain", "--out", "out")
     if when == "loading":
-        time.sleep(0.5)
+        until(lambda: any("numpy" in one.path for one in psutil.Process(process.pid).memory_maps()), process)
     elif isinstance(when, str):
         until(lambda: written(Path("out")) > 0, process)
     else:
