@@ -82,7 +82,7 @@ def sizes_of_changes(setting: Setting) -> Figure:
     figure, axes = _figure(setting, "changes in critical solutions", rows, columns, (9.0, 1.0 + 1.85 * rows))
     for axis, member in zip(axes.flat, members, strict=False):
         change = found.loc[found["characteristic"] == member.name, "change"]
-        low, high = member.lower - member.original, member.upper - member.original
+        low, high = (float(f"{end - member.original:.9g}") for end in (member.lower, member.upper))
         sides = {INCREASE: change[change > 0], DECREASE: change[change < 0]}
         for colour, side in sides.items():
             if len(side):

@@ -14,6 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
+from matplotlib.transforms import Bbox, BboxBase
 
 from safevar_sumo.analysis import FIGURES, Setting, draw_all
 from safevar_sumo.analysis.figures import hypervolume_growth, number_of_changes, pareto_fronts, sizes_of_changes
@@ -23,9 +24,9 @@ from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
 
 
-def random_lgsvl() -> Setting:
-    """Twelve characteristics, some with long names, three algorithms."""
-    rng, study = np.random.default_rng(4), load_study("lgsvl")
+def random_setting(name: str) -> Setting:
+    """A shipped study's characteristics, some with long names, and three algorithms."""
+    rng, study = np.random.default_rng(4), load_study(name)
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     rows = [row(algorithm, run, sd=rng.uniform(-5, 11)) for algorithm in study.search.algorithms for run in range(3) for _ in range(100)]
     evaluations = [{**one, "evaluation": i % 100} for i, one in enumerate(rows)]
@@ -55,23 +56,30 @@ def test_there_is_a_figure_for_everything_promised() -> None:
     assert len(FIGURES) == 5
 
 
-@pytest.mark.parametrize("many", [False, True])
+@pytest.mark.parametrize("study", ["made-up", "sun", "lgsvl", "native"])
 @pytest.mark.parametrize("name", list(FIGURES))
-def test_axes_are_labelled_and_no_text_lies_on_another(name: str, many: bool, setting: Setting) -> None:
-    figure = FIGURES[name](random_lgsvl() if many else setting)
+def test_axes_are_labelled_and_no_text_lies_on_another(name: str, study: str, setting: Setting) -> None:
+    figure = FIGURES[name](setting if study == "made-up" else random_setting(study))
     FigureCanvasAgg(figure).draw()
     shared = {"rq3.3-sizes-of-changes"}
     for axis in figure.axes:
         if axis.axison and axis.get_label() != "<colorbar>":
             assert axis.get_xlabel()
             assert axis.get_ylabel() or (name in shared and figure.get_supylabel())
+            low, high = axis.get_xlim()
+            assert sum(low - 1e-9 <= tick <= high + 1e-9 for tick in axis.get_xticks()) >= 2, "one tick tells no scale"
     texts = {id(one): one for one in _texts(figure) if one.get_visible() and one.get_text().strip()}
     assert len(texts) > 10
-    boxes = [(one.get_text(), one.get_window_extent().shrunk(0.98, 0.8)) for one in texts.values()]
+    boxes = [(one.get_text(), _with_space_beside(one.get_window_extent())) for one in texts.values()]
     for (first, box), (second, other) in combinations(boxes, 2):
         assert not box.overlaps(other), f"{first!r} and {second!r}"
     for text, box in boxes:
         assert min(box.x0, box.y0, figure.bbox.x1 - box.x1, figure.bbox.y1 - box.y1) > -1, f"{text!r} is cut off"
+
+
+def _with_space_beside(box: BboxBase) -> Bbox:
+    """The box of a text with what must stay free at its ends, without what its line has above and below."""
+    return Bbox.from_extents(box.x0 - 1, box.y0 + 0.1 * box.height, box.x1 + 1, box.y1 - 0.1 * box.height)
 
 
 def _texts(figure: Figure) -> Iterator[Text]:
