@@ -36,6 +36,8 @@ class ResultsDirectory:
         Is made if it does not exist.
     study
         The study as it is run, options applied.
+    network
+        Fingerprint of the network that it is run on.
 
     Raises
     ------
@@ -43,11 +45,12 @@ class ResultsDirectory:
         If the directory cannot be written or belongs to another study or version.
     """
 
-    def __init__(self, path: Path, study: Study) -> None:
+    def __init__(self, path: Path, study: Study, network: str = "") -> None:
         self.path, self._study = path, study
         self._manifest = {
             "study": msgspec.to_builtins(study),
             "seed": study.search.seed,
+            "network": network,
             "versions": {name: version(name) for name in VERSIONED},
         }
         make_directory(path)
@@ -56,7 +59,7 @@ class ResultsDirectory:
     def journal(self, run: str) -> Journal:
         """Open and lock the journal of a run, such as nsga2-03."""
         fixed = {key: value for key, value in self._manifest["study"]["search"].items() if key not in FREE_OPTIONS}
-        identity = json.dumps([{**self._manifest["study"], "search": fixed}, self._manifest["versions"]], sort_keys=True)
+        identity = json.dumps([{**self._manifest["study"], "search": fixed}, self._manifest["versions"], self._manifest["network"]], sort_keys=True)
         return Journal(self.path / RUNS / f"{run}.journal", sha256(identity.encode()).hexdigest(), run)
 
     def begin(self, original: Evaluations) -> None:
@@ -75,7 +78,8 @@ class ResultsDirectory:
             return
         stored = read_manifest(self.path)
         differs = (_difference(stored["study"], self._manifest["study"])
-                   or _difference(stored["versions"], self._manifest["versions"], "version of"))
+                   or _difference(stored["versions"], self._manifest["versions"], "version of")
+                   or _difference(stored.get("network"), self._manifest["network"], "fingerprint of the network"))
         if differs:
             raise InputError(self.path, f"holds results of another study: {differs}", "another --out, or the same study and options")
 

@@ -1,7 +1,8 @@
 """Simulation: many settings of a study in one SUMO process."""
 
 from safevar_sumo.simulation.batch import evaluate, score, simulate
+from safevar_sumo.simulation.network import network_fingerprint
 from safevar_sumo.simulation.sumo import Engine
 from safevar_sumo.simulation.system import System, assemble
 
-__all__ = ["Engine", "System", "assemble", "evaluate", "score", "simulate"]
+__all__ = ["Engine", "System", "assemble", "evaluate", "network_fingerprint", "score", "simulate"]

@@ -61,6 +61,12 @@ def copied_network(folder: str, n: int) -> CopiedNetwork:
     return CopiedNetwork(roads, traffic, place / OPTIONS)
 
 
+def network_fingerprint(folder: str) -> str:
+    """Tells networks of different content apart: sources, traffic and options."""
+    place = _folder(folder)
+    return _digest(tuple((place / name).read_bytes() for name in (*SOURCES, TRAFFIC, OPTIONS)), 0)
+
+
 def netconvert_version() -> str:
     """Version of the SUMO that builds and simulates."""
     from importlib.metadata import version

@@ -88,6 +88,12 @@ def test_results_of_another_study_are_not_overwritten(tmp_path: Path, study: Stu
         ResultsDirectory(tmp_path, load_study("native"))
 
 
+def test_another_network_is_another_study(tmp_path: Path, study: Study) -> None:
+    written(tmp_path, study)
+    with pytest.raises(InputError, match="fingerprint of the network"):
+        ResultsDirectory(tmp_path, study, "abc")
+
+
 @pytest.mark.parametrize("text", ["", "{}", "[]", "null", "{\"study\": 3", "\x00"])
 def test_a_file_that_is_no_manifest_is_refused(tmp_path: Path, study: Study, text: str) -> None:
     (tmp_path / "manifest.json").write_text(text)

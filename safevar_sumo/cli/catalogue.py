@@ -1,0 +1,73 @@
+"""The command that lists what there is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import click
+import msgspec
+from rich.console import Console
+
+from safevar_sumo import terminal
+from safevar_sumo.ads import ADS
+from safevar_sumo.cli.program import commands
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.scenarios import SCENARIOS, WEATHERS
+from safevar_sumo.search import ALGORITHMS
+from safevar_sumo.study import Study, load_study, study_names
+from safevar_sumo.vehicles import VEHICLES, CharacteristicSet
+
+
+@commands.command(name="list")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def list_command(as_json: bool) -> None:
+    """List studies, vehicles, ADSs, scenarios, weathers, algorithms and metrics."""
+    studies = [load_study(name) for name in study_names()]
+    if as_json:
+        click.echo(json.dumps(_catalogue(studies), indent=2))
+    else:
+        _print_catalogue(Console(), studies)
+
+
+def _catalogue(studies: list[Study]) -> dict[str, Any]:
+    vehicles: dict[str, list[dict[str, Any]]] = {}
+    for one in studies:
+        vehicles.setdefault(one.vehicle.model, [
+            {"name": member.name, "unit": member.unit, "original": member.original, "lower": member.lower, "upper": member.upper,
+             "threshold": member.threshold} for member in CharacteristicSet.of(one.vehicle.characteristics)])
+    return {
+        "studies": [{"name": one.name, "title": one.title, "vehicle": one.vehicle.model, "ads": one.ads.model,
+                     "scenario": one.scenario.model, "weather": _weather_name(one)} for one in studies],
+        "vehicles": [{"name": name, "characteristics": vehicles.get(name, [])} for name in VEHICLES],
+        "ads": [_described(name, cls) for name, cls in ADS.items()],
+        "scenarios": [_described(name, cls) for name, cls in SCENARIOS.items()],
+        "weathers": [msgspec.to_builtins(weather) for weather in WEATHERS.values()],
+        "algorithms": [_described(name, cls) for name, cls in ALGORITHMS.items()],
+        "metrics": [_described(name, metric) for name, metric in METRICS.items()],
+    }
+
+
+def _weather_name(study: Study) -> str:
+    return study.weather if isinstance(study.weather, str) else study.weather.name
+
+
+def _described(name: str, what: Callable[..., Any]) -> dict[str, str]:
+    """Its name, and the first sentence of its docstring."""
+    return {"name": name, "description": (what.__doc__ or "").strip().partition("\n")[0]}
+
+
+def _print_catalogue(console: Console, studies: list[Study]) -> None:
+    catalogue = _catalogue(studies)
+    terminal.print_names(console, "Studies", [tuple(row.values()) for row in catalogue["studies"]],
+                         ("name", "title", "vehicle", "ADS", "scenario", "weather"))
+    for vehicle in catalogue["vehicles"]:
+        rows = [(row["name"], row["unit"], *(f"{row[key]:g}" for key in ("original", "lower", "upper", "threshold")))
+                for row in vehicle["characteristics"]]
+        heads = ("characteristic", "unit", "original", "lower", "upper", "threshold")
+        terminal.print_names(console, f"Vehicle {vehicle['name']}", rows, heads)
+    weathers = [(row["name"], f"{row['road_friction']:g}", f"{row['visibility']:g}") for row in catalogue["weathers"]]
+    terminal.print_names(console, "Weathers", weathers, ("name", "road friction", "visibility"))
+    for title, key in (("ADSs", "ads"), ("Scenarios", "scenarios"), ("Algorithms", "algorithms"), ("Metrics", "metrics")):
+        terminal.print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "what"))

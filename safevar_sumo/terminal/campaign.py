@@ -1,0 +1,80 @@
+"""What a campaign would take, and what it found."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from safevar_sumo.analysis import brief, setting_of
+from safevar_sumo.campaign import Campaign, Forecast
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import record, solutions_frame
+from safevar_sumo.study import Study
+from safevar_sumo.terminal.heads import METRIC_HEADS
+from safevar_sumo.vehicles import CharacteristicSet
+
+SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\nTET, TIT: over solutions without collision."
+
+
+def print_forecast(console: Console, study: Study, runs: int, told: Forecast) -> None:
+    """What a campaign would take."""
+    console.print(study.title, soft_wrap=True, highlight=False)
+    table = Table(show_header=False)
+    table.add_row("algorithms", ", ".join(study.search.algorithms))
+    table.add_row("runs", str(runs))
+    table.add_row("evaluations, at the most", str(told.evaluations))
+    table.add_row("evaluations/s, measured by a short probe", f"{told.rate:.0f}")
+    table.add_row("time, at the most", f"{told.seconds / 60:.1f} min")
+    table.add_row("disk, at the most", f"{told.size / 1e6:.0f} MB")
+    console.print(table)
+
+
+def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path) -> None:
+    """Per algorithm what was found, beside the original vehicle; the most critical setting; what RQ1 and RQ2 say of it."""
+    found = {"original vehicle": campaign.original}
+    for algorithm in study.search.algorithms:
+        of_it = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]
+        if of_it:
+            found[algorithm] = Evaluations.concatenate(of_it)
+    table = Table("", title=study.title, title_justify="left")
+    for head in found:
+        table.add_column(head, justify="right")
+    table.add_row("solutions", "-", *(str(len(one)) for one in list(found.values())[1:]))
+    table.add_row("collisions", *(str(int(np.count_nonzero(one.collided))) for one in found.values()))
+    for name, head in METRIC_HEADS.items():
+        table.add_row(f"mean {head}", *(_mean(one.metrics[name]) for one in found.values()))
+    console.print(table)
+    console.print(SAFETY_NOTE)
+    if campaign.failures:
+        console.print(f"{campaign.failures} settings could not be simulated (simulator-error); they are in no result.")
+    _print_most_critical(console, study, campaign)
+    names = tuple(study.vehicle.characteristics)
+    solutions = solutions_frame(names, campaign.solutions.items())
+    for line in brief(setting_of(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions))):
+        console.print(line, soft_wrap=True, markup=False, highlight=False)
+    console.print(f"All tables: python -m safevar_sumo tables {shlex.quote(str(directory))}", soft_wrap=True, markup=False, highlight=False)
+
+
+def _mean(values: FloatArray) -> str:
+    defined = values[~np.isnan(values)]
+    return f"{np.mean(defined):.2f}" if defined.size else "-"
+
+
+def _print_most_critical(console: Console, study: Study, campaign: Campaign) -> None:
+    if not any(map(len, campaign.solutions.values())):
+        console.print("No solution.")
+        return
+    pooled = Evaluations.concatenate(list(campaign.solutions.values()))
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    worst = pooled.take([int(np.lexsort((pooled.f_diff, pooled.f_num_diff, pooled.f_safe))[0])])
+    changes = [
+        f"{member.name} {member.original:g} -> {value:.6g} {'' if member.unit == '-' else member.unit}".rstrip()
+        for member, value in zip(characteristics, worst.settings[0].tolist(), strict=True) if value != member.original]
+    console.print(f"Most critical setting: SD {worst.f_safe[0]:.2f} ({worst.outcome[0]}), "
+                  f"the original's {campaign.original.f_safe[0]:.2f} ({campaign.original.outcome[0]}), by")
+    for change in changes or ["no change at all"]:
+        console.print(f"  {change}")

@@ -1,0 +1,46 @@
+"""A study beside reference data."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.table import Table
+
+from safevar_sumo.analysis import Agreement
+from safevar_sumo.calibration import Calibration
+from safevar_sumo.study import Study
+from safevar_sumo.terminal.heads import METRIC_HEADS
+
+
+def print_agreement(console: Console, study: Study, told: Agreement) -> None:
+    """Comparison with reference data, metric by metric."""
+    table = Table("", title=f"{study.title}: {told.rows} rows", title_justify="left")
+    for head in ("Spearman's rho", "mean abs. error", "bias", "original there", "original here"):
+        table.add_column(head, justify="right")
+    for name, head in METRIC_HEADS.items():
+        numbers = (told.spearman[name], told.mean_absolute_error[name], told.bias[name], *told.original[name].values())
+        table.add_row(head, *("-" if number is None else f"{number:.3f}" for number in numbers))
+    console.print(table)
+    collisions = told.collisions
+    console.print(f"Collisions: {collisions['reference']} in the reference, {collisions['here']} here, {collisions['both']} in both.")
+
+
+def print_calibration(console: Console, study: Study, found: Calibration) -> None:
+    """Found values, and how well they do on both halves of the data."""
+    table = Table("parameter", "unit", title=study.title, title_justify="left")
+    for head in ("found", "lower", "upper"):
+        table.add_column(head, justify="right")
+    for name, value in found.values.items():
+        row = study.calibration[name]
+        table.add_row(name, row.unit, *(f"{number:.5g}" for number in (value, row.lower, row.upper)))
+    console.print(table)
+    for name in found.used:
+        both = Table(f"{name}: used half / held back", title_justify="left")
+        for head in ("Spearman's rho", "mean abs. error", "bias"):
+            both.add_column(head, justify="right")
+        halves = (found.used[name], found.held_back[name])
+        for metric, head in METRIC_HEADS.items():
+            both.add_row(head, *(
+                " / ".join("-" if number is None else f"{number:.3f}" for number in (getattr(half, what)[metric] for half in halves))
+                for what in ("spearman", "mean_absolute_error", "bias")))
+        console.print(both)
+    console.print(f"Cost {found.cost:.4f}")
