@@ -81,7 +81,7 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
     trial = _Trial(study, names, halves, pool)
     lower, upper = np.array([(row.lower, row.upper) for row in parameters.values()]).T
     strategy = cma.CMAEvolutionStrategy(np.clip((first - lower) / (upper - lower), 0, 1), SPREAD, {
-        "bounds": [0, 1], "seed": seed + 1, "verbose": -9, "popsize": min(POPULATION, trials)})
+        "bounds": [0, 1], "seed": seed + 1, "verbose": -9, "popsize": POPULATION})
     best, cost = first, trial.costs(first[np.newaxis])[0]
     done(cost)
     for start in range(1, trials, strategy.popsize):

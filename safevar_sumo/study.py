@@ -148,6 +148,12 @@ def load_study(study: str) -> Study:
     parsed = _converted(path, raw, Study)
     for name, row in parsed.vehicle.characteristics.items():
         _check_characteristic(path, f"vehicle.characteristics.{name}", row)
+    for name, free in parsed.calibration.items():
+        if not (math.isfinite(free.lower) and math.isfinite(free.upper) and free.lower < free.upper):
+            raise InputError(path, f"calibration.{name!r}: lower = {free.lower} and upper = {free.upper}", "numbers, lower < upper")
+    for name, number in parsed.published.items():
+        if not math.isfinite(number) or number == 0:
+            raise InputError(path, f"published.{name} = {number}", "a finite number other than 0")
     for key, value in (("ttc_threshold", parsed.metrics.ttc_threshold),
                        ("sampling_interval", parsed.metrics.sampling_interval)):
         if value is not None and not math.isfinite(value):

@@ -59,7 +59,8 @@ class ResultsDirectory:
     def journal(self, run: str) -> Journal:
         """Open and lock the journal of a run, such as nsga2-03."""
         fixed = {key: value for key, value in self._manifest["study"]["search"].items() if key not in FREE_OPTIONS}
-        identity = json.dumps([{**self._manifest["study"], "search": fixed}, self._manifest["versions"], self._manifest["network"]], sort_keys=True)
+        study = {**self._manifest["study"], "search": fixed}
+        identity = json.dumps([study, self._manifest["versions"], self._manifest["network"]], sort_keys=True)
         return Journal(self.path / RUNS / f"{run}.journal", sha256(identity.encode()).hexdigest(), run)
 
     def begin(self, original: Evaluations) -> None:
