@@ -79,6 +79,10 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
     import cma  # only here: it takes longer to load than all the rest
 
     trial = _Trial(study, names, halves, pool)
+    for name, value in zip(names, first.tolist(), strict=True):
+        row = parameters[name]
+        if not row.lower <= value <= row.upper:
+            raise InputError(f"study {study.name!r}", f"{name} = {value}", f"a value in its bounds, [{row.lower:g}, {row.upper:g}]")
     lower, upper = np.array([(row.lower, row.upper) for row in parameters.values()]).T
     strategy = cma.CMAEvolutionStrategy(np.clip((first - lower) / (upper - lower), 0, 1), SPREAD, {
         "bounds": [0, 1], "seed": seed + 1, "verbose": -9, "popsize": POPULATION})
@@ -134,7 +138,7 @@ def _place(study: Study, raw: Any, name: str) -> tuple[Any, Any]:
     try:
         for key in path:
             table = table[int(key) if isinstance(table, list) else key]
-        place: int | str = int(last) if isinstance(table, list) else last
+        place: int | str = int(last) if isinstance(table, list) and last.isdecimal() else last
         if not isinstance(table[place], int | float):
             raise refused
     except (KeyError, IndexError, ValueError, TypeError):
@@ -157,11 +161,16 @@ def calibration_comment(found: Calibration, study: Study, references: Sequence[P
     """How the values of a calibrated study were found: for the head of its file."""
     data = [f"  {path.name}, SHA-256 {sha256(path.read_bytes()).hexdigest()}" for path in references]
     halves = [
-        f"  {name}: rho of the safety degree {found.used[name].spearman['safety_degree']:.3f} on the used half,"
-        f" {found.held_back[name].spearman['safety_degree']:.3f} on the other" for name in found.used]
+        f"  {name}: rho of the safety degree {_rho(found.used[name])} on the used half, {_rho(found.held_back[name])} on the other"
+        for name in found.used]
     return "\n".join([
         f"Study {study.name!r}, calibrated by CMA-ES ({trials} trials, seed {seed}) to the original vehicle's",
         "published values" + (" and to every second row of" if data else "."), *data, f"Cost {found.cost:.4f}.", *halves])
+
+
+def _rho(told: Agreement) -> str:
+    rho = told.spearman["safety_degree"]
+    return "undefined" if rho is None else f"{rho:.3f}"
 
 
 class _Trial:

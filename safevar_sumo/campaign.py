@@ -80,7 +80,7 @@ class Observer(Protocol):
 
 def all_runs(study: Study) -> list[RunKey]:
     """Every run of a study."""
-    return [RunKey(name, run) for name in study.search.algorithms for run in range(study.search.runs)]
+    return [RunKey(name, run) for name in dict.fromkeys(study.search.algorithms) for run in range(study.search.runs)]
 
 
 def algorithm_of(name: str, study: Study) -> Algorithm:

@@ -39,6 +39,15 @@ class SimulationError(SafevarError):
     """SUMO, a network or an ADS failed while a simulation was prepared or ran."""
 
 
+def told(error: BaseException) -> str:
+    """What kind of error it is and the first line of what it says, whatever its author did to its text."""
+    try:
+        said = str(error).strip().splitlines()
+    except Exception:
+        said = []
+    return f"{type(error).__name__}: {said[0]}" if said else type(error).__name__
+
+
 def one_of(names: Iterable[str]) -> str:
     """List the legal names of a choice for an error message."""
     return "one of " + ", ".join(sorted(names))

@@ -14,10 +14,12 @@ from msgspec import Meta, Struct
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.shipped import STUDIES
 
-Positive = Annotated[float, Meta(gt=0)]
+Positive = Annotated[float, Meta(gt=0, le=1e6)]
 PositiveInt = Annotated[int, Meta(ge=1)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
+LARGEST = 1e12
+"""Of what a characteristic may be, in its unit."""
 REPLACED = ("calibration",)
 """Tables that a study does not inherit in part from the one that it extends."""
 T = TypeVar("T")
@@ -99,7 +101,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `calibration` tells which parameters are free, by their keys in the file, such as `ads.parameters.corridor`.
     """
 
-    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z")]
     title: str
     scenario: ModelTable
     weather: str | Weather
@@ -127,10 +129,17 @@ def study_path(study: str) -> Path:
     if study in study_names():
         return STUDIES / f"{study}.toml"
     path = Path(study)
-    if path.is_file():
+    if _is_file(path):
         return path
     legal = f"{one_of(study_names())}, or the path of a study file (TOML)"
     raise InputError("study", f"there is no study or file {study!r}", legal)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long, say
+        return False
 
 
 def load_study(study: str) -> Study:
@@ -152,12 +161,9 @@ def load_study(study: str) -> Study:
         if not (math.isfinite(free.lower) and math.isfinite(free.upper) and free.lower < free.upper):
             raise InputError(path, f"calibration.{name!r}: lower = {free.lower} and upper = {free.upper}", "numbers, lower < upper")
     for name, number in parsed.published.items():
-        if not math.isfinite(number) or number == 0:
-            raise InputError(path, f"published.{name} = {number}", "a finite number other than 0")
-    for key, value in (("ttc_threshold", parsed.metrics.ttc_threshold),
-                       ("sampling_interval", parsed.metrics.sampling_interval)):
-        if value is not None and not math.isfinite(value):
-            raise InputError(path, f"metrics.{key} = {value}", "a finite number of seconds")
+        if number == 0:
+            raise InputError(path, f"published.{name} = 0", "a number other than 0")
+    _check_finite(path, msgspec.to_builtins(parsed), "")
     return parsed
 
 
@@ -193,9 +199,11 @@ def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     if path in seen:
         raise InputError(path, f"extends = {path.stem!r} leads back to this file", "a study that does not extend this one")
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except tomllib.TOMLDecodeError as error:
         raise InputError(path, f"is not TOML: {error}") from None
+    except RecursionError:
+        raise InputError(path, "is nested too deeply", "a study as in studies/") from None
     except UnicodeDecodeError as error:
         raise InputError(path, f"is not UTF-8 text: {error}") from None
     except OSError as error:
@@ -206,7 +214,7 @@ def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     if not isinstance(base, str):
         raise InputError(path, f"extends = {base!r}", "the name or path of a study")
     beside = path.parent / base
-    return _merged(_read(beside if beside.is_file() else study_path(base), (*seen, path)), raw)
+    return _merged(_read(beside if _is_file(beside) else study_path(base), (*seen, path)), raw)
 
 
 def write_study(path: Path, study: Study, comment: str) -> None:
@@ -263,11 +271,25 @@ def _refines(key: str, old: object, new: object) -> bool:
     return bool(new.get("model", old.get("model")) == old.get("model"))
 
 
+def _check_finite(path: Path, value: object, key: str) -> None:
+    """Refuse nan and infinities wherever they stand."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            _check_finite(path, inner, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, list):
+        for i, inner in enumerate(value):
+            _check_finite(path, inner, f"{key}.{i}")
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise InputError(path, f"{key} = {value}", "a finite number")
+
+
 def _check_characteristic(path: Path, key: str, row: CharacteristicTable) -> None:
     values = {"original": row.original, "lower": row.lower, "upper": row.upper}
     for name, value in values.items():
         if not math.isfinite(value):
             raise InputError(path, f"{key}.{name} = {value}", "a finite number")
+        if abs(value) > LARGEST:
+            raise InputError(path, f"{key}.{name} = {value}", f"a number up to {LARGEST:g}")
     if row.lower >= row.upper:
         raise InputError(path, f"{key}: lower = {row.lower} and upper = {row.upper}", "lower < upper")
     if not row.lower <= row.original <= row.upper:

@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
-Positive = Annotated[float, Meta(gt=0)]
+Positive = Annotated[float, Meta(gt=0, le=1e5)]
 HOLDING_DECELERATION = 2.0  # m/s^2, asked for to stand and to stay
 TAPER_TIME = 0.3  # s, over which the deceleration fades into the creep
 CREEP_MARGIN = 0.1  # m/s, above the creep's speed where the creep begins

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, told
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
 
@@ -79,7 +79,7 @@ class Checked:
     def start(self, n: int, nominal: Nominal, step: float) -> Any:
         try:
             return self._ads.start(n, nominal, step)
-        except Exception as error:
+        except (Exception, SystemExit, GeneratorExit) as error:
             raise self._failed("start", error) from error
 
     def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
@@ -87,7 +87,7 @@ class Checked:
             command, memory = self._ads.drive(seen, memory)
             pedals = {name: np.broadcast_to(np.asarray(value, dtype=float), seen.speed.shape)
                       for name, value in zip(("throttle", "brake"), command, strict=True)}
-        except Exception as error:
+        except (Exception, SystemExit, GeneratorExit) as error:
             raise self._failed("drive", error) from error
         for name, values in pedals.items():
             self._check(name, values)
@@ -98,8 +98,8 @@ class Checked:
         if wrong.size:
             raise InputError(self._source, f"ads.model = {self._name!r} commanded {pedal} = {wrong[0]}", "a number in [0, 1]")
 
-    def _failed(self, call: str, error: Exception) -> InputError:
-        return InputError(self._source, f"ads.model = {self._name!r} raised in {call}: {type(error).__name__}: {error}")
+    def _failed(self, call: str, error: BaseException) -> InputError:
+        return InputError(self._source, f"ads.model = {self._name!r} raised in {call}: {told(error)}")
 
 
 def _one(seen: Observation, i: int) -> Observation:

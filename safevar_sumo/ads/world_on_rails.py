@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
-NotNegative = Annotated[float, Meta(ge=0)]
+NotNegative = Annotated[float, Meta(ge=0, le=60)]
 Throttle = Annotated[float, Meta(ge=0, le=1)]
 SPEED_LIMIT = 20 / 3.6
 """Above this speed the agent releases the throttle [m/s] (its source, 20 km/h)."""

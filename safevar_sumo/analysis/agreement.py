@@ -125,7 +125,7 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
             axis.set_ylim(min(lowest) - margin, max(highest) + margin)
             if i % columns == 0:
                 axis.set_ylabel("error of SD\n(here - reference)")
-        figure.suptitle(title)
+        figure.suptitle(title.replace("$", r"\$"))
         try:
             figure.savefig(path, dpi=150)
         except (OSError, ValueError) as error_written:

@@ -82,13 +82,15 @@ def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> 
 
 def _table(path: Path) -> pd.DataFrame:
     try:
-        table = pd.read_csv(path, dtype=str, skipinitialspace=True)
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            table = pd.read_csv(file, dtype=str, skipinitialspace=True, index_col=False)
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror or error}", "a CSV file") from None
     except pd.errors.EmptyDataError:
         raise InputError(path, "is empty", "a CSV file with a header and rows") from None
     except (pd.errors.ParserError, UnicodeDecodeError) as error:
         raise InputError(path, f"is not CSV: {str(error).splitlines()[0]}", "a CSV file with a header and rows") from None
+    table.columns = table.columns.str.strip()
     if table.empty:
         raise InputError(path, "has no rows", "a CSV file with a header and rows")
     return table
@@ -101,7 +103,11 @@ def _plain(name: str) -> str:
 
 def _characteristic_columns(path: Path, table: pd.DataFrame, characteristics: CharacteristicSet) -> list[str]:
     """The file's columns of the characteristics, in the study's order."""
-    found = {_plain(str(column)): str(column) for column in table.columns}
+    found: dict[str, str] = {}
+    for column in map(str, table.columns):
+        if _plain(column) in found:
+            raise InputError(path, f"has two columns of one name, {found[_plain(column)]!r} and {column!r}", "each column once")
+        found[_plain(column)] = column
     missing = [name for name in characteristics.names if _plain(name) not in found]
     if missing:
         raise InputError(path, f"lacks the columns {', '.join(missing)}", f"all of {', '.join(characteristics.names)}")

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, told
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import FloatArray, Outcome
 from safevar_sumo.results import load
@@ -139,9 +139,16 @@ def load_settings(directories: Iterable[str | Path]) -> list[Setting]:
     twice = [place for place, number in Counter(place.resolve() for place in places).items() if number > 1]
     if twice:
         raise InputError("DIR", f"{twice[0]} is given twice", "each results directory once")
-    found = [load_setting(place) for place in places]
+    found = [_loaded(place) for place in places]
     names = Counter(one.name for one in found)
     return [replace(one, name=f"{one.name} ({place})") if names[one.name] > 1 else one for one, place in zip(found, places, strict=True)]
+
+
+def _loaded(place: Path) -> Setting:
+    try:
+        return load_setting(place)
+    except (TypeError, ValueError, KeyError, ArithmeticError) as error:
+        raise InputError(place, f"is damaged: {told(error)}", "a directory as the command study has left it") from error
 
 
 def load_setting(directory: Path) -> Setting:

@@ -14,9 +14,12 @@ from safevar_sumo.analysis import agreement, plot_agreement, read_reference
 from safevar_sumo.calibration import calibrate, calibration_comment
 from safevar_sumo.cli.program import commands
 from safevar_sumo.computing import available_cores, local_pool
+from safevar_sumo.errors import InputError
 from safevar_sumo.simulation import assemble
 from safevar_sumo.study import check_writable, load_study, write_study
 from safevar_sumo.validation import evaluate_all
+
+PICTURES = (".png", ".pdf", ".svg")
 
 
 @commands.command()
@@ -28,7 +31,9 @@ from safevar_sumo.validation import evaluate_all
 def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, as_json: bool) -> None:
     """Compare STUDY with settings and metrics in the published package's CSV format."""
     chosen = load_study(study)
-    system = assemble(chosen)
+    system = assemble(chosen, study)
+    if plot is not None and plot.suffix not in PICTURES:
+        raise InputError("--plot", str(plot), f"a file that ends in {', '.join(PICTURES)}")
     data = read_reference(reference, system.characteristics)
     if data.skipped:
         click.echo(f"warning: {reference}: {data.skipped} rows with values outside the domains are left out", err=True)
@@ -56,9 +61,11 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
 def calibrate_command(study: str, references: tuple[Path, ...], trials: int, seed: int, jobs: int | None, out: Path | None) -> None:
     """Fit what STUDY declares under [calibration] to the published values and to half of the rows of reference files."""
     chosen = load_study(study)
-    system = assemble(chosen)
+    system = assemble(chosen, study)
     target = out or Path(f"{chosen.name}-calibrated.toml")
     check_writable(target)
+    if len({path.name for path in references}) < len(references):
+        raise InputError("REFERENCE.csv", "two files have one name", "files of different names")
     data = {path.name: read_reference(path, system.characteristics) for path in references}
     with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
           terminal.trials(Console(stderr=True), trials) as done):

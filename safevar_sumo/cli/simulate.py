@@ -30,7 +30,7 @@ from safevar_sumo.study import load_study
 def simulate_command(study: str, changes: tuple[str, ...], no_filter: bool, trace: Path | None, gui: bool, as_json: bool) -> None:
     """Simulate STUDY once."""
     chosen = load_study(study)
-    system = assemble(chosen)
+    system = assemble(chosen, study)
     setting = system.characteristics.setting(_assignments(changes), "--set")[np.newaxis]
     if not no_filter:
         setting = system.characteristics.filter(setting)
@@ -67,6 +67,7 @@ def _write_trace(path: Path, run: Run) -> None:
         "throttle [-]": trace.throttle, "brake [-]": trace.brake, "gear [-]": trace.gear}
     frame = pd.DataFrame({name: values[shown, 0] for name, values in columns.items()}).replace(np.inf, np.nan)
     try:
-        frame.to_csv(path, index=False, lineterminator="\n")
+        with path.open("w", encoding="utf-8", newline="") as file:
+            frame.to_csv(file, index=False, lineterminator="\n")
     except OSError as error:
         raise InputError("--trace", f"cannot write {path}: {error.strerror or error}", "a file in a directory that exists") from None

@@ -21,14 +21,14 @@ from safevar_sumo.study import Study, load_study
 
 @commands.command()
 @click.argument("study")
-@click.option("--runs", type=click.IntRange(min=1), help="Runs of each algorithm.")
-@click.option("--evaluations", type=click.IntRange(min=1), help="Simulations of each run.")
+@click.option("--runs", type=click.IntRange(1, 100_000), help="Runs of each algorithm.")
+@click.option("--evaluations", type=click.IntRange(1, 10_000_000), help="Simulations of each run.")
 @click.option("--algorithms", help="Which algorithms, separated by commas.")
 @click.option("--seed", type=click.IntRange(min=0, max=2**63 - 1), help="Seed of the whole study.")
-@click.option("--batch", type=click.IntRange(min=1),
+@click.option("--batch", type=click.IntRange(1, 10_000),
               help="Settings per SUMO simulation; never changes a result.  [default: the population's size]")
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the results.  [default: results/STUDY]")
-@click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
+@click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes.  [default: the cores of this machine]")
 @click.option("--cluster", metavar="ADDRESS", help="Compute on the workers of this Dask scheduler instead.")
 @click.option("--only", metavar="ALGORITHM:RUN", help="This run alone, the first run is 0.")
 @click.option("--shard", metavar="K/N", help="Every N-th run, from the K-th (1..N): for job arrays that share --out.")
@@ -38,7 +38,7 @@ def study(study: str, batch: int | None, out: Path | None, jobs: int | None, clu
           quiet: bool, dry_run: bool, **options: Any) -> None:
     """Search STUDY; the same command again goes on where it was stopped."""
     chosen = _with_options(load_study(study), **options)
-    system = assemble(chosen)
+    system = assemble(chosen, study)
     for name in chosen.search.algorithms:
         algorithm_of(name, chosen)
     keys = _selected(all_runs(chosen), only, shard)
@@ -76,7 +76,7 @@ def _selected(keys: list[RunKey], only: str | None, shard: str | None) -> list[R
             raise InputError("--only", repr(only), "ALGORITHM:RUN, an algorithm of the study and a run from 0 to less than --runs")
     if shard is not None:
         first, _, number = shard.partition("/")
-        if not (first.isdecimal() and number.isdecimal() and 1 <= int(first) <= int(number)):
+        if not (first.isdecimal() and number.isdecimal() and len(number) < 10 and len(first) < 10 and 1 <= int(first) <= int(number)):
             raise InputError("--shard", repr(shard), "K/N, with K in 1..N")
         keys = keys[int(first) - 1::int(number)]
     return keys

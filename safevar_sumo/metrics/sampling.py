@@ -29,4 +29,4 @@ def every(step: float, interval: float | None) -> int:
 
 def total(samples: FloatArray) -> FloatArray:
     """Sum over the first axis, one after the other: numpy's own sum would group by the shape of the array."""
-    return np.asarray(np.add.accumulate(samples, axis=0)[-1])
+    return np.asarray(np.add.accumulate(samples, axis=0)[-1]) if len(samples) else np.zeros(samples.shape[1:])

@@ -54,6 +54,8 @@ def load(directory: str | Path) -> Results:
     everything, solved, positions = [], [], []
     for path in sorted((place / RUNS).glob("*-*.journal")):
         algorithm, _, run = path.stem.rpartition("-")
+        if not run.isdecimal():
+            continue
         places, evaluations, result = read_journal(path)
         if evaluations is None:
             continue

@@ -137,7 +137,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         raise InputError(directory, f"is no results directory: there is no {MANIFEST}", legal) from None
     except OSError as error:
         raise InputError(file, f"cannot be read: {error.strerror}") from None
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         pass
     raise InputError(file, "is not a manifest of this program", legal)
 

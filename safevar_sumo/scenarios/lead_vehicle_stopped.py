@@ -34,7 +34,7 @@ class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_field
     """
 
     network: str = "lead_vehicle_stopped"
-    duration: Annotated[float, Meta(gt=0)] = 16.0
+    duration: Annotated[float, Meta(gt=0, le=3600)] = 16.0
 
     def begin(self, world: World) -> _Memory:
         rear = world.vehicle_positions(PARKED)[:, 0] - world.vehicle_length(PARKED)

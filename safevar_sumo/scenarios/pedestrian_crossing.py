@@ -10,7 +10,7 @@ from msgspec import Meta, Struct
 from safevar_sumo.records import Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import VUT, Scene, World
 
-Positive = Annotated[float, Meta(gt=0)]
+Positive = Annotated[float, Meta(gt=0, le=3600)]
 PEDESTRIAN = "pedestrian"
 CROSSING_LANE = ":crossing_c0_0"
 

@@ -76,13 +76,20 @@ def netconvert_version() -> str:
 
 def _folder(folder: str) -> Path:
     for place in (NETWORKS / folder, Path(folder)):
-        if place.is_dir():
+        if _is_folder(place):
             for name in (*SOURCES, TRAFFIC, OPTIONS):
                 if not (place / name).is_file():
                     raise InputError(place, f"{name} is missing", f"a folder with {', '.join((*SOURCES, TRAFFIC, OPTIONS))}")
             return place
     names = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
     raise InputError("scenario.parameters.network", f"there is no network {folder!r}", f"one of {', '.join(names)}, or a folder")
+
+
+def _is_folder(place: Path) -> bool:
+    try:
+        return place.is_dir()
+    except OSError:  # a name that is too long, say
+        return False
 
 
 def _round_up(n: int) -> int:

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from safevar_sumo.ads import ADS, Ads, Checked, PerVehicle, ScalarAds
-from safevar_sumo.errors import InputError, SafevarError, one_of
+from safevar_sumo.errors import InputError, SafevarError, one_of, told
 from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import SCENARIOS, Scenario, weather_of
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, invalid
@@ -34,15 +34,15 @@ class System:
     nominal: Nominal
 
 
-def assemble(study: Study) -> System:
-    """Look the study's models up and give them their parameters.
+def assemble(study: Study, source: str = "") -> System:
+    """Look the study's models up and give them their parameters; `source` is how errors call the study.
 
     Raises
     ------
     InputError
         Naming the study, the key, the value and what is legal.
     """
-    source = f"study {study.name!r}"
+    source = source or f"study {study.name!r}"
     vehicle = _model(VEHICLES, study.vehicle, "vehicle", source)
     _check_units(study, vehicle, source)
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
@@ -63,6 +63,8 @@ def _check_units(study: Study, vehicle: Vehicle, source: str) -> None:
             raise InputError(source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", one_of(known))
         if given[name].unit != known[name]:
             raise InputError(source, f"vehicle.characteristics.{name}.unit = {given[name].unit!r}", repr(known[name]))
+        if type(vehicle) in VEHICLES.values() and given[name].lower <= 0:
+            raise InputError(source, f"vehicle.characteristics.{name}.lower = {given[name].lower}", "a value above 0")
     for name in known:
         if name not in given:
             raise InputError(source, f"vehicle.characteristics.{name} is missing", f"all of {', '.join(known)}")
@@ -97,8 +99,8 @@ class _Guarded:
             return method(*arguments)
         except SafevarError:
             raise
-        except Exception as error:
-            raise InputError(self._source, f"{self._name} raised in {attribute}: {type(error).__name__}: {error}") from error
+        except (Exception, SystemExit, GeneratorExit) as error:
+            raise InputError(self._source, f"{self._name} raised in {attribute}: {told(error)}") from error
 
 
 def _ads(choice: ModelTable, source: str) -> Ads:
@@ -113,8 +115,8 @@ def _ads(choice: ModelTable, source: str) -> Ads:
 def _called(cls: Any, choice: ModelTable | VehicleTable, key: str, source: str) -> Any:
     try:
         return cls(**choice.parameters)
-    except Exception as error:
-        problem = f"{key}.model = {choice.model!r} does not take parameters {choice.parameters}: {type(error).__name__}: {error}"
+    except (Exception, SystemExit, GeneratorExit) as error:
+        problem = f"{key}.model = {choice.model!r} does not take parameters {choice.parameters}: {told(error)}"
         raise InputError(source, problem) from error
 
 
@@ -129,5 +131,5 @@ def _class(models: Mapping[str, Any], name: str, key: str, source: str) -> Any:
         sys.path.insert(0, os.getcwd())
     try:
         return getattr(importlib.import_module(module_name), attribute)
-    except Exception as error:
-        raise InputError(source, f"{key} = {name!r} cannot be imported: {type(error).__name__}: {error}", legal) from error
+    except (Exception, SystemExit, GeneratorExit) as error:
+        raise InputError(source, f"{key} = {name!r} cannot be imported: {told(error)}", legal) from error

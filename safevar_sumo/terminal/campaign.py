@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from safevar_sumo.analysis import brief, setting_of
@@ -22,7 +23,7 @@ SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\n
 
 def print_forecast(console: Console, study: Study, runs: int, told: Forecast) -> None:
     """What a campaign would take."""
-    console.print(study.title, soft_wrap=True, highlight=False)
+    console.print(study.title, soft_wrap=True, highlight=False, markup=False)
     table = Table(show_header=False)
     table.add_row("algorithms", ", ".join(study.search.algorithms))
     table.add_row("runs", str(runs))
@@ -40,7 +41,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
         of_it = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]
         if of_it:
             found[algorithm] = Evaluations.concatenate(of_it)
-    table = Table("", title=study.title, title_justify="left")
+    table = Table("", title=escape(study.title), title_justify="left")
     for head in found:
         table.add_column(head, justify="right")
     table.add_row("solutions", "-", *(str(len(one)) for one in list(found.values())[1:]))

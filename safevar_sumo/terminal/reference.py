@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from safevar_sumo.analysis import Agreement
@@ -13,7 +14,7 @@ from safevar_sumo.terminal.heads import METRIC_HEADS
 
 def print_agreement(console: Console, study: Study, told: Agreement) -> None:
     """Comparison with reference data, metric by metric."""
-    table = Table("", title=f"{study.title}: {told.rows} rows", title_justify="left")
+    table = Table("", title=escape(f"{study.title}: {told.rows} rows"), title_justify="left")
     for head in ("Spearman's rho", "mean abs. error", "bias", "original there", "original here"):
         table.add_column(head, justify="right")
     for name, head in METRIC_HEADS.items():
@@ -26,7 +27,7 @@ def print_agreement(console: Console, study: Study, told: Agreement) -> None:
 
 def print_calibration(console: Console, study: Study, found: Calibration) -> None:
     """Found values, and how well they do on both halves of the data."""
-    table = Table("parameter", "unit", title=study.title, title_justify="left")
+    table = Table("parameter", "unit", title=escape(study.title), title_justify="left")
     for head in ("found", "lower", "upper"):
         table.add_column(head, justify="right")
     for name, value in found.values.items():

@@ -15,7 +15,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 def print_evaluation(console: Console, study: Study, record: Mapping[str, Any], characteristics: CharacteristicSet) -> None:
     """One simulation: the setting, how it ended, metrics and objectives."""
-    table = Table("characteristic", "unit", title=study.title)
+    table = Table("characteristic", "unit", title=escape(study.title))
     for head in ("original", "simulated"):
         table.add_column(head, justify="right")
     for member in characteristics:

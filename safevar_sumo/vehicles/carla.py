@@ -16,7 +16,7 @@ from msgspec import Meta, Struct
 from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
 
-Positive = Annotated[float, Meta(gt=0)]
+Positive = Annotated[float, Meta(gt=0, le=1e5)]
 GRAVITY = 9.81  # m/s^2
 RPM = 2 * math.pi / 60  # rad/s per r/min
 ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default

@@ -203,6 +203,49 @@ def test_a_bad_study_file_ends_with_code_2(old: str, new: str, told: tuple[str, 
     refused("simulate", "mine.toml", told=told)
 
 
+@pytest.mark.parametrize(("text", "told"), [
+    ('[ads.parameters]\nbrake_gap = nan\n', ("ads.parameters.brake_gap = nan",)),
+    ('[ads.parameters]\nlatency = 1e300\n', ("ads.parameters.latency = 1e+300",)),
+    ('[scenario.parameters]\nduration = inf\n', ("scenario.parameters.duration",)),
+    ('[vehicle.characteristics.mass]\nlower = -1e308\nupper = 1e308\n', ("vehicle.characteristics.mass",)),
+    ('[vehicle.characteristics.mass]\nlower = -5\n', ("vehicle.characteristics.mass.lower", "above 0")),
+    ('[published]\ntet = 0\n', ("published.tet = 0",)),
+])
+def test_numbers_that_make_no_sense_are_refused(text: str, told: tuple[str, ...], in_tmp: Path) -> None:
+    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n' + text)
+    refused("simulate", "mine.toml", told=told)
+
+
+@pytest.mark.parametrize("where", ["__init__", "drive"])
+def test_an_ads_that_exits_is_a_fault_and_no_success(where: str, in_tmp: Path) -> None:
+    arguments = {"__init__": "self", "drive": "self, seen"}[where]
+    Path("my_ads.py").write_text(
+        "import sys\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Careful(ScalarAds):\n"
+        "    def drive(self, seen):\n        return 0.5, 0.0\n\n"
+        f"    def {where}({arguments}):\n        sys.exit()\n")
+    Path("mine.toml").write_text('extends = "sun"\nname = "mine"\n[ads]\nmodel = "my_ads:Careful"\n')
+    refused("simulate", "mine.toml", told=("my_ads:Careful", "SystemExit"))
+
+
+def test_a_title_is_no_markup(in_tmp: Path) -> None:
+    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\ntitle = "[red]x[/blue] {$"\n')
+    assert "[red]x[/blue]" in run("simulate", "mine.toml").stdout
+    run("study", "mine.toml", "--evaluations", "10", "--runs", "1")
+
+
+def test_an_algorithm_that_is_named_twice_runs_once(in_tmp: Path) -> None:
+    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n[search]\nalgorithms = ["rs", "rs"]\n')
+    run("study", "mine.toml", "--evaluations", "10", "--runs", "1")
+
+
+def test_a_full_disk_behind_the_output_is_told() -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run([*SAFEVAR, "list"], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    assert "No space left" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_a_study_file_with_an_unknown_algorithm_ends_with_code_2(in_tmp: Path) -> None:
     Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n[search]\nalgorithms = ["moea"]\n')
     refused("study", "mine.toml", told=("moea", "nsga2"))
@@ -212,7 +255,11 @@ def test_ctrl_c_ends_with_code_130(in_tmp: Path) -> None:
     process = subprocess.Popen([*SAFEVAR, "study", "rain", "--out", "out"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     time.sleep(4)
     os.kill(process.pid, signal.SIGINT)
-    output, errors = process.communicate(timeout=20)
+    try:
+        output, errors = process.communicate(timeout=20)
+    except subprocess.TimeoutExpired:  # Python drops an interrupt that comes while it finalizes an object: a user presses again
+        os.kill(process.pid, signal.SIGINT)
+        output, errors = process.communicate(timeout=20)
     assert process.returncode == 130
     assert "Traceback" not in output + errors
     assert "interrupted" in errors

@@ -20,6 +20,7 @@ from processes import SAFEVAR, ended, killed, left_of_group, started, until, wor
 
 from safevar_sumo.results import ResultsDirectory, load
 from safevar_sumo.shipped import NETWORKS, STUDIES
+from safevar_sumo.simulation import network_fingerprint
 from safevar_sumo.study import load_study
 
 STUDY = """
@@ -183,7 +184,7 @@ def test_damage_in_the_middle_names_file_and_offset(copied: Path) -> None:
 
 def test_a_run_in_the_hands_of_another_process_is_not_started_twice(whole: Path) -> None:
     chosen = load_study("small.toml")
-    theirs = ResultsDirectory(Path("out"), chosen).journal("rs-00")
+    theirs = ResultsDirectory(Path("out"), chosen, network_fingerprint("pedestrian_crossing")).journal("rs-00")
     told = study("--out", "out", "--jobs", "2", expect=1)
     assert "another process works on rs-00" in told
     assert len(load("out").solutions.groupby(["algorithm", "run"])) == 5

@@ -102,6 +102,18 @@ def test_calibrate_touches_nothing_but_parameters(key: str, told: tuple[str, ...
     refused("calibrate", "mine.toml", "--trials", "1", "--out", "x.toml", told=told)
 
 
+def test_calibrate_keeps_what_it_found_whatever_the_data(data: Path, in_tmp: Path) -> None:
+    """Too few rows for a rank correlation are no reason to lose the trials."""
+    pd.read_csv(data).head(1).to_csv("one.csv", index=False)
+    run("calibrate", "sun", "one.csv", "--trials", "1", "--out", "found.toml")
+    assert "undefined" in Path("found.toml").read_text()
+
+
+def test_a_picture_of_an_unknown_kind_is_refused_before_the_work(data: Path, in_tmp: Path) -> None:
+    refused("validate", "sun", str(data), "--plot", "picture.gif", told=("--plot", ".png"))
+    assert list(in_tmp.iterdir()) == []
+
+
 def test_calibrate_needs_something_to_fit(in_tmp: Path) -> None:
     refused("calibrate", "native", "--trials", "1", told=("native", "[calibration]"))
     refused("calibrate", "rain", "--trials", "1", "--out", "/proc/nowhere.toml", told=("--out",))
