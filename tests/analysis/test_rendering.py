@@ -59,7 +59,7 @@ def test_latex_has_no_mistakes(settings: list[Setting]) -> None:
 def test_latex_compiles(settings: list[Setting], tmp_path: Path) -> None:
     (tmp_path / "tables.tex").write_text(latex(answer(settings)), encoding="utf-8")
     done = subprocess.run(["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "tables.tex"], cwd=tmp_path, capture_output=True,
-                          text=True, check=False)
+                          text=True, errors="replace", check=False)
     assert done.returncode == 0, done.stdout[-2000:]
     assert (tmp_path / "tables.pdf").stat().st_size > 1000
 
