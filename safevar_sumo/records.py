@@ -13,6 +13,11 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
+STANDSTILL = 1e-3
+"""Below this speed a vehicle counts as standing [m/s] (method section 4)."""
+TIME_DECIMALS = 9
+"""Sums of steps are told as 0.15 s, not as 0.15000000000000002 s."""
+
 
 class Outcome(StrEnum):
     """How a simulation ended."""

@@ -5,11 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from safevar_sumo.metrics.sampling import every, total
-from safevar_sumo.records import FloatArray, Run
+from safevar_sumo.records import STANDSTILL, FloatArray, Run
 from safevar_sumo.study import MetricsTable
-
-STILL = 1e-3
-"""Below this speed the vehicle no longer moves, and the braking cycle is over [m/s]."""
 
 
 def average_deceleration(run: Run, thresholds: MetricsTable) -> FloatArray:
@@ -20,7 +17,7 @@ def average_deceleration(run: Run, thresholds: MetricsTable) -> FloatArray:
     stride = every(run.trace.step, thresholds.sampling_interval)
     interval = stride * run.trace.step
     speed, active = run.trace.speed[::stride], run.trace.active[::stride]
-    braking = active & (run.trace.brake[::stride] > 0) & (np.abs(speed) > STILL)
+    braking = active & (run.trace.brake[::stride] > 0) & (np.abs(speed) > STANDSTILL)
     lost = (speed[:-1] - speed[1:]) / interval
     counts = braking[1:]
     number = np.count_nonzero(counts, axis=0)

@@ -5,13 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from safevar_sumo.metrics.sampling import every, total
-from safevar_sumo.records import FloatArray, Run
+from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, FloatArray, Run
 from safevar_sumo.study import MetricsTable
-
-STANDSTILL = 1e-3
-"""Below this speed a vehicle counts as standing [m/s]."""
-TIME_DECIMALS = 9
-"""A number of steps of 0.05 s is told as 0.6 s, not as 0.6000000000000001 s."""
 
 
 def time_to_collision(run: Run) -> FloatArray:

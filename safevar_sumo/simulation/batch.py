@@ -6,16 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Observation, Outcome, Run, Trace
+from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Evaluations, FloatArray, Observation, Outcome, Run, Trace
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.simulation.network import copied_network
 from safevar_sumo.simulation.sumo import Engine, SumoWorld, open_world
 from safevar_sumo.simulation.system import System
-
-TIME_DECIMALS = 9
-"""The third step of 0.05 s comes at 0.15 s, not at 0.15000000000000002 s."""
-STANDSTILL = 1e-3
-"""Below this speed a vehicle counts as standing [m/s]."""
 
 
 def evaluate(system: System, settings: FloatArray) -> Evaluations:
