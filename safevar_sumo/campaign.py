@@ -7,11 +7,14 @@ costs a batch, and no result depends on who computed what.
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
 import zlib
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import contextmanager
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -25,6 +28,8 @@ from safevar_sumo.search import ALGORITHMS, Algorithm, Problem, Search
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
+SECONDS_BETWEEN_LOOKS = 0.2
+"""How long Ctrl-C may go unnoticed at the most."""
 RUNS_PER_WORKER = 2
 """How many runs are under way for each worker: one is computed while another is searched and journalled."""
 
@@ -138,20 +143,22 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
                 active[persistent.submit(work, settings)] = run
 
     try:
-        while waiting or active:
-            while waiting and len(runs) < RUNS_PER_WORKER * persistent.workers:
-                key = waiting.popleft()
-                try:
-                    journal = results.journal(str(key))
-                except JournalBusy:
-                    campaign.busy.append(key)
-                    continue
-                runs.add(run := _Run(key, algorithm_of(key.algorithm, study).search(problem, run_generator(study, key)), journal, observer))
-                go_on(run)
-            for future in wait(active, return_when=FIRST_COMPLETED).done if active else ():
-                run = active.pop(future)
-                if run.take(future.result()):
+        with _interrupts_between_waits() as first_of:
+            while waiting or active:
+                while waiting and len(runs) < RUNS_PER_WORKER * persistent.workers:
+                    key = waiting.popleft()
+                    try:
+                        journal = results.journal(str(key))
+                    except JournalBusy:
+                        campaign.busy.append(key)
+                        continue
+                    search = algorithm_of(key.algorithm, study).search(problem, run_generator(study, key))
+                    runs.add(run := _Run(key, search, journal, observer))
                     go_on(run)
+                for future in first_of(active):
+                    run = active.pop(future)
+                    if run.take(future.result()):
+                        go_on(run)
     finally:
         for run in runs:
             run.close()
@@ -178,6 +185,35 @@ def forecast(study: Study, runs: int, pool: Pool, batch: int | None = None) -> F
     evaluations = runs * study.search.evaluations
     row = 8 * (len(characteristics) + len(METRICS) + NUMBERS_BESIDE_METRICS)
     return Forecast(evaluations, rate, evaluations / rate, evaluations * row)
+
+
+@contextmanager
+def _interrupts_between_waits() -> Iterator[Callable[[Iterable[Future[Evaluations]]], set[Future[Evaluations]]]]:
+    """Yields how to wait for the first of some futures; Ctrl-C is raised there, never while a future's lock is held.
+
+    An interrupt inside `concurrent.futures` may leave a lock behind that the worker's thread then waits for, for ever.
+    """
+    pressed = False
+
+    def note(*_: object) -> None:
+        nonlocal pressed
+        pressed = True
+
+    def first_of(futures: Iterable[Future[Evaluations]]) -> set[Future[Evaluations]]:
+        while True:
+            done, not_done = wait(futures, timeout=SECONDS_BETWEEN_LOOKS, return_when=FIRST_COMPLETED)
+            if pressed:
+                raise KeyboardInterrupt
+            if done or not not_done:
+                return done
+
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, note) if in_main_thread else None
+    try:
+        yield first_of
+    finally:
+        if in_main_thread:
+            signal.signal(signal.SIGINT, before)
 
 
 def _original(work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: PersistentPool) -> Evaluations:
