@@ -77,8 +77,6 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
     head = Path("found.toml").read_text().split("\n\n")[0]
     for word in ("CMA-ES", "seed 3", "mine.csv, SHA-256", "Cost"):
         assert word in head
-    for name in ("characteristics",):
-        assert found["vehicle"][name] == tomllib.loads(Path("found.toml").read_text())["vehicle"][name]
     assert load_study("found.toml").vehicle.characteristics == load_study("mine.toml").vehicle.characteristics
     run("calibrate", "mine.toml", str(data), "--trials", "37", "--seed", "3", "--jobs", "1", "--out", "again.toml")
     assert Path("again.toml").read_bytes() == Path("found.toml").read_bytes()
