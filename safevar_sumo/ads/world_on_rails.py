@@ -15,8 +15,6 @@ SPEED_LIMIT = 20 / 3.6
 """Above this speed the agent releases the throttle [m/s] (its source, 20 km/h)."""
 SPEED_LEVELS = (0.0, 8 / 3, 16 / 3)
 """Speeds that the policy is interpolated over, as far as the limit lets it [m/s] (its source: four in 0..8 m/s)."""
-RELEASE_MARGIN = 0.5
-"""Somebody that it brakes for leaves the corridor this much later than he entered it [m]."""
 PASSED = -0.5
 """Gap at which somebody is beside it rather than ahead [m]."""
 
@@ -39,12 +37,13 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     latency
         Time from an image to its command [s], in whole steps.
     corridor
-        Half the width of what it takes for its way [m].
+        Half the width of what it watches: it brakes for nobody beyond, and releases the brake when he leaves it [m].
     brake_gap, brake_gap_per_speed
-        It brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s], times the visibility.
-    brake_gap_past, past
-        That gap shrinks by `brake_gap_past` for every metre that the pedestrian is beyond the place `past`, measured
-        from the lane's middle towards where he came from: somebody about to leave the way is braked for later [-, m].
+        It brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s], times the visibility, for somebody at
+        `brake_place`.
+    brake_place, brake_gap_before, brake_gap_past
+        For every metre that he is short of that lateral place, or past it, the gap shrinks by as much [m, -, -]: whoever
+        is about to enter the way, or to leave it, is braked for later.
     throttle
         Throttle at the policy's speed levels 0, 2.7 and 5.3 m/s.
     """
@@ -54,8 +53,9 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     corridor: NotNegative
     brake_gap: float
     brake_gap_per_speed: float
-    brake_gap_past: float
-    past: float
+    brake_place: float
+    brake_gap_before: NotNegative
+    brake_gap_past: NotNegative
     throttle: Annotated[tuple[Throttle, Throttle, Throttle], Meta()]
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
@@ -71,11 +71,12 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def _brakes(self, seen: Observation, braked: BoolArray) -> BoolArray:
         """Whether the brake probability exceeds one half: somebody is in the corridor and near enough."""
-        beyond = np.maximum(seen.lateral + self.past, 0.0)
-        near = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - self.brake_gap_past * beyond)
-        aside = np.abs(seen.lateral)
-        begins = (aside <= self.corridor) & (seen.gap <= near) & (seen.gap > PASSED)
-        goes_on = braked & (aside <= self.corridor + RELEASE_MARGIN) & (seen.gap > 2 * PASSED)
+        past = seen.lateral - self.brake_place
+        aside = self.brake_gap_past * np.maximum(past, 0.0) + self.brake_gap_before * np.maximum(-past, 0.0)
+        near = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - aside)
+        watched = np.abs(seen.lateral) <= self.corridor
+        begins = watched & (seen.gap <= near) & (seen.gap > PASSED)
+        goes_on = watched & braked & (seen.gap > 2 * PASSED)
         return np.asarray(begins | goes_on)
 
     def _throttle(self, speed: FloatArray) -> FloatArray:

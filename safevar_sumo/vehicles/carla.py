@@ -1,8 +1,8 @@
 """LincolnMkz2017 of CARLA 0.9.10: NVIDIA PhysX 3.4, PxVehicleDrive4W, along its path.
 
-The equations are those of `PxVehicleUpdate.cpp` and `PxVehicleDefaultTireShader` (PhysX 3.4), with one
-equivalent wheel for the four. Engine, clutch, wheels and body are one linear system in a substep, with the
-tyre's secant stiffness; it is solved implicitly and in closed form, so that no stiffness limits the substep.
+The equations are those of `PxVehicleUpdate.cpp` and `PxVehicleDefaultTireShader` (PhysX 3.4), with one equivalent
+wheel for the four, and so is the order of integration: the tyres' force from the slip at the beginning of a step,
+then engine, clutch and wheels implicitly and in closed form, so that the stiff clutch does not limit the step.
 """
 
 from __future__ import annotations
@@ -33,12 +33,14 @@ AIR_DENSITY = 1.2  # kg/m^3
 FRONTAL_AREA = 2.2  # m^2, of the LincolnMkz2017
 TIME_ROUNDING = 1e-9  # s; below it two sums of steps are the same time
 STANDSTILL = 0.03  # m/s, below which a braked vehicle is held by its tyres (PxVehicle sticky tires)
-SUBSTEPS = 3  # CARLA 0.9.10 substeps at 1/60 s
+SUBSTEP = 1 / 60  # s at most; CARLA 0.9.10 (MaxSubstepDeltaTime)
+TYRE_STEPS = 3  # in a substep; what PhysX takes below 5 m/s (setSubStepCount), here at any speed
 
 
 class _Prepared(NamedTuple):
     """Constants of a run, SI, shape (N,)."""
 
+    substeps: int
     step: float
     mass: FloatArray
     radius: FloatArray
@@ -46,6 +48,7 @@ class _Prepared(NamedTuple):
     wheel_damping: FloatArray
     brake_torque: FloatArray
     grip: FloatArray
+    slip_stiffness: FloatArray  # K / (3 |slip|)
     clutch: FloatArray
     engine_limit: FloatArray
     damping_full: FloatArray
@@ -78,8 +81,8 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Friction coefficient of a tyre on a dry road per unit of tireFric [-].
     longitudinal_stiffness
         Of a tyre, over gravity [N s^2/m per unit slip] (PxVehicleTireData.mLongitudinalStiffnessPerUnitGravity).
-    slip_floor
-        Least speed that a slip is relative to [m/s] (PxVehicle minLongSlipDenominator).
+    slip_offset
+        Speed that is added to the one that a slip is relative to [m/s] (0.1 in PxVehicle's `computeTireSlips`).
     engine_torque
         Engine torque over that of CARLA's default car [-].
     throttle_rise, throttle_fall, brake_rise, brake_fall
@@ -97,7 +100,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     tyre_friction: Positive
     longitudinal_stiffness: Positive
-    slip_floor: Positive
+    slip_offset: Positive
     engine_torque: Positive
     throttle_rise: Positive = 6.0
     throttle_fall: Positive = 10.0
@@ -109,10 +112,13 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> _Prepared:
         c = characteristics
         radius = c["radius"] / 100
+        grip = c["tireFric"] * (self.tyre_friction * road_friction) * c["mass"] * GRAVITY
+        substeps = math.ceil(step / SUBSTEP - TIME_ROUNDING)
         return _Prepared(
-            step=step / SUBSTEPS, mass=c["mass"], radius=radius, wheel_inertia=WHEELS * 0.5 * WHEEL_MASS * radius * radius,
+            substeps=substeps, step=step / substeps, mass=c["mass"], radius=radius,
+            wheel_inertia=WHEELS * 0.5 * WHEEL_MASS * radius * radius,
             wheel_damping=WHEELS * c["dampRate"], brake_torque=WHEELS * c["maxBrakeTorque"],
-            grip=c["tireFric"] * (self.tyre_friction * road_friction) * c["mass"] * GRAVITY,
+            grip=grip, slip_stiffness=WHEELS * GRAVITY * self.longitudinal_stiffness / (3 * grip),
             clutch=c["clutchStrength"], engine_limit=c["max_rpm"] * RPM, damping_full=c["dampRateFullT"],
             damping_engaged=c["dampRateZeroT_CE"], damping_neutral=c["dampRateZeroT_CD"], shift_time=c["gearSwitchTime"],
             air_drag=0.5 * AIR_DENSITY * FRONTAL_AREA * c["dragCoeff"],
@@ -126,7 +132,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             accel=np.minimum(drive, p.grip) / p.mass,
             decel=np.minimum(p.brake_torque / p.radius, p.grip) / p.mass,
             max_speed=p.engine_limit / (GEAR_RATIOS[-1] * FINAL_RATIO) * p.radius,
-            tau=np.full_like(p.mass, p.step * SUBSTEPS + 1 / self.brake_rise))
+            tau=np.full_like(p.mass, p.step * p.substeps + 1 / self.brake_rise))
 
     def at_rest(self, prepared: _Prepared) -> CarlaState:
         nothing = np.zeros_like(prepared.mass)
@@ -137,7 +143,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return seen._replace(gap=seen.gap * prepared.assumed_height), state
 
     def advance(self, prepared: _Prepared, state: CarlaState, command: Command) -> CarlaState:
-        for _ in range(SUBSTEPS):
+        for _ in range(prepared.substeps):
             state = self._pedals(prepared, state, command)
             state = _shift(prepared, state)
             state = self._roll(prepared, state)
@@ -152,44 +158,48 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             brake=s.brake + np.minimum(np.maximum(brake, -self.brake_fall * h), self.brake_rise * h))
 
     def _roll(self, p: _Prepared, s: CarlaState) -> CarlaState:
-        """One implicit Euler step of engine, clutch, wheels and body, linear in the new speeds.
+        """Engine, clutch, wheels, tyres and body over one substep.
 
         I_e dw_e/dt = throttle T(w_e) - c_e w_e - k_c (w_e - G w_w)
-        I_w dw_w/dt = G k_c (w_e - G w_w) - d w_w - T_brake - r K (r w_w - v)
-        m dv/dt = K (r w_w - v) - D v |v|
+        I_w dw_w/dt = G k_c (w_e - G w_w) - d w_w - T_brake - r F
+        m dv/dt = F - D v |v|
+
+        The force F is explicit. It ends the slip within a step at most, and never reverses it: so it cannot ring.
         """
-        ratio = GEAR_RATIOS[s.gear.astype(np.intp)] * FINAL_RATIO
+        step = p.step / TYRE_STEPS
         in_gear = s.gear > 0
-        clutch = np.where(in_gear, p.clutch, 0.0)
         closed = np.where(in_gear, p.damping_engaged, p.damping_neutral)
-        damping = closed + (p.damping_full - closed) * s.throttle
-        stiffness = self._tyre_stiffness(p, s)
-
-        inverse = 1 / p.step
-        engine = ENGINE_INERTIA * inverse + damping + clutch
-        engine_free = (ENGINE_INERTIA * inverse * s.engine_speed + s.throttle * self._torque(p, s)) / engine
-        body = p.mass * inverse + stiffness + p.air_drag * s.speed
-        body_free = p.mass * inverse * s.speed / body
+        clutch = np.where(in_gear, p.clutch, 0.0)
+        ratio = GEAR_RATIOS[s.gear.astype(np.intp)] * FINAL_RATIO
         through_clutch = ratio * clutch
-        wheel = (p.wheel_inertia * inverse + p.wheel_damping + through_clutch * ratio * (1 - clutch / engine)
-                 + stiffness * p.radius * p.radius * (1 - stiffness / body))
-        push = p.wheel_inertia * inverse * s.wheel_speed + through_clutch * engine_free + stiffness * p.radius * body_free
-        wheel_speed = np.maximum(push - s.brake * p.brake_torque, 0.0) / wheel
-        return s._replace(
-            speed=np.maximum(body_free + stiffness * p.radius * wheel_speed / body, 0.0),
-            wheel_speed=wheel_speed,
-            engine_speed=np.minimum(engine_free + through_clutch * wheel_speed / engine, p.engine_limit))
+        engine = ENGINE_INERTIA / step + closed + (p.damping_full - closed) * s.throttle + clutch
+        wheel = p.wheel_inertia / step + p.wheel_damping + through_clutch * ratio * (1 - clutch / engine)
+        torque, braking = s.throttle * self._torque(p, s), s.brake * p.brake_torque
+        drag = p.air_drag * s.speed * s.speed
+        by_force = step / p.mass
+        slip_by_force = p.radius * p.radius / wheel + by_force
 
-    def _tyre_stiffness(self, p: _Prepared, s: CarlaState) -> FloatArray:
-        """Force per speed of slipping, F / (r w_w - v) [N s/m], of `PxVehicleComputeTireForceDefault`.
+        speed, wheel_speed, engine_speed = s.speed, s.wheel_speed, s.engine_speed
+        for _ in range(TYRE_STEPS):
+            engine_free = (ENGINE_INERTIA / step * engine_speed + torque) / engine
+            push = p.wheel_inertia / step * wheel_speed + through_clutch * engine_free - braking
+            ends_slip = (p.radius * push / wheel - speed) / slip_by_force
+            force = self._tyre_force(p, speed, p.radius * wheel_speed)
+            force = np.minimum(np.maximum(force, np.minimum(ends_slip, 0.0)), np.maximum(ends_slip, 0.0))
+            wheel_speed = np.maximum(push - p.radius * force, 0.0) / wheel
+            engine_speed = np.minimum(engine_free + through_clutch / engine * wheel_speed, p.engine_limit)
+            speed = np.maximum(speed + by_force * (force - drag), 0.0)
+        return s._replace(speed=speed, wheel_speed=wheel_speed, engine_speed=engine_speed)
 
-        With slip = (r w_w - v) / max(v, r w_w, floor) and K = C |slip| / (mu load):
-        F = mu load (K - K^2 / 3 + K^3 / 27) up to K = 3, mu load beyond.
+    def _tyre_force(self, p: _Prepared, speed: FloatArray, rim: FloatArray) -> FloatArray:
+        """Force of the tyres along the way [N] (`PxVehicleComputeTireForceDefault` without lateral slip).
+
+        With slip = (rim - speed) / (max(rim, speed) + offset) and K = C |slip| / (mu load):
+        F = mu load (K - K^2 / 3 + K^3 / 27) = mu load (1 - (1 - K / 3)^3) up to K = 3, mu load beyond.
         """
-        rim = p.radius * s.wheel_speed
-        stiffness = WHEELS * GRAVITY * self.longitudinal_stiffness / np.maximum(np.maximum(s.speed, rim), self.slip_floor)
-        k = stiffness * np.abs(rim - s.speed) / p.grip
-        return stiffness * np.where(k < 3, 1 - k * (1 / 3) + k * k * (1 / 27), 1 / np.maximum(k, 3.0))
+        slides = rim - speed
+        left = np.maximum(1 - p.slip_stiffness * np.abs(slides) / (np.maximum(rim, speed) + self.slip_offset), 0.0)
+        return np.copysign(p.grip * (1 - left * left * left), slides)
 
     def _torque(self, p: _Prepared, s: CarlaState) -> FloatArray:
         """Engine torque at full throttle [N m]: linear between the points of the curve, zero above its end."""

@@ -42,10 +42,10 @@ def test_sumo_reports_a_collision_just_where_bodies_overlap(study: str) -> None:
     _, run = driven(study, 120)
     trace, collided = run.trace, run.outcome == Outcome.COLLISION
     assert 10 < np.count_nonzero(collided) < 110
-    half_width, person = (2.1284 / 2, 0.478) if study == "sun" else (1.85 / 2, 0.0)
-    beside = np.abs(trace.lateral) <= half_width + 0.25 if study == "sun" else np.ones_like(trace.active)
+    half_width, person, thickness = (2.1284 / 2, 0.478, 0.215) if study == "sun" else (1.85 / 2, 0.0, 0.0)
+    beside = np.abs(trace.lateral) <= half_width + thickness + 0.02 if study == "sun" else np.ones_like(trace.active)
     within = (trace.gap < -0.02) & (trace.gap > -trace.vehicle_length - person + 0.02)
-    surely_beside = np.abs(trace.lateral) <= half_width - 0.25 if study == "sun" else beside
+    surely_beside = np.abs(trace.lateral) <= half_width - 0.02 if study == "sun" else beside
     overlaps = (trace.active & within & surely_beside).any(axis=0)
     touches = (trace.active & (trace.gap <= 0.02) & beside).any(axis=0)
     assert np.all(collided[overlaps])
