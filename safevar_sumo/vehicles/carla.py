@@ -199,7 +199,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """
         slides = rim - speed
         left = np.maximum(1 - p.slip_stiffness * np.abs(slides) / (np.maximum(rim, speed) + self.slip_offset), 0.0)
-        return np.copysign(p.grip * (1 - left * left * left), slides)
+        return np.asarray(np.copysign(p.grip * (1 - left * left * left), slides))
 
     def _torque(self, p: _Prepared, s: CarlaState) -> FloatArray:
         """Engine torque at full throttle [N m]: linear between the points of the curve, zero above its end."""

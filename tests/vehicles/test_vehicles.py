@@ -70,12 +70,16 @@ def test_energy_is_never_created(model: str) -> None:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_braking_never_raises_speed(model: str) -> None:
-    """Whatever was done before: who brakes is never faster than who only releases the throttle, and slows down.
+    """Whatever was done before: who brakes is never faster than who only releases the throttle in the same gear, and slows down.
 
     An engine that turns faster than its wheels ask gives its momentum away through the clutch first.
     """
     coasting, braking = at_random(model, 0.0), at_random(model, 1.0)
-    assert np.all(braking.speed <= coasting.speed + 1e-9)
+    slower = braking.speed <= coasting.speed + 1e-9
+    if model == "carla":
+        gears = [np.stack([state.gear for state in run.states]) for run in (braking, coasting)]
+        slower |= np.logical_or.accumulate(gears[0] != gears[1], axis=0)
+    assert np.all(slower)
     since = braking.at(4.5)
     slows = np.diff(braking.speed[since:], axis=0) <= 1e-12
     if model == "carla":
@@ -211,45 +215,6 @@ def test_a_brake_command_waits_for_the_delay() -> None:
     run = drive("sumo", ends("sumo", "brakeDelay"), lambda time: (0.0, 1.0), 1.0)
     brake = np.stack([state.brake for state in run.states])
     assert np.allclose([np.argmax(brake[:, i] > 0.5) * STEP for i in range(5)], np.linspace(0.05, 0.5, 5) + STEP, atol=STEP)
-
-
-def test_a_camera_on_smaller_wheels_overestimates_the_gap() -> None:
-    vehicle, population = SYSTEMS["carla"].vehicle, ends("carla", "radius")
-    values = dict(zip(SYSTEMS["carla"].characteristics.names, np.ascontiguousarray(population.T), strict=True))
-    prepared = vehicle.prepare(values, 1.0, STEP)
-    nothing = np.zeros(5)
-    seen, _ = vehicle.sense(prepared, vehicle.at_rest(prepared), Observation(0.0, nothing, nothing + 8, nothing, nothing, nothing, 1.0))
-    assert np.all(np.diff(seen.gap) < 0)
-    assert np.interp(35.5, population[:, 10], seen.gap) == pytest.approx(8.0, rel=1e-3)
-
-
-def test_carla_waits_in_neutral_for_its_first_gear() -> None:
-    """A switch takes gearSwitchTime, counted in substeps of 1/60 s: 33 of them for 0.55 s, 34 for anything above."""
-    settings_ = original("carla", 2)
-    settings_[:, 4] = [0.55, 0.5501]
-    gears = np.stack([state.gear for state in drive("carla", settings_, full_throttle, 0.7).states])
-    assert np.argmax(gears[:, 0] > 0) == 12  # substep 33 lies in the frame that ends at 0.6 s
-    assert np.argmax(gears[:, 1] > 0) == 12
-    speeds = drive("carla", settings_, full_throttle, 0.6).speed[-1]
-    assert speeds[0] > speeds[1]
-
-
-def test_carlas_braked_deceleration_is_torque_over_radius_and_mass_where_tyres_hold() -> None:
-    """Neutral of the textbook: F = T / r as long as the slip is small; engine braking comes on top."""
-    run = drive("carla", original("carla"), braking_after(1.4), 3.0)
-    speed = run.speed[:, 0]
-    middle = (speed[1:] < 4) & (speed[1:] > 1) & (np.arange(1, len(speed)) > run.at(1.8))
-    deceleration = -np.diff(speed)[middle] / STEP
-    floor = 4 * 1500 / 0.355 / 2404
-    assert np.all(deceleration > 0.9 * floor)
-    assert np.all(deceleration < 1.8 * floor)
-
-
-def test_pedals_follow_at_their_rates() -> None:
-    vehicle = SYSTEMS["carla"].vehicle
-    run = drive("carla", original("carla"), full_throttle, 0.3)
-    throttle = [float(state.throttle[0]) for state in run.states]
-    assert throttle[:4] == pytest.approx([min(1.0, vehicle.throttle_rise * k * STEP) for k in range(4)])
 
 
 def test_commands_are_not_changed_in_place() -> None:
