@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from safevar_sumo.ads import ADS, Ads, Checked, PerVehicle, ScalarAds
+from safevar_sumo.ads.world_on_rails import WorldOnRails
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.simulation import assemble
@@ -16,6 +17,7 @@ from safevar_sumo.study import load_study, study_names
 
 STEP = 0.05
 SYSTEMS = {load_study(name).ads.model: assemble(load_study(name)) for name in study_names()}
+KNOWN = assemble(load_study("sun")).nominal
 
 
 @pytest.fixture(params=sorted(ADS))
@@ -64,6 +66,23 @@ def test_an_open_road_makes_it_drive(name: str) -> None:
     assert pedals[:, 1].max() == 0
 
 
+@given(lateral=st.floats(-3, 3), speed=st.floats(0, 8), gap=st.floats(0, 12))
+def test_world_on_rails_brakes_up_to_a_gap_that_shrinks_before_and_past_its_place(lateral: float, speed: float, gap: float) -> None:
+    ads = WorldOnRails(first_command=0.0, latency=0.0, corridor=2.5, brake_gap=9.0, brake_gap_per_speed=-0.5, brake_place=-0.4,
+                       brake_gap_before=10.0, brake_gap_past=2.0, throttle=(0.8, 0.8, 0.5))
+    short, past = max(-0.4 - lateral, 0.0), max(lateral + 0.4, 0.0)
+    limit = 0.9 * (9.0 - 0.5 * speed - 10.0 * short - 2.0 * past)
+    assume(abs(gap - limit) > 1e-9)
+    seen = observation(1.0, np.full(1, speed), np.full(1, gap), np.full(1, lateral))._replace(visibility=0.9)
+    command, memory = ads.drive(seen, ads.start(1, KNOWN, STEP))
+    assert bool(command.brake[0]) == (gap < limit and abs(lateral) <= 2.5)
+    # Once it brakes it goes on, until he is out of what it watches.
+    further, _ = ads.drive(seen._replace(gap=np.full(1, 50.0)), memory)
+    assert further.brake[0] == command.brake[0]
+    gone, _ = ads.drive(seen._replace(lateral=np.full(1, 2.6)), memory)
+    assert gone.brake[0] == 0
+
+
 class Timid(ScalarAds):
     """Brakes in front of everything, and counts how often it was asked."""
 
@@ -73,9 +92,6 @@ class Timid(ScalarAds):
     def drive(self, seen: Observation) -> tuple[float, float]:
         self.asked += 1
         return (0.0, 1.0) if seen.gap < self.distance else (0.1 * self.asked, 0.0)
-
-
-KNOWN = assemble(load_study("sun")).nominal
 
 
 def test_a_scalar_ads_drives_every_vehicle_with_an_instance_of_its_own() -> None:
