@@ -31,7 +31,7 @@ def test_rain_differs_from_sun_in_weather_alone() -> None:
     assert rain.weather != sun.weather
     same = {"name": sun.name, "title": sun.title, "published": sun.published, "calibration": sun.calibration}
     assert msgspec.structs.replace(rain, weather=sun.weather, **same) == sun
-    assert set(rain.calibration) == {"weather.road_friction", "weather.visibility"}
+    assert set(rain.calibration) == {"weather.road_friction", "weather.recognition_delay"}
 
 
 def variant(tmp_path: Path, old: str, new: str) -> str:

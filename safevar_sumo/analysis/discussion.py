@@ -59,7 +59,7 @@ def combinations(setting: Setting) -> pd.DataFrame:
 
 
 def weather_pairs(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
-    """Settings that differ in the weather alone: the one with the better grip first.
+    """Settings that differ in the weather alone: the clearer one first (by friction, then sight, then delay).
 
     Raises
     ------
@@ -67,7 +67,7 @@ def weather_pairs(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
         If there is no such pair.
     """
     pairs = [(one, other) for one, other in permutations(settings, 2)
-             if _without_weather(one) == _without_weather(other) and one.weather.road_friction > other.weather.road_friction]
+             if _without_weather(one) == _without_weather(other) and _clearness(one) > _clearness(other)]
     if not pairs:
         raise Unanswerable(", ".join(one.name for one in settings), "two settings are needed that differ in the weather alone",
                            "results such as those of sun and rain")
@@ -116,6 +116,11 @@ def effects(setting: Setting) -> pd.DataFrame:
     parts = [pd.DataFrame({"setting": setting.name, "characteristic": name, "change": column[column != 0]})
              for name, column in zip(setting.characteristics.names, changed.T, strict=True)]
     return pd.concat(parts, ignore_index=True)
+
+
+def _clearness(setting: Setting) -> tuple[float, float, float]:
+    weather = setting.weather
+    return weather.road_friction, weather.visibility, -weather.recognition_delay
 
 
 def _without_weather(setting: Setting) -> tuple[object, ...]:

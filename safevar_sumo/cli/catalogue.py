@@ -67,7 +67,8 @@ def _print_catalogue(console: Console, studies: list[Study]) -> None:
                 for row in vehicle["characteristics"]]
         heads = ("characteristic", "unit", "original", "lower", "upper", "threshold")
         terminal.print_names(console, f"Vehicle {vehicle['name']}", rows, heads)
-    weathers = [(row["name"], f"{row['road_friction']:g}", f"{row['visibility']:g}") for row in catalogue["weathers"]]
-    terminal.print_names(console, "Weathers", weathers, ("name", "road friction", "visibility"))
+    weathers = [(row["name"], *(f"{row[key]:g}" for key in ("road_friction", "visibility", "recognition_delay")))
+                for row in catalogue["weathers"]]
+    terminal.print_names(console, "Weathers", weathers, ("name", "road friction", "visibility", "recognition delay, s"))
     for title, key in (("ADSs", "ads"), ("Scenarios", "scenarios"), ("Algorithms", "algorithms"), ("Metrics", "metrics")):
         terminal.print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "what"))

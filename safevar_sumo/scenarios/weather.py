@@ -25,5 +25,6 @@ def weather_of(choice: str | Weather, source: object) -> Weather:
     if isinstance(choice, Weather):
         return choice
     if choice not in WEATHERS:
-        raise InputError(source, f"weather = {choice!r}", f"{one_of(WEATHERS)}, or a table with name, road_friction and visibility")
+        fields = ", ".join(Weather.__struct_fields__)
+        raise InputError(source, f"weather = {choice!r}", f"{one_of(WEATHERS)}, or a table with {fields}")
     return WEATHERS[choice]

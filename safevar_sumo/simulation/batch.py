@@ -6,9 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Evaluations, FloatArray, Observation, Outcome, Run, Trace
+from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Evaluations, FloatArray, Outcome, Run, Trace
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.simulation.network import copied_network
+from safevar_sumo.simulation.perception import Perception
 from safevar_sumo.simulation.sumo import Engine, SumoWorld, open_world
 from safevar_sumo.simulation.system import System
 
@@ -57,6 +58,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld) -> Run:
 
     state = vehicle.at_rest(prepared)
     driver = system.ads.start(n, system.nominal, step)
+    perception = Perception(system.weather, n, step)
     memory = scenario.begin(world)
     log = _Log(n, round(scenario.duration / step) + 1)
     verdict = _Verdict(n)
@@ -64,8 +66,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld) -> Run:
         speed = world.speeds()
         scene, memory = scenario.observe(world, step, memory)
         active = verdict.judge(speed, scene.over, world.collisions(), last=sample == log.length - 1)
-        seen = Observation(sample * step, speed, scene.gap, speed, scene.lateral, scene.lateral_speed, system.weather.visibility)
-        seen, state = vehicle.sense(prepared, state, seen)
+        seen, state = vehicle.sense(prepared, state, perception.observe(sample * step, speed, scene))
         command, driver = system.ads.drive(seen, driver)
         log.write(sample, position=world.vehicle_positions(VUT)[:, 0], speed=speed, gap=scene.gap, lateral=scene.lateral,
                   lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active)

@@ -1,0 +1,33 @@
+"""What bad weather keeps from an ADS, and for how long."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from safevar_sumo.scenarios.base import Scene
+from safevar_sumo.simulation.perception import Perception
+from safevar_sumo.study import Weather
+
+STEP = 0.05
+TIMES = np.arange(12) * STEP
+
+
+def observed(delay: float) -> tuple[np.ndarray, np.ndarray]:
+    """Own speeds and (gap, closing speed, lateral, lateral speed) as seen over time, of one vehicle whose scene changes steadily."""
+    perception = Perception(Weather(name="any", road_friction=1.0, visibility=0.7, recognition_delay=delay), 1, STEP)
+    seen = []
+    for time in TIMES:
+        scene = Scene(np.array([20 - 5 * time]), np.array([-3 + 2 * time]), np.array([2 + time]), np.zeros(1, dtype=bool))
+        seen.append(perception.observe(float(time), np.array([5 + time]), scene))
+    assert all(one.visibility == 0.7 for one in seen)
+    return (np.array([one.speed[0] for one in seen]),
+            np.array([[values[0] for values in (one.gap, one.closing_speed, one.lateral, one.lateral_speed)] for one in seen]))
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.05, 0.0863, 0.1, 0.15])
+def test_the_scene_is_seen_late_and_the_own_speed_at_once(delay: float) -> None:
+    speed, scene = observed(delay)
+    then = np.maximum(TIMES - delay, 0.0)
+    assert speed == pytest.approx(5 + TIMES)
+    assert scene == pytest.approx(np.stack([20 - 5 * then, 5 + then, -3 + 2 * then, 2 + then], axis=1))
