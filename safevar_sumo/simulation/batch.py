@@ -58,7 +58,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld) -> Run:
 
     state = vehicle.at_rest(prepared)
     driver = system.ads.start(n, system.nominal, step)
-    perception = Perception(system.weather, n, step)
+    perception = Perception(system.weather, step)
     memory = scenario.begin(world)
     log = _Log(n, round(scenario.duration / step) + 1)
     verdict = _Verdict(n)

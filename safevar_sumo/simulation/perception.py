@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from safevar_sumo.records import FloatArray, Observation
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather
-from safevar_sumo.vehicles.delay import delayed, history, remembered
 
 
 class Perception:
     """Observations of N vehicles, one step after the other."""
 
-    def __init__(self, weather: Weather, n: int, step: float) -> None:
-        self._weather, self._step = weather, step
-        self._delay = np.full(n, weather.recognition_delay)
-        self._past: FloatArray | None = None
+    def __init__(self, weather: Weather, step: float) -> None:
+        self._visibility = weather.visibility
+        self._whole, self._part = divmod(weather.recognition_delay / step, 1)
+        self._past: deque[FloatArray] = deque()
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
         """What is seen at this step; every step is to be shown."""
         gap, closing_speed, lateral, lateral_speed = self._late(np.stack([scene.gap, speed, scene.lateral, scene.lateral_speed]))
-        return Observation(time, speed, gap, closing_speed, lateral, lateral_speed, self._weather.visibility)
+        return Observation(time, speed, gap, closing_speed, lateral, lateral_speed, self._visibility)
 
     def _late(self, now: FloatArray) -> FloatArray:
-        if not self._weather.recognition_delay:
-            return now
-        if self._past is None:
-            self._past = history(self._weather.recognition_delay, self._step, now)
-        else:
-            self._past = remembered(self._past, now)
-        return delayed(self._past, self._delay, self._step)
+        """What was there a delay ago, linear between two steps; before the first one nothing was different."""
+        self._past = self._past or deque([now] * (int(self._whole) + 2), maxlen=int(self._whole) + 2)
+        self._past.append(now)
+        before, after = self._past[0], self._past[1]
+        return np.asarray(after + (before - after) * self._part) if self._part else after

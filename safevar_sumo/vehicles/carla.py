@@ -25,6 +25,7 @@ TORQUE_IDLE, TORQUE_PEAK, TORQUE_END = 400.0, 500.0, 400.0  # N m
 PEAK_AT, END_AT = 1890 / 5800, 5730 / 5800  # of the maximum speed; the falling line goes on to it
 GEAR_RATIOS = np.array([0.0, 2.85, 2.02, 1.35, 1.0])  # neutral first; blueprint of the LincolnMkz2017
 FINAL_RATIO = 4.0
+OVERALL_RATIOS = GEAR_RATIOS * FINAL_RATIO
 SHIFT_UP, SHIFT_DOWN = 0.65, 0.5  # of max_rpm
 AUTOBOX_LATENCY = 2.0  # s, least time between two switches of the automatic gearbox; PxVehicleAutoBoxData
 WHEELS = 4
@@ -57,6 +58,8 @@ class _Prepared(NamedTuple):
     shift_time: FloatArray
     air_drag: FloatArray
     assumed_height: FloatArray
+    slip_offset: FloatArray
+    nothing: FloatArray
 
 
 class CarlaState(NamedTuple):
@@ -122,7 +125,8 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             clutch=c["clutchStrength"], engine_limit=c["max_rpm"] * RPM, damping_full=c["dampRateFullT"],
             damping_engaged=c["dampRateZeroT_CE"], damping_neutral=c["dampRateZeroT_CD"], shift_time=c["gearSwitchTime"],
             air_drag=0.5 * AIR_DENSITY * FRONTAL_AREA * c["dragCoeff"],
-            assumed_height=self.camera_height / (self.camera_height + (radius - self.camera_design_radius)))
+            assumed_height=self.camera_height / (self.camera_height + (radius - self.camera_design_radius)),
+            slip_offset=np.full_like(radius, self.slip_offset), nothing=np.zeros_like(radius))
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
@@ -167,29 +171,35 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         The force F is explicit. It ends the slip within a step at most, and never reverses it: so it cannot ring.
         """
         step = p.step / TYRE_STEPS
-        in_gear = s.gear > 0
-        closed = np.where(in_gear, p.damping_engaged, p.damping_neutral)
-        clutch = np.where(in_gear, p.clutch, 0.0)
-        ratio = GEAR_RATIOS[s.gear.astype(np.intp)] * FINAL_RATIO
+        gear = s.gear.astype(np.intp)
+        in_gear = gear > 0
+        ratio = OVERALL_RATIOS[gear]
+        clutch = p.clutch * in_gear
         through_clutch = ratio * clutch
+        closed = np.where(in_gear, p.damping_engaged, p.damping_neutral)
         engine = ENGINE_INERTIA / step + closed + (p.damping_full - closed) * s.throttle + clutch
         wheel = p.wheel_inertia / step + p.wheel_damping + through_clutch * ratio * (1 - clutch / engine)
-        torque, braking = s.throttle * self._torque(p, s), s.brake * p.brake_torque
-        drag = p.air_drag * s.speed * s.speed
-        by_force = step / p.mass
-        slip_by_force = p.radius * p.radius / wheel + by_force
+        # What a step makes of each speed (that of a wheel at its rim), of torques and of the tyres' force:
+        engine_keeps, engine_gains = ENGINE_INERTIA / step / engine, s.throttle * self._torque(p, s) / engine
+        rim_by_torque = p.radius / wheel
+        rim_keeps, rim_by_engine = p.wheel_inertia / step / wheel, through_clutch * rim_by_torque
+        rim_loses = s.brake * p.brake_torque * rim_by_torque
+        rim_by_force, speed_by_force = p.radius * rim_by_torque, step / p.mass
+        speed_loses = speed_by_force * p.air_drag * s.speed * s.speed
+        slip_by_force = rim_by_force + speed_by_force
+        engine_by_rim = through_clutch / (engine * p.radius)
 
-        speed, wheel_speed, engine_speed = s.speed, s.wheel_speed, s.engine_speed
+        speed, rim, engine_speed = s.speed, p.radius * s.wheel_speed, s.engine_speed
         for _ in range(TYRE_STEPS):
-            engine_free = (ENGINE_INERTIA / step * engine_speed + torque) / engine
-            push = p.wheel_inertia / step * wheel_speed + through_clutch * engine_free - braking
-            ends_slip = (p.radius * push / wheel - speed) / slip_by_force
-            force = self._tyre_force(p, speed, p.radius * wheel_speed)
-            force = np.minimum(np.maximum(force, np.minimum(ends_slip, 0.0)), np.maximum(ends_slip, 0.0))
-            wheel_speed = np.maximum(push - p.radius * force, 0.0) / wheel
-            engine_speed = np.minimum(engine_free + through_clutch / engine * wheel_speed, p.engine_limit)
-            speed = np.maximum(speed + by_force * (force - drag), 0.0)
-        return s._replace(speed=speed, wheel_speed=wheel_speed, engine_speed=engine_speed)
+            engine_free = engine_keeps * engine_speed + engine_gains
+            rim_free = rim_keeps * rim + rim_by_engine * engine_free - rim_loses
+            ends_slip = (rim_free - speed) / slip_by_force
+            force = self._tyre_force(p, speed, rim)
+            force = np.minimum(np.maximum(force, np.minimum(ends_slip, p.nothing)), np.maximum(ends_slip, p.nothing))
+            rim = np.maximum(rim_free - rim_by_force * force, p.nothing)
+            engine_speed = np.minimum(engine_free + engine_by_rim * rim, p.engine_limit)
+            speed = np.maximum(speed + speed_by_force * force - speed_loses, p.nothing)
+        return s._replace(speed=speed, wheel_speed=rim / p.radius, engine_speed=engine_speed)
 
     def _tyre_force(self, p: _Prepared, speed: FloatArray, rim: FloatArray) -> FloatArray:
         """Force of the tyres along the way [N] (`PxVehicleComputeTireForceDefault` without lateral slip).
@@ -197,9 +207,9 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         With slip = (rim - speed) / (max(rim, speed) + offset) and K = C |slip| / (mu load):
         F = mu load (K - K^2 / 3 + K^3 / 27) = mu load (1 - (1 - K / 3)^3) up to K = 3, mu load beyond.
         """
-        slides = rim - speed
-        left = np.maximum(1 - p.slip_stiffness * np.abs(slides) / (np.maximum(rim, speed) + self.slip_offset), 0.0)
-        return np.asarray(np.copysign(p.grip * (1 - left * left * left), slides))
+        slides, relative_to = rim - speed, np.maximum(rim, speed) + p.slip_offset
+        left = np.maximum(relative_to - p.slip_stiffness * np.abs(slides), p.nothing) / relative_to
+        return np.asarray(np.copysign(p.grip - p.grip * left * left * left, slides))
 
     def _torque(self, p: _Prepared, s: CarlaState) -> FloatArray:
         """Engine torque at full throttle [N m]: linear between the points of the curve, zero above its end."""

@@ -15,7 +15,7 @@ TIMES = np.arange(12) * STEP
 
 def observed(delay: float) -> tuple[np.ndarray, np.ndarray]:
     """Own speeds and (gap, closing speed, lateral, lateral speed) as seen over time, of one vehicle whose scene changes steadily."""
-    perception = Perception(Weather(name="any", road_friction=1.0, visibility=0.7, recognition_delay=delay), 1, STEP)
+    perception = Perception(Weather(name="any", road_friction=1.0, visibility=0.7, recognition_delay=delay), STEP)
     seen = []
     for time in TIMES:
         scene = Scene(np.array([20 - 5 * time]), np.array([-3 + 2 * time]), np.array([2 + time]), np.zeros(1, dtype=bool))
