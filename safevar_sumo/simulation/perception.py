@@ -10,13 +10,15 @@ from safevar_sumo.records import FloatArray, Observation
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather
 
+STEP_DECIMALS = 6  # of a delay in steps: a whole number of steps is whole
+
 
 class Perception:
     """Observations of N vehicles, one step after the other."""
 
     def __init__(self, weather: Weather, step: float) -> None:
         self._visibility = weather.visibility
-        self._whole, self._part = divmod(weather.recognition_delay / step, 1)
+        self._whole, self._part = divmod(round(weather.recognition_delay / step, STEP_DECIMALS), 1)
         self._past: deque[FloatArray] = deque()
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
@@ -29,4 +31,8 @@ class Perception:
         self._past = self._past or deque([now] * (int(self._whole) + 2), maxlen=int(self._whole) + 2)
         self._past.append(now)
         before, after = self._past[0], self._past[1]
-        return np.asarray(after + (before - after) * self._part) if self._part else after
+        if not self._part:
+            return after
+        with np.errstate(invalid="ignore"):  # what appears or vanishes between the two is still as it was
+            between = after + (before - after) * self._part
+        return np.where(np.isfinite(between), between, before)

@@ -30,4 +30,14 @@ def test_the_scene_is_seen_late_and_the_own_speed_at_once(delay: float) -> None:
     speed, scene = observed(delay)
     then = np.maximum(TIMES - delay, 0.0)
     assert speed == pytest.approx(5 + TIMES)
+    if delay in (0.05, 0.15):
+        assert np.array_equal(scene[4:], observed(0.0)[1][4 - round(delay / STEP):-round(delay / STEP)]), "whole steps are exact"
     assert scene == pytest.approx(np.stack([20 - 5 * then, 5 + then, -3 + 2 * then, 2 + then], axis=1))
+
+
+def test_what_appears_between_two_steps_is_not_there_yet() -> None:
+    perception = Perception(Weather(name="any", road_friction=1.0, visibility=1.0, recognition_delay=0.03), STEP)
+    nothing = np.zeros(1)
+    gaps = [perception.observe(time, nothing, Scene(np.array([gap]), nothing, nothing, nothing > 0)).gap[0]
+            for time, gap in zip(TIMES.tolist(), [np.inf, np.inf, 5.0, 4.0], strict=False)]
+    assert gaps == pytest.approx([np.inf, np.inf, np.inf, 4.6])
