@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from hashlib import sha256
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
@@ -17,10 +16,11 @@ import numpy as np
 
 from safevar_sumo.analysis import Agreement, ReferenceData, agreement
 from safevar_sumo.computing import PersistentPool, Pool, packed
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.scenarios import weather_of
+from safevar_sumo.simulation import models_of
 from safevar_sumo.study import Study, invalid
 from safevar_sumo.validation import BATCH, evaluate_all
 from safevar_sumo.vehicles import CharacteristicSet
@@ -51,7 +51,7 @@ class Calibration(NamedTuple):
 
 
 def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool, trials: int, seed: int,
-              done: Callable[[float], None] = lambda best: None) -> Calibration:
+              done: Callable[[float, Study], None] = lambda cost, best: None) -> Calibration:
     """Fit by CMA-ES (Hansen 2016), which starts from the study's own values.
 
     Parameters
@@ -61,12 +61,14 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
     trials
         How many sets of parameters are tried.
     done
-        Is called after every trial with the lowest cost so far.
+        Is called after every trial with the lowest cost so far, and the study that has it.
 
     Raises
     ------
     InputError
         If the study declares nothing to fit, or something that cannot be, or has nothing to fit it to.
+    SimulationError
+        If the study cannot be simulated with its own values.
     """
     parameters = study.calibration
     if not parameters:
@@ -83,11 +85,15 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
         row = parameters[name]
         if not row.lower <= value <= row.upper:
             raise InputError(f"study {study.name!r}", f"{name} = {value}", f"a value in its bounds, [{row.lower:g}, {row.upper:g}]")
+        for side in ("lower", "upper"):
+            _check_bound(study, name, side, getattr(row, side))
     lower, upper = np.array([(row.lower, row.upper) for row in parameters.values()]).T
     strategy = cma.CMAEvolutionStrategy(np.clip((first - lower) / (upper - lower), 0, 1), SPREAD, {
         "bounds": [0, 1], "seed": seed + 1, "verbose": -9, "popsize": POPULATION})
     best, cost = first, trial.costs(first[np.newaxis])[0]
-    done(cost)
+    if cost >= LOST:
+        raise SimulationError(f"study {study.name!r} cannot be simulated with its own values")
+    done(cost, study)
     for start in range(1, trials, strategy.popsize):
         shares = strategy.ask()
         candidates = lower + np.array(shares)[:trials - start] * (upper - lower)
@@ -95,13 +101,22 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
         for candidate, its_cost in zip(candidates, costs, strict=True):
             if its_cost < cost:
                 best, cost = candidate, its_cost
-            done(cost)
+            done(cost, with_values(study, dict(zip(names, best.tolist(), strict=True))))
         if len(costs) == len(shares):
             strategy.tell(shares, costs)
     values = dict(zip(names, best.tolist(), strict=True))
     fitted = with_values(study, values)
     return Calibration(values, fitted, cost, _told(fitted, halves, pool),
                        _told(fitted, {name: _half(data, 1) for name, data in references.items()}, pool))
+
+
+def _check_bound(study: Study, name: str, side: str, bound: float) -> None:
+    """A search goes as far as its bounds: the models must take them."""
+    try:
+        models_of(with_values(study, {name: bound}), name)
+    except InputError as error:
+        legal = error.legal or error.problem
+        raise InputError(f"study {study.name!r}", f"calibration.{name!r}.{side} = {bound:g}", legal) from None
 
 
 def with_values(study: Study, values: Mapping[str, float]) -> Study:
@@ -157,9 +172,14 @@ def _half(data: ReferenceData, first: int) -> ReferenceData:
     return ReferenceData(data.settings[first::2], metrics, data.skipped)
 
 
-def calibration_comment(found: Calibration, study: Study, references: Sequence[Path], trials: int, seed: int) -> str:
+def data_lines(references: Mapping[str, ReferenceData], contents: Mapping[str, bytes]) -> list[str]:
+    """Which data a calibration used: name, fingerprint of the file's bytes, and rows that were left out."""
+    return [f"  {name}, SHA-256 {sha256(contents[name]).hexdigest()}"
+            + (f", without {data.skipped} rows outside the domains" if data.skipped else "") for name, data in references.items()]
+
+
+def calibration_comment(found: Calibration, study: Study, data: Sequence[str], trials: int, seed: int) -> str:
     """How the values of a calibrated study were found: for the head of its file."""
-    data = [f"  {path.name}, SHA-256 {sha256(path.read_bytes()).hexdigest()}" for path in references]
     halves = [
         f"  {name}: rho of the safety degree {_rho(found.used[name])} on the used half, {_rho(found.held_back[name])} on the other"
         for name in found.used]

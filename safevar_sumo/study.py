@@ -228,14 +228,15 @@ def write_study(path: Path, study: Study, comment: str) -> None:
         If the file cannot be written.
     """
     tables = {name: value for name, value in _without_nothing(msgspec.to_builtins(study)).items() if value != {}}
-    text = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines()) + "\n" + tomli_w.dumps(tables)
+    printable = ("".join(character if character.isprintable() else "?" for character in line) for line in comment.splitlines())
+    text = "".join(f"# {line}".rstrip() + "\n" for line in printable) + "\n" + tomli_w.dumps(tables)
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError("--out", f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
 
 
-def check_writable(path: Path) -> None:
+def check_writable(path: Path, flag: str = "--out") -> None:
     """Refuse a file that cannot be written before the work whose result it is to take.
 
     Raises
@@ -250,7 +251,7 @@ def check_writable(path: Path) -> None:
         if is_new:
             path.unlink()
     except OSError as error:
-        raise InputError("--out", f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
+        raise InputError(flag, f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
 
 
 def _without_nothing(raw: Any) -> Any:

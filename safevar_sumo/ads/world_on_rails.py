@@ -35,15 +35,14 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     first_command
         Time from the run's start to the first throttle [s].
     latency
-        Time from an image to its command [s], in whole steps.
+        Time from an image to its command [s], rounded to whole steps.
     corridor
         Half the width of what it watches: it brakes for nobody beyond, and releases the brake when he leaves it [m].
     brake_gap, brake_gap_per_speed
-        It brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s], times the visibility, for somebody at
-        `brake_place`.
+        It brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s] for somebody at `brake_place`.
     brake_place, brake_gap_before, brake_gap_past
         For every metre that he is short of that lateral place, or past it, the gap shrinks by as much [m, -, -]: whoever
-        is about to enter the way, or to leave it, is braked for later.
+        is about to enter the way, or to leave it, is braked for later. The visibility is a factor on what is left.
     throttle
         Throttle at the policy's speed levels 0, 2.7 and 5.3 m/s.
     """

@@ -6,6 +6,7 @@ in most files, `Dece`. There is no run column.
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 from typing import NamedTuple
 
@@ -83,14 +84,21 @@ def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> 
 def _table(path: Path) -> pd.DataFrame:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
+            header = [name.strip() for name in next(csv.reader(file), [])]
+            file.seek(0)
             table = pd.read_csv(file, dtype=str, skipinitialspace=True, index_col=False)
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror or error}", "a CSV file") from None
     except pd.errors.EmptyDataError:
         raise InputError(path, "is empty", "a CSV file with a header and rows") from None
-    except (pd.errors.ParserError, UnicodeDecodeError) as error:
+    except (pd.errors.ParserError, csv.Error, UnicodeDecodeError) as error:
         raise InputError(path, f"is not CSV: {str(error).splitlines()[0]}", "a CSV file with a header and rows") from None
     table.columns = table.columns.str.strip()
+    twice = [name for name in header if header.count(name) > 1]
+    if twice:
+        raise InputError(path, f"has the column {twice[0]!r} twice", "one column of a name")
+    if len(header) == 1:
+        raise InputError(path, f"has one column, {header[0][:40]!r}", "values that are separated by commas")
     if table.empty:
         raise InputError(path, "has no rows", "a CSV file with a header and rows")
     return table

@@ -10,14 +10,16 @@ import numpy as np
 from rich.console import Console
 
 from safevar_sumo import terminal
-from safevar_sumo.analysis import agreement, plot_agreement, read_reference
-from safevar_sumo.calibration import calibrate, calibration_comment
+from safevar_sumo.analysis import ReferenceData, agreement, plot_agreement, read_reference
+from safevar_sumo.calibration import calibrate, calibration_comment, data_lines
 from safevar_sumo.cli.program import commands
 from safevar_sumo.computing import available_cores, local_pool
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.records import Evaluations
 from safevar_sumo.simulation import assemble
-from safevar_sumo.study import check_writable, load_study, write_study
+from safevar_sumo.study import Study, check_writable, load_study, write_study
 from safevar_sumo.validation import evaluate_all
+from safevar_sumo.vehicles import CharacteristicSet
 
 PICTURES = (".png", ".pdf", ".svg")
 
@@ -32,16 +34,18 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     """Compare STUDY with settings and metrics in the published package's CSV format."""
     chosen = load_study(study)
     system = assemble(chosen, study)
-    if plot is not None and plot.suffix not in PICTURES:
-        raise InputError("--plot", str(plot), f"a file that ends in {', '.join(PICTURES)}")
-    data = read_reference(reference, system.characteristics)
-    if data.skipped:
-        click.echo(f"warning: {reference}: {data.skipped} rows with values outside the domains are left out", err=True)
+    if plot is not None:
+        if plot.suffix.lower() not in PICTURES:
+            raise InputError("--plot", str(plot), f"a file that ends in {', '.join(PICTURES)}")
+        check_writable(plot, "--plot")
+    data = _read(reference, system.characteristics)
     settings = np.concatenate([system.characteristics.original[np.newaxis], data.settings])
     with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
           terminal.counted(Console(stderr=True), "settings", len(np.unique(settings, axis=0))) as done):
         evaluations = evaluate_all(chosen, settings, pool, done)
-    here = evaluations.take(np.arange(1, len(settings)))
+    data, here = _simulated(reference, data, evaluations.take(np.arange(1, len(settings))))
+    if not evaluations.valid[0]:
+        raise SimulationError(f"study {study!r} cannot be simulated with the original vehicle")
     result = agreement(data, here, chosen.published, evaluations.take([0]))
     if plot is not None:
         plot_agreement(plot, f"{chosen.title}\nagainst {reference.name}", system.characteristics, data, here)
@@ -55,7 +59,7 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
 @click.argument("study")
 @click.argument("references", type=click.Path(path_type=Path), nargs=-1, metavar="[REFERENCE.csv]...")
 @click.option("--trials", type=click.IntRange(min=1), default=400, show_default=True, help="How many sets of parameters are tried.")
-@click.option("--seed", type=click.IntRange(min=0, max=2**63 - 1), default=1, show_default=True, help="Seed of the search.")
+@click.option("--seed", type=click.IntRange(min=0, max=2**32 - 2), default=1, show_default=True, help="Seed of the search.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE.toml", help="Study file to write.  [default: STUDY-calibrated.toml]")
 def calibrate_command(study: str, references: tuple[Path, ...], trials: int, seed: int, jobs: int | None, out: Path | None) -> None:
@@ -63,13 +67,47 @@ def calibrate_command(study: str, references: tuple[Path, ...], trials: int, see
     chosen = load_study(study)
     system = assemble(chosen, study)
     target = out or Path(f"{chosen.name}-calibrated.toml")
+    for taken in (Path(study), *references):
+        if target.exists() and taken.exists() and target.samefile(taken):
+            raise InputError("--out", f"{target} is what the calibration starts from", "another file")
     check_writable(target)
     if len({path.name for path in references}) < len(references):
         raise InputError("REFERENCE.csv", "two files have one name", "files of different names")
-    data = {path.name: read_reference(path, system.characteristics) for path in references}
-    with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
-          terminal.trials(Console(stderr=True), trials) as done):
-        found = calibrate(chosen, data, pool, trials, seed, done)
-    write_study(target, found.study, calibration_comment(found, chosen, references, trials, seed))
+    data = {path.name: _read(path, system.characteristics) for path in references}
+    used = data_lines(data, {path.name: path.read_bytes() for path in references})
+    progress: list[tuple[float, Study]] = []
+    try:
+        with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
+              terminal.trials(Console(stderr=True), trials) as done):
+            def one_done(cost: float, best: Study) -> None:
+                progress.append((cost, best))
+                done(cost)
+
+            found = calibrate(chosen, data, pool, trials, seed, one_done)
+    except KeyboardInterrupt:
+        if progress:
+            cost, best = progress[-1]
+            write_study(target, best, f"Best of {len(progress)} of {trials} trials, then interrupted (seed {seed}). Cost {cost:.4f}.")
+            click.echo(f"interrupted: the best of {len(progress)} trials is in {target}", err=True)
+        raise
     terminal.print_calibration(Console(), chosen, found)
+    write_study(target, found.study, calibration_comment(found, chosen, used, trials, seed))
     Console().print(f"Study file: {target}", soft_wrap=True)
+
+
+def _read(path: Path, characteristics: CharacteristicSet) -> ReferenceData:
+    data = read_reference(path, characteristics)
+    if data.skipped:
+        click.echo(f"warning: {path}: {data.skipped} rows with values outside the domains are left out", err=True)
+    return data
+
+
+def _simulated(path: Path, data: ReferenceData, here: Evaluations) -> tuple[ReferenceData, Evaluations]:
+    """The rows that could be simulated."""
+    valid = here.valid
+    if not valid.any():
+        raise SimulationError(f"{path}: not one of its {len(valid)} rows could be simulated")
+    if not valid.all():
+        click.echo(f"warning: {path}: {np.count_nonzero(~valid)} rows could not be simulated and are left out", err=True)
+    metrics = {name: values[valid] for name, values in data.metrics.items()}
+    return data._replace(settings=data.settings[valid], metrics=metrics), here.take(valid)

@@ -15,6 +15,7 @@ import msgspec
 
 from safevar_sumo.ads import ADS, Ads, Checked, PerVehicle, ScalarAds
 from safevar_sumo.errors import InputError, SafevarError, one_of, told
+from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import SCENARIOS, Scenario, weather_of
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, invalid
@@ -43,17 +44,21 @@ def assemble(study: Study, source: str = "") -> System:
         Naming the study, the key, the value and what is legal.
     """
     source = source or f"study {study.name!r}"
-    vehicle = _model(VEHICLES, study.vehicle, "vehicle", source)
+    vehicle, ads, scenario, weather = models_of(study, source)
     _check_units(study, vehicle, source)
+    for name in study.published:
+        if name not in METRICS:
+            raise InputError(source, f"published.{name} is no metric", one_of(METRICS))
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     return System(
-        characteristics=characteristics,
-        vehicle=vehicle,
-        ads=_ads(study.ads, source),
-        scenario=_model(SCENARIOS, study.scenario, "scenario", source),
-        weather=weather_of(study.weather, source),
-        metrics=study.metrics,
+        characteristics=characteristics, vehicle=vehicle, ads=ads, scenario=scenario, weather=weather, metrics=study.metrics,
         nominal=calibration_drive(vehicle, characteristics))
+
+
+def models_of(study: Study, source: str) -> tuple[Any, Ads, Scenario, Weather]:
+    """The study's models with their parameters; raises as `assemble`."""
+    return (_model(VEHICLES, study.vehicle, "vehicle", source), _ads(study.ads, source),
+            _model(SCENARIOS, study.scenario, "scenario", source), weather_of(study.weather, source))
 
 
 def _check_units(study: Study, vehicle: Vehicle, source: str) -> None:

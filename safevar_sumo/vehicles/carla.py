@@ -109,8 +109,8 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     throttle_fall: Positive = 10.0
     brake_rise: Positive = 6.0
     brake_fall: Positive = 10.0
-    camera_height: Positive
-    camera_design_radius: Positive = 0.355
+    camera_height: Annotated[float, Meta(ge=0.1, le=10)]
+    camera_design_radius: Annotated[float, Meta(ge=0.1, le=1)] = 0.355
 
     def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> _Prepared:
         c = characteristics

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from click.testing import CliRunner
 from test_commands import refused, run
 
+from safevar_sumo.calibration import with_values
+from safevar_sumo.cli import reference
+from safevar_sumo.cli.program import commands
 from safevar_sumo.simulation import assemble, evaluate
-from safevar_sumo.study import load_study
+from safevar_sumo.study import Study, load_study
 
 COLUMNS = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
 
@@ -60,7 +65,11 @@ def test_validate_warns_of_rows_outside_the_domains(data: Path, in_tmp: Path) ->
 
 def test_validate_refuses_what_is_no_reference_data(in_tmp: Path) -> None:
     Path("text.csv").write_text("nothing\nhere\n")
-    refused("validate", "sun", "text.csv", told=("text.csv", "lacks the columns"))
+    refused("validate", "sun", "text.csv", told=("text.csv", "has one column, 'nothing'", "commas"))
+    Path("twice.csv").write_text("mass,SaftyDegree,mass\n2404,2.7,2000\n")
+    refused("validate", "sun", "twice.csv", told=("twice.csv", "'mass' twice"))
+    Path("few.csv").write_text("mass,SaftyDegree\n2404,2.7\n")
+    refused("validate", "sun", "few.csv", told=("few.csv", "lacks the columns"))
     refused("validate", "sun", "nowhere.csv", told=("nowhere.csv", "cannot be read"))
 
 
@@ -98,6 +107,43 @@ def test_calibrate_touches_nothing_but_parameters(key: str, told: tuple[str, ...
     Path("mine.toml").write_text(
         f'extends = "sun"\nname = "mine"\n[calibration]\n"{key}" = {{ lower = 1, upper = 2, unit = "-", meaning = "none" }}\n')
     refused("calibrate", "mine.toml", "--trials", "1", "--out", "x.toml", told=told)
+
+
+@pytest.mark.parametrize(("key", "lower", "upper", "told"), [
+    ("weather.road_friction", -3, 3, ("weather.road_friction", "lower = -3", "> 0")),
+    ("weather.road_friction", 0.5, 3, ("weather.road_friction", "upper = 3", "<= 1.5")),
+    ("vehicle.parameters.camera_height", 0.01, 3, ("camera_height", "lower = 0.01", ">= 0.1")),
+])
+def test_calibrate_refuses_bounds_that_the_models_do_not_take(key: str, lower: float, upper: float, told: tuple[str, ...],
+                                                              in_tmp: Path) -> None:
+    Path("mine.toml").write_text(f'extends = "sun"\nname = "mine"\n[calibration]\n'
+                                 f'"{key}" = {{ lower = {lower}, upper = {upper}, unit = "-", meaning = "none" }}\n')
+    refused("calibrate", "mine.toml", "--trials", "13", "--out", "x.toml", told=told)
+
+
+def test_calibrate_does_not_write_over_what_it_starts_from(data: Path, in_tmp: Path) -> None:
+    refused("calibrate", "sun", str(data), "--trials", "1", "--out", str(data), told=("--out", data.name))
+    assert data.read_text().startswith("max_rpm")
+
+
+def test_settings_that_cannot_be_simulated_are_told(data: Path, in_tmp: Path) -> None:
+    Path("hasty.toml").write_text('extends = "sun"\nname = "hasty"\n[search]\ntime_limit = 0.001\n')
+    pd.read_csv(data).head(1).to_csv("one.csv", index=False)
+    assert "not one of its 1 rows could be simulated" in run("validate", "hasty.toml", "one.csv", expect=1).stderr
+    assert "cannot be simulated with its own values" in run("calibrate", "hasty.toml", "one.csv", "--trials", "1", expect=1).stderr
+
+
+def test_an_interrupted_calibration_leaves_the_best_so_far(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(study: Study, references: object, pool: object, trials: int, seed: int,
+                    done: Callable[[float, Study], None]) -> None:
+        done(2.0, study)
+        done(1.0, with_values(study, {"ads.parameters.brake_gap": 5.5}))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(reference, "calibrate", interrupted)
+    CliRunner().invoke(commands, ["calibrate", "sun", "--trials", "9", "--out", "best.toml"])
+    assert "Best of 2 of 9 trials" in Path("best.toml").read_text()
+    assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
 
 
 def test_calibrate_keeps_what_it_found_whatever_the_data(data: Path, in_tmp: Path) -> None:
