@@ -46,7 +46,7 @@ def test_sumo_reports_a_collision_just_where_bodies_overlap(study: str) -> None:
 
 def test_sumo_reports_who_hardly_touches_a_pedestrian_with_a_corner() -> None:
     """It cuts the corners off some shapes of vehicles (`guiShape`); the network's must not be one of them."""
-    _, run = driven("sun", 1500, brakes_until=4.0)
+    _, run = driven("sun", 800, brakes_until=4.0)
     hit = np.flatnonzero(run.outcome == Outcome.COLLISION)
     last = [np.flatnonzero(run.trace.active[:, vehicle])[-1] for vehicle in hit]
     assert np.any((np.abs(run.trace.lateral[last, hit]) > 0.9) & (run.trace.gap[last, hit] > -0.2))
