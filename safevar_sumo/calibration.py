@@ -90,21 +90,21 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
     lower, upper = np.array([(row.lower, row.upper) for row in parameters.values()]).T
     strategy = cma.CMAEvolutionStrategy(np.clip((first - lower) / (upper - lower), 0, 1), SPREAD, {
         "bounds": [0, 1], "seed": seed + 1, "verbose": -9, "popsize": POPULATION})
-    best, cost = first, trial.costs(first[np.newaxis])[0]
+    best, cost = study, trial.costs(first[np.newaxis])[0]
     if cost >= LOST:
         raise SimulationError(f"study {study.name!r} cannot be simulated with its own values")
-    done(cost, study)
+    done(cost, best)
     for start in range(1, trials, strategy.popsize):
         shares = strategy.ask()
         candidates = lower + np.array(shares)[:trials - start] * (upper - lower)
         costs = trial.costs(candidates)
         for candidate, its_cost in zip(candidates, costs, strict=True):
             if its_cost < cost:
-                best, cost = candidate, its_cost
-            done(cost, with_values(study, dict(zip(names, best.tolist(), strict=True))))
+                best, cost = with_values(study, dict(zip(names, candidate.tolist(), strict=True))), its_cost
+            done(cost, best)
         if len(costs) == len(shares):
             strategy.tell(shares, costs)
-    values = dict(zip(names, best.tolist(), strict=True))
+    values = {name: _value(best, name) for name in names}
     fitted = with_values(study, values)
     return Calibration(values, fitted, cost, _told(fitted, halves, pool),
                        _told(fitted, {name: _half(data, 1) for name, data in references.items()}, pool))

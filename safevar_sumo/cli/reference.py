@@ -75,20 +75,20 @@ def calibrate_command(study: str, references: tuple[Path, ...], trials: int, see
         raise InputError("REFERENCE.csv", "two files have one name", "files of different names")
     data = {path.name: _read(path, system.characteristics) for path in references}
     used = data_lines(data, {path.name: path.read_bytes() for path in references})
-    progress: list[tuple[float, Study]] = []
+    tried, lowest, best = 0, np.inf, chosen
     try:
         with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
               terminal.trials(Console(stderr=True), trials) as done):
-            def one_done(cost: float, best: Study) -> None:
-                progress.append((cost, best))
+            def one_done(cost: float, so_far: Study) -> None:
+                nonlocal tried, lowest, best
+                tried, lowest, best = tried + 1, cost, so_far
                 done(cost)
 
             found = calibrate(chosen, data, pool, trials, seed, one_done)
     except KeyboardInterrupt:
-        if progress:
-            cost, best = progress[-1]
-            write_study(target, best, f"Best of {len(progress)} of {trials} trials, then interrupted (seed {seed}). Cost {cost:.4f}.")
-            click.echo(f"interrupted: the best of {len(progress)} trials is in {target}", err=True)
+        if tried:
+            write_study(target, best, f"Best of {tried} of {trials} trials, then interrupted (seed {seed}). Cost {lowest:.4f}.")
+            click.echo(f"interrupted: the best of {tried} trials is in {target}", err=True)
         raise
     terminal.print_calibration(Console(), chosen, found)
     write_study(target, found.study, calibration_comment(found, chosen, used, trials, seed))

@@ -39,7 +39,7 @@ TYRE_STEPS = 3  # in a substep; what PhysX takes below 5 m/s (setSubStepCount), 
 
 
 class _Prepared(NamedTuple):
-    """Constants of a run, SI, shape (N,)."""
+    """Constants of a run, SI; arrays of shape (N,)."""
 
     substeps: int
     step: float
@@ -130,12 +130,12 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
-        drive = self.engine_torque * TORQUE_PEAK * (GEAR_RATIOS[1] * FINAL_RATIO) / p.radius
+        drive = self.engine_torque * TORQUE_PEAK * OVERALL_RATIOS[1] / p.radius
         return SumoType(
             mass=p.mass,
             accel=np.minimum(drive, p.grip) / p.mass,
             decel=np.minimum(p.brake_torque / p.radius, p.grip) / p.mass,
-            max_speed=p.engine_limit / (GEAR_RATIOS[-1] * FINAL_RATIO) * p.radius,
+            max_speed=p.engine_limit / OVERALL_RATIOS[-1] * p.radius,
             tau=np.full_like(p.mass, p.step * p.substeps + 1 / self.brake_rise))
 
     def at_rest(self, prepared: _Prepared) -> CarlaState:
