@@ -6,13 +6,11 @@ from pathlib import Path
 
 import click
 
-from safevar_sumo.analysis import QUESTIONS, answer, draw_all, evaluations_of, load_settings, original_metrics, read_reference
+from safevar_sumo.analysis import QUESTIONS, answer, draw_all, load_settings
 from safevar_sumo.analysis.figures import FORMATS as PICTURES
 from safevar_sumo.analysis.tables import ENDINGS, FORMATS
 from safevar_sumo.cli.program import commands
-from safevar_sumo.results import make_directory, write_imported, write_whole
-from safevar_sumo.study import load_study
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.results import make_directory, write_whole
 
 WITHOUT_NOTES = ("csv", "json")
 """Formats that hold the numbers alone; the notes go to the standard error."""
@@ -51,30 +49,6 @@ def figures(directories: tuple[str, ...], out: Path, kind: str) -> None:
     _warn([*(remark for setting in settings for remark in setting.remarks), *lacking])
     for path in written:
         click.echo(str(path))
-
-
-@commands.command(name="import")
-@click.argument("study")
-@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory of the results.")
-@click.option("--nsga2", type=click.Path(path_type=Path), required=True, metavar="FILE.csv", help="Solutions of NSGA-II.")
-@click.option("--rs", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of random search.")
-@click.option("--safe-fuzzer", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of SafeFuzzer.")
-@click.option("--original", metavar="sd=2.7,tet=1.2,tit=0.44,ave_dece=5.97",
-              help="The original vehicle's metrics.  [default: those published for STUDY]")
-def import_command(study: str, out: Path, original: str | None, **given: Path | None) -> None:
-    """Make results of STUDY from solutions in the published package's CSV format."""
-    chosen = load_study(study)
-    files = {algorithm: path for algorithm, path in given.items() if path is not None}
-    metrics = original_metrics(original, chosen.published)
-    characteristics = CharacteristicSet.of(chosen.vehicle.characteristics)
-    solutions = {}
-    for algorithm, path in files.items():
-        data = read_reference(path, characteristics)
-        if data.skipped:
-            _warn([f"{path}: {data.skipped} rows with values outside the domains are left out"])
-        solutions[algorithm] = evaluations_of(data, characteristics)
-    write_imported(out, chosen, solutions, metrics, {algorithm: path.name for algorithm, path in files.items()})
-    click.echo(f"Results: {out}, {', '.join(f'{len(found)} solutions of {name}' for name, found in solutions.items())}")
 
 
 def _warn(messages: list[str]) -> None:

@@ -10,15 +10,24 @@ import numpy as np
 from rich.console import Console
 
 from safevar_sumo import terminal
-from safevar_sumo.analysis import ReferenceData, agreement, plot_agreement, read_reference
-from safevar_sumo.calibration import calibrate, calibration_comment, data_lines
 from safevar_sumo.cli.program import commands
-from safevar_sumo.computing import available_cores, local_pool
+from safevar_sumo.computing import available_cores, evaluate_all, local_pool
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import Evaluations
+from safevar_sumo.reference import (
+    ReferenceData,
+    agreement,
+    calibrate,
+    calibration_comment,
+    data_lines,
+    evaluations_of,
+    original_metrics,
+    plot_agreement,
+    read_reference,
+)
+from safevar_sumo.results import write_imported
 from safevar_sumo.simulation import assemble
 from safevar_sumo.study import Study, check_writable, load_study, write_study
-from safevar_sumo.validation import evaluate_all
 from safevar_sumo.vehicles import CharacteristicSet
 
 PICTURES = (".png", ".pdf", ".svg")
@@ -93,6 +102,27 @@ def calibrate_command(study: str, references: tuple[Path, ...], trials: int, see
     terminal.print_calibration(Console(), chosen, found)
     write_study(target, found.study, calibration_comment(found, chosen, used, trials, seed))
     Console().print(f"Study file: {target}", soft_wrap=True)
+
+
+@commands.command(name="import")
+@click.argument("study")
+@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory of the results.")
+@click.option("--nsga2", type=click.Path(path_type=Path), required=True, metavar="FILE.csv", help="Solutions of NSGA-II.")
+@click.option("--rs", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of random search.")
+@click.option("--safe-fuzzer", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of SafeFuzzer.")
+@click.option("--original", metavar="sd=2.7,tet=1.2,tit=0.44,ave_dece=5.97",
+              help="The original vehicle's metrics.  [default: those published for STUDY]")
+def import_command(study: str, out: Path, original: str | None, **given: Path | None) -> None:
+    """Make results of STUDY from solutions in the published package's CSV format."""
+    chosen = load_study(study)
+    files = {algorithm: path for algorithm, path in given.items() if path is not None}
+    metrics = original_metrics(original, chosen.published)
+    characteristics = CharacteristicSet.of(chosen.vehicle.characteristics)
+    solutions = {}
+    for algorithm, path in files.items():
+        solutions[algorithm] = evaluations_of(_read(path, characteristics), characteristics)
+    write_imported(out, chosen, solutions, metrics, {algorithm: path.name for algorithm, path in files.items()})
+    click.echo(f"Results: {out}, {', '.join(f'{len(found)} solutions of {name}' for name, found in solutions.items())}")
 
 
 def _read(path: Path, characteristics: CharacteristicSet) -> ReferenceData:

@@ -6,8 +6,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from safevar_sumo.analysis import Agreement
-from safevar_sumo.calibration import Calibration
+from safevar_sumo.reference import Agreement, Calibration
 from safevar_sumo.study import Study
 from safevar_sumo.terminal.heads import METRIC_HEADS
 

@@ -13,9 +13,9 @@ import pytest
 from click.testing import CliRunner
 from test_commands import refused, run
 
-from safevar_sumo.calibration import with_values
 from safevar_sumo.cli import reference
 from safevar_sumo.cli.program import commands
+from safevar_sumo.reference import with_values
 from safevar_sumo.simulation import assemble, evaluate
 from safevar_sumo.study import Study, load_study
 

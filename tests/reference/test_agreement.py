@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis import ReferenceData, agreement, plot_agreement
-from safevar_sumo.analysis.agreement import rank_correlation
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations
+from safevar_sumo.reference import ReferenceData, agreement, plot_agreement
+from safevar_sumo.reference.agreement import rank_correlation
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 ONE = CharacteristicSet((Characteristic(name="c", unit="kg", original=5.0, lower=1.0, upper=9.0),))

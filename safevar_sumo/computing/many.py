@@ -1,4 +1,4 @@
-"""A study held against reference data: every row simulated, then compared."""
+"""Many settings of a study evaluated by a pool, in batches."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from concurrent.futures import as_completed
 
 import numpy as np
 
-from safevar_sumo.computing import PersistentPool, Pool, packed
+from safevar_sumo.computing.base import Pool, packed
+from safevar_sumo.computing.persistent import PersistentPool
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from safevar_sumo.analysis.reference import ReferenceData
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, Outcome
+from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.vehicles import CharacteristicSet
 

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from safevar_sumo.analysis import package_filter, read_reference
 from safevar_sumo.errors import InputError
+from safevar_sumo.reference import package_filter, read_reference
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
 

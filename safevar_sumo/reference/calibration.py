@@ -14,15 +14,16 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.analysis import Agreement, ReferenceData, agreement
-from safevar_sumo.computing import PersistentPool, Pool, packed
+from safevar_sumo.computing import PersistentPool, Pool, evaluate_all, packed
+from safevar_sumo.computing.many import BATCH
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.reference.agreement import Agreement, agreement
+from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.simulation import models_of
 from safevar_sumo.study import Study, invalid
-from safevar_sumo.validation import BATCH, evaluate_all
 from safevar_sumo.vehicles import CharacteristicSet
 
 WEIGHTS = {"safety_degree": 1.0, "tet": 0.3, "tit": 0.3, "ave_dece": 0.5}

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from safevar_sumo.analysis.reference import ReferenceData
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
