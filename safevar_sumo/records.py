@@ -109,7 +109,7 @@ class Trace:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run:
+class Drives:
     """N simulations as they went; `outcome` holds values of `Outcome`, `collision_speed` is NaN without one [m/s]."""
 
     trace: Trace

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import pandas as pd
 
+from safevar_sumo.analysis.case import ALGORITHM_TITLES, Case, Unanswerable
 from safevar_sumo.analysis.inference import ALPHA
 from safevar_sumo.analysis.layout import METRIC_TITLES
 from safevar_sumo.analysis.rq1 import rq1
 from safevar_sumo.analysis.rq2 import rq2
-from safevar_sumo.analysis.setting import ALGORITHM_TITLES, Setting, Unanswerable
 
 
-def brief(setting: Setting) -> list[str]:
+def brief(case: Case) -> list[str]:
     """One line for each algorithm and baseline: effect sizes, and an asterisk where p says that they are no chance."""
     lines = []
     asked = ((rq1, "algorithm", "RQ1: more unsafe than the original if below 0.5 (A12)"),
              (rq2, "baseline", "RQ2: NSGA-II better than the other if above 0.5 (A12)"))
     for ask, who, title in asked:
         try:
-            frame = ask(setting)
+            frame = ask(case)
         except Unanswerable as error:
             lines.append(f"{title.partition(':')[0]}: {error.problem}.")
             continue

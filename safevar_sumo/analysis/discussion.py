@@ -9,8 +9,8 @@ from itertools import permutations
 import numpy as np
 import pandas as pd
 
+from safevar_sumo.analysis.case import Case, Unanswerable, collided
 from safevar_sumo.analysis.rq3 import ANY, changes, critical, rq32, rq33
-from safevar_sumo.analysis.setting import Setting, Unanswerable, collided
 
 COMBINED = 4
 """How many characteristics are changed in the combinations that are counted."""
@@ -18,7 +18,7 @@ SHOWN = 3
 """How many of the most frequent combinations are shown."""
 
 
-def collisions(setting: Setting) -> pd.DataFrame:
+def collisions(case: Case) -> pd.DataFrame:
     """Per algorithm how many of its solutions are collisions; columns setting, algorithm, solutions, collisions, share [fraction].
 
     Raises
@@ -26,17 +26,17 @@ def collisions(setting: Setting) -> pd.DataFrame:
     Unanswerable
         If no run is finished.
     """
-    if not setting.algorithms:
-        raise Unanswerable(setting.name, "has no finished run", "results with at least one finished run")
+    if not case.algorithms:
+        raise Unanswerable(case.name, "has no finished run", "results with at least one finished run")
     rows = []
-    for algorithm in setting.algorithms:
-        found = setting.solutions_of(algorithm)
+    for algorithm in case.algorithms:
+        found = case.solutions_of(algorithm)
         crashes = int(collided(found).sum())
-        rows.append((setting.name, algorithm, len(found), crashes, crashes / len(found) if len(found) else None))
+        rows.append((case.name, algorithm, len(found), crashes, crashes / len(found) if len(found) else None))
     return pd.DataFrame(rows, columns=["setting", "algorithm", "solutions", "collisions", "share"], dtype=object)
 
 
-def combinations(setting: Setting) -> pd.DataFrame:
+def combinations(case: Case) -> pd.DataFrame:
     """The most frequent combinations among the critical solutions with exactly four characteristics changed.
 
     Columns setting, rank (ties share the better one), characteristics (a list), percent of those solutions; no row
@@ -48,17 +48,17 @@ def combinations(setting: Setting) -> pd.DataFrame:
     Unanswerable
         As `critical`.
     """
-    changed = changes(setting, critical(setting)) != 0
+    changed = changes(case, critical(case)) != 0
     of_four = changed[np.count_nonzero(changed, axis=1) == COMBINED]
     counted = Counter(tuple(np.flatnonzero(row).tolist()) for row in of_four)
     ordered = sorted(counted.items(), key=lambda item: (-item[1], item[0]))[:SHOWN]
-    names = setting.characteristics.names
-    rows = [(setting.name, 1 + sum(other > number for other in counted.values()), [names[i] for i in members], 100 * number / len(of_four))
+    names = case.characteristics.names
+    rows = [(case.name, 1 + sum(other > number for other in counted.values()), [names[i] for i in members], 100 * number / len(of_four))
             for members, number in ordered]
     return pd.DataFrame(rows, columns=["setting", "rank", "characteristics", "percent"])
 
 
-def weather_pairs(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
+def weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
     """Settings that differ in the weather alone: the clearer one first (by friction, then sight, then delay).
 
     Raises
@@ -66,15 +66,15 @@ def weather_pairs(settings: Sequence[Setting]) -> list[tuple[Setting, Setting]]:
     Unanswerable
         If there is no such pair.
     """
-    pairs = [(one, other) for one, other in permutations(settings, 2)
+    pairs = [(one, other) for one, other in permutations(cases, 2)
              if _without_weather(one) == _without_weather(other) and _clearness(one) > _clearness(other)]
     if not pairs:
-        raise Unanswerable(", ".join(one.name for one in settings), "two settings are needed that differ in the weather alone",
+        raise Unanswerable(", ".join(one.name for one in cases), "two cases are needed that differ in the weather alone",
                            "results such as those of sun and rain")
     return pairs
 
 
-def weather(clear: Setting, wet: Setting) -> pd.DataFrame:
+def weather(clear: Case, wet: Case) -> pd.DataFrame:
     """One weather against another, characteristic by characteristic, over the critical solutions.
 
     Columns setting, other, characteristic, percent and percent_other (in which share of the critical solutions it is
@@ -87,8 +87,8 @@ def weather(clear: Setting, wet: Setting) -> pd.DataFrame:
         As `critical`.
     """
     sides = []
-    for setting in (clear, wet):
-        share, size = rq32(setting), rq33(setting)
+    for case in (clear, wet):
+        share, size = rq32(case), rq33(case)
         side = share[share["j"] == ANY].set_index("characteristic")[["percent", "rank"]]
         for direction in ("increase", "decrease"):
             of_it = size[(size["j"] == ANY) & (size["direction"] == direction)]
@@ -104,7 +104,7 @@ def weather(clear: Setting, wet: Setting) -> pd.DataFrame:
     return both.reset_index()[columns]
 
 
-def effects(setting: Setting) -> pd.DataFrame:
+def effects(case: Case) -> pd.DataFrame:
     """Every change in every critical solution; columns setting, characteristic, change (signed, in its unit).
 
     Raises
@@ -112,17 +112,17 @@ def effects(setting: Setting) -> pd.DataFrame:
     Unanswerable
         As `critical`.
     """
-    changed = changes(setting, critical(setting))
-    parts = [pd.DataFrame({"setting": setting.name, "characteristic": name, "change": column[column != 0]})
-             for name, column in zip(setting.characteristics.names, changed.T, strict=True)]
+    changed = changes(case, critical(case))
+    parts = [pd.DataFrame({"setting": case.name, "characteristic": name, "change": column[column != 0]})
+             for name, column in zip(case.characteristics.names, changed.T, strict=True)]
     return pd.concat(parts, ignore_index=True)
 
 
-def _clearness(setting: Setting) -> tuple[float, float, float]:
-    weather = setting.weather
+def _clearness(case: Case) -> tuple[float, float, float]:
+    weather = case.weather
     return weather.road_friction, weather.visibility, -weather.recognition_delay
 
 
-def _without_weather(setting: Setting) -> tuple[object, ...]:
-    study = setting.study
+def _without_weather(case: Case) -> tuple[object, ...]:
+    study = case.study
     return study.scenario, study.vehicle, study.ads, study.metrics

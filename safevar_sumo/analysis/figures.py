@@ -1,4 +1,4 @@
-"""Pictures of a setting's results: one function a picture, from a setting to a matplotlib figure."""
+"""Pictures of a case's results: one function a picture, from a case to a matplotlib figure."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from safevar_sumo.analysis.case import ALGORITHM_TITLES, Case, Unanswerable
 from safevar_sumo.analysis.discussion import effects
 from safevar_sumo.analysis.quality import WORST, convergence, nondominated
 from safevar_sumo.analysis.rq3 import ANY, critical, rq31, rq32
-from safevar_sumo.analysis.setting import ALGORITHM_TITLES, Setting, Unanswerable
 from safevar_sumo.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,12 +35,12 @@ BINS = 24
 """Bins over a characteristic's domain."""
 
 
-def number_of_changes(setting: Setting) -> Figure:
+def number_of_changes(case: Case) -> Figure:
     """RQ3.1: how many critical solutions of a run have j characteristics changed, as box plots over the runs."""
     import seaborn as sns
 
-    counts = rq31(setting)
-    figure, ((axis,),) = _figure(setting, "number of changed characteristics", 1, 1, (6.4, 3.8))
+    counts = rq31(case)
+    figure, ((axis,),) = _figure(case, "number of changed characteristics", 1, 1, (6.4, 3.8))
     sns.boxplot(counts, x="j", y="count", ax=axis, color="#56b4e9", linecolor="black", linewidth=0.8, fliersize=3)
     axis.set_xlabel("characteristics changed")
     axis.set_ylabel(f"critical solutions per run\n({counts['run'].nunique()} runs)")
@@ -48,16 +48,16 @@ def number_of_changes(setting: Setting) -> Figure:
     return figure
 
 
-def changed_characteristics(setting: Setting) -> Figure:
+def changed_characteristics(case: Case) -> Figure:
     """RQ3.2: in which share of the critical solutions with j changed each characteristic is changed, as a heat map."""
     import seaborn as sns
 
-    _some_critical(setting)
-    shares = rq32(setting)
+    _some_critical(case)
+    shares = rq32(case)
     order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
     grid = shares.pivot(index="characteristic", columns="j", values="percent").astype(float)
     grid = grid.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=_plain)
-    figure, ((axis,),) = _figure(setting, "characteristics changed in critical solutions", 1, 1, (7.6, 1.4 + 0.3 * len(grid)))
+    figure, ((axis,),) = _figure(case, "characteristics changed in critical solutions", 1, 1, (7.6, 1.4 + 0.3 * len(grid)))
     sns.heatmap(grid, ax=axis, cmap="cividis", vmin=0, vmax=100, annot=True, fmt=".0f", annot_kws={"fontsize": 7}, linewidths=0.5,
                 cbar_kws={"label": "critical solutions\nin which it is changed [%]"})
     axis.grid(visible=False)
@@ -70,16 +70,16 @@ def changed_characteristics(setting: Setting) -> Figure:
     return figure
 
 
-def sizes_of_changes(setting: Setting) -> Figure:
+def sizes_of_changes(case: Case) -> Figure:
     """How each characteristic is changed in the critical solutions: the distribution of its signed changes."""
     import seaborn as sns
 
-    total = _some_critical(setting)
-    found = effects(setting)
-    members = setting.characteristics.members
+    total = _some_critical(case)
+    found = effects(case)
+    members = case.characteristics.members
     columns = min(4, len(members))
     rows = -(-len(members) // columns)
-    figure, axes = _figure(setting, "changes in critical solutions", rows, columns, (9.0, 1.0 + 1.85 * rows))
+    figure, axes = _figure(case, "changes in critical solutions", rows, columns, (9.0, 1.0 + 1.85 * rows))
     for axis, member in zip(axes.flat, members, strict=False):
         change = found.loc[found["characteristic"] == member.name, "change"]
         low, high = (float(f"{end - member.original:.9g}") for end in (member.lower, member.upper))
@@ -105,7 +105,7 @@ def sizes_of_changes(setting: Setting) -> Figure:
     return figure
 
 
-def pareto_fronts(setting: Setting) -> Figure:
+def pareto_fronts(case: Case) -> Figure:
     """The non-dominated solutions of each algorithm, all its runs together, in the three pairs of objectives.
 
     Raises
@@ -115,13 +115,13 @@ def pareto_fronts(setting: Setting) -> Figure:
     """
     names = list(OBJECTIVE_TITLES)
     fronts = {}
-    for algorithm in setting.algorithms:
-        points = setting.solutions_of(algorithm)[names].dropna().to_numpy(dtype=float)
+    for algorithm in case.algorithms:
+        points = case.solutions_of(algorithm)[names].dropna().to_numpy(dtype=float)
         if len(points):
             fronts[algorithm] = nondominated(points) * [1, 100, 1]
     if not fronts:
-        raise Unanswerable(setting.name, "has no solution", "results with at least one finished run")
-    figure, (axes,) = _figure(setting, "non-dominated solutions of each algorithm, all runs together", 1, 3, (9.6, 3.7))
+        raise Unanswerable(case.name, "has no solution", "results with at least one finished run")
+    figure, (axes,) = _figure(case, "non-dominated solutions of each algorithm, all runs together", 1, 3, (9.6, 3.7))
     for axis, (first, second) in zip(axes, combinations(range(3), 2), strict=True):
         for i, (algorithm, points) in enumerate(fronts.items()):
             axis.plot(points[:, first], points[:, second], linestyle="", marker=MARKERS[i % len(MARKERS)], markersize=4, alpha=0.6,
@@ -132,10 +132,10 @@ def pareto_fronts(setting: Setting) -> Figure:
     return figure
 
 
-def hypervolume_growth(setting: Setting) -> Figure:
+def hypervolume_growth(case: Case) -> Figure:
     """Convergence: the hypervolume of what was found against evaluations, median and range over the runs."""
-    growth = convergence(setting)
-    figure, ((axis,),) = _figure(setting, "convergence", 1, 1, (6.4, 4.0))
+    growth = convergence(case)
+    figure, ((axis,),) = _figure(case, "convergence", 1, 1, (6.4, 4.0))
     for i, (algorithm, of_it) in enumerate(growth.groupby("algorithm", sort=False)):
         over = of_it.groupby("evaluations")["hypervolume"].agg(["min", "median", "max"])
         colour = COLOURS[i % len(COLOURS)]
@@ -150,7 +150,7 @@ def hypervolume_growth(setting: Setting) -> Figure:
     return figure
 
 
-FIGURES: Mapping[str, Callable[[Setting], Figure]] = {
+FIGURES: Mapping[str, Callable[[Case], Figure]] = {
     "rq3.1-number-of-changes": number_of_changes,
     "rq3.2-changed-characteristics": changed_characteristics,
     "rq3.3-sizes-of-changes": sizes_of_changes,
@@ -159,8 +159,8 @@ FIGURES: Mapping[str, Callable[[Setting], Figure]] = {
 }
 
 
-def draw_all(settings: Sequence[Setting], directory: Path, kind: str) -> tuple[list[Path], list[str]]:
-    """Draw every picture of every setting; returns the files, and why some pictures are not there.
+def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Path], list[str]]:
+    """Draw every picture of every case; returns the files, and why some pictures are not there.
 
     Raises
     ------
@@ -168,14 +168,14 @@ def draw_all(settings: Sequence[Setting], directory: Path, kind: str) -> tuple[l
         If the directory cannot be written, or no picture can be drawn.
     """
     written, refused = [], []
-    for setting in settings:
+    for case in cases:
         for name, draw in FIGURES.items():
             try:
-                figure = draw(setting)
+                figure = draw(case)
             except Unanswerable as error:
                 refused.append(error)
                 continue
-            path = directory / f"{_file_name(setting.name)}-{name}.{kind}"
+            path = directory / f"{_file_name(case.name)}-{name}.{kind}"
             try:
                 directory.mkdir(parents=True, exist_ok=True)
                 figure.savefig(path, dpi=DPI)
@@ -187,7 +187,7 @@ def draw_all(settings: Sequence[Setting], directory: Path, kind: str) -> tuple[l
     return written, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in refused))
 
 
-def _figure(setting: Setting, what: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
+def _figure(case: Case, what: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
     """A figure with its axes, shape (rows, columns), that no global state knows of."""
     import matplotlib.style
     from matplotlib.figure import Figure
@@ -196,7 +196,7 @@ def _figure(setting: Setting, what: str, rows: int, columns: int, size: tuple[fl
     with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT, "axes.labelsize": FONT, "axes.titlesize": FONT}]):
         figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.1))
         axes = figure.subplots(rows, columns, squeeze=False)
-    figure.suptitle(f"{_plain(setting.name)}: {what}", fontsize=FONT + 2)
+    figure.suptitle(f"{_plain(case.name)}: {what}", fontsize=FONT + 2)
     return figure, axes
 
 
@@ -205,11 +205,11 @@ def _legend_below(figure: Figure, axis: Axes) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3), frameon=False, fontsize=FONT)
 
 
-def _some_critical(setting: Setting) -> int:
+def _some_critical(case: Case) -> int:
     """How many critical solutions there are; without any there is nothing to draw."""
-    number = len(critical(setting))
+    number = len(critical(case))
     if not number:
-        raise Unanswerable(setting.name, "has no critical solution", "results with solutions that are more unsafe than the original")
+        raise Unanswerable(case.name, "has no critical solution", "results with solutions that are more unsafe than the original")
     return number
 
 
@@ -234,5 +234,5 @@ def _unit(unit: str) -> str:
 
 
 def _file_name(name: str) -> str:
-    """A setting's name without what file systems dislike."""
+    """A case's name without what file systems dislike."""
     return "".join(sign if sign.isalnum() or sign in "._-" else "-" for sign in name).strip("-")

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from safevar_sumo.analysis.case import ALGORITHM_TITLES, MORE_IS_UNSAFE
 from safevar_sumo.analysis.inference import ALPHA, ASYMPTOTIC, EXACT, NOTABLE
 from safevar_sumo.analysis.questions import SAFETY, Answer
 from safevar_sumo.analysis.rq3 import ANY
-from safevar_sumo.analysis.setting import ALGORITHM_TITLES, MORE_IS_UNSAFE
 
 UNDEFINED = "-"
 METRIC_TITLES = {"igd": "IGD", "igd_plus": "IGD+", "hypervolume": "HV", "safety_degree": "SD", "tet": "TET", "tit": "TIT",
@@ -41,7 +41,7 @@ class Table(NamedTuple):
 
 
 def lay_out(answer: Answer) -> list[Table]:
-    """The paper's tables of an answer; without any setting that has it, one that says why."""
+    """The paper's tables of an answer; without any case that has it, one that says why."""
     if answer.frame.empty:
         return [Table(TITLES[answer.name], (), [], 0, (), answer.notes)]
     tables = LAYOUTS[answer.name](answer.frame)
@@ -49,15 +49,15 @@ def lay_out(answer: Answer) -> list[Table]:
 
 
 def _tests(frame: pd.DataFrame, who: str, name: str, notes: tuple[str, ...]) -> Table:
-    """p-values and effect sizes, settings side by side."""
-    settings = list(dict.fromkeys(frame["setting"]))
+    """p-values and effect sizes, cases side by side."""
+    cases = list(dict.fromkeys(frame["setting"]))
     cells = {(row[who], row["metric"], row["setting"]): row for row in frame.to_dict("records")}
-    parts = ("p", "A12", "magnitude", "n1", "n2") if len(settings) == 1 else ("p", "A12", "magnitude")
+    parts = ("p", "A12", "magnitude", "n1", "n2") if len(cases) == 1 else ("p", "A12", "magnitude")
     rows = [(_algorithm(algorithm), METRIC_TITLES[metric],
-             *(cell for setting in settings for cell in _test(cells.get((algorithm, metric, setting)), len(parts))))
+             *(cell for case in cases for cell in _test(cells.get((algorithm, metric, case)), len(parts))))
             for algorithm, metric in dict.fromkeys(zip(frame[who], frame["metric"], strict=True))]
     methods = [f"p{' with e' if method == EXACT else ''}: {method}." for method in (ASYMPTOTIC, EXACT) if method in set(frame["method"])]
-    return Table(TITLES[name], (who, "metric", *parts * len(settings)), rows, 2, tuple((setting, len(parts)) for setting in settings),
+    return Table(TITLES[name], (who, "metric", *parts * len(cases)), rows, 2, tuple((case, len(parts)) for case in cases),
                  (*methods, *notes, BOLD_NOTE))
 
 
@@ -73,14 +73,14 @@ def _rq1(frame: pd.DataFrame) -> list[Table]:
     test = _tests(frame, "algorithm", "rq1", (
         "A12 below 0.5: the algorithm's solutions are more unsafe than the original vehicle,",
         "whose value is repeated to the sample's size.", NON_COLLISION_NOTE))
-    settings = list(dict.fromkeys(frame["setting"]))
+    cases = list(dict.fromkeys(frame["setting"]))
     means = {(row["setting"], row["algorithm"], row["metric"]): row["mean"] for row in frame.to_dict("records")}
     means |= {(row["setting"], "original", row["metric"]): row["original"] for row in frame.to_dict("records")}
-    rows = [(_algorithm(name), *(_number(means.get((setting, name, metric)), ".2f") for setting in settings for metric in MORE_IS_UNSAFE))
+    rows = [(_algorithm(name), *(_number(means.get((case, name, metric)), ".2f") for case in cases for metric in MORE_IS_UNSAFE))
             for name in ("original", *dict.fromkeys(frame["algorithm"]))]
     heads = tuple(METRIC_TITLES[metric] for metric in MORE_IS_UNSAFE)
-    spans = tuple((setting, len(heads)) for setting in settings)
-    return [test, Table("RQ1: mean metrics", ("vehicle", *heads * len(settings)), rows, 1, spans, (UNITS_NOTE, NON_COLLISION_NOTE))]
+    spans = tuple((case, len(heads)) for case in cases)
+    return [test, Table("RQ1: mean metrics", ("vehicle", *heads * len(cases)), rows, 1, spans, (UNITS_NOTE, NON_COLLISION_NOTE))]
 
 
 def _rq2(frame: pd.DataFrame) -> list[Table]:
@@ -90,26 +90,26 @@ def _rq2(frame: pd.DataFrame) -> list[Table]:
 
 
 def _rq31(frame: pd.DataFrame) -> list[Table]:
-    settings = list(dict.fromkeys(frame["setting"]))
+    cases = list(dict.fromkeys(frame["setting"]))
     counts = {key: group["count"].to_numpy() for key, group in frame.groupby(["setting", "j"])}
     heads = ("min", "Q1", "median", "Q3", "max")
     rows = []
     for j in _js(frame):
-        quartiles = [np.quantile(counts[setting, j], [0, 0.25, 0.5, 0.75, 1]) if (setting, j) in counts else [None] * 5
-                     for setting in settings]
+        quartiles = [np.quantile(counts[case, j], [0, 0.25, 0.5, 0.75, 1]) if (case, j) in counts else [None] * 5
+                     for case in cases]
         rows.append((j, *(_number(value, "g") for of_it in quartiles for value in of_it)))
-    return [Table(TITLES["rq3.1"], ("j", *heads * len(settings)), rows, 1, tuple((setting, 5) for setting in settings),
+    return [Table(TITLES["rq3.1"], ("j", *heads * len(cases)), rows, 1, tuple((case, 5) for case in cases),
                   ("Critical solutions of a run with exactly j characteristics changed, over the runs.",))]
 
 
 def _rq32(frame: pd.DataFrame) -> list[Table]:
     tables = []
-    for setting, of_it in frame.groupby("setting", sort=False):
+    for case, of_it in frame.groupby("setting", sort=False):
         percent, js = _grid(of_it, ["characteristic"], "percent"), _js(of_it)
         overall = of_it[of_it["j"] == ANY]
         rank: dict[str, object] = dict(zip(overall["characteristic"], overall["rank"], strict=True))
         rows = [(name, *(_number(percent[name, j], ".1f") for j in js), _number(rank[name], "d")) for name in rank]
-        tables.append(Table(f"{TITLES['rq3.2']}: {setting}", ("characteristic", *js, "rank"), rows, 1,
+        tables.append(Table(f"{TITLES['rq3.2']}: {case}", ("characteristic", *js, "rank"), rows, 1,
                             notes=("Columns: number of characteristics changed; ranked by 'any'.",)))
     return [*tables, _side_by_side(frame)] if len(tables) > 1 else tables
 
@@ -117,18 +117,18 @@ def _rq32(frame: pd.DataFrame) -> list[Table]:
 def _side_by_side(frame: pd.DataFrame) -> Table:
     """Settings beside each other by their columns `any` and rank."""
     overall = frame[frame["j"] == ANY]
-    settings = list(dict.fromkeys(overall["setting"]))
+    cases = list(dict.fromkeys(overall["setting"]))
     cells = {(row["setting"], row["characteristic"]): (_number(row["percent"], ".1f"), _number(row["rank"], "d"))
              for row in overall.to_dict("records")}
-    rows = [(name, *(cell for setting in settings for cell in cells.get((setting, name), (UNDEFINED, UNDEFINED))))
+    rows = [(name, *(cell for case in cases for cell in cells.get((case, name), (UNDEFINED, UNDEFINED))))
             for name in dict.fromkeys(overall["characteristic"])]
-    return Table("RQ3.2: % of all critical solutions, settings side by side", ("characteristic", *("any", "rank") * len(settings)), rows, 1,
-                 tuple((setting, 2) for setting in settings))
+    return Table("RQ3.2: % of all critical solutions, cases side by side", ("characteristic", *("any", "rank") * len(cases)), rows, 1,
+                 tuple((case, 2) for case in cases))
 
 
 def _rq33(frame: pd.DataFrame) -> list[Table]:
     tables = []
-    for setting, of_it in frame.groupby("setting", sort=False):
+    for case, of_it in frame.groupby("setting", sort=False):
         of_it = of_it.assign(pc=[_number(value, ".1%") for value in of_it["pc"]],
                              delta=[_number(value, "+.3g") for value in of_it["delta"]])
         pc, delta, js = (*(_grid(of_it, ["characteristic", "direction"], name) for name in ("pc", "delta")), _js(of_it))
@@ -136,10 +136,10 @@ def _rq33(frame: pd.DataFrame) -> list[Table]:
         labels = list(dict.fromkeys(zip(of_it["characteristic"], of_it["direction"], strict=True)))
         note = ("PC: mean of |v - v''| / v; delta: mean signed change in the characteristic's unit.",)
         tables += [
-            Table(f"{TITLES['rq3.3']}, 2 to 6 changed: {setting}", ("characteristic", "direction", *("PC", "delta") * len(of_paper)),
+            Table(f"{TITLES['rq3.3']}, 2 to 6 changed: {case}", ("characteristic", "direction", *("PC", "delta") * len(of_paper)),
                   [(*label, *(cell for j in of_paper for cell in (pc[*label, j], delta[*label, j]))) for label in labels], 2,
                   tuple((f"j = {j}", 2) for j in of_paper), note),
-            *(Table(f"RQ3.3: {what}, any number changed: {setting}", ("characteristic", "direction", *js),
+            *(Table(f"RQ3.3: {what}, any number changed: {case}", ("characteristic", "direction", *js),
                     [(*label, *(cells[*label, j] for j in js)) for label in labels], 2)
               for what, cells in (("PC", pc), ("delta", delta)))]
     return tables
@@ -147,27 +147,27 @@ def _rq33(frame: pd.DataFrame) -> list[Table]:
 
 def _safety(frame: pd.DataFrame) -> list[Table]:
     tables = []
-    for setting, of_it in frame.groupby("setting", sort=False):
+    for case, of_it in frame.groupby("setting", sort=False):
         value, percent, js = _grid(of_it, ["quantity"], "value"), _grid(of_it, ["quantity"], "percent"), _js(of_it)
         rows = []
         for name, title in SAFETY_UNITS.items():
             rows.append((title, *(_number(value[name, j], ".2f") for j in js)))
             if name != "avgSD_cS":
                 rows.append(("  % of the original", *(_number(percent[name, j], ".1f") for j in js)))
-        tables.append(Table(f"{TITLES[SAFETY]}: {setting}", ("mean of", *js), rows, 1, notes=(
+        tables.append(Table(f"{TITLES[SAFETY]}: {case}", ("mean of", *js), rows, 1, notes=(
             "avgSD_mD: reduction of the distance; TET, TIT: increase (all three without collisions);",
             "avgSD_cS: speed of collisions; aveDece: decrease, over all.")))
     return tables
 
 
 def _collisions(frame: pd.DataFrame) -> list[Table]:
-    settings = list(dict.fromkeys(frame["setting"]))
+    cases = list(dict.fromkeys(frame["setting"]))
     cells = {(row["algorithm"], row["setting"]): (str(row["solutions"]), str(row["collisions"]), _number(row["share"], ".1%"))
              for row in frame.to_dict("records")}
-    rows = [(_algorithm(name), *(cell for setting in settings for cell in cells.get((name, setting), (UNDEFINED,) * 3)))
+    rows = [(_algorithm(name), *(cell for case in cases for cell in cells.get((name, case), (UNDEFINED,) * 3)))
             for name in dict.fromkeys(frame["algorithm"])]
-    return [Table(TITLES["collisions"], ("algorithm", *("solutions", "collisions", "share") * len(settings)), rows, 1,
-                  tuple((setting, 3) for setting in settings))]
+    return [Table(TITLES["collisions"], ("algorithm", *("solutions", "collisions", "share") * len(cases)), rows, 1,
+                  tuple((case, 3) for case in cases))]
 
 
 def _combinations(frame: pd.DataFrame) -> list[Table]:
@@ -179,11 +179,11 @@ def _combinations(frame: pd.DataFrame) -> list[Table]:
 
 def _weather(frame: pd.DataFrame) -> list[Table]:
     tables = []
-    for (setting, other), of_it in frame.groupby(["setting", "other"], sort=False):
+    for (case, other), of_it in frame.groupby(["setting", "other"], sort=False):
         rows = [(row["characteristic"], *(_number(row[name], form) for name, form in WEATHER_COLUMNS.items()))
                 for row in of_it.to_dict("records")]
-        tables.append(Table(f"{TITLES['weather']}: {setting} against {other}",
-                            ("characteristic", str(setting), str(other), "diff.", *(str(setting), str(other)) * 3), rows, 1,
+        tables.append(Table(f"{TITLES['weather']}: {case} against {other}",
+                            ("characteristic", str(case), str(other), "diff.", *(str(case), str(other)) * 3), rows, 1,
                             (("% changed", 3), ("rank", 2), ("mean increase", 2), ("mean decrease", 2)),
                             ("Over the critical solutions; increase and decrease in the characteristic's unit.",)))
     return tables

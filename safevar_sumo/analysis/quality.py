@@ -8,7 +8,7 @@ import moocore
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.setting import Setting, Unanswerable
+from safevar_sumo.analysis.case import Case, Unanswerable
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 
@@ -61,7 +61,7 @@ def objectives(frame: pd.DataFrame) -> FloatArray:
     return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
-def reference_front(setting: Setting) -> FloatArray:
+def reference_front(case: Case) -> FloatArray:
     """The non-dominated union of the results of all runs of all algorithms.
 
     Raises
@@ -69,13 +69,13 @@ def reference_front(setting: Setting) -> FloatArray:
     Unanswerable
         If there is no solution.
     """
-    points = objectives(setting.solutions)
+    points = objectives(case.solutions)
     if not len(points):
-        raise Unanswerable(setting.name, "has no solution", "results with at least one finished run")
+        raise Unanswerable(case.name, "has no solution", "results with at least one finished run")
     return nondominated(points)
 
 
-def indicators(setting: Setting) -> pd.DataFrame:
+def indicators(case: Case) -> pd.DataFrame:
     """IGD, IGD+ and hypervolume of every finished run that has solutions; columns algorithm, run and theirs.
 
     Raises
@@ -84,12 +84,12 @@ def indicators(setting: Setting) -> pd.DataFrame:
         If there are no runs or no solutions.
     """
     rows = []
-    runs = [(algorithm, run) for algorithm in setting.algorithms for run in setting.runs_of(algorithm)]
+    runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
     if runs:
-        reference = reference_front(setting)
+        reference = reference_front(case)
         scale = Scale.of(reference)
         normal = scale.normalised(reference)
-    by_run = dict(list(setting.solutions.groupby(["algorithm", "run"])))
+    by_run = dict(list(case.solutions.groupby(["algorithm", "run"])))
     for algorithm, run in runs:
         front = objectives(by_run[algorithm, run]) if (algorithm, run) in by_run else np.zeros((0, 3))
         if len(front):
@@ -98,7 +98,7 @@ def indicators(setting: Setting) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["algorithm", "run", *MORE_IS_BETTER])
 
 
-def convergence(setting: Setting, points: int = 50) -> pd.DataFrame:
+def convergence(case: Case, points: int = 50) -> pd.DataFrame:
     """The hypervolume of what each run had found after so many evaluations; columns algorithm, run, evaluations, hypervolume.
 
     A run that ended early keeps what it had; a hypervolume is 0 while everything found is beyond the reference point.
@@ -108,15 +108,15 @@ def convergence(setting: Setting, points: int = 50) -> pd.DataFrame:
     Unanswerable
         If there are no runs or no solutions.
     """
-    keys = [(algorithm, run) for algorithm in setting.algorithms for run in setting.runs_of(algorithm)]
-    scale = Scale.of(reference_front(setting))
-    budget = setting.study.search.evaluations
-    grid = np.unique(np.linspace(min(setting.study.search.population, budget), budget, points).astype(int))
-    by_run = dict(list(setting.evaluations.groupby(["algorithm", "run"])))
+    keys = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
+    scale = Scale.of(reference_front(case))
+    budget = case.study.search.evaluations
+    grid = np.unique(np.linspace(min(case.study.search.population, budget), budget, points).astype(int))
+    by_run = dict(list(case.evaluations.groupby(["algorithm", "run"])))
     parts = [pd.DataFrame({"algorithm": key[0], "run": key[1], "evaluations": grid, "hypervolume": _growth(by_run[key], scale, grid)})
              for key in keys if key in by_run]
     if not parts:
-        raise Unanswerable(setting.name, "has no evaluations", "results with the journals of their runs")
+        raise Unanswerable(case.name, "has no evaluations", "results with the journals of their runs")
     return pd.concat(parts, ignore_index=True)
 
 

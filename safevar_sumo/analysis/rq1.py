@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from safevar_sumo.analysis.case import MORE_IS_UNSAFE, Case, Unanswerable, values
 from safevar_sumo.analysis.inference import Comparison, compare, magnitude
-from safevar_sumo.analysis.setting import MORE_IS_UNSAFE, Setting, Unanswerable, values
 
 COLUMNS = ["setting", "algorithm", "metric", "p_value", "effect_size", "magnitude", "n1", "n2", "method", "mean", "original"]
 
 
-def rq1(setting: Setting) -> pd.DataFrame:
+def rq1(case: Case) -> pd.DataFrame:
     """Every algorithm's solutions against the original's value, repeated to the sample's size, metric by metric.
 
     Columns: `COLUMNS`. `effect_size` is A12, turned so that a smaller one means that the algorithm's solutions are
@@ -22,15 +22,15 @@ def rq1(setting: Setting) -> pd.DataFrame:
     Unanswerable
         If no run is finished.
     """
-    if not setting.algorithms:
-        raise Unanswerable(setting.name, "has no finished run", "results with at least one finished run")
+    if not case.algorithms:
+        raise Unanswerable(case.name, "has no finished run", "results with at least one finished run")
     rows = []
-    for algorithm in setting.algorithms:
-        solutions = setting.solutions_of(algorithm)
-        for metric, original in setting.original.items():
+    for algorithm in case.algorithms:
+        solutions = case.solutions_of(algorithm)
+        for metric, original in case.original.items():
             sample = values(solutions, metric)
             told = against(sample, original, MORE_IS_UNSAFE[metric])
-            rows.append((setting.name, algorithm, metric, *told, float(np.mean(sample)) if sample.size else None,
+            rows.append((case.name, algorithm, metric, *told, float(np.mean(sample)) if sample.size else None,
                          None if np.isnan(original) else original))
     return pd.DataFrame(rows, columns=COLUMNS, dtype=object)
 

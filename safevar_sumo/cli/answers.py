@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from safevar_sumo.analysis import QUESTIONS, answer, draw_all, load_settings
+from safevar_sumo.analysis import QUESTIONS, answer, draw_all, load_cases
 from safevar_sumo.analysis.figures import FORMATS as PICTURES
 from safevar_sumo.analysis.tables import ENDINGS, FORMATS
 from safevar_sumo.cli.program import commands
@@ -23,7 +23,7 @@ WITHOUT_NOTES = ("csv", "json")
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write each table to a file of this directory.")
 def tables(directories: tuple[str, ...], rq: str | None, kind: str, out: Path | None) -> None:
     """Answer the research questions as tables, from the results directories DIR..., one for each setting."""
-    answers = answer(load_settings(directories), rq)
+    answers = answer(load_cases(directories), rq)
     if kind in WITHOUT_NOTES:
         _warn(list(dict.fromkeys(note for one in answers for note in one.notes)))
     if out is not None:
@@ -43,10 +43,10 @@ def tables(directories: tuple[str, ...], rq: str | None, kind: str, out: Path | 
 @click.option("--format", "kind", type=click.Choice(PICTURES), default="png", show_default=True, help="Kind of the pictures.")
 def figures(directories: tuple[str, ...], out: Path, kind: str) -> None:
     """Draw the figures of the results directories DIR..., one file for each figure and setting."""
-    settings = load_settings(directories)
+    cases = load_cases(directories)
     make_directory(out)
-    written, lacking = draw_all(settings, out, kind)
-    _warn([*(remark for setting in settings for remark in setting.remarks), *lacking])
+    written, lacking = draw_all(cases, out, kind)
+    _warn([*(remark for case in cases for remark in case.remarks), *lacking])
     for path in written:
         click.echo(str(path))
 

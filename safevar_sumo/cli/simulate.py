@@ -14,7 +14,7 @@ from safevar_sumo import terminal
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import time_to_collision
-from safevar_sumo.records import FloatArray, Run
+from safevar_sumo.records import Drives, FloatArray
 from safevar_sumo.results import record
 from safevar_sumo.simulation import Engine, assemble, score, simulate
 from safevar_sumo.study import load_study
@@ -56,7 +56,7 @@ def _assignments(changes: tuple[str, ...]) -> dict[str, float]:
     return values
 
 
-def _write_trace(path: Path, run: Run) -> None:
+def _write_trace(path: Path, run: Drives) -> None:
     """One row per simulation step of the only vehicle, units in the header."""
     trace = run.trace
     shown = trace.active[:, 0]

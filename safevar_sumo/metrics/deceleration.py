@@ -5,19 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from safevar_sumo.metrics.sampling import every, total
-from safevar_sumo.records import STANDSTILL, FloatArray, Run
+from safevar_sumo.records import STANDSTILL, Drives, FloatArray
 from safevar_sumo.study import MetricsTable
 
 
-def average_deceleration(run: Run, thresholds: MetricsTable) -> FloatArray:
+def average_deceleration(drives: Drives, thresholds: MetricsTable) -> FloatArray:
     """Mean loss of speed per time over the samples in which the brake is commanded and the vehicle moves.
 
     In m/s^2, positive when slowing down; shape (N,); NaN for a vehicle that never braked.
     """
-    stride = every(run.trace.step, thresholds.sampling_interval)
-    interval = stride * run.trace.step
-    speed, active = run.trace.speed[::stride], run.trace.active[::stride]
-    braking = active & (run.trace.brake[::stride] > 0) & (np.abs(speed) > STANDSTILL)
+    stride = every(drives.trace.step, thresholds.sampling_interval)
+    interval = stride * drives.trace.step
+    speed, active = drives.trace.speed[::stride], drives.trace.active[::stride]
+    braking = active & (drives.trace.brake[::stride] > 0) & (np.abs(speed) > STANDSTILL)
     lost = (speed[:-1] - speed[1:]) / interval
     counts = braking[1:]
     number = np.count_nonzero(counts, axis=0)

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from safevar_sumo.records import FloatArray, Run
+from safevar_sumo.records import Drives, FloatArray
 from safevar_sumo.study import MetricsTable
 
 
-def safety_degree(run: Run, thresholds: MetricsTable) -> FloatArray:
+def safety_degree(drives: Drives, thresholds: MetricsTable) -> FloatArray:
     """Least separation during the encounter [m, > 0], or minus the speed of the collision [m/s, <= 0].
 
     Shape (N,); NaN where there was neither an encounter nor a collision.
     """
-    counts = run.trace.active & run.encounter.in_conflict
-    least = np.min(np.where(counts, run.encounter.separation, np.inf), axis=0)
+    counts = drives.trace.active & drives.encounter.in_conflict
+    least = np.min(np.where(counts, drives.encounter.separation, np.inf), axis=0)
     least = np.where(np.isfinite(least), least, np.nan)
-    return np.where(np.isnan(run.collision_speed), least, -run.collision_speed)
+    return np.where(np.isnan(drives.collision_speed), least, -drives.collision_speed)

@@ -5,38 +5,38 @@ from __future__ import annotations
 import numpy as np
 
 from safevar_sumo.metrics.sampling import every, total
-from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, FloatArray, Run
+from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Drives, FloatArray
 from safevar_sumo.study import MetricsTable
 
 
-def time_to_collision(run: Run) -> FloatArray:
+def time_to_collision(drives: Drives) -> FloatArray:
     """TTC(t) = L_s / v_L, distance projected over closing speed [s]; shape (T, N).
 
     Infinite while not closing, out of the encounter, and after the vehicle first stood still again.
     """
-    moved = np.logical_or.accumulate(run.trace.speed > STANDSTILL, axis=0)
-    stood = np.logical_or.accumulate(moved & (run.trace.speed <= STANDSTILL), axis=0)
-    closing, distance = run.encounter.closing_speed, run.encounter.distance
-    counts = run.trace.active & run.encounter.in_conflict & ~stood & (closing > 0) & (distance >= 0)
+    moved = np.logical_or.accumulate(drives.trace.speed > STANDSTILL, axis=0)
+    stood = np.logical_or.accumulate(moved & (drives.trace.speed <= STANDSTILL), axis=0)
+    closing, distance = drives.encounter.closing_speed, drives.encounter.distance
+    counts = drives.trace.active & drives.encounter.in_conflict & ~stood & (closing > 0) & (distance >= 0)
     return np.divide(distance, closing, out=np.full_like(distance, np.inf), where=counts)
 
 
-def time_exposed(run: Run, thresholds: MetricsTable) -> FloatArray:
+def time_exposed(drives: Drives, thresholds: MetricsTable) -> FloatArray:
     """TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s]; shape (N,), NaN on a collision."""
-    critical, interval = _critical(run, thresholds)
+    critical, interval = _critical(drives, thresholds)
     exposed = np.round(np.count_nonzero(np.isfinite(critical), axis=0) * interval, TIME_DECIMALS)
-    return np.where(np.isnan(run.collision_speed), exposed, np.nan)
+    return np.where(np.isnan(drives.collision_speed), exposed, np.nan)
 
 
-def time_integrated(run: Run, thresholds: MetricsTable) -> FloatArray:
+def time_integrated(drives: Drives, thresholds: MetricsTable) -> FloatArray:
     """TIT* = sum of (TTC* - TTC(t)) dt over the same samples [s^2]; shape (N,), NaN on a collision."""
-    critical, interval = _critical(run, thresholds)
+    critical, interval = _critical(drives, thresholds)
     deficit = np.where(np.isfinite(critical), thresholds.ttc_threshold - critical, 0.0)
-    return np.where(np.isnan(run.collision_speed), total(deficit) * interval, np.nan)
+    return np.where(np.isnan(drives.collision_speed), total(deficit) * interval, np.nan)
 
 
-def _critical(run: Run, thresholds: MetricsTable) -> tuple[FloatArray, float]:
+def _critical(drives: Drives, thresholds: MetricsTable) -> tuple[FloatArray, float]:
     """TTC where it is critical, infinite elsewhere, at the samples; and the time between two samples."""
-    stride = every(run.trace.step, thresholds.sampling_interval)
-    ttc = time_to_collision(run)[::stride]
-    return np.where(ttc <= thresholds.ttc_threshold, ttc, np.inf), stride * run.trace.step
+    stride = every(drives.trace.step, thresholds.sampling_interval)
+    ttc = time_to_collision(drives)[::stride]
+    return np.where(ttc <= thresholds.ttc_threshold, ttc, np.inf), stride * drives.trace.step

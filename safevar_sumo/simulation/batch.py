@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Evaluations, FloatArray, Outcome, Run, Trace
+from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Drives, Evaluations, FloatArray, Outcome, Trace
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.simulation.network import copied_network
 from safevar_sumo.simulation.perception import Perception
@@ -22,7 +22,7 @@ def evaluate(system: System, settings: FloatArray) -> Evaluations:
     return score(system, settings, simulate(system, settings))
 
 
-def score(system: System, settings: FloatArray, run: Run) -> Evaluations:
+def score(system: System, settings: FloatArray, run: Drives) -> Evaluations:
     """Metrics and objectives of simulated settings."""
     return Evaluations(
         settings=settings,
@@ -33,7 +33,7 @@ def score(system: System, settings: FloatArray, run: Run) -> Evaluations:
         f_num_diff=system.characteristics.number_changed(settings))
 
 
-def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = ()) -> Run:
+def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = ()) -> Drives:
     """Run the scenario once for every setting; shape (N, n).
 
     Raises
@@ -48,7 +48,7 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSU
         return drive(system, settings, world)
 
 
-def drive(system: System, settings: FloatArray, world: SumoWorld) -> Run:
+def drive(system: System, settings: FloatArray, world: SumoWorld) -> Drives:
     """Drive the vehicles of an open world that nobody has stepped yet; see `simulate`."""
     vehicle, scenario, step, n = system.vehicle, system.scenario, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
@@ -75,7 +75,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld) -> Run:
         state = vehicle.advance(prepared, state, command)
         world.advance(np.where(verdict.open, state.speed, 0.0))
     trace = log.trace(sample + 1, step, world.vehicle_length(VUT))
-    return Run(trace=trace, encounter=scenario.encounter(trace), outcome=verdict.outcome(), collision_speed=verdict.collision_speed)
+    return Drives(trace=trace, encounter=scenario.encounter(trace), outcome=verdict.outcome(), collision_speed=verdict.collision_speed)
 
 
 class _Log:

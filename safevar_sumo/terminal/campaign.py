@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from safevar_sumo.analysis import brief, setting_of
+from safevar_sumo.analysis import brief, case_of
 from safevar_sumo.campaign import Campaign, Forecast
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import record, solutions_frame
@@ -55,7 +55,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     _print_most_critical(console, study, campaign)
     names = tuple(study.vehicle.characteristics)
     solutions = solutions_frame(names, campaign.solutions.items())
-    for line in brief(setting_of(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions))):
+    for line in brief(case_of(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions))):
         console.print(line, soft_wrap=True, markup=False, highlight=False)
     console.print(f"All tables: python -m safevar_sumo tables {shlex.quote(str(directory))}", soft_wrap=True, markup=False, highlight=False)
 

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import pandas as pd
 
-from safevar_sumo.analysis import Setting, setting_of
+from safevar_sumo.analysis import Case, case_of
 from safevar_sumo.study import CharacteristicTable, Study, load_study
 
 ORIGINAL = {"safety_degree": 2.0, "tet": 1.0, "tit": 0.5, "ave_dece": 6.0}
@@ -44,9 +44,9 @@ def frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 
 def made_up(*rows: Mapping[str, Any], original: Mapping[str, Any] = ORIGINAL, study: Study | None = None,
             evaluations: Sequence[Mapping[str, Any]] = (), finished: Sequence[tuple[str, int]] | None = None,
-            has_runs: bool = True) -> Setting:
+            has_runs: bool = True) -> Case:
     """A setting of these solutions; its finished runs are those that have one, if nothing else is said."""
     done = list(dict.fromkeys((one["algorithm"], one["run"]) for one in rows)) if finished is None else finished
     seen = frame(evaluations)
     seen.insert(2, "evaluation", [one["evaluation"] for one in evaluations])
-    return setting_of(study or made_up_study(), original, frame(rows), seen, done if has_runs else (), has_runs)
+    return case_of(study or made_up_study(), original, frame(rows), seen, done if has_runs else (), has_runs)

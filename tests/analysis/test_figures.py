@@ -16,15 +16,15 @@ from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox, BboxBase
 
-from safevar_sumo.analysis import FIGURES, Setting, draw_all
+from safevar_sumo.analysis import FIGURES, Case, draw_all
+from safevar_sumo.analysis.case import Unanswerable
 from safevar_sumo.analysis.figures import hypervolume_growth, number_of_changes, pareto_fronts, sizes_of_changes
-from safevar_sumo.analysis.setting import Unanswerable
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
 
 
-def random_setting(name: str) -> Setting:
+def random_setting(name: str) -> Case:
     """A shipped study's characteristics, some with long names, and three algorithms."""
     rng, study = np.random.default_rng(4), load_study(name)
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
@@ -38,7 +38,7 @@ def random_setting(name: str) -> Setting:
 
 
 @pytest.fixture(scope="module")
-def setting() -> Setting:
+def case() -> Case:
     rng = np.random.default_rng(2)
     rows, evaluations = [], []
     for algorithm in ("nsga2", "rs"):
@@ -58,8 +58,8 @@ def test_there_is_a_figure_for_everything_promised() -> None:
 
 @pytest.mark.parametrize("study", ["made-up", "sun", "lgsvl", "native"])
 @pytest.mark.parametrize("name", list(FIGURES))
-def test_axes_are_labelled_and_no_text_lies_on_another(name: str, study: str, setting: Setting) -> None:
-    figure = FIGURES[name](setting if study == "made-up" else random_setting(study))
+def test_axes_are_labelled_and_no_text_lies_on_another(name: str, study: str, case: Case) -> None:
+    figure = FIGURES[name](case if study == "made-up" else random_setting(study))
     FigureCanvasAgg(figure).draw()
     shared = {"rq3.3-sizes-of-changes"}
     for axis in figure.axes:
@@ -96,19 +96,19 @@ def _texts(figure: Figure) -> Iterator[Text]:
                 yield from (tick.label2 for tick in axis.get_major_ticks() if low - 1e-9 <= tick.get_loc() <= high + 1e-9)
 
 
-def test_each_algorithm_has_its_own_colour_and_marker(setting: Setting) -> None:
-    lines = pareto_fronts(setting).axes[0].lines
+def test_each_algorithm_has_its_own_colour_and_marker(case: Case) -> None:
+    lines = pareto_fronts(case).axes[0].lines
     assert len({line.get_color() for line in lines}) == len({line.get_marker() for line in lines}) == 2
 
 
-def test_box_plots_are_of_the_runs(setting: Setting) -> None:
-    axis = number_of_changes(setting).axes[0]
+def test_box_plots_are_of_the_runs(case: Case) -> None:
+    axis = number_of_changes(case).axes[0]
     assert [label.get_text() for label in axis.get_xticklabels()] == ["1", "2", "3"]
     assert "2 runs" in axis.get_ylabel()
 
 
-def test_changes_are_counted_on_their_side_of_zero(setting: Setting) -> None:
-    axis = sizes_of_changes(setting).axes[0]
+def test_changes_are_counted_on_their_side_of_zero(case: Case) -> None:
+    axis = sizes_of_changes(case).axes[0]
     bars = [bar for bar in axis.patches if isinstance(bar, Rectangle) and bar.get_height() > 0]
     up, down = sum(bar.get_height() for bar in bars if bar.get_x() >= -1e-9), sum(bar.get_height() for bar in bars if bar.get_x() < -1e-9)
     assert axis.get_title() == f"mass\n+{up:.0f}, -{down:.0f}"
@@ -117,8 +117,8 @@ def test_changes_are_counted_on_their_side_of_zero(setting: Setting) -> None:
     assert not [bar for bar in bars if bar.get_x() < -1e-9 and bar.get_x() + bar.get_width() > 1e-9]
 
 
-def test_convergence_shows_the_median_between_the_extremes(setting: Setting) -> None:
-    low, high, middle = (line.get_ydata() for line in hypervolume_growth(setting).axes[0].lines[:3])
+def test_convergence_shows_the_median_between_the_extremes(case: Case) -> None:
+    low, high, middle = (line.get_ydata() for line in hypervolume_growth(case).axes[0].lines[:3])
     assert (np.asarray(low) <= middle).all()
     assert (np.asarray(middle) <= high).all()
 

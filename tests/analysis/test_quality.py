@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from made_up import made_up, row
 
+from safevar_sumo.analysis.case import Unanswerable
 from safevar_sumo.analysis.quality import (
     Scale,
     convergence,
@@ -21,7 +22,6 @@ from safevar_sumo.analysis.quality import (
     objectives,
     reference_front,
 )
-from safevar_sumo.analysis.setting import Unanswerable
 from safevar_sumo.errors import InputError
 
 FRONT = np.array([[0.0, 1, 2], [1, 0, 1], [2, 2, 0]])
@@ -78,13 +78,13 @@ def test_scale_maps_ideal_to_0_and_nadir_to_1() -> None:
 
 
 def test_the_reference_front_is_of_all_runs_of_all_algorithms() -> None:
-    setting = made_up(row(sd=1, f_diff=0.5), row("rs", sd=0.5, f_diff=0.7), row("rs", run=1, sd=1, f_diff=0.6))
-    assert sorted(reference_front(setting).tolist()) == [[0.5, 0.7, 0], [1, 0.5, 0]]
+    case = made_up(row(sd=1, f_diff=0.5), row("rs", sd=0.5, f_diff=0.7), row("rs", run=1, sd=1, f_diff=0.6))
+    assert sorted(reference_front(case).tolist()) == [[0.5, 0.7, 0], [1, 0.5, 0]]
 
 
 def test_indicators_are_those_of_each_runs_own_front() -> None:
-    setting = made_up(row(sd=1, f_diff=0.5), row("rs", sd=0.5, f_diff=0.7), row("rs", run=1, sd=1, f_diff=0.6))
-    found = indicators(setting).set_index(["algorithm", "run"])
+    case = made_up(row(sd=1, f_diff=0.5), row("rs", sd=0.5, f_diff=0.7), row("rs", run=1, sd=1, f_diff=0.6))
+    found = indicators(case).set_index(["algorithm", "run"])
     apart = math.hypot(0.5, 0.2)
     assert found.loc[("nsga2", 0), "igd"] == pytest.approx(apart / 2)
     assert found.loc[("rs", 1), "igd"] == pytest.approx((0.1 + math.hypot(0.5, 0.1)) / 2)
@@ -93,8 +93,8 @@ def test_indicators_are_those_of_each_runs_own_front() -> None:
 
 
 def test_a_finished_run_without_solutions_has_no_indicators() -> None:
-    setting = made_up(row(), finished=[("nsga2", 0), ("nsga2", 1)])
-    assert indicators(setting)["run"].tolist() == [0]
+    case = made_up(row(), finished=[("nsga2", 0), ("nsga2", 1)])
+    assert indicators(case)["run"].tolist() == [0]
 
 
 def test_imported_solutions_have_no_indicators() -> None:
@@ -103,21 +103,21 @@ def test_imported_solutions_have_no_indicators() -> None:
 
 
 def test_a_solution_without_safety_degree_is_on_no_front() -> None:
-    setting = made_up(row(sd=math.nan), row(sd=1.5))
-    assert objectives(setting.solutions).tolist() == [[1.5, 0, 0]]
+    case = made_up(row(sd=math.nan), row(sd=1.5))
+    assert objectives(case.solutions).tolist() == [[1.5, 0, 0]]
 
 
 def test_convergence_grows_to_the_hypervolume_of_all() -> None:
     rng = np.random.default_rng(1)
     evaluations = [{**row("nsga2", run, sd=sd, f_diff=diff), "evaluation": i}
                    for run in (0, 1) for i, (sd, diff) in enumerate(rng.uniform(0.1, 1, size=(100 if run else 40, 2)))]
-    setting = made_up(row(sd=0.1, f_diff=1), row(run=1, sd=1, f_diff=0.1), evaluations=evaluations)
-    grown = convergence(setting)
+    case = made_up(row(sd=0.1, f_diff=1), row(run=1, sd=1, f_diff=0.1), evaluations=evaluations)
+    grown = convergence(case)
     assert set(grown["evaluations"]) >= {10, 100}
     for run, of_it in grown.groupby("run"):
         assert (np.diff(of_it["hypervolume"]) >= 0).all()
-        seen = setting.evaluations[setting.evaluations["run"] == run]
-        normal = Scale.of(reference_front(setting)).normalised(objectives(seen))
+        seen = case.evaluations[case.evaluations["run"] == run]
+        normal = Scale.of(reference_front(case)).normalised(objectives(seen))
         assert of_it["hypervolume"].iloc[-1] == pytest.approx(moocore.hypervolume(normal, ref=[1.1] * 3))
     early = grown[grown["run"] == 0]
     assert early.loc[early["evaluations"] >= 40, "hypervolume"].nunique() == 1, "a run that ended early keeps what it had"

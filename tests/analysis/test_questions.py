@@ -13,11 +13,11 @@ from made_up import CHARACTERISTICS, ORIGINAL, UNCHANGED, made_up, made_up_study
 
 from safevar_sumo.analysis import answer
 from safevar_sumo.analysis.brief import brief
+from safevar_sumo.analysis.case import Unanswerable
 from safevar_sumo.analysis.discussion import collisions, combinations, effects, weather, weather_pairs
 from safevar_sumo.analysis.rq1 import rq1
 from safevar_sumo.analysis.rq2 import rq2
 from safevar_sumo.analysis.rq3 import critical, rq31, rq32, rq33, rq33_safety
-from safevar_sumo.analysis.setting import Unanswerable
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable
 
@@ -32,8 +32,8 @@ def only(frame: pd.DataFrame, **wanted: Any) -> dict[str, Any]:
 
 
 def test_rq1_is_small_where_solutions_are_more_unsafe() -> None:
-    setting = made_up(*(row(sd=1 + i / 10, tet=2, tit=1, ave_dece=3) for i in range(5)))
-    frame = rq1(setting)
+    case = made_up(*(row(sd=1 + i / 10, tet=2, tit=1, ave_dece=3) for i in range(5)))
+    frame = rq1(case)
     assert frame["metric"].tolist() == ["safety_degree", "tet", "tit", "ave_dece"]
     assert frame["effect_size"].tolist() == [0, 0, 0, 0]
     assert set(frame["magnitude"]) == {"large"}
@@ -56,11 +56,11 @@ def test_tet_and_tit_do_not_count_collisions_and_the_others_do() -> None:
 
 
 def test_a_tet_that_stands_at_a_collision_is_not_counted() -> None:
-    setting = made_up({**row(sd=-3), "tet": 0.0, "tit": 0.0}, row(sd=1, tet=1.4, tit=0.7), {**row("rs", sd=-3), "tet": 9.0, "tit": 9.0},
+    case = made_up({**row(sd=-3), "tet": 0.0, "tit": 0.0}, row(sd=1, tet=1.4, tit=0.7), {**row("rs", sd=-3), "tet": 9.0, "tit": 9.0},
                       row("rs", sd=1, tet=1.3, tit=0.6))
-    assert only(rq1(setting), algorithm="nsga2", metric="tet")["mean"] == 1.4
-    assert only(rq2(setting), metric="tet")["effect_size"] == 1
-    assert only(rq33_safety(setting), quantity="TIT", j="any")["value"] == pytest.approx(0.2)
+    assert only(rq1(case), algorithm="nsga2", metric="tet")["mean"] == 1.4
+    assert only(rq2(case), metric="tet")["effect_size"] == 1
+    assert only(rq33_safety(case), quantity="TIT", j="any")["value"] == pytest.approx(0.2)
 
 
 def test_rq1_of_collisions_alone_has_no_tet() -> None:
@@ -115,15 +115,15 @@ def test_a_finished_run_that_found_nothing_is_told_of() -> None:
 
 
 def test_critical_solutions_are_strictly_below_the_original() -> None:
-    setting = made_up(row(sd=2.0), row(sd=1.999), row(sd=-1), row("rs", sd=1), row(sd=math.nan))
-    assert critical(setting)["safety_degree"].tolist() == [1.999, -1]
+    case = made_up(row(sd=2.0), row(sd=1.999), row(sd=-1), row("rs", sd=1), row(sd=math.nan))
+    assert critical(case)["safety_degree"].tolist() == [1.999, -1]
     with pytest.raises(Unanswerable, match="safety degree"):
         critical(made_up(row(), original={}))
 
 
 def test_rq31_counts_runs_without_any() -> None:
-    setting = made_up(row(values=HEAVY), row(values=GRIPLESS), row(values=BOTH), finished=[("nsga2", 0), ("nsga2", 1)])
-    counts = {(one.run, one.j): one.count_ for one in rq31(setting).rename(columns={"count": "count_"}).itertuples()}
+    case = made_up(row(values=HEAVY), row(values=GRIPLESS), row(values=BOTH), finished=[("nsga2", 0), ("nsga2", 1)])
+    counts = {(one.run, one.j): one.count_ for one in rq31(case).rename(columns={"count": "count_"}).itertuples()}
     assert counts == {(0, "1"): 2, (0, "2"): 1, (0, "3"): 0, (1, "1"): 0, (1, "2"): 0, (1, "3"): 0}
 
 
@@ -148,12 +148,12 @@ def test_ties_share_the_better_rank_and_the_next_is_skipped() -> None:
 
 
 def test_rq3_without_critical_solutions_is_empty_not_zero() -> None:
-    setting = made_up(row(sd=5, values=HEAVY))
-    assert rq32(setting)["percent"].isna().all()
-    assert rq32(setting)["rank"].isna().all()
-    assert (rq33(setting)["n"] == 0).all()
-    assert rq33_safety(setting)["value"].isna().all()
-    assert rq31(setting)["count"].sum() == 0
+    case = made_up(row(sd=5, values=HEAVY))
+    assert rq32(case)["percent"].isna().all()
+    assert rq32(case)["rank"].isna().all()
+    assert (rq33(case)["n"] == 0).all()
+    assert rq33_safety(case)["value"].isna().all()
+    assert rq31(case)["count"].sum() == 0
 
 
 def test_rq33_tells_increases_from_decreases() -> None:
@@ -195,9 +195,9 @@ def test_combinations_of_exactly_four() -> None:
         return {**{name: one for name, one in row().items() if name not in CHARACTERISTICS},
                 **{name: 2.0 if name in names else 1.0 for name in tables}}
 
-    setting = made_up(study=study, finished=[("nsga2", 0)])
+    case = made_up(study=study, finished=[("nsga2", 0)])
     solutions = pd.DataFrame([changed(names) for names in ("abcd", "bcde", "abcd", "cdef", "abcf", "abcde", "abc")])
-    found = combinations(dataclasses.replace(setting, solutions=solutions))
+    found = combinations(dataclasses.replace(case, solutions=solutions))
     assert found["characteristics"].tolist() == [list("abcd"), list("abcf"), list("bcde")]
     assert found["percent"].tolist() == [40, 20, 20]
     assert found["rank"].tolist() == [1, 2, 2]
@@ -249,8 +249,8 @@ def test_several_settings_stand_in_one_frame_and_the_refused_in_the_notes() -> N
 
 
 def test_unfinished_campaigns_say_so() -> None:
-    setting = made_up(row(), row("rs"), row("rs", run=1))
-    assert any("unfinished, nsga2 1 of 2 runs" in note for note in answer([setting], "rq1")[0].notes)
+    case = made_up(row(), row("rs"), row("rs", run=1))
+    assert any("unfinished, nsga2 1 of 2 runs" in note for note in answer([case], "rq1")[0].notes)
     finished = made_up(row(), row(run=1), row("rs"), row("rs", run=1))
     assert not finished.remarks
 

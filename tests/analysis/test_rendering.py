@@ -15,7 +15,7 @@ import pytest
 from latex_syntax import mistakes
 from made_up import made_up, made_up_study, row
 
-from safevar_sumo.analysis import Setting, answer
+from safevar_sumo.analysis import Case, answer
 from safevar_sumo.analysis.tables import FORMATS, as_json, csv, escaped, latex, markdown, text
 from safevar_sumo.study import CharacteristicTable
 
@@ -23,7 +23,7 @@ NASTY = ['a&b',
          "50%_of $x$", "#1 {brace}", r"back\slash", "~tilde^2", "[option]", "*star", "<less|more>", "quo\"te'`", "ä µ ° ² Δ 車", "--"]
 
 
-def rich_setting(**changes: Any) -> Setting:
+def rich_setting(**changes: Any) -> Case:
     """Two algorithms, two runs, changes of one to three characteristics, a collision."""
     values = [(1000 + 50 * i, 2 - 0.1 * (i % 3), 0.1 if i % 2 else 0.2) for i in range(8)]
     rows = [row(algorithm, run, values=value, sd=1 - 0.3 * i + 0.1 * run + (0.5 if algorithm == "rs" else 0), tet=1 + i / 10)
@@ -31,33 +31,33 @@ def rich_setting(**changes: Any) -> Setting:
     return made_up(*rows, study=made_up_study(**changes) if changes else None)
 
 
-def nasty_setting() -> Setting:
+def nasty_setting() -> Case:
     study = made_up_study()
     tables = {name: CharacteristicTable(unit=name, original=1, lower=0.5, upper=2) for name in NASTY}
     study = msgspec.structs.replace(study, vehicle=msgspec.structs.replace(study.vehicle, characteristics=tables))
-    setting = made_up(row(), row("rs"), study=study)
+    case = made_up(row(), row("rs"), study=study)
     changed = {name: 1.5 if i < 4 else 1.0 for i, name in enumerate(NASTY)}
-    solutions = setting.solutions.drop(columns=["mass", "grip", "lag"]).assign(**changed)
-    object.__setattr__(setting, "solutions", solutions)
-    object.__setattr__(setting, "name", "_".join(NASTY))
-    return setting
+    solutions = case.solutions.drop(columns=["mass", "grip", "lag"]).assign(**changed)
+    object.__setattr__(case, "solutions", solutions)
+    object.__setattr__(case, "name", "_".join(NASTY))
+    return case
 
 
 @pytest.fixture(params=["one", "two", "nasty"])
-def settings(request: pytest.FixtureRequest) -> list[Setting]:
+def cases(request: pytest.FixtureRequest) -> list[Case]:
     return {"one": [rich_setting()], "two": [rich_setting(), rich_setting(name="wet", weather="hard_rain")], "nasty": [nasty_setting()]}[
         request.param]
 
 
-def test_latex_has_no_mistakes(settings: list[Setting]) -> None:
-    document = latex(answer(settings))
+def test_latex_has_no_mistakes(cases: list[Case]) -> None:
+    document = latex(answer(cases))
     assert mistakes(document) == []
     assert document.count(r"\toprule") == document.count(r"\bottomrule") > 5
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX here; the syntax is checked without")
-def test_latex_compiles(settings: list[Setting], tmp_path: Path) -> None:
-    (tmp_path / "tables.tex").write_text(latex(answer(settings)), encoding="utf-8")
+def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
+    (tmp_path / "tables.tex").write_text(latex(answer(cases)), encoding="utf-8")
     done = subprocess.run(["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "tables.tex"], cwd=tmp_path, capture_output=True,
                           text=True, errors="replace", check=False)
     assert done.returncode == 0, done.stdout[-2000:]
@@ -79,14 +79,14 @@ def test_special_characters_are_escaped(plain: str, latex_form: str) -> None:
     assert escaped(plain) == latex_form
 
 
-def test_markdown_rows_are_as_wide_as_their_heads(settings: list[Setting]) -> None:
-    for block in markdown(answer(settings)).split("\n\n"):
+def test_markdown_rows_are_as_wide_as_their_heads(cases: list[Case]) -> None:
+    for block in markdown(answer(cases)).split("\n\n"):
         lines = [line.replace(r"\|", "") for line in block.splitlines() if line.startswith("|")]
         assert len({line.count("|") for line in lines}) <= 1
 
 
-def test_text_columns_stand_under_their_heads(settings: list[Setting]) -> None:
-    printed = text(answer(settings))
+def test_text_columns_stand_under_their_heads(cases: list[Case]) -> None:
+    printed = text(answer(cases))
     assert "nan" not in printed.lower().replace("magnan", "")
     blocks = printed.split("\n\n")
     ruled = [block.splitlines() for block in blocks if any(set(line) == {"-"} for line in block.splitlines())]
@@ -96,9 +96,9 @@ def test_text_columns_stand_under_their_heads(settings: list[Setting]) -> None:
         assert max(len(line) for line in lines[rule - 1:]) <= len(lines[rule]) + 1
 
 
-def test_json_is_one_list_of_plain_records(settings: list[Setting]) -> None:
+def test_json_is_one_list_of_plain_records(cases: list[Case]) -> None:
     for question in ("rq1", "rq2", "rq3.1", "rq3.2", "rq3.3", "collisions"):
-        records = json.loads(as_json(answer(settings, question)[:1]))
+        records = json.loads(as_json(answer(cases, question)[:1]))
         assert isinstance(records, list)
         assert all(isinstance(one["setting"], str) for one in records)
 
@@ -131,8 +131,8 @@ def test_csv_holds_the_numbers_of_the_json() -> None:
 
 
 def test_significant_and_notable_cells_stand_out() -> None:
-    settings = [made_up(*(row(sd=1 - i / 100) for i in range(30)))]
-    told = answer(settings, "rq1")
+    cases = [made_up(*(row(sd=1 - i / 100) for i in range(30)))]
+    told = answer(cases, "rq1")
     assert "<0.001*  0.000*" in text(told)
     assert r"\textbf{\textless{}0.001} & \textbf{0.000}" in latex(told)
     assert r"**\<0.001** | **0.000**" in markdown(told)
@@ -142,5 +142,5 @@ def test_significant_and_notable_cells_stand_out() -> None:
 
 @pytest.mark.parametrize("kind", list(FORMATS))
 def test_what_cannot_be_told_is_never_a_nan(kind: str) -> None:
-    settings = [made_up(row(sd=-1), row("rs", tet=None, ave_dece=None), original={"safety_degree": 0.5})]
-    assert "nan" not in FORMATS[kind](answer(settings)).lower()
+    cases = [made_up(row(sd=-1), row("rs", tet=None, ave_dece=None), original={"safety_degree": 0.5})]
+    assert "nan" not in FORMATS[kind](answer(cases)).lower()

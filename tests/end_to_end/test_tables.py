@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 from test_commands import run as run_process
 
-from safevar_sumo.analysis import load_settings
+from safevar_sumo.analysis import load_cases
 from safevar_sumo.cli import main
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -146,7 +146,7 @@ def test_imported_solutions_are_filtered_and_counted_anew(imported: Path) -> Non
 
 
 def test_imported_settings_survive_the_file_to_the_last_bit(imported: Path) -> None:
-    setting = load_settings([imported])[0]
+    setting = load_cases([imported])[0]
     changed = setting.characteristics.number_changed(setting.solutions[list(setting.characteristics.names)].to_numpy())
     assert changed.tolist() == setting.solutions["f_num_diff"].tolist()
     assert 0 < (changed < 12).sum() < 70

@@ -1,4 +1,4 @@
-"""One setting's results as the research questions need them: who found what, and what the original vehicle did."""
+"""One case's results as the research questions need them: who found what, and what the original vehicle did."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Unanswerable(InputError):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Setting:
+class Case:
     """The results of one study.
 
     Attributes
@@ -102,7 +102,7 @@ class Setting:
 
     @property
     def remarks(self) -> list[str]:
-        """What a reader of any table of this setting should know."""
+        """What a reader of any table of this case should know."""
         told = []
         if not self.has_runs:
             told.append(f"{self.name}: imported solutions, without runs; the original vehicle as published or given.")
@@ -127,8 +127,8 @@ def collided(solutions: pd.DataFrame) -> pd.Series[bool]:
     return solutions["outcome"] == str(Outcome.COLLISION)
 
 
-def load_settings(directories: Iterable[str | Path]) -> list[Setting]:
-    """Read results directories; settings of the same name are told apart by their directories.
+def load_cases(directories: Iterable[str | Path]) -> list[Case]:
+    """Read results directories; cases of the same name are told apart by their directories.
 
     Raises
     ------
@@ -144,14 +144,14 @@ def load_settings(directories: Iterable[str | Path]) -> list[Setting]:
     return [replace(one, name=f"{one.name} ({place})") if names[one.name] > 1 else one for one, place in zip(found, places, strict=True)]
 
 
-def _loaded(place: Path) -> Setting:
+def _loaded(place: Path) -> Case:
     try:
-        return load_setting(place)
+        return load_case(place)
     except (TypeError, ValueError, KeyError, ArithmeticError) as error:
         raise InputError(place, f"is damaged: {told(error)}", "a directory as the command study has left it") from error
 
 
-def load_setting(directory: Path) -> Setting:
+def load_case(directory: Path) -> Case:
     """Read one results directory."""
     manifest, evaluations, solutions, finished = load(directory)
     try:
@@ -161,12 +161,12 @@ def load_setting(directory: Path) -> Setting:
     original = manifest.get("original")
     if not isinstance(original, dict):
         raise InputError(directory / "manifest.json", "tells nothing of the original vehicle", "what the command study has written")
-    return setting_of(study, original, solutions, evaluations, finished, "imported" not in manifest)
+    return case_of(study, original, solutions, evaluations, finished, "imported" not in manifest)
 
 
-def setting_of(study: Study, original: Mapping[str, Any], solutions: pd.DataFrame, evaluations: pd.DataFrame,
-               finished: Sequence[tuple[str, int]], has_runs: bool = True) -> Setting:
-    """Put a setting together; in `original` an undefined metric is None or missing."""
+def case_of(study: Study, original: Mapping[str, Any], solutions: pd.DataFrame, evaluations: pd.DataFrame,
+               finished: Sequence[tuple[str, int]], has_runs: bool = True) -> Case:
+    """Put a case together; in `original` an undefined metric is None or missing."""
     metrics = {name: np.nan if original.get(name) is None else float(original[name]) for name in METRICS}
-    return Setting(name=study.name, study=study, original=metrics, solutions=solutions, evaluations=evaluations,
+    return Case(name=study.name, study=study, original=metrics, solutions=solutions, evaluations=evaluations,
                    finished=tuple(finished), has_runs=has_runs)
