@@ -2,13 +2,16 @@
 PYTHON ?= python3
 RUN := .venv/bin/python
 
-.PHONY: study test lint benchmark clean
+.PHONY: study test test-all lint benchmark clean
 
 study: .venv/installed
 	$(RUN) -m safevar_sumo study rain
 
 test: .venv/installed
 	$(RUN) -m pytest
+
+test-all: test
+	$(RUN) -m pytest -m slow
 
 lint: .venv/installed
 	$(RUN) -m ruff check .
