@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -112,7 +113,7 @@ def test_list_names_everything_in_text_and_json() -> None:
 
 
 def test_version_and_help_say_what_this_is() -> None:
-    assert "0.1.0" in run("--version").stdout
+    assert version("safevar_sumo") in run("--version").stdout
     assert "automated driving" in run("--help").stdout
 
 
