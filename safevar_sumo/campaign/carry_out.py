@@ -1,0 +1,123 @@
+"""Many runs at once over one pool, each with its journal."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.campaign.interrupts import interrupts_between_waits
+from safevar_sumo.campaign.keys import RunKey, algorithm_of, run_generator
+from safevar_sumo.campaign.run import Observer, Run
+from safevar_sumo.computing import PersistentPool, Pool, packed
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import JournalBusy, ResultsDirectory
+from safevar_sumo.search import Problem
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
+
+RUNS_PER_WORKER = 2
+"""How many runs are under way for each worker: one is computed while another is searched and journalled."""
+
+
+class Campaign(NamedTuple):
+    """What runs of a study found: the original vehicle's evaluation and the solutions of every finished run.
+
+    `failures` settings could not be simulated; `busy` runs are in the hands of another process.
+    """
+
+    original: Evaluations
+    solutions: dict[RunKey, Evaluations]
+    failures: int
+    busy: list[RunKey]
+
+
+def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, pool: Pool, observer: Observer,
+              batch: int | None = None) -> Campaign:
+    """Carry out runs of a study, or finish what of them is unfinished.
+
+    Parameters
+    ----------
+    keys
+        Which runs.
+    results
+        Where their journals are kept.
+    pool
+        Computes batches.
+    batch
+        Settings per SUMO simulation, the population's size by default.
+
+    Raises
+    ------
+    SafevarError
+        If a journal cannot be written or the study itself is at fault.
+    """
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    persistent, work = PersistentPool(pool, characteristics), packed(study)
+    original = _original(work, characteristics, results, persistent)
+    results.begin(original)
+    problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations)
+    campaign = Campaign(original, {}, 0, [])
+    waiting, active = deque(keys), dict[Future[Evaluations], Run]()
+    runs: set[Run] = set()
+
+    def go_on(run: Run) -> None:
+        """Let a run go as far as it can, then have computed what it misses."""
+        nonlocal campaign
+        if run.advance():
+            campaign.solutions[run.key] = run.result
+            campaign = campaign._replace(failures=campaign.failures + run.failures)
+            runs.discard(run)
+            run.close()
+        else:
+            for settings in _batches(run.missing, batch or study.search.population):
+                active[persistent.submit(work, settings)] = run
+
+    try:
+        with interrupts_between_waits() as first_of:
+            while waiting or active:
+                while waiting and len(runs) < RUNS_PER_WORKER * persistent.workers:
+                    key = waiting.popleft()
+                    try:
+                        journal = results.journal(str(key))
+                    except JournalBusy:
+                        campaign.busy.append(key)
+                        continue
+                    search = algorithm_of(key.algorithm, study).search(problem, run_generator(study, key))
+                    runs.add(run := Run(key, search, journal, observer))
+                    go_on(run)
+                for future in first_of(active):
+                    run = active.pop(future)
+                    if run.take(future.result()):
+                        go_on(run)
+    finally:
+        for run in runs:
+            run.close()
+    return campaign._replace(solutions={key: campaign.solutions[key] for key in sorted(campaign.solutions)})
+
+
+def _original(work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: PersistentPool) -> Evaluations:
+    """The original vehicle's evaluation, simulated once; where it fails, the study is at fault."""
+    def simulated() -> Evaluations:
+        return pool.submit(work, characteristics.original[np.newaxis], must_succeed=True).result()
+
+    try:
+        journal = results.journal("original")
+    except JournalBusy:  # another process, of a job array say, is about to write the same
+        return simulated()
+    try:
+        if journal.evaluations is None:
+            evaluations = simulated()
+            journal.append([0], evaluations)
+            return evaluations
+        return journal.evaluations
+    finally:
+        journal.close()
+
+
+def _batches(settings: FloatArray, size: int) -> Iterator[FloatArray]:
+    for start in range(0, len(settings), size):
+        yield settings[start:start + size]

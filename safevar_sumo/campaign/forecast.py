@@ -1,0 +1,49 @@
+"""What a campaign would take, measured by a short probe."""
+
+from __future__ import annotations
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.computing import PersistentPool, Pool, packed
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
+
+PROBE_BATCHES = 4
+"""Batches on every worker that a forecast is measured with."""
+NUMBERS_BESIDE_METRICS = 4
+"""A journal keeps f_diff, f_num_diff, the collision's speed and a position and outcome with the metrics of a setting."""
+
+
+class Forecast(NamedTuple):
+    """Evaluations, evaluations per second, seconds and bytes that a campaign takes at the most."""
+
+    evaluations: int
+    rate: float
+    seconds: float
+    size: int
+
+
+def forecast(study: Study, runs: int, pool: Pool, batch: int | None = None) -> Forecast:
+    """What carrying out `runs` runs takes at the most, after a short probe of the pool that will do it."""
+    characteristics, size = CharacteristicSet.of(study.vehicle.characteristics), batch or study.search.population
+    persistent, work, rng = PersistentPool(pool, characteristics), packed(study), np.random.default_rng(study.search.seed)
+
+    def probe(number: int) -> float:
+        """Seconds that `number` batches on every worker take."""
+        start = time.perf_counter()
+        drawn = [characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (size, len(characteristics))))
+                 for _ in range(number * pool.workers)]
+        for future in [persistent.submit(work, settings) for settings in drawn]:
+            future.result()
+        return time.perf_counter() - start
+
+    persistent.submit(work, characteristics.original[np.newaxis], must_succeed=True).result()
+    probe(1)  # starts the workers and builds the network
+    rate = PROBE_BATCHES * pool.workers * size / probe(PROBE_BATCHES)
+    evaluations = runs * study.search.evaluations
+    row = 8 * (len(characteristics) + len(METRICS) + NUMBERS_BESIDE_METRICS)
+    return Forecast(evaluations, rate, evaluations / rate, evaluations * row)

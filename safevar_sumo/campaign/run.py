@@ -1,0 +1,98 @@
+"""One run under way: a search, what it asks for, and what of that is known."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from safevar_sumo.campaign.keys import RunKey
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import Journal
+from safevar_sumo.search import Search
+
+
+class Observer(Protocol):
+    """Is told how a campaign goes on."""
+
+    def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
+        """A population of a run is evaluated, `simulated` of it now, the others from journal or memory."""
+
+    def finished(self, key: RunKey, asked: int) -> None:
+        """A run is over, after `asked` evaluations."""
+
+    def warned(self, message: str) -> None:
+        """Something happened that the user should know."""
+
+
+class Run:
+    """A search, what it asks for, and what of that is known."""
+
+    def __init__(self, key: RunKey, search: Search, journal: Journal, observer: Observer) -> None:
+        self.key, self._search, self._journal, self._observer = key, search, journal, observer
+        self._known: dict[bytes, tuple[int, Evaluations, int]] = {}
+        self.failures = self._asked = 0
+        self._settings: FloatArray | None = None
+        self._fresh = 0
+        self.result: Evaluations
+        if journal.cut:
+            observer.warned(f"{journal.path}: the last {journal.cut} bytes were torn; what they held is simulated again")
+        if journal.evaluations is not None:
+            self._learn(journal.positions, journal.evaluations)
+
+    @property
+    def missing(self) -> FloatArray:
+        """What the search asks for and nobody knows yet, each once; shape (k, n)."""
+        assert self._settings is not None
+        return np.array(list({row.tobytes(): row for row in self._settings if row.tobytes() not in self._known}.values()))
+
+    def advance(self) -> bool:
+        """Answer the search as long as everything it asks for is known; whether it has ended."""
+        if self._journal.result is not None:
+            self.result = self._by_position(self._journal.result)
+            self._observer.finished(self.key, self._journal.asked)
+            return True
+        if self._settings is None:
+            self._settings = next(self._search)
+        while not len(self.missing):
+            evaluations = self._recalled(self._settings)
+            self._observer.evaluated(self.key, evaluations, self._fresh)
+            self._asked, self._fresh = self._asked + len(evaluations), 0
+            try:
+                self._settings = self._search.send(evaluations)
+            except StopIteration as end:
+                self.result = end.value
+                self._journal.finish([self._known[row.tobytes()][0] for row in self.result.settings], self._asked)
+                self._observer.finished(self.key, self._asked)
+                return True
+        return False
+
+    def take(self, evaluations: Evaluations) -> bool:
+        """Journal and learn a computed batch; whether that was all that was missing."""
+        assert self._settings is not None
+        places = {row.tobytes(): self._asked + i for i, row in reversed(list(enumerate(self._settings)))}
+        positions = [places[row.tobytes()] for row in evaluations.settings]
+        self._journal.append(positions, evaluations)
+        self._learn(positions, evaluations)
+        self._fresh += len(evaluations)
+        return not len(self.missing)
+
+    def close(self) -> None:
+        """Give the journal back."""
+        self._journal.close()
+
+    def _learn(self, positions: list[int], evaluations: Evaluations) -> None:
+        self.failures += int(np.count_nonzero(~evaluations.valid))
+        if self._journal.result is None:
+            for i, position in enumerate(positions):
+                self._known[evaluations.settings[i].tobytes()] = (position, evaluations, i)
+
+    def _recalled(self, settings: FloatArray) -> Evaluations:
+        """The evaluations of known settings, in their order."""
+        found = [self._known[row.tobytes()] for row in settings]
+        return Evaluations.concatenate([evaluations.take([i]) for _, evaluations, i in found])
+
+    def _by_position(self, positions: list[int]) -> Evaluations:
+        assert self._journal.evaluations is not None
+        row_of = {position: row for row, position in enumerate(self._journal.positions)}
+        return self._journal.evaluations.take([row_of[position] for position in positions])
