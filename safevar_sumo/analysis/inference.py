@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import mannwhitneyu
 
 from safevar_sumo.errors import InputError
 
@@ -48,6 +47,8 @@ def compare(x: ArrayLike, y: ArrayLike) -> Comparison:
     InputError
         If a value is NaN.
     """
+    from scipy.stats import mannwhitneyu  # takes longer to load than most answers to find
+
     one, other = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if np.isnan(one).any() or np.isnan(other).any():
         raise InputError("Mann-Whitney U", "a value is NaN", "samples without undefined values")

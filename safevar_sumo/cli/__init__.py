@@ -1,6 +1,5 @@
-"""The commands: parse, call, print; one module for each kind of them."""
+"""The commands: parse, call, print; one module for each kind of them, loaded when one of its commands is called."""
 
-from safevar_sumo.cli import answers, catalogue, reference, simulate, study
 from safevar_sumo.cli.program import main
 
-__all__ = ["answers", "catalogue", "main", "reference", "simulate", "study"]
+__all__ = ["main"]

@@ -10,13 +10,13 @@ import click
 import msgspec
 from rich.console import Console
 
-from safevar_sumo import terminal
 from safevar_sumo.ads import ADS
 from safevar_sumo.cli.program import commands
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study, study_names
+from safevar_sumo.terminal.simulation import print_names
 from safevar_sumo.vehicles import VEHICLES, CharacteristicSet
 
 
@@ -60,15 +60,15 @@ def _described(name: str, what: Callable[..., Any]) -> dict[str, str]:
 
 def _print_catalogue(console: Console, studies: list[Study]) -> None:
     catalogue = _catalogue(studies)
-    terminal.print_names(console, "Studies", [tuple(row.values()) for row in catalogue["studies"]],
+    print_names(console, "Studies", [tuple(row.values()) for row in catalogue["studies"]],
                          ("name", "title", "vehicle", "ADS", "scenario", "weather"))
     for vehicle in catalogue["vehicles"]:
         rows = [(row["name"], row["unit"], *(f"{row[key]:g}" for key in ("original", "lower", "upper", "threshold")))
                 for row in vehicle["characteristics"]]
         heads = ("characteristic", "unit", "original", "lower", "upper", "threshold")
-        terminal.print_names(console, f"Vehicle {vehicle['name']}", rows, heads)
+        print_names(console, f"Vehicle {vehicle['name']}", rows, heads)
     weathers = [(row["name"], *(f"{row[key]:g}" for key in ("road_friction", "visibility", "recognition_delay")))
                 for row in catalogue["weathers"]]
-    terminal.print_names(console, "Weathers", weathers, ("name", "road friction", "visibility", "recognition delay, s"))
+    print_names(console, "Weathers", weathers, ("name", "road friction", "visibility", "recognition delay, s"))
     for title, key in (("ADSs", "ads"), ("Scenarios", "scenarios"), ("Algorithms", "algorithms"), ("Metrics", "metrics")):
-        terminal.print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "what"))
+        print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "what"))

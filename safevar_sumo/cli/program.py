@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import os
 import signal
@@ -12,9 +13,36 @@ import click
 from safevar_sumo.errors import SafevarError
 
 INTERRUPTED = 130
+COMMANDS = {
+    "study": ("study", "Search a study; the same command again goes on where it was stopped."),
+    "simulate": ("simulate", "Simulate a study once: how it ends, its safety metrics and objectives."),
+    "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms and metrics."),
+    "tables": ("answers", "Answer the research questions as tables."),
+    "figures": ("answers", "Draw the figures of results."),
+    "import": ("reference", "Make results of solutions in the published package's CSV format."),
+    "validate": ("reference", "Compare a study with reference data, row by row."),
+    "calibrate": ("reference", "Fit a study's free parameters to reference data."),
+}
+"""Every command, in the order of the help: the module of this folder that it lives in, and what the help says of it."""
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+class OnDemand(click.Group):
+    """Loads a command's module when the command is called: most of the others need a lot that it does not."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name in COMMANDS:
+            importlib.import_module(f"safevar_sumo.cli.{COMMANDS[name][0]}")
+        return super().get_command(ctx, name)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, sentence) for name, (_, sentence) in COMMANDS.items()])
+
+
+@click.group(cls=OnDemand, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="safevar_sumo")
 def commands() -> None:
     """Search the smallest variations of a vehicle that make its automated driving system unsafe, on SUMO.

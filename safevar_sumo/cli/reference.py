@@ -9,7 +9,6 @@ import click
 import numpy as np
 from rich.console import Console
 
-from safevar_sumo import terminal
 from safevar_sumo.cli.program import commands
 from safevar_sumo.computing import available_cores, evaluate_all, local_pool
 from safevar_sumo.errors import InputError, SimulationError
@@ -28,6 +27,8 @@ from safevar_sumo.reference import (
 from safevar_sumo.results import write_imported
 from safevar_sumo.simulation import assemble
 from safevar_sumo.study import Study, check_writable, load_study, write_study
+from safevar_sumo.terminal.progress import counted, counted_trials
+from safevar_sumo.terminal.reference import print_agreement, print_calibration
 from safevar_sumo.vehicles import CharacteristicSet
 
 PICTURES = (".png", ".pdf", ".svg")
@@ -50,7 +51,7 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     data = _read(reference, system.characteristics)
     settings = np.concatenate([system.characteristics.original[np.newaxis], data.settings])
     with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
-          terminal.counted(Console(stderr=True), "settings", len(np.unique(settings, axis=0))) as done):
+          counted(Console(stderr=True), "settings", len(np.unique(settings, axis=0))) as done):
         evaluations = evaluate_all(chosen, settings, pool, done)
     data, here = _simulated(reference, data, evaluations.take(np.arange(1, len(settings))))
     if not evaluations.valid[0]:
@@ -61,7 +62,7 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     if as_json:
         click.echo(json.dumps(result.to_dict(), indent=2, allow_nan=False))
     else:
-        terminal.print_agreement(Console(), chosen, result)
+        print_agreement(Console(), chosen, result)
 
 
 @commands.command(name="calibrate")
@@ -87,7 +88,7 @@ def calibrate_command(study: str, references: tuple[Path, ...], trials: int, see
     tried, lowest, best = 0, np.inf, chosen
     try:
         with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
-              terminal.trials(Console(stderr=True), trials) as done):
+              counted_trials(Console(stderr=True), trials) as done):
             def one_done(cost: float, so_far: Study) -> None:
                 nonlocal tried, lowest, best
                 tried, lowest, best = tried + 1, cost, so_far
@@ -99,7 +100,7 @@ def calibrate_command(study: str, references: tuple[Path, ...], trials: int, see
             write_study(target, best, f"Best of {tried} of {trials} trials, then interrupted (seed {seed}). Cost {lowest:.4f}.")
             click.echo(f"interrupted: the best of {tried} trials is in {target}", err=True)
         raise
-    terminal.print_calibration(Console(), chosen, found)
+    print_calibration(Console(), chosen, found)
     write_study(target, found.study, calibration_comment(found, chosen, used, trials, seed))
     Console().print(f"Study file: {target}", soft_wrap=True)
 

@@ -7,10 +7,8 @@ from pathlib import Path
 
 import click
 import numpy as np
-import pandas as pd
 from rich.console import Console
 
-from safevar_sumo import terminal
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import time_to_collision
@@ -18,6 +16,7 @@ from safevar_sumo.records import Drives, FloatArray
 from safevar_sumo.results import record
 from safevar_sumo.simulation import Engine, assemble, score, simulate
 from safevar_sumo.study import load_study
+from safevar_sumo.terminal.simulation import print_evaluation
 
 
 @commands.command(name="simulate")
@@ -42,7 +41,7 @@ def simulate_command(study: str, changes: tuple[str, ...], no_filter: bool, trac
     if as_json:
         click.echo(json.dumps(result, indent=2, allow_nan=False))
     else:
-        terminal.print_evaluation(Console(), chosen, result, system.characteristics)
+        print_evaluation(Console(), chosen, result, system.characteristics)
 
 
 def _assignments(changes: tuple[str, ...]) -> dict[str, float]:
@@ -58,6 +57,8 @@ def _assignments(changes: tuple[str, ...]) -> dict[str, float]:
 
 def _write_trace(path: Path, run: Drives) -> None:
     """One row per simulation step of the only vehicle, units in the header."""
+    import pandas as pd  # takes longer to load than the simulation
+
     trace = run.trace
     shown = trace.active[:, 0]
     acceleration = np.diff(trace.speed, axis=0, prepend=trace.speed[:1]) / trace.step

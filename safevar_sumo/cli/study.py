@@ -9,7 +9,6 @@ import click
 import msgspec
 from rich.console import Console
 
-from safevar_sumo import terminal
 from safevar_sumo.campaign import RunKey, algorithm_of, all_runs, carry_out, forecast
 from safevar_sumo.cli.program import commands
 from safevar_sumo.computing import available_cores, cluster_pool, local_pool
@@ -17,6 +16,8 @@ from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.simulation import assemble, network_fingerprint
 from safevar_sumo.study import Study, load_study
+from safevar_sumo.terminal.campaign import print_forecast, print_summary
+from safevar_sumo.terminal.progress import CampaignProgress
 
 
 @commands.command()
@@ -45,17 +46,17 @@ def study(study: str, batch: int | None, out: Path | None, jobs: int | None, clu
     limit = chosen.search.time_limit
     with cluster_pool(cluster, limit) if cluster is not None else local_pool(jobs or available_cores(), limit) as pool:
         if dry_run:
-            terminal.print_forecast(Console(), chosen, len(keys), forecast(chosen, len(keys), pool, batch))
+            print_forecast(Console(), chosen, len(keys), forecast(chosen, len(keys), pool, batch))
             return
         results = ResultsDirectory(out or Path("results") / chosen.name, chosen, network_fingerprint(system.scenario.network))
-        with terminal.CampaignProgress(Console(stderr=True), chosen, keys, quiet) as progress:
+        with CampaignProgress(Console(stderr=True), chosen, keys, quiet) as progress:
             campaign = carry_out(chosen, keys, results, pool, progress, batch)
     if campaign.busy:
         raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: the same command later finishes the study")
     if keys == all_runs(chosen):
         results.finish(campaign.solutions)
     if not quiet:
-        terminal.print_summary(Console(), chosen, campaign, results.path)
+        print_summary(Console(), chosen, campaign, results.path)
         Console().print(f"Results: {results.path}", soft_wrap=True)
 
 

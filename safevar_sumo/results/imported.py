@@ -6,17 +6,19 @@ import json
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
-import pandas as pd
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results.store import MANIFEST, RUNS, SOLUTIONS, make_directory, read_manifest, solutions_frame, write_whole
 from safevar_sumo.study import Study
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 UNKNOWN = "unknown"
 """Outcome of an imported solution that did not collide: how it ended is not told."""
@@ -61,6 +63,8 @@ def read_imported(path: Path, characteristics: tuple[str, ...]) -> pd.DataFrame:
     InputError
         If the file is missing or damaged.
     """
+    import pandas as pd
+
     file = path / SOLUTIONS
     numbers = [*characteristics, "f_safe", "f_diff", "f_num_diff", *METRICS]
     try:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.results.imported import read_imported
 from safevar_sumo.results.journal import read_journal
 from safevar_sumo.results.store import MANIFEST, RUNS, evaluations_frame, read_manifest, solutions_frame
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class Results(NamedTuple):

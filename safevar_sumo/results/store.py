@@ -9,17 +9,19 @@ from collections.abc import Iterable, Mapping
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
-import pandas as pd
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results.journal import Journal
 from safevar_sumo.study import Study
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 MANIFEST, SOLUTIONS, RUNS = "manifest.json", "solutions.csv", "runs"
 VERSIONED = ("safevar_sumo", "libsumo", "deap", "numpy")
@@ -155,12 +157,16 @@ def evaluations_frame(characteristics: tuple[str, ...], runs: Iterable[tuple[tup
     Columns: algorithm, run, the characteristics' filtered values in their table units, f_safe, f_diff [fraction],
     f_num_diff, safety_degree [m or -m/s], tet [s], tit [s^2], ave_dece [m/s^2], outcome.
     """
+    import pandas as pd
+
     frames = [_frame("", 0, characteristics, Evaluations.none(len(characteristics), METRICS))]
     frames += [_frame(algorithm, run, characteristics, found) for (algorithm, run), found in runs]
     return pd.concat(frames, ignore_index=True)
 
 
 def _frame(algorithm: str, run: int, characteristics: tuple[str, ...], found: Evaluations) -> pd.DataFrame:
+    import pandas as pd
+
     return pd.DataFrame({
         "algorithm": np.full(len(found), algorithm, dtype=object), "run": np.full(len(found), run),
         **dict(zip(characteristics, found.settings.T, strict=True)), "f_safe": found.f_safe, "f_diff": found.f_diff,

@@ -10,7 +10,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from safevar_sumo.analysis import brief, case_of
 from safevar_sumo.campaign import Campaign, Forecast
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import record, solutions_frame
@@ -36,6 +35,8 @@ def print_forecast(console: Console, study: Study, runs: int, told: Forecast) ->
 
 def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path) -> None:
     """Per algorithm what was found, beside the original vehicle; the most critical setting; what RQ1 and RQ2 say of it."""
+    from safevar_sumo.analysis import brief, case_of  # takes longer to load than all the rest
+
     found = {"original vehicle": campaign.original}
     for algorithm in study.search.algorithms:
         of_it = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]

@@ -120,7 +120,7 @@ def counted(console: Console, what: str, total: int) -> Iterator[Callable[[int],
 
 
 @contextmanager
-def trials(console: Console, total: int) -> Iterator[Callable[[float], None]]:
+def counted_trials(console: Console, total: int) -> Iterator[Callable[[float], None]]:
     """A bar that counts trials; yields what to call after each with the lowest cost so far."""
     columns = (TextColumn("trials"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.fields[told]}"))
     spoke = time.monotonic()

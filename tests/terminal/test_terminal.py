@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from safevar_sumo import terminal
 from safevar_sumo.campaign import RunKey, all_runs
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study, load_study
+from safevar_sumo.terminal.progress import CampaignProgress
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def shown(study: Study, clock: list[float], *, terminal_width: int | None, quiet
     """What is printed by 400 evaluations, one hundred every ten seconds, and then a run that ends."""
     out = StringIO()
     console = Console(file=out, force_terminal=terminal_width is not None, width=terminal_width or 80, _environ={})
-    with terminal.CampaignProgress(console, study, all_runs(study), quiet) as progress:
+    with CampaignProgress(console, study, all_runs(study), quiet) as progress:
         for _ in range(5):
             progress.evaluated(RunKey("nsga2", 0), found(100), 100)
             clock[0] += 10
@@ -68,7 +68,7 @@ def test_quiet_says_nothing(study: Study, clock: list[float]) -> None:
 
 def test_what_comes_from_journals_counts_as_done_and_not_as_fast(study: Study, clock: list[float]) -> None:
     out = StringIO()
-    with terminal.CampaignProgress(Console(file=out, width=80), study, all_runs(study), quiet=False) as progress:
+    with CampaignProgress(Console(file=out, width=80), study, all_runs(study), quiet=False) as progress:
         progress.finished(RunKey("nsga2", 0), 1000)
         progress.evaluated(RunKey("nsga2", 1), found(500), 0)
         clock[0] += 40

@@ -1,0 +1,55 @@
+"""The program itself: what it lists, and what it loads."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import subprocess
+import sys
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from safevar_sumo import cli
+from safevar_sumo.cli.program import COMMANDS, commands
+
+HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
+
+
+def loaded(code: str) -> set[str]:
+    """Which of the heavy packages a fresh interpreter has loaded after some code."""
+    told = f"import sys\n{code}\nprint(*(set(sys.modules) & {HEAVY!r}))"
+    return set(subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=True).stdout.splitlines()[-1].split())
+
+
+def test_every_command_is_listed_and_every_listed_one_is_there() -> None:
+    for module in pkgutil.iter_modules(cli.__path__):
+        importlib.import_module(f"safevar_sumo.cli.{module.name}")
+    assert set(commands.commands) == set(COMMANDS)
+    told = " ".join(CliRunner().invoke(commands, ["--help"]).stdout.split())
+    for name, (_, sentence) in COMMANDS.items():
+        assert f" {name} {sentence}" in told
+        assert sentence.endswith(".")
+
+
+@pytest.mark.parametrize("command", list(COMMANDS))
+def test_every_command_and_each_of_its_options_has_a_whole_sentence_of_help(command: str) -> None:
+    found = commands.get_command(None, command)  # type: ignore[arg-type]
+    assert found is not None
+    assert str(found.help).endswith(".")
+    told = CliRunner().invoke(commands, [command, "--help"])
+    assert told.exit_code == 0
+    for option in found.params:
+        assert isinstance(option, click.Argument) or str(option.help).endswith((".", "]")), option.name  # type: ignore[attr-defined]
+
+
+def test_the_package_and_the_help_load_nothing_heavy() -> None:
+    assert loaded("import safevar_sumo") == set()
+    assert loaded("import safevar_sumo.cli") == set()
+
+
+def test_one_simulation_loads_sumo_and_no_statistics() -> None:
+    code = "from click.testing import CliRunner\nfrom safevar_sumo.cli.program import commands\n"
+    assert loaded(code + "print(CliRunner().invoke(commands, ['list']).exit_code)") == set()
+    assert loaded(code + "print(CliRunner().invoke(commands, ['simulate', 'sun', '--json']).exit_code)") <= {"libsumo", "traci"}
