@@ -1,0 +1,113 @@
+"""Handles: how a solution of a results directory is called, `ALGORITHM:RUN:N`, and the solutions that are asked for by what they are."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import pandas as pd
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import Outcome
+
+LEGAL = "ALGORITHM:RUN:N, the N-th row of that run in solutions.csv, from 0"
+HALF = 0.5
+"""Share of the original's safety degree below which a solution counts as unsafe where none collides."""
+
+
+class Handle(NamedTuple):
+    """One solution: the `row`-th of a run's solutions in the order of solutions.csv, from 0.
+
+    Imported solutions belong to no run; theirs count as run 0.
+    """
+
+    algorithm: str
+    run: int
+    row: int
+
+    def __str__(self) -> str:
+        return f"{self.algorithm}:{self.run}:{self.row}"
+
+    @classmethod
+    def parse(cls, text: str, source: object = "--solution") -> Handle:
+        """Read a handle.
+
+        Raises
+        ------
+        InputError
+            If it is none.
+        """
+        algorithm, _, rest = text.partition(":")
+        run, _, row = rest.partition(":")
+        if not (algorithm and all(number.isascii() and number.isdecimal() and len(number) < 10 for number in (run, row))):
+            raise InputError(source, repr(text), LEGAL)
+        return cls(algorithm, int(run), int(row))
+
+
+def handles(solutions: pd.DataFrame) -> list[Handle]:
+    """The handle of every row of a frame of solutions, as `safevar_sumo.results.load` gives it."""
+    run = solutions["run"] if "run" in solutions else pd.Series(0, index=solutions.index)
+    row = solutions.groupby([solutions["algorithm"], run], sort=False).cumcount()
+    return [Handle(str(algorithm), int(number), int(place))
+            for algorithm, number, place in zip(solutions["algorithm"], run, row, strict=True)]
+
+
+def position_of(solutions: pd.DataFrame, handle: Handle, source: object = "--solution") -> int:
+    """The place of a handle's solution among the rows of the frame.
+
+    Raises
+    ------
+    InputError
+        If there is no such solution.
+    """
+    known = handles(solutions)
+    if handle in known:
+        return known.index(handle)
+    last: dict[tuple[str, int], int] = {}
+    for one in known:
+        last[one.algorithm, one.run] = one.row
+    if (handle.algorithm, handle.run) in last:
+        legal = f"N from 0 to {last[handle.algorithm, handle.run]}"
+    else:
+        runs = [f"{algorithm}:{run}" for algorithm, run in last]
+        legal = f"a run with solutions: {', '.join(runs[:6])}{', ...' if len(runs) > 6 else ''}" if runs else "results with a solution"
+    raise InputError(source, f"there is no solution {handle}", legal)
+
+
+def unsafe_rows(solutions: pd.DataFrame, original: float) -> pd.Series[bool]:
+    """Which solutions are unsafe: collisions, or if none collides, those below half of the original's safety degree [m]."""
+    collisions = solutions["outcome"] == str(Outcome.COLLISION)
+    return collisions if collisions.any() else solutions["f_safe"] < HALF * original
+
+
+CHOICES = {
+    "most_severe": ["f_safe", "f_num_diff", "f_diff"],
+    "fewest": ["f_num_diff", "f_safe", "f_diff"],
+    "smallest": ["f_diff", "f_safe", "f_num_diff"],
+}
+"""What solutions are asked for by: the objectives that decide, one after the other, the least first."""
+
+
+def chosen_handle(solutions: pd.DataFrame, original: float, choice: str, source: object) -> Handle:
+    """The most severe of all solutions, or the unsafe one with the fewest or the smallest changes.
+
+    Parameters
+    ----------
+    original
+        The original vehicle's safety degree [m].
+    choice
+        A name of `CHOICES`.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    named = solutions.assign(handle=handles(solutions))
+    candidates = named if choice == "most_severe" else named[unsafe_rows(named, original)]
+    if candidates.empty:
+        if named.empty:
+            raise InputError(source, "these results hold no solution", "results with a solution")
+        raise InputError(source, "these results hold no unsafe solution", "--most-severe, or --solution")
+    best = candidates.sort_values(CHOICES[choice], kind="stable")["handle"].iloc[0]
+    assert isinstance(best, Handle)
+    return best
