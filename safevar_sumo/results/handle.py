@@ -102,12 +102,10 @@ def chosen_handle(solutions: pd.DataFrame, original: float, choice: str, source:
     InputError
         If there is none.
     """
-    named = solutions.assign(handle=handles(solutions))
+    named = solutions.assign(handle=list(map(str, handles(solutions))))
     candidates = named if choice == "most_severe" else named[unsafe_rows(named, original)]
     if candidates.empty:
         if named.empty:
             raise InputError(source, "these results hold no solution", "results with a solution")
         raise InputError(source, "these results hold no unsafe solution", "--most-severe, or --solution")
-    best = candidates.sort_values(CHOICES[choice], kind="stable")["handle"].iloc[0]
-    assert isinstance(best, Handle)
-    return best
+    return Handle.parse(candidates.sort_values(CHOICES[choice], kind="stable")["handle"].iloc[0], source)
