@@ -1,0 +1,140 @@
+"""What the shipped ADSs command, against the formulas that they are made of."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from safevar_sumo.ads.apollo import Apollo
+from safevar_sumo.ads.krauss import Krauss
+from safevar_sumo.ads.world_on_rails import WorldOnRails
+from safevar_sumo.records import Nominal, Observation
+
+STEP = 0.05
+FAR = 1e6
+COASTING, FULL, BRAKING = 0.1, 2.0, 10.0
+SPEEDS = np.arange(0.0, 20.5, 0.5)
+KNOWN = Nominal(mass=1500.0, accel=3.0, decel=8.0, max_speed=50.0, tau=0.2, speeds=SPEEDS, full_throttle=np.full(len(SPEEDS), FULL),
+                coasting=np.full(len(SPEEDS), COASTING), braking=BRAKING)
+
+
+def seen(time: float, speed: float, gap: float, lateral: float = 0.0, visibility: float = 1.0) -> Observation:
+    one = np.ones(1)
+    return Observation(time, speed * one, gap * one, speed * one, lateral * one, 0 * one, visibility)
+
+
+def world_on_rails(**changes: object) -> WorldOnRails:
+    return WorldOnRails(**{**{
+        "first_command": 0.0, "latency": 0.0, "corridor": 2.5, "brake_gap": 9.0, "brake_gap_per_speed": 0.0, "brake_place": 0.0,
+        "brake_gap_before": 0.0, "brake_gap_past": 0.0, "throttle": (0.9, 0.7, 0.4)}, **changes})  # type: ignore[arg-type]
+
+
+def apollo(**changes: float) -> Apollo:
+    return Apollo(**{**{
+        "first_command": 0.0, "cruise_speed": 8.0, "cruise_gain": 1.0, "cruise_acceleration": 1.5, "jerk": 5.0, "stop_gap": 5.0,
+        "comfortable_deceleration": 2.0, "largest_deceleration": 3.0, "creep_speed": 0.5, "creep_time": 1.0, "pedal_lag": 0.1}, **changes})
+
+
+@pytest.mark.parametrize(("speed", "throttle"), [
+    (0.0, 0.9), (4 / 3, 0.8), (8 / 3, 0.7), (4.0, 0.55), (16 / 3, 0.4), (20 / 3.6 - 1e-6, 0.4), (20 / 3.6 + 1e-6, 0.0)])
+def test_world_on_rails_throttle_is_linear_between_its_speeds_and_none_above_20_kmh(speed: float, throttle: float) -> None:
+    ads = world_on_rails()
+    command, _ = ads.drive(seen(1.0, speed, FAR), ads.start(1, KNOWN, STEP))
+    assert command.throttle[0] == pytest.approx(throttle)
+
+
+def test_world_on_rails_waits_for_its_first_command_and_for_its_latency() -> None:
+    ads = world_on_rails(first_command=0.2, latency=0.1)
+    memory, throttle = ads.start(1, KNOWN, STEP), []
+    for k in range(9):
+        command, memory = ads.drive(seen(k * STEP, 0.0, FAR), memory)
+        throttle.append(float(command.throttle[0]))
+    assert throttle == [0.0] * 6 + [0.9] * 3, "0.2 s is step 4, the command arrives two steps later"
+
+
+@pytest.mark.parametrize(("gap", "begins", "goes_on"), [(-0.4, True, True), (-0.6, False, True), (-0.9, False, True), (-1.1, False, False)])
+def test_world_on_rails_begins_to_brake_for_nobody_beside_it_and_lets_go_a_metre_past_him(gap: float, begins: bool, goes_on: bool) -> None:
+    ads = world_on_rails()
+    command, _ = ads.drive(seen(1.0, 3.0, gap), ads.start(1, KNOWN, STEP))
+    assert bool(command.brake[0]) == begins
+    _, braking = ads.drive(seen(1.0, 3.0, 5.0), ads.start(1, KNOWN, STEP))
+    command, _ = ads.drive(seen(1.05, 3.0, gap), braking)
+    assert bool(command.brake[0]) == goes_on
+
+
+def onset(ads: Apollo, speed: float, visibility: float = 1.0, start: float = 60.0) -> float:
+    """The gap at which it first brakes, driven on at constant speed."""
+    memory, gap, time = ads.start(1, KNOWN, STEP), start, 0.0
+    while gap > 0:
+        command, memory = ads.drive(seen(time, speed, gap, visibility=visibility), memory)
+        if command.brake[0] > 0:
+            return gap
+        gap, time = gap - speed * STEP, time + STEP
+    return 0.0
+
+
+@pytest.mark.parametrize(("speed", "lag"), [(4.0, 0.1), (8.0, 0.1), (8.0, 0.6)])
+def test_apollo_begins_where_a_comfortable_stop_and_the_way_lost_in_pedals_and_jerk_need_it(speed: float, lag: float) -> None:
+    """gap = stop gap + v^2 / (2 b) + v (lag + b / (2 jerk))."""
+    expected = 5.0 + speed**2 / (2 * 2.0) + speed * (lag + 0.5 * 2.0 / 5.0)
+    begun = onset(apollo(pedal_lag=lag, cruise_speed=speed), speed)
+    assert expected - 2.5 * speed * STEP < begun < expected + 1e-9
+
+
+def test_apollo_knows_of_nothing_beyond_its_range_times_the_visibility() -> None:
+    clear, foggy = (onset(apollo(perception_range=30.0, cruise_speed=10.0), 10.0, visibility) for visibility in (1.0, 0.5))
+    assert clear > 25
+    assert 14 < foggy <= 15
+
+
+def test_apollo_asks_for_what_is_needed_to_stand_at_its_gap_through_the_originals_brake_table() -> None:
+    """Once the jerk has let it: deceleration = v^2 / (2 (gap - stop gap)), up to the largest; pedal = (that - coasting) / braking."""
+    ads = apollo(jerk=1e4)
+    memory = ads.start(1, KNOWN, STEP)
+    _, memory = ads.drive(seen(0.0, 8.0, 20.0), memory)
+    for gap, deceleration in ((18.0, 64 / 26), (17.0, 64 / 24), (12.0, 3.0)):
+        command, memory = ads.drive(seen(STEP, 8.0, gap), memory)
+        assert command.brake[0] == pytest.approx((deceleration - COASTING) / BRAKING)
+        assert command.throttle[0] == 0
+
+
+def test_apollo_changes_what_it_asks_for_by_no_more_than_its_jerk() -> None:
+    ads = apollo(jerk=2.0)
+    memory, asked = ads.start(1, KNOWN, STEP), []
+    for k in range(30):
+        command, memory = ads.drive(seen(k * STEP, 0.0, FAR), memory)
+        asked.append(float(command.throttle[0]) * (FULL + COASTING) - COASTING)
+    assert asked[:15] == pytest.approx([2.0 * STEP * (k + 1) for k in range(15)])
+    assert asked[-1] == pytest.approx(1.5), "the largest cruise acceleration"
+
+
+def test_apollo_cruises_by_its_gain_waits_for_its_first_command_and_holds_after_the_creep() -> None:
+    ads = apollo(jerk=1e4, first_command=0.1, creep_time=0.975)
+    memory = ads.start(1, KNOWN, STEP)
+    command, memory = ads.drive(seen(0.05, 0.0, FAR), memory)
+    assert command.throttle[0] == command.brake[0] == 0
+    command, memory = ads.drive(seen(0.1, 7.0, FAR), memory)
+    assert command.throttle[0] == pytest.approx((1.0 + COASTING) / (FULL + COASTING))
+    _, memory = ads.drive(seen(0.15, 8.0, 10.0), memory)
+    pedals = []
+    for k in range(30):
+        command, memory = ads.drive(seen(0.2 + k * STEP, 0.4, 5.5), memory)
+        pedals.append(float(command.brake[0]))
+    creeping = 19  # steps that take 0.95 s; the twentieth would be beyond
+    assert pedals[:creeping] == [0.0] * creeping
+    assert pedals[-1] == pytest.approx((2.0 - COASTING) / BRAKING), "2 m/s^2 to stay where it stands"
+
+
+@given(speed=st.floats(0, 20), gap=st.floats(0, 100))
+def test_krauss_aims_at_the_speed_from_which_it_can_still_stop(speed: float, gap: float) -> None:
+    """v tau + v^2 / (2 b) = gap - standing gap, reached within a step and the vehicle's own lag."""
+    ads = Krauss()
+    command, _ = ads.drive(seen(0.0, speed, gap), ads.start(1, KNOWN, STEP))
+    b = 0.6 * KNOWN.decel
+    room = max(gap - 2.5, 0.0)
+    safe = float(np.roots([1 / (2 * b), 1.0, -room]).max()) if room else 0.0
+    wanted = (min(safe, 13.89) - speed) / (STEP + KNOWN.tau)
+    assert command.throttle[0] == pytest.approx(min(max(wanted / KNOWN.accel, 0), 1), abs=1e-6)
+    assert command.brake[0] == pytest.approx(min(max(-wanted / KNOWN.decel, 0), 1), abs=1e-6)

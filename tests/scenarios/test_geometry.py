@@ -1,0 +1,116 @@
+"""The shipped scenarios seen from a world that is made up: where things are, when they count, when somebody turns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from safevar_sumo.records import Trace
+from safevar_sumo.scenarios.lead_vehicle_stopped import LeadVehicleStopped
+from safevar_sumo.scenarios.pedestrian_crossing import PedestrianCrossing
+
+STEP, LENGTH, LANE, PATH, WIDTH = 0.05, 5.0, 14.0, 40.0, 0.5
+
+
+class MadeUp:
+    """One vehicle and one pedestrian, placed by the test; lengths and widths are what the constants say."""
+
+    def __init__(self, front: float, place: float) -> None:
+        self.front, self.place = front, place
+        self.turned_at: float | None = None
+
+    def vehicle_positions(self, actor: str) -> np.ndarray:
+        return np.array([[self.front if actor == "vut" else 100.0, LANE]])
+
+    def person_positions(self, actor: str) -> np.ndarray:
+        return np.array([[PATH, LANE + self.place]])
+
+    def vehicle_length(self, actor: str) -> float:
+        return LENGTH if actor == "vut" else 7.0
+
+    def lane_start(self, lane: str) -> tuple[float, float]:
+        return PATH, 20.0
+
+    def person_width(self, actor: str) -> float:
+        return WIDTH
+
+    def turn_back(self, person: str) -> None:
+        self.turned_at = self.place
+
+
+def test_the_gap_to_a_parked_vehicle_ends_at_its_rear() -> None:
+    scenario, world = LeadVehicleStopped(), MadeUp(60.0, 0.0)
+    scene, _ = scenario.observe(world, STEP, scenario.begin(world))
+    assert scene.gap[0] == 100.0 - 7.0 - 60.0
+    assert not scene.over[0]
+
+
+def test_the_gap_to_a_pedestrian_ends_at_the_strip_that_he_walks_on() -> None:
+    scenario, world = PedestrianCrossing(), MadeUp(30.0, -5.0)
+    memory = scenario.begin(world)
+    world.place = -4.91
+    scene, _ = scenario.observe(world, STEP, memory)
+    assert scene.gap[0] == pytest.approx(PATH - WIDTH / 2 - 30.0)
+    assert scene.lateral[0] == pytest.approx(-4.91)
+    assert scene.lateral_speed[0] == pytest.approx(1.8)
+
+
+@pytest.mark.parametrize(("front", "over"), [(PATH + WIDTH / 2 + LENGTH - 0.01, False), (PATH + WIDTH / 2 + LENGTH + 0.01, True)])
+def test_the_vehicle_has_passed_once_its_rear_has_left_the_strip(front: float, over: bool) -> None:
+    scenario, world = PedestrianCrossing(), MadeUp(front, 0.0)
+    scene, _ = scenario.observe(world, STEP, scenario.begin(world))
+    assert scene.over[0] == over
+
+
+@pytest.mark.parametrize(("before", "now", "over"), [
+    (1.70, 1.79, True), (1.60, 1.74, False), (1.90, 1.81, False), (-1.90, -1.80, False), (-1.70, -1.79, True)])
+def test_the_pedestrian_has_left_the_lane_when_he_walks_away_beyond_its_edge(before: float, now: float, over: bool) -> None:
+    scenario, world = PedestrianCrossing(turns_after=None, lane_width=3.5), MadeUp(0.0, before)
+    memory = scenario.begin(world)
+    world.place = now
+    assert scenario.observe(world, STEP, memory)[0].over[0] == over
+
+
+def test_the_pedestrian_turns_in_the_last_step_that_keeps_him_within_the_distance() -> None:
+    """At 1.8 m/s, 0.09 m a step: told in the step from which the next one would lead beyond 0.7 m; and only once."""
+    scenario, world = PedestrianCrossing(), MadeUp(0.0, 0.0)
+    memory, turns = scenario.begin(world), []
+    for k in range(1, 12):
+        world.place = 0.09 * k
+        _, memory = scenario.observe(world, STEP, memory)
+        if world.turned_at is not None:
+            turns.append(k)
+            world.turned_at = None
+    assert turns == [7], "0.63 m; 0.72 m would be beyond"
+
+
+def test_who_walks_on_never_turns() -> None:
+    scenario, world = PedestrianCrossing(turns_after=None), MadeUp(0.0, 0.69)
+    memory = scenario.begin(world)
+    world.place = 0.9
+    scenario.observe(world, STEP, memory)
+    assert world.turned_at is None
+
+
+def trace(gap: np.ndarray, speed: np.ndarray, lateral: np.ndarray, lateral_speed: np.ndarray) -> Trace:
+    columns = {name: values[:, np.newaxis] for name, values in
+               {"gap": gap, "speed": speed, "lateral": lateral, "lateral_speed": lateral_speed}.items()}
+    nothing = np.zeros_like(columns["gap"])
+    unused = {name: nothing for name in Trace.__dataclass_fields__ if name not in (*columns, "step", "vehicle_length", "time", "active")}
+    return Trace(step=STEP, vehicle_length=LENGTH, time=STEP * np.arange(len(gap)), active=nothing == 0, **columns, **unused)
+
+
+def test_closing_speed_of_a_pedestrian_has_both_speeds_along_the_line_of_sight() -> None:
+    """Vehicle's centre at (0, 0), he at (4, -3): distance 5, theta from cos = 0.8; v cos + v_ped sin = 0.8 * 6 + 0.6 * 1.5."""
+    encounter = PedestrianCrossing().encounter(trace(np.array([4.0 - LENGTH / 2]), np.array([6.0]), np.array([-3.0]), np.array([1.5])))
+    assert encounter.distance[0, 0] == pytest.approx(5.0 - LENGTH / 2)
+    assert encounter.closing_speed[0, 0] == pytest.approx(0.8 * 6 + 0.6 * 1.5)
+    assert encounter.separation[0, 0] == pytest.approx(4.0 - LENGTH / 2)
+
+
+def test_a_parked_vehicle_is_separated_by_centres_and_closed_in_on_by_bumpers() -> None:
+    encounter = LeadVehicleStopped().encounter(trace(np.array([3.0, -0.1]), np.array([2.0, 2.0]), np.zeros(2), np.zeros(2)))
+    assert encounter.separation[:, 0].tolist() == [3.0 + LENGTH, -0.1 + LENGTH]
+    assert encounter.distance[:, 0].tolist() == [3.0, -0.1]
+    assert encounter.closing_speed[:, 0].tolist() == [2.0, 2.0]
+    assert encounter.in_conflict[:, 0].tolist() == [True, False]

@@ -1,0 +1,123 @@
+"""The numbers behind the vehicles, seen in how they drive: drag, gears, pedals, limits, and what SUMO is told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drives import STEP, SYSTEMS, braking_after, drive, full_throttle, original
+
+from safevar_sumo.records import Command
+
+GRAVITY = 9.81
+
+
+def prepared(model: str, **changes: float) -> object:
+    """One vehicle, the original with some characteristics changed."""
+    characteristics = SYSTEMS[model].characteristics
+    values = {member.name: np.full(1, changes.get(member.name, float(member.original))) for member in characteristics}
+    return SYSTEMS[model].vehicle.prepare(values, 1.0, STEP)
+
+
+def step(model: str, state: object, throttle: float = 0.0, brake: float = 0.0) -> object:
+    return SYSTEMS[model].vehicle.advance(prepared(model), state, Command(np.full(1, throttle), np.full(1, brake)))
+
+
+def test_air_slows_carlas_vehicle_by_half_rho_cd_a_v_squared() -> None:
+    """In neutral, wheels rolling without damping: rho = 1.2 kg/m^3, A = 2.2 m^2."""
+    slowed = []
+    for drag in (0.2, 0.5):
+        vehicle, p = SYSTEMS["carla"].vehicle, prepared("carla", dragCoeff=drag)
+        state = vehicle.at_rest(p)._replace(speed=np.full(1, 20.0), wheel_speed=np.full(1, 20.0 / 0.355))
+        slowed.append(20.0 - float(vehicle.advance(p, state, Command(np.zeros(1), np.zeros(1))).speed[0]))
+    # The wheels' inertia takes part: four wheels of 20 kg, I / r^2 = 40 kg.
+    assert slowed[1] - slowed[0] == pytest.approx(0.5 * 1.2 * 2.2 * 0.3 * 400 / (2404 + 40) * STEP, rel=0.02)
+
+
+def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_and_waits_two_seconds() -> None:
+    vehicle, p = SYSTEMS["carla"].vehicle, prepared("carla")
+    limit = 5800 * 2 * np.pi / 60
+
+    def target(gear: int, share: float, since: float = 2.0) -> float:
+        from safevar_sumo.vehicles.carla import _shift
+
+        one = np.ones(1)
+        state = vehicle.at_rest(p)._replace(gear=gear * one, target_gear=gear * one, since_shift=since * one, throttle=one,
+                                            engine_speed=share * limit * one)
+        return float(_shift(p, state).target_gear[0])
+
+    assert [target(1, 0.649), target(1, 0.651), target(1, 0.651, 1.9)] == [1, 2, 1]
+    assert [target(2, 0.501), target(2, 0.499), target(2, 0.499, 1.9), target(1, 0.1), target(4, 0.9)] == [2, 1, 2, 1, 4]
+
+
+def test_carlas_engine_pulls_nothing_beyond_its_limit_and_its_curve_has_its_points() -> None:
+    vehicle, p = SYSTEMS["carla"].vehicle, prepared("carla")
+    limit = 5800 * 2 * np.pi / 60
+
+    def torque(rpm: float) -> float:
+        state = vehicle.at_rest(p)._replace(engine_speed=np.full(1, rpm / 5800 * limit))
+        return float(vehicle._torque(p, state)[0]) / vehicle.engine_torque
+
+    assert [torque(rpm) for rpm in (0, 945, 1890, 3810, 5730)] == pytest.approx([400, 450, 500, 450, 400])
+    assert torque(5801) == 0
+
+
+def test_carlas_pedals_rise_and_fall_at_their_own_rates() -> None:
+    vehicle = SYSTEMS["carla"].vehicle
+    one = np.ones(1)
+    state = vehicle.at_rest(prepared("carla"))._replace(throttle=one, brake=one)
+    released = step("carla", state)
+    assert released.throttle[0] == pytest.approx(1 - vehicle.throttle_fall * STEP)  # type: ignore[attr-defined]
+    assert released.brake[0] == pytest.approx(max(1 - vehicle.brake_fall * STEP, 0.0))  # type: ignore[attr-defined]
+    pressed = step("carla", vehicle.at_rest(prepared("carla")), 1.0, 1.0)
+    assert pressed.throttle[0] == pytest.approx(vehicle.throttle_rise * STEP)  # type: ignore[attr-defined]
+    assert pressed.brake[0] == pytest.approx(min(vehicle.brake_rise * STEP, 1.0))  # type: ignore[attr-defined]
+
+
+def test_sumo_is_told_what_carlas_vehicle_can_do() -> None:
+    vehicle = SYSTEMS["carla"].vehicle
+    told = vehicle.sumo_type(prepared("carla"))
+    grip = vehicle.tyre_friction * 3.5 * GRAVITY
+    assert told.max_speed[0] == pytest.approx(5800 * 2 * np.pi / 60 / 4.0 * 0.355), "the highest gear is 1.0, the final drive 4.0"
+    assert told.accel[0] == pytest.approx(min(vehicle.engine_torque * 500 * 2.85 * 4 / 0.355 / 2404, grip))
+    assert told.decel[0] == pytest.approx(min(4 * 1500 / 0.355 / 2404, grip))
+    assert told.tau[0] == pytest.approx(STEP + 1 / vehicle.brake_rise)
+    assert told.mass[0] == 2404
+    icy = vehicle.sumo_type(vehicle.prepare({m.name: np.full(1, float(m.original)) for m in SYSTEMS["carla"].characteristics}, 0.01, STEP))
+    assert icy.accel[0] == pytest.approx(0.01 * grip)
+    assert icy.decel[0] == pytest.approx(0.01 * grip)
+
+
+def test_sumo_is_told_what_lgsvls_vehicle_can_do() -> None:
+    told = SYSTEMS["lgsvl"].vehicle.sumo_type(prepared("lgsvl"))
+    assert told.max_speed[0] == pytest.approx(8299 * 2 * np.pi / 60 / (0.67 * 2.56) * 0.35)
+    assert told.decel[0] == pytest.approx(min(4 * 3000 / 0.35 / 2120, GRAVITY))
+    assert told.accel[0] == pytest.approx(min(450 * 4.17 * 2.56 / 0.35 / 2120, GRAVITY))
+
+
+def test_lgsvls_gearbox_and_traction_control_have_their_numbers() -> None:
+    """At least 0.7 s between changes; torque from 0.325 of the largest, by 337.5 N m/s."""
+    states = drive("lgsvl", original("lgsvl"), full_throttle, 12).states
+    gears = np.array([float(state.gear[0]) for state in states])
+    changes = np.flatnonzero(np.diff(gears)) * STEP
+    assert len(changes) > 2
+    assert np.diff(changes).min() >= 0.7 - STEP / 2
+    torque = [float(state.traction_torque[0]) for state in states[:4]]
+    assert torque == pytest.approx([0.325 * 450 + 337.5 * STEP * k for k in range(4)])
+
+
+def test_sumos_vehicle_accelerates_with_its_load_and_within_its_grip() -> None:
+    vehicle = SYSTEMS["sumo"].vehicle
+    loaded = vehicle.sumo_type(prepared("sumo", mass=2000.0))
+    assert loaded.accel[0] == pytest.approx(2.6 * 1500 / 2000)
+    assert loaded.decel[0] == pytest.approx(9.0 * 1500 / 2000)
+    assert vehicle.sumo_type(prepared("sumo")).decel[0] == pytest.approx(min(9.0, 0.9 * GRAVITY))
+
+
+def test_a_released_brake_lets_carlas_vehicle_roll_on() -> None:
+    """Braked for 0.2 s, then nothing: it keeps rolling, and rolls farther than one that goes on braking."""
+    def dabbing(time: float) -> tuple[float, float]:
+        return (1.0, 0.0) if time < 1.4 else (0.0, 1.0 if time < 1.6 else 0.0)
+
+    dabbed, held = drive("carla", original("carla"), dabbing, 2.6), drive("carla", original("carla"), braking_after(1.4), 2.6)
+    assert dabbed.speed[-1, 0] > 1.0
+    assert dabbed.speed[-1, 0] > held.speed[-1, 0] + 0.5
