@@ -99,6 +99,7 @@ class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole study as its TOML file gives it; `load_study` reads one.
 
+    `step_length` is the simulation's time step [s], by default the one of the network's options;
     `published` are the original vehicle's metrics in the published study, by name, as far as there are any;
     `calibration` tells which parameters are free, by their keys in the file, such as `ads.parameters.corridor`.
     """
@@ -111,6 +112,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     ads: ModelTable
     metrics: MetricsTable
     search: SearchTable
+    step_length: Annotated[float, Meta(ge=0.001, le=1)] | None = None
     published: dict[str, float] = {}
     calibration: dict[str, FreeParameter] = {}
 

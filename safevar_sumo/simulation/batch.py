@@ -44,6 +44,8 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSU
         If a user's ADS fails.
     """
     n = len(settings)
+    if system.step_length is not None:
+        options = ("--step-length", repr(system.step_length), *options)
     with open_world(copied_network(system.scenario.network, n), n, engine, options) as world:
         return drive(system, settings, world)
 

@@ -24,7 +24,7 @@ from safevar_sumo.vehicles import VEHICLES, CharacteristicSet, Vehicle, calibrat
 
 @dataclass(frozen=True, kw_only=True)
 class System:
-    """What a simulation is made of."""
+    """What a simulation is made of; `step_length` [s] is None where the network's own counts."""
 
     characteristics: CharacteristicSet
     vehicle: Vehicle
@@ -33,6 +33,7 @@ class System:
     weather: Weather
     metrics: MetricsTable
     nominal: Nominal
+    step_length: float | None = None
 
 
 def assemble(study: Study, source: str = "") -> System:
@@ -52,7 +53,7 @@ def assemble(study: Study, source: str = "") -> System:
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     return System(
         characteristics=characteristics, vehicle=vehicle, ads=ads, scenario=scenario, weather=weather, metrics=study.metrics,
-        nominal=calibration_drive(vehicle, characteristics))
+        nominal=calibration_drive(vehicle, characteristics), step_length=study.step_length)
 
 
 def models_of(study: Study, source: str) -> tuple[Any, Ads, Scenario, Weather]:
