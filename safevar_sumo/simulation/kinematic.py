@@ -1,0 +1,101 @@
+"""Many vehicles under test beside one copy of a network: for searches that need thousands of vehicles at once.
+
+SUMO simulates everybody else, once, with a vehicle under test that stays where it starts. N vehicles move along its
+lane as SUMO's ballistic update moves them and collide where bodies overlap. That is the same as N copies where the lane
+is straight and nobody reacts to the vehicle under test; whoever uses it holds it against `simulate`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from safevar_sumo.records import BoolArray, Drives, FloatArray
+from safevar_sumo.scenarios import VUT
+from safevar_sumo.simulation.batch import drive
+from safevar_sumo.simulation.network import copied_id, copied_network
+from safevar_sumo.simulation.sumo import Engine, SumoWorld, open_world
+from safevar_sumo.simulation.system import System
+from safevar_sumo.vehicles import SumoType
+
+
+def simulate_alone(system: System, settings: FloatArray) -> Drives:
+    """`simulate`, with one copy of the network for all settings, shape (N, n)."""
+    with open_world(copied_network(system.scenario.network, 1), 1, Engine.LIBSUMO) as world:
+        return drive(system, settings, KinematicWorld(world, len(settings)))
+
+
+class KinematicWorld(SumoWorld):
+    """N vehicles under test in one copy of a network; shapes as in `SumoWorld`."""
+
+    def __init__(self, world: SumoWorld, n: int) -> None:
+        super().__init__(world._api, n)
+        self._speeds, self._way = np.zeros(n), np.zeros(n)
+
+    def ids(self, name: str) -> list[str]:
+        return [copied_id(0, name)]
+
+    def set_types(self, types: SumoType) -> None:
+        """The vehicles' SUMO types have no part in how they move."""
+
+    def depart(self) -> None:
+        super().depart()
+        vehicle, vut = self._api.vehicle, self.ids(VUT)[0]
+        self._start = np.array(vehicle.getPosition(vut))
+        self._along = _direction(vehicle.getAngle(vut))
+        self._body = vehicle.getLength(vut), vehicle.getWidth(vut)
+        self._speeds += vehicle.getSpeed(vut)
+
+    def advance(self, speeds: FloatArray) -> None:
+        """Ballistic: the way of a step is that of the mean speed."""
+        self._way = self._way + (self._speeds + speeds) * (0.5 * self.step_length)
+        self._speeds = speeds
+        super().advance(np.zeros(1))
+
+    def speeds(self) -> FloatArray:
+        return self._speeds
+
+    def _looked_up(self, actor: str, position: Any) -> FloatArray:
+        if actor not in self._positions:
+            place = self._start + self._way[:, np.newaxis] * self._along if actor == VUT else position(self.ids(actor)[0])
+            self._positions[actor] = np.broadcast_to(place, (self.n, 2))
+        return self._positions[actor]
+
+    def collisions(self) -> dict[int, float]:
+        hit = np.zeros(self.n, dtype=bool)
+        for front, along, length, width in self._others():
+            hit |= self._overlaps(front, along, length, width)
+        return dict(zip(np.flatnonzero(hit).tolist(), self._speeds[hit].tolist(), strict=True))
+
+    def _others(self) -> Iterator[tuple[FloatArray, FloatArray, float, float]]:
+        """Front, direction, length and width of everybody else."""
+        for api in (self._api.vehicle, self._api.person):
+            for name in api.getIDList():
+                if name != self.ids(VUT)[0]:
+                    yield np.array(api.getPosition(name)), _direction(api.getAngle(name)), api.getLength(name), api.getWidth(name)
+
+    def _overlaps(self, front: FloatArray, along: FloatArray, length: float, width: float) -> BoolArray:
+        """Whether rectangles overlap: no side of either parts them."""
+        own_length, own_width = self._body
+        own, across, other_across = self._along, _left(self._along), _left(along)
+        to_other = front - along * (length / 2) - (self.vehicle_positions(VUT) - own * (own_length / 2))
+        cosine, sine = abs(along @ own), abs(other_across @ own)
+        reaches = (
+            (own, own_length + length * cosine + width * sine), (across, own_width + length * sine + width * cosine),
+            (along, length + own_length * cosine + own_width * sine), (other_across, width + own_length * sine + own_width * cosine))
+        overlaps = np.ones(self.n, dtype=bool)
+        for axis, reach in reaches:
+            overlaps &= np.abs(to_other @ axis) < reach / 2
+        return overlaps
+
+
+def _direction(angle: float) -> FloatArray:
+    """Unit vector of SUMO's angle: degrees clockwise from north."""
+    return np.array([math.sin(math.radians(angle)), math.cos(math.radians(angle))])
+
+
+def _left(direction: FloatArray) -> FloatArray:
+    return np.array([-direction[1], direction[0]])
