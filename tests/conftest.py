@@ -8,6 +8,7 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+from slippery import make_results
 
 from safevar_sumo.simulation import System, assemble
 from safevar_sumo.study import load_study, study_names
@@ -44,3 +45,9 @@ def in_tmp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty working directory."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture(scope="session")
+def slippery(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A results directory with collisions and near misses."""
+    return make_results(tmp_path_factory.mktemp("slippery"))

@@ -9,6 +9,7 @@ import click
 import numpy as np
 from rich.console import Console
 
+from safevar_sumo.cli.outputs import PICTURES, check_output
 from safevar_sumo.cli.program import commands
 from safevar_sumo.computing import available_cores, evaluate_all, local_pool
 from safevar_sumo.errors import InputError, SimulationError
@@ -31,8 +32,6 @@ from safevar_sumo.terminal.progress import counted, counted_trials
 from safevar_sumo.terminal.reference import print_agreement, print_calibration
 from safevar_sumo.vehicles import CharacteristicSet
 
-PICTURES = (".png", ".pdf", ".svg")
-
 
 @commands.command()
 @click.argument("study")
@@ -45,9 +44,7 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     chosen = load_study(study)
     system = assemble(chosen, study)
     if plot is not None:
-        if plot.suffix.lower() not in PICTURES:
-            raise InputError("--plot", str(plot), f"a file that ends in {', '.join(PICTURES)}")
-        check_writable(plot, "--plot")
+        check_output(plot, "--plot", PICTURES)
     data = _read(reference, system.characteristics)
     settings = np.concatenate([system.characteristics.original[np.newaxis], data.settings])
     with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 
@@ -12,6 +14,8 @@ from safevar_sumo.simulation.network import copied_network
 from safevar_sumo.simulation.perception import Perception
 from safevar_sumo.simulation.sumo import Engine, SumoWorld, open_world
 from safevar_sumo.simulation.system import System
+
+Watcher = Callable[[SumoWorld], None]
 
 
 def evaluate(system: System, settings: FloatArray) -> Evaluations:
@@ -33,8 +37,9 @@ def score(system: System, settings: FloatArray, run: Drives) -> Evaluations:
         f_num_diff=system.characteristics.number_changed(settings))
 
 
-def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = ()) -> Drives:
-    """Run the scenario once for every setting; shape (N, n).
+def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = (),
+             watch: Watcher | None = None) -> Drives:
+    """Run the scenario once for every setting; shape (N, n). `watch` is shown the world at every sample.
 
     Raises
     ------
@@ -47,10 +52,10 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSU
     if system.step_length is not None:
         options = ("--step-length", repr(system.step_length), *options)
     with open_world(copied_network(system.scenario.network, n), n, engine, options) as world:
-        return drive(system, settings, world)
+        return drive(system, settings, world, watch)
 
 
-def drive(system: System, settings: FloatArray, world: SumoWorld) -> Drives:
+def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher | None = None) -> Drives:
     """Drive the vehicles of an open world that nobody has stepped yet; see `simulate`."""
     vehicle, scenario, step, n = system.vehicle, system.scenario, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
@@ -65,6 +70,8 @@ def drive(system: System, settings: FloatArray, world: SumoWorld) -> Drives:
     log = _Log(n, round(scenario.duration / step) + 1)
     verdict = _Verdict(n)
     for sample in range(log.length):
+        if watch is not None:
+            watch(world)
         speed = world.speeds()
         scene, memory = scenario.observe(world, step, memory)
         active = verdict.judge(speed, scene.over, world.collisions(), last=sample == log.length - 1)

@@ -45,6 +45,13 @@ def copied_id(copy: int, name: str) -> str:
     return f":{copy}.{name[1:]}" if name.startswith(":") else f"{copy}.{name}"
 
 
+def copy_and_name(copied: str) -> tuple[int, str]:
+    """The copy that an id belongs to and what it is called in the original: the inverse of `copied_id`."""
+    colon = ":" if copied.startswith(":") else ""
+    copy, _, name = copied.removeprefix(":").partition(".")
+    return int(copy), colon + name
+
+
 def copied_network(folder: str, n: int) -> CopiedNetwork:
     """At least `n` copies of a network of `sumo_nets/` (or of a folder given by path) with traffic in `n` of them.
 

@@ -116,6 +116,17 @@ class SumoWorld:
             self._positions[actor] = np.array([position(name) for name in self.ids(actor)])
         return self._positions[actor]
 
+    def whereabouts(self) -> dict[str, tuple[float, float, float]]:
+        """Where everybody is who is on the road, by id: front bumper or person [m], heading clockwise from north [degrees]."""
+        kinds = (self._api.vehicle, self._api.person)
+        return {name: (*kind.getPosition(name), kind.getAngle(name)) for kind in kinds for name in kind.getIDList()}
+
+    def measures(self, name: str) -> tuple[bool, float, float]:
+        """Whether the one of this id is a person, and its length and width [m]."""
+        is_person = name in self._api.person.getIDList()
+        kind = self._api.person if is_person else self._api.vehicle
+        return is_person, kind.getLength(name), kind.getWidth(name)
+
     def vehicle_length(self, actor: str) -> float:
         return float(self._api.vehicle.getLength(self.ids(actor)[0]))
 

@@ -1,0 +1,103 @@
+"""A changed vehicle and the original in one simulation, and what they are called."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.results import UNKNOWN
+from safevar_sumo.showing.moments import moments
+from safevar_sumo.simulation import System, score
+from safevar_sumo.simulation.film import Film, film
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
+
+ORIGINAL, CHANGED = 0, 1
+"""Rows of a comparison."""
+WORDS = {Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is still driving at the end",
+         Outcome.NEVER_MOVED: "never moves", Outcome.SIMULATOR_ERROR: "cannot be simulated"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Drives of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is changed).
+
+    `title` is the study's, `evaluations` and `film` have one row for each vehicle.
+    """
+
+    title: str
+    characteristics: CharacteristicSet
+    ttc_threshold: float
+    evaluations: Evaluations
+    film: Film
+
+    @property
+    def rows(self) -> range:
+        return range(len(self.evaluations))
+
+    def name(self, row: int) -> str:
+        return "original" if row == ORIGINAL else "changed"
+
+    @property
+    def changes(self) -> list[str]:
+        """Every change in words, with its unit and share."""
+        if len(self.evaluations) == 1:
+            return []
+        return changes_in_words(self.characteristics, self.evaluations.settings[CHANGED])
+
+    def verdict(self, row: int) -> str:
+        """How a drive ended, in words: hits at 3.9 m/s, or stops 2.22 m before."""
+        drives = self.film.drives
+        if not math.isnan(drives.collision_speed[row]):
+            return f"hits at {drives.collision_speed[row]:.1f} m/s"
+        nearest = moments(drives, row).nearest
+        word = WORDS[Outcome(str(drives.outcome[row]))]
+        if nearest is None or drives.outcome[row] != Outcome.STOPPED:
+            return word
+        return f"{word} {drives.trace.gap[nearest, row]:.2f} m before"
+
+
+def changes_in_words(characteristics: CharacteristicSet, setting: FloatArray) -> list[str]:
+    """What differs from the original: `tireFric 3.5 → 1.1 (-69 %)`."""
+    return [f"{member.name} {number(member.original)} → {number(value)}{spaced(member.unit)} "
+            f"({(value - member.original) / abs(member.original) * 100:+.0f} %)"
+            for member, value in zip(characteristics, setting.tolist(), strict=True) if value != member.original]
+
+
+def number(value: float) -> str:
+    """Four digits that matter, and all of a larger number's."""
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:.4g}"
+
+
+def spaced(unit: str) -> str:
+    """A unit as it follows a number, its powers raised; nothing for a pure number."""
+    return "" if unit == "-" else " " + unit.replace("^2", "²").replace("^3", "³")
+
+
+def compare(study: Study, system: System, setting: FloatArray) -> Comparison:
+    """Simulate a filtered setting, shape (n,), beside the original vehicle.
+
+    Raises
+    ------
+    SimulationError, InputError
+        As `simulation.simulate`.
+    """
+    original = system.characteristics.original
+    settings = np.stack([original]) if np.array_equal(original, setting) else np.stack([original, setting])
+    taken = film(system, settings)
+    return Comparison(title=study.title, characteristics=system.characteristics, ttc_threshold=system.metrics.ttc_threshold,
+                      evaluations=score(system, settings, taken.drives), film=taken)
+
+
+def differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:
+    """Where the only row of a replay differs from its row of solutions.csv: each with both values."""
+    told = [f"{name} is {recorded[name]:.6g} there and {replayed.metrics[name][0]:.6g} here" for name in replayed.metrics
+            if name in recorded and not np.array_equal(float(recorded[name]), float(replayed.metrics[name][0]), equal_nan=True)]
+    if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):
+        told.insert(0, f"the outcome is {recorded['outcome']} there and {replayed.outcome[0]} here")
+    return told

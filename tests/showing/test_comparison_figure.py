@@ -1,0 +1,48 @@
+"""The figure of a changed vehicle beside the original."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from safevar_sumo.analysis import load_cases
+from safevar_sumo.showing import Comparison, compare, draw_comparison, write_figure
+from safevar_sumo.simulation import assemble
+
+
+@pytest.fixture(scope="module")
+def comparison(slippery: Path) -> Comparison:
+    (case,) = load_cases([slippery])
+    return compare(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
+
+
+def test_it_draws_both_drives_as_far_as_they_go(comparison: Comparison) -> None:
+    figure = draw_comparison(comparison)
+    trace = comparison.film.drives.trace
+    for axis, values in zip(figure.axes, (trace.speed, trace.gap, trace.throttle - trace.brake), strict=False):
+        for row, line in zip(comparison.rows, axis.lines[:1] + [one for one in axis.lines[1:] if len(one.get_xdata()) > 9], strict=False):
+            end = comparison.film.last[row] + 1
+            assert list(line.get_xdata()) == list(trace.time[:end])
+            assert list(line.get_ydata()) == list(values[:end, row])
+    assert [axis.get_ylabel() for axis in figure.axes] == [
+        "speed [m/s]", "gap to the obstacle [m]", "brake     |     throttle", "time to collision [s]"]
+    words = " ".join(text.get_text() for text in figure.legends[0].get_texts())
+    assert comparison.verdict(0) in words
+    assert comparison.verdict(1) in words
+    heading = figure.get_suptitle()
+    for change in comparison.changes:
+        assert change in heading
+
+
+def test_a_title_of_dollars_is_no_formula(comparison: Comparison, tmp_path: Path) -> None:
+    import dataclasses
+
+    write_figure(draw_comparison(dataclasses.replace(comparison, title=r"costs $\frac{$ and <b>more</b>")), tmp_path / "it.png")
+
+
+@pytest.mark.parametrize("kind", ["png", "pdf", "svg"])
+def test_the_same_bytes_twice(kind: str, comparison: Comparison, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_figure(draw_comparison(comparison), tmp_path / f"{name}.{kind}")
+    assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
