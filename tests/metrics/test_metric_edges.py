@@ -44,7 +44,7 @@ def test_a_sampling_interval_of_one_step_is_every_step() -> None:
         assert value(name, run, MetricsTable(ttc_threshold=2.0, sampling_interval=STEP)) == value(name, run)
 
 
-@pytest.mark.parametrize("interval", [STEP / 2, 1.5 * STEP, STEP / 1000])
+@pytest.mark.parametrize("interval", [STEP / 2, 1.5 * STEP, STEP / 1000, 1e-7])
 def test_a_sampling_interval_between_steps_is_refused(interval: float) -> None:
     with pytest.raises(InputError, match="whole multiple"):
         value("tet", braking_run(10, 5, 12), MetricsTable(ttc_threshold=2.0, sampling_interval=interval))

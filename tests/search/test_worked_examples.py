@@ -88,6 +88,14 @@ def test_the_number_of_changes_is_rounded_half_up(settings: list[list[float]], m
     assert ranges.most_changed == most, "a mean of 1.5 makes 2, of 4/3 makes 1"
 
 
+def test_an_even_half_is_rounded_up_too() -> None:
+    """2.5 makes 3, where rounding to even would make 2."""
+    three = CharacteristicSet(tuple(Characteristic(name=name, unit="-", original=50.0, lower=0.0, upper=100.0) for name in "abc"))
+    ranges = _Ranges(Problem(characteristics=three, original=evaluated(three, three.original[np.newaxis], np.array([5.0])), evaluations=9))
+    ranges.narrow(evaluated(three, np.array([[60.0, 40, 50], [60, 40, 30]]), np.ones(2)))
+    assert ranges.most_changed == 3
+
+
 def test_a_window_without_anything_unsafe_narrows_nothing() -> None:
     ranges = _Ranges(problem())
     ranges.narrow(window([[60, 40]], [5.0]))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from drives import STEP, SYSTEMS, braking_after, drive, full_throttle, original
 
-from safevar_sumo.records import Command
+from safevar_sumo.records import Command, Observation
+from safevar_sumo.vehicles.lgsvl import _roll, _tyre_stiffness
 
 GRAVITY = 9.81
 
@@ -121,3 +122,38 @@ def test_a_released_brake_lets_carlas_vehicle_roll_on() -> None:
     dabbed, held = drive("carla", original("carla"), dabbing, 2.6), drive("carla", original("carla"), braking_after(1.4), 2.6)
     assert dabbed.speed[-1, 0] > 1.0
     assert dabbed.speed[-1, 0] > held.speed[-1, 0] + 0.5
+
+
+def test_carlas_wheels_are_four_discs_of_twenty_kilograms() -> None:
+    assert prepared("carla").wheel_inertia[0] == pytest.approx(4 * 0.5 * 20 * 0.355**2)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(("slip", "share"), [(0.2, 0.75), (0.4, 1.0), (0.6, 0.75), (0.8, 0.5), (0.95, 0.5)])
+def test_lgsvls_tyres_follow_unitys_curve(slip: float, share: float) -> None:
+    """A parabola up to the extremum at slip 0.4, a line down to half of it at 0.8; load with 2 v^2 N of downforce."""
+    p, rim, one = prepared("lgsvl"), 10.0, np.ones(1)
+    speed = rim * (1 - slip)
+    force = float(_tyre_stiffness(p, speed * one, rim * one, (rim - speed) * one)[0]) * (rim - speed)  # type: ignore[arg-type]
+    assert force == pytest.approx(share * (2120 * GRAVITY + 2 * speed * speed))
+
+
+def test_lgsvls_engine_follows_its_wheels_with_a_lag_of_a_twentieth_of_a_second() -> None:
+    vehicle, p = SYSTEMS["lgsvl"].vehicle, prepared("lgsvl")
+    one, h = np.ones(1), STEP / 2
+    state = vehicle.at_rest(p)._replace(engine_rpm=2000.0 * one, wheel_speed=10.0 * one, speed=3.5 * one)
+    gearing = 4.17 * 2.56
+    wanted = 800 + 10 * gearing * 60 / (2 * np.pi)
+    told = _roll(p, state, gearing * one, 0 * one).engine_rpm[0]  # type: ignore[arg-type]
+    assert told == pytest.approx(2000 + (wanted - 2000) * 20 * h / (1 + 20 * h))
+
+
+@pytest.mark.parametrize(("visibility", "seen"), [(1.0, True), (0.8, True), (0.7, False)])
+def test_sumos_sensor_sees_less_far_in_bad_sight(visibility: float, seen: bool) -> None:
+    vehicle, p, one = SYSTEMS["sumo"].vehicle, prepared("sumo"), np.ones(1)
+    told, _ = vehicle.sense(p, vehicle.at_rest(p), Observation(0.0, one, 60 * one, one, 0 * one, 0 * one, visibility))
+    assert bool(np.isfinite(told.gap[0])) == seen, "80 m in clear sight"
+
+
+def test_a_calibration_drive_finds_what_the_brake_adds_to_coasting() -> None:
+    """SUMO's vehicle coasts without loss and brakes at decel, 9 m/s^2, per unit of pedal."""
+    assert SYSTEMS["sumo"].nominal.braking == pytest.approx(9.0, rel=0.02)
