@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -30,12 +30,22 @@ class Outcome(StrEnum):
     SIMULATOR_ERROR = "simulator-error"
 
 
+NOTHING: FloatArray = np.zeros(())
+"""A zero that stands for N zeros."""
+EVERYWHERE: BoolArray = np.ones((), dtype=bool)
+"""A truth that stands for N truths."""
+for _constant in (NOTHING, EVERYWHERE):
+    _constant.flags.writeable = False
+
+
 class Observation(NamedTuple):
     """What the sensors of N vehicles tell their ADS; every array has shape (N,).
 
     `gap` is the distance along the vehicle's path from its front bumper to the obstacle, infinite
     while the obstacle is not detected [m]; `lateral` is the obstacle's offset from the middle of the
-    vehicle's lane, negative on the side that it comes from [m].
+    vehicle's lane, negative on the side that it comes from, infinite while it is out of sight [m].
+    `closing_speed` is by how much the gap shrinks, `obstacle_speed` the obstacle's own speed along the vehicle's way [m/s];
+    `throttle` is where the accelerator stands [-].
     """
 
     time: float
@@ -44,7 +54,9 @@ class Observation(NamedTuple):
     closing_speed: FloatArray
     lateral: FloatArray
     lateral_speed: FloatArray
-    visibility: float
+    visibility: float | FloatArray
+    obstacle_speed: FloatArray = NOTHING
+    throttle: FloatArray = NOTHING
 
 
 class Command(NamedTuple):
@@ -91,7 +103,8 @@ class Trace:
     """T samples of N vehicles, `step` seconds apart; arrays of shape (T, N), `time` (T,).
 
     A vehicle's samples count while `active`; later ones are whatever SUMO did with the rest of the batch.
-    `vehicle_length`, `position`, `gap` and `lateral` in m, speeds in m/s, `throttle` and `brake` as commanded.
+    `vehicle_length`, `position`, `gap` and `lateral` in m, speeds in m/s, `throttle` and `brake` as commanded;
+    `obstacle_speed` is the obstacle's along the vehicle's way.
     """
 
     step: float
@@ -106,6 +119,7 @@ class Trace:
     brake: FloatArray
     gear: FloatArray
     active: BoolArray
+    obstacle_speed: FloatArray = field(default_factory=lambda: NOTHING)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,7 +34,7 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     Parameters
     ----------
     first_command
-        Time from the run's start to the first command [s].
+        Time from the run's start to the first command, of a vehicle that stands [s].
     perception_range
         It knows of obstacles up to this gap, times the visibility [m].
     cruise_speed, cruise_gain, cruise_acceleration
@@ -71,10 +71,13 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return _Memory(nominal, step, nothing > 0, nothing, nothing, nothing)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        if seen.time < self.first_command - FIRST_COMMAND_ROUNDING:
+        waits = (seen.speed == 0) & (seen.time < self.first_command - FIRST_COMMAND_ROUNDING)
+        if waits.all():
             return Command(np.zeros_like(seen.speed), np.zeros_like(seen.speed)), memory
-        memory = self._plan(seen, memory)
-        return self._pedals(seen, memory), memory
+        planned = self._plan(seen, memory)
+        throttle, brake = self._pedals(seen, planned)
+        kept = (np.where(waits, old, new) for old, new in zip(memory[2:], planned[2:], strict=True))
+        return Command(np.where(waits, 0.0, throttle), np.where(waits, 0.0, brake)), _Memory(memory.nominal, memory.step, *kept)
 
     def _plan(self, seen: Observation, memory: _Memory) -> _Memory:
         """The acceleration to ask for: cruise, or v^2 / (2 d) to stand before the obstacle; then creep and hold."""

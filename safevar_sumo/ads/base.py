@@ -104,4 +104,4 @@ class Checked:
 
 def _one(seen: Observation, i: int) -> Observation:
     """What vehicle `i` sees, as plain numbers."""
-    return Observation(*(float(value[i]) if isinstance(value, np.ndarray) else value for value in seen))  # type: ignore[arg-type]
+    return Observation(*(float(value[i] if isinstance(value, np.ndarray) and value.ndim else value) for value in seen))  # type: ignore[arg-type]

@@ -33,7 +33,7 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     Parameters
     ----------
     first_command
-        Time from the run's start to the first throttle [s].
+        Time from the run's start to the first throttle, of a vehicle that stands [s].
     latency
         Time from an image to its command [s], rounded to whole steps.
     corridor
@@ -63,8 +63,8 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         brakes = self._brakes(seen, memory.brakes)
-        released = brakes | (seen.speed > SPEED_LIMIT)
-        throttle = np.where(released, 0.0, self._throttle(seen.speed) if seen.time >= self.first_command else 0.0)
+        waits = (seen.speed == 0) & (seen.time < self.first_command)
+        throttle = np.where(brakes | waits | (seen.speed > SPEED_LIMIT), 0.0, self._throttle(seen.speed))
         command, *under_way = (*memory.under_way, Command(throttle, np.where(brakes, 1.0, 0.0)))
         return command, memory._replace(brakes=brakes, under_way=tuple(under_way))
 

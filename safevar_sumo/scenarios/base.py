@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol
 
-from safevar_sumo.records import BoolArray, Encounter, FloatArray, Trace
+from safevar_sumo.records import EVERYWHERE, NOTHING, BoolArray, Encounter, FloatArray, Trace
 
 VUT = "vut"
 """Id of the vehicle under test in every network's traffic."""
@@ -35,13 +35,15 @@ class World(Protocol):
 class Scene(NamedTuple):
     """The obstacle relative to N vehicles, each of shape (N,); see `Observation` for the quantities.
 
-    `over` tells where the encounter has ended and cannot come back.
+    `over` tells where the encounter has ended and cannot come back, `visible` where nothing stands in the sensors' way.
     """
 
     gap: FloatArray
     lateral: FloatArray
     lateral_speed: FloatArray
     over: BoolArray
+    obstacle_speed: FloatArray = NOTHING
+    visible: BoolArray = EVERYWHERE
 
 
 class Scenario(Protocol):

@@ -14,6 +14,7 @@ from safevar_sumo.simulation.network import copied_network
 from safevar_sumo.simulation.perception import Perception
 from safevar_sumo.simulation.sumo import Engine, SumoWorld, open_world
 from safevar_sumo.simulation.system import System
+from safevar_sumo.vehicles import at_start
 
 Watcher = Callable[[SumoWorld], None]
 
@@ -63,7 +64,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
     world.set_types(vehicle.sumo_type(prepared))
     world.depart()
 
-    state = vehicle.at_rest(prepared)
+    state = at_start(vehicle, prepared, world.speeds())
     driver = system.ads.start(n, system.nominal, step)
     perception = Perception(system.weather, step)
     memory = scenario.begin(world)
@@ -75,10 +76,12 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
         speed = world.speeds()
         scene, memory = scenario.observe(world, step, memory)
         active = verdict.judge(speed, scene.over, world.collisions(), last=sample == log.length - 1)
-        seen, state = vehicle.sense(prepared, state, perception.observe(sample * step, speed, scene))
+        seen = perception.observe(sample * step, speed, scene)._replace(throttle=state.throttle)
+        seen, state = vehicle.sense(prepared, state, seen)
         command, driver = system.ads.drive(seen, driver)
         log.write(sample, position=world.vehicle_positions(VUT)[:, 0], speed=speed, gap=scene.gap, lateral=scene.lateral,
-                  lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active)
+                  lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active,
+                  obstacle_speed=scene.obstacle_speed)
         if not verdict.open.any():
             break
         state = vehicle.advance(prepared, state, command)
@@ -90,7 +93,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
 class _Log:
     """Samples of a run in arrays of shape (T, N)."""
 
-    _COLUMNS = ("position", "speed", "gap", "lateral", "lateral_speed", "throttle", "brake", "gear", "active")
+    _COLUMNS = ("position", "speed", "gap", "lateral", "lateral_speed", "throttle", "brake", "gear", "active", "obstacle_speed")
 
     def __init__(self, n: int, length: int) -> None:
         self.length = length

@@ -22,9 +22,12 @@ class Perception:
         self._past: deque[FloatArray] = deque()
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
-        """What is seen at this step; every step is to be shown."""
-        gap, closing_speed, lateral, lateral_speed = self._late(np.stack([scene.gap, speed, scene.lateral, scene.lateral_speed]))
-        return Observation(time, speed, gap, closing_speed, lateral, lateral_speed, self._visibility)
+        """What is seen at this step; every step is to be shown. Who is hidden is infinitely far away and still."""
+        there = (scene.gap, scene.lateral, scene.lateral_speed, np.broadcast_to(scene.obstacle_speed, speed.shape))
+        hidden = (np.inf, np.inf, 0.0, 0.0)
+        seen = [np.where(scene.visible, one, other) for one, other in zip(there, hidden, strict=True)]
+        gap, lateral, lateral_speed, obstacle_speed, own = self._late(np.stack([*seen, speed]))
+        return Observation(time, speed, gap, own - obstacle_speed, lateral, lateral_speed, self._visibility, obstacle_speed)
 
     def _late(self, now: FloatArray) -> FloatArray:
         """What was there a delay ago, linear between two steps; before the first one nothing was different."""

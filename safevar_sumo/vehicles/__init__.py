@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from safevar_sumo.vehicles.base import SumoType, Vehicle, VehicleState
+from safevar_sumo.vehicles.base import SumoType, Vehicle, VehicleState, at_start
 from safevar_sumo.vehicles.calibration_drive import calibration_drive
 from safevar_sumo.vehicles.carla import Carla
 from safevar_sumo.vehicles.characteristics import Characteristic, CharacteristicSet
@@ -16,4 +16,5 @@ VEHICLES: Mapping[str, type[Any]] = {
     "sumo": SumoVehicle,
 }
 
-__all__ = ["VEHICLES", "Carla", "Characteristic", "CharacteristicSet", "SumoType", "Vehicle", "VehicleState", "calibration_drive"]
+__all__ = [
+    "VEHICLES", "Carla", "Characteristic", "CharacteristicSet", "SumoType", "Vehicle", "VehicleState", "at_start", "calibration_drive"]

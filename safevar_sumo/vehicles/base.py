@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+
 from safevar_sumo.records import Command, FloatArray, Observation
 
 Characteristics = Mapping[str, FloatArray]
@@ -53,8 +55,23 @@ class Vehicle(Protocol):
     def at_rest(self, prepared: Any) -> Any:
         """The state at the start: standing, pedals released."""
 
+    def at_speed(self, prepared: Any, speed: FloatArray) -> Any:
+        """The steady state at a speed above 0 [m/s], shape (N,): with the pedals kept where they are nothing changes."""
+
     def sense(self, prepared: Any, state: Any, seen: Observation) -> tuple[Observation, Any]:
         """What the vehicles' own sensors leave of an observation, and the state after it."""
 
     def advance(self, prepared: Any, state: Any, command: Command) -> Any:
         """The state one simulation step later."""
+
+
+def at_start(vehicle: Vehicle, prepared: Any, speed: FloatArray) -> Any:
+    """The state of vehicles that the traffic puts onto the road with `speed` [m/s], shape (N,): at rest, or steady."""
+    rest = vehicle.at_rest(prepared)
+    rolls = speed > 0
+    if not rolls.any():
+        return rest
+    steady = vehicle.at_speed(prepared, np.where(rolls, speed, 1.0))
+    if rolls.all():
+        return steady
+    return type(rest)(*(one if one is None else np.where(rolls, one, other) for one, other in zip(steady, rest, strict=True)))

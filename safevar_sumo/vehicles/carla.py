@@ -35,6 +35,7 @@ FRONTAL_AREA = 2.2  # m^2, of the LincolnMkz2017
 TIME_ROUNDING = 1e-9  # s; below it two sums of steps are the same time
 STANDSTILL = 0.03  # m/s, below which a braked vehicle is held by its tyres (PxVehicle sticky tires)
 SUBSTEP = 1 / 60  # s at most; CARLA 0.9.10 (MaxSubstepDeltaTime)
+NEWTON_STEPS = 8  # from 1 to a cube root near 1: the last ones change nothing
 TYRE_STEPS = 3  # in a substep; what PhysX takes below 5 m/s (setSubStepCount), here at any speed
 
 
@@ -141,6 +142,34 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def at_rest(self, prepared: _Prepared) -> CarlaState:
         nothing = np.zeros_like(prepared.mass)
         return CarlaState(*(nothing for _ in CarlaState._fields))
+
+    def at_speed(self, prepared: _Prepared, speed: FloatArray) -> CarlaState:
+        """What stays as it is under the throttle that holds the speed: every equation of `_roll` with its change set to zero.
+
+        The gear is the one that the gearbox has when it comes from below; a switch that it would take back is just over.
+        """
+        p, nothing = prepared, np.zeros_like(prepared.mass)
+        rim, force = self._rim_at(p, speed)
+        wheel_speed = rim / p.radius
+        gear = nothing + 1
+        for ratio in OVERALL_RATIOS[1:-1]:
+            gear += wheel_speed * ratio > SHIFT_UP * p.engine_limit
+        ratio = OVERALL_RATIOS[gear.astype(np.intp)]
+        through_clutch = (p.wheel_damping * wheel_speed + p.radius * force) / ratio
+        engine_speed = np.minimum(ratio * wheel_speed + through_clutch / p.clutch, p.engine_limit)
+        state = CarlaState(speed, wheel_speed, engine_speed, gear, gear, nothing, nothing, nothing)
+        pull = self._torque(p, state) - (p.damping_full - p.damping_engaged) * engine_speed
+        throttle = np.minimum((p.damping_engaged * engine_speed + through_clutch) / np.maximum(pull, 1.0), 1.0)
+        lugs = (gear > 1) & (engine_speed < SHIFT_DOWN * p.engine_limit)
+        return state._replace(throttle=throttle, since_shift=np.where(lugs, p.shift_time, AUTOBOX_LATENCY))
+
+    def _rim_at(self, p: _Prepared, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Speed of the wheels' rim at which the tyres push as hard as the air resists [m/s], and that force [N]."""
+        force = np.minimum(p.air_drag * speed * speed, p.grip)
+        left = np.ones_like(speed)
+        for _ in range(NEWTON_STEPS):  # left^3 = 1 - force / grip; see `_tyre_force`
+            left = left - (left * left * left - 1 + force / p.grip) / (3 * left * left)
+        return (p.slip_stiffness * speed + p.slip_offset * (1 - left)) / (p.slip_stiffness - 1 + left), force
 
     def sense(self, prepared: _Prepared, state: CarlaState, seen: Observation) -> tuple[Observation, CarlaState]:
         """The camera stands where the wheels put it."""

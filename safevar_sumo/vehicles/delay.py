@@ -25,4 +25,6 @@ def delayed(past: FloatArray, delay: FloatArray, step: float) -> FloatArray:
     share = age - newer
     row, column = newer.astype(np.intp), np.arange(len(delay))
     after, before = np.moveaxis(past[row, ..., column], 0, -1), np.moveaxis(past[row + 1, ..., column], 0, -1)
-    return np.asarray(after * (1 - share) + before * share)
+    with np.errstate(invalid="ignore"):  # infinitely far a whole number of steps ago, and now in sight
+        between = after * (1 - share) + before * share
+    return np.where(np.isnan(between), after, between)

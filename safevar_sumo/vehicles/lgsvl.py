@@ -131,6 +131,28 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             since_shift=nothing + SHIFT_DELAY, traction_torque=TRACTION_START * p.motor_torque, lateral=nothing + LATERAL_ERROR,
             heading=nothing + HEADING_ERROR, throttle=nothing, brake=nothing)
 
+    def at_speed(self, prepared: _Prepared, speed: FloatArray) -> LgsvlState:
+        """What stays as it is under the accelerator that holds the speed: every equation with its change set to zero.
+
+        The lane keeping has no error left; the gear is the one that the gearbox has when it comes from below.
+        """
+        p, nothing = prepared, np.zeros_like(prepared.mass)
+        force = (AIR_DRAG * speed + p.rolling_drag) * speed
+        rim = _rim_at(p, speed, force)
+        wheel_speed = rim / p.radius
+        gear = nothing + 1
+        for step_ratio in GEAR_RATIOS[:-1]:
+            gear += p.least_rpm + wheel_speed * (step_ratio * FINAL_RATIO * RPM) > SHIFT_UP * p.largest_rpm
+        ratio = GEAR_RATIOS[gear.astype(np.intp) - 1]
+        gearing = ratio * FINAL_RATIO
+        engine_rpm = p.least_rpm + wheel_speed * gearing * RPM
+        full = _torque_share(engine_rpm / p.largest_rpm) * gearing * p.motor_torque
+        throttle = np.minimum((p.damping * wheel_speed + p.radius * force) / np.maximum(full, 1.0), 1.0)
+        return LgsvlState(
+            speed=speed, wheel_speed=wheel_speed, engine_rpm=engine_rpm, gear=gear, old_ratio=ratio, new_ratio=ratio,
+            since_shift=nothing + SHIFT_DELAY, traction_torque=p.motor_torque, lateral=nothing, heading=nothing,
+            throttle=throttle, brake=nothing)
+
     def sense(self, prepared: _Prepared, state: LgsvlState, seen: Observation) -> tuple[Observation, LgsvlState]:
         return seen, state
 
@@ -208,6 +230,14 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
 def _torque_share(share: FloatArray) -> FloatArray:
     """Engine torque over the largest one, at a share of maxRpm: a parabola, zero above the end (assumption)."""
     return np.where(share < 1, 0.4 + 2.4 * share * (1 - share), 0.0)
+
+
+def _rim_at(p: _Prepared, speed: FloatArray, force: FloatArray) -> FloatArray:
+    """Speed of the wheels' rim at which the tyres push with `force` [m/s]: the rising part of `_tyre_stiffness` solved for it."""
+    share = np.minimum(force / (p.friction * (p.mass * GRAVITY + DOWNFORCE * speed * speed)), 1.0)
+    slip = PEAK_SLIP * share / (1 + np.sqrt(1 - share))
+    slow = speed + SLIP_FLOOR * slip
+    return np.asarray(np.where(slow <= SLIP_FLOOR, slow, speed / (1 - slip)))
 
 
 def _tyre_stiffness(p: _Prepared, speed: FloatArray, rim: FloatArray, slipping: FloatArray) -> FloatArray:

@@ -78,15 +78,20 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         commands = history(float(np.max(prepared.brake_delay)), prepared.step, nothing)
         return SumoState(nothing, nothing, nothing, nothing, nothing + 1, None, commands)
 
+    def at_speed(self, prepared: _Prepared, speed: FloatArray) -> SumoState:
+        """Nothing resists: whoever rolls goes on with the pedals released."""
+        return self.at_rest(prepared)._replace(speed=speed)
+
     def sense(self, prepared: _Prepared, state: SumoState, seen: Observation) -> tuple[Observation, SumoState]:
         """Sensors report what was `reactionTime` ago, and nothing beyond `sensorRange` times the visibility."""
         p = prepared
-        now = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed])
+        obstacle_speed = np.broadcast_to(seen.obstacle_speed, seen.gap.shape)
+        now = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed, obstacle_speed])
         past = history(float(np.max(p.reaction_time)), p.step, now) if state.seen is None else remembered(state.seen, now)
-        gap, closing_speed, lateral, lateral_speed = delayed(past, p.reaction_time, p.step)
+        gap, closing_speed, lateral, lateral_speed, obstacle_speed = delayed(past, p.reaction_time, p.step)
         detected = gap <= p.sensor_range * seen.visibility
-        late = seen._replace(
-            gap=np.where(detected, gap, np.inf), closing_speed=closing_speed, lateral=lateral, lateral_speed=lateral_speed)
+        late = seen._replace(gap=np.where(detected, gap, np.inf), closing_speed=closing_speed, lateral=lateral,
+                             lateral_speed=lateral_speed, obstacle_speed=obstacle_speed)
         return late, state._replace(seen=past)
 
     def advance(self, prepared: _Prepared, state: SumoState, command: Command) -> SumoState:

@@ -1,0 +1,101 @@
+"""Vehicles that the traffic puts onto the road while they drive: in a steady state, in every part of them."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from drives import STEP, SYSTEMS, drawn, original
+
+from safevar_sumo.records import Command
+from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.simulation import assemble, simulate
+from safevar_sumo.study import load_study
+from safevar_sumo.vehicles import at_start
+
+SPEEDS = (10, 20, 30, 40, 50, 60)  # km/h, where the original vehicles' gearboxes hold their gear
+
+
+def moving(model: str, settings: np.ndarray, speed: float) -> tuple[object, object]:
+    system = SYSTEMS[model]
+    values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
+    prepared = system.vehicle.prepare(values, 1.0, STEP)
+    return prepared, at_start(system.vehicle, prepared, np.full(len(settings), speed))
+
+
+@pytest.mark.parametrize("model", sorted(SYSTEMS))
+@pytest.mark.parametrize("kmh", SPEEDS)
+def test_nothing_changes_while_the_pedals_stay(model: str, kmh: float) -> None:
+    prepared, state = moving(model, original(model), kmh / 3.6)
+    before, pedals = state, Command(state.throttle, state.brake)  # type: ignore[attr-defined]
+    assert state.speed == pytest.approx(kmh / 3.6)  # type: ignore[attr-defined]
+    for _ in range(200):
+        state = SYSTEMS[model].vehicle.advance(prepared, state, pedals)
+    for name in ("speed", "wheel_speed", "engine_speed", "engine_rpm", "gear", "traction_torque"):
+        if hasattr(state, name):
+            assert getattr(state, name) == pytest.approx(getattr(before, name), rel=1e-12), name
+
+
+@pytest.mark.parametrize("model", sorted(SYSTEMS))
+def test_whoever_is_not_about_to_shift_keeps_his_speed_whatever_his_characteristics(model: str) -> None:
+    prepared, state = moving(model, drawn(model, 300, 5), 30 / 3.6)
+    gear, pedals = state.gear, Command(state.throttle, state.brake)  # type: ignore[attr-defined]
+    stays = np.ones(300, dtype=bool)
+    for _ in range(100):
+        state = SYSTEMS[model].vehicle.advance(prepared, state, pedals)
+        stays &= state.gear == gear
+    assert np.mean(stays) > 0.9
+    assert state.speed[stays] == pytest.approx(30 / 3.6, rel=1e-12)
+
+
+@pytest.mark.parametrize("model", sorted(SYSTEMS))
+def test_coasting_from_a_steady_start_has_no_transient(model: str) -> None:
+    """What it loses grows to a peak as the driveline lets go, and falls: no jump, no swing; and just so after five steady seconds."""
+    def coasting(after: float) -> np.ndarray:
+        prepared, state = moving(model, original(model), 40 / 3.6)
+        held, nothing = Command(state.throttle, state.brake), np.zeros(1)  # type: ignore[attr-defined]
+        speeds = []
+        for k in range(round((after + 1.5) / STEP)):
+            speeds.append(float(state.speed[0]))  # type: ignore[attr-defined]
+            state = SYSTEMS[model].vehicle.advance(prepared, state, held if k * STEP < after else Command(nothing, nothing))
+        return -np.diff(speeds[round(after / STEP):]) / STEP
+
+    lost = coasting(0.0)
+    assert np.all(lost >= 0)
+    peak = int(np.argmax(lost))
+    assert np.all(np.diff(lost[:peak + 1]) >= -1e-9)
+    assert np.all(np.diff(lost[peak:]) <= 1e-9)
+    assert np.max(np.abs(np.diff(lost, prepend=0.0))) < 1.0
+    assert coasting(5.0) == pytest.approx(lost, abs=1e-9)
+
+
+def test_whoever_stands_and_whoever_rolls_start_together_and_each_as_if_alone() -> None:
+    for model, system in SYSTEMS.items():
+        settings = drawn(model, 4, 9)
+        values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
+        prepared = system.vehicle.prepare(values, 1.0, STEP)
+        mixed = at_start(system.vehicle, prepared, np.array([0.0, 8.0, 0.0, 12.0]))
+        rest, rolling = system.vehicle.at_rest(prepared), at_start(system.vehicle, prepared, np.array([3.0, 8.0, 4.0, 12.0]))
+        for one, stands, rolls in zip(mixed, rest, rolling, strict=True):
+            if one is not None:
+                assert one[..., [0, 2]].tolist() == stands[..., [0, 2]].tolist()
+                assert one[..., [1, 3]].tolist() == rolls[..., [1, 3]].tolist()
+
+
+@pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
+def test_the_depart_speed_of_the_traffic_is_honoured(study: str, tmp_path: Path) -> None:
+    chosen = load_study(study)
+    folder = tmp_path / "net"
+    shutil.copytree(NETWORKS / chosen.scenario.model, folder)
+    traffic = folder / "traffic.rou.xml"
+    head, vut, tail = traffic.read_text().partition('<vehicle id="vut"')
+    traffic.write_text(head + vut + tail.replace('departSpeed="0"', 'departSpeed="5"', 1))
+    scenario = msgspec.structs.replace(chosen.scenario, parameters={**chosen.scenario.parameters, "network": str(folder)})
+    system = assemble(msgspec.structs.replace(chosen, scenario=scenario))
+    trace = simulate(system, system.characteristics.original[np.newaxis]).trace
+    assert trace.speed[0, 0] == 5
+    assert abs(trace.speed[1, 0] - 5) < 0.3, "no jump in the first step, whatever the system commands"
+    assert trace.position[1, 0] - trace.position[0, 0] == pytest.approx((trace.speed[0, 0] + trace.speed[1, 0]) / 2 * trace.step)
