@@ -1,1 +1,46 @@
-"""SafeVar on SUMO: which smallest variations of a vehicle make its automated driving system unsafe?"""
+"""SafeVar on SUMO: which smallest variations of a vehicle make its automated driving system unsafe?
+
+`import safevar_sumo as sv`, and then `sv.simulate("rain", {"tireFric": 1.1})`. Every name below is loaded when it is used
+first, so importing the package costs next to nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from safevar_sumo.api import Figures, Results, Simulation, Tables, evaluate, figures, load, run, simulate, tables
+    from safevar_sumo.errors import InputError, SafevarError, SimulationError
+    from safevar_sumo.study import Study, Weather, load_study, study_names
+
+    __version__: str
+
+_ROOM_OF = {
+    "load_study": "study", "study_names": "study", "Study": "study", "Weather": "study",
+    "simulate": "api", "Simulation": "api",
+    "evaluate": "api",
+    "run": "api", "load": "api", "Results": "api",
+    "tables": "api", "Tables": "api",
+    "figures": "api", "Figures": "api",
+    "SafevarError": "errors", "InputError": "errors", "SimulationError": "errors",
+}
+"""Every public name and the room that it comes from."""
+
+__all__ = [
+    "Figures", "InputError", "Results", "SafevarError", "Simulation", "SimulationError", "Study", "Tables", "Weather", "__version__",
+    "evaluate", "figures", "load", "load_study", "run", "simulate", "study_names", "tables",
+]
+
+if not TYPE_CHECKING:  # a type checker is to know the names above, and no others
+    def __getattr__(name: str) -> Any:
+        if name == "__version__":
+            from importlib.metadata import version
+
+            return version("safevar_sumo")
+        if name not in _ROOM_OF:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(f"{__name__}.{_ROOM_OF[name]}"), name)
+
+    def __dir__() -> list[str]:
+        return sorted(__all__)

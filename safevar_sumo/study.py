@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -117,6 +118,10 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     calibration: dict[str, FreeParameter] = {}
 
 
+StudyLike = str | Path | Mapping[str, Any] | Study
+"""A study by its name, the path of its file, its tables, or itself."""
+
+
 def study_names() -> list[str]:
     """Names of the studies that come with the package."""
     return sorted(path.stem for path in STUDIES.glob("*.toml"))
@@ -146,16 +151,37 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def load_study(study: str) -> Study:
-    """Read a study by its name or path, strictly.
+def load_study(study: StudyLike, **changes: Any) -> Study:
+    """Read a study strictly.
+
+    Parameters
+    ----------
+    study
+        Its name, the path of its file, its tables as they would stand in a file, or a study that is to be changed.
+    changes
+        Keys that override the study's, table by table as in a file that extends it:
+        `weather="fog"`, `search={"runs": 2}`.
 
     Raises
     ------
     InputError
         Naming file, key, value and what is legal.
     """
-    path = study_path(study)
-    raw = _read(path, seen=())
+    source, raw = _given(study)
+    return _checked(source, _merged(raw, changes))
+
+
+def _given(study: StudyLike) -> tuple[object, dict[str, Any]]:
+    """What a study is called in errors, and its tables."""
+    if isinstance(study, Study):
+        return f"study {study.name!r}", _without_nothing(msgspec.to_builtins(study))
+    if isinstance(study, Mapping):
+        return "study", _extended(dict(study), Path("."), ())
+    path = study_path(str(study))
+    return path, _read(path, seen=())
+
+
+def _checked(path: object, raw: dict[str, Any]) -> Study:
     for key, row in _characteristic_rows(raw):
         _converted(path, row, CharacteristicTable, key)  # before the whole: msgspec does not tell which row of a table is wrong
     parsed = _converted(path, raw, Study)
@@ -212,6 +238,11 @@ def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
         raise InputError(path, f"is not UTF-8 text: {error}") from None
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
+    return _extended(raw, path, seen)
+
+
+def _extended(raw: dict[str, Any], path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
+    """The tables of the study that `raw` extends, overridden by its own."""
     if "extends" not in raw:
         return raw
     base = raw.pop("extends")
@@ -276,7 +307,7 @@ def _refines(key: str, old: object, new: object) -> bool:
     return bool(new.get("model", old.get("model")) == old.get("model"))
 
 
-def _check_finite(path: Path, value: object, key: str) -> None:
+def _check_finite(path: object, value: object, key: str) -> None:
     """Refuse nan and infinities wherever they stand."""
     if isinstance(value, dict):
         for name, inner in value.items():
@@ -288,7 +319,7 @@ def _check_finite(path: Path, value: object, key: str) -> None:
         raise InputError(path, f"{key} = {value}", "a finite number")
 
 
-def _check_characteristic(path: Path, key: str, row: CharacteristicTable) -> None:
+def _check_characteristic(path: object, key: str, row: CharacteristicTable) -> None:
     values = {"original": row.original, "lower": row.lower, "upper": row.upper}
     for name, value in values.items():
         if not math.isfinite(value):

@@ -1,4 +1,4 @@
-"""Pictures of a case's results: one function a picture, from a case to a matplotlib figure."""
+"""Pictures of results: one function a picture, from a case, or all of them, to a matplotlib figure."""
 
 from __future__ import annotations
 
@@ -31,20 +31,36 @@ DPI = 200
 FONT = 8
 LONG_NAME = 28
 """Letters that fit above a small axis."""
+PANELS = 3
+"""Panels of cases in a row."""
 BINS = 24
 """Bins over a characteristic's domain."""
 
 
-def number_of_changes(case: Case) -> Figure:
-    """RQ3.1: how many critical solutions of a run have j characteristics changed, as box plots over the runs."""
+def number_of_changes(cases: Sequence[Case]) -> Figure:
+    """RQ3.1: how many critical solutions of a run have j characteristics changed, as box plots over the runs; a panel per case.
+
+    Raises
+    ------
+    Unanswerable
+        As `rq31`, for the first case that holds no answer.
+    """
     import seaborn as sns
 
-    counts = rq31(case)
-    figure, ((axis,),) = _figure(case, "number of changed characteristics", 1, 1, (6.4, 3.8))
-    sns.boxplot(counts, x="j", y="count", ax=axis, color="#56b4e9", linecolor="black", linewidth=0.8, fliersize=3)
-    axis.set_xlabel("characteristics changed")
-    axis.set_ylabel(f"critical solutions per run\n({counts['run'].nunique()} runs)")
-    _whole_numbers(axis.yaxis)
+    counts = [rq31(case) for case in cases]
+    columns = min(len(cases), PANELS)
+    rows = -(-len(cases) // columns)
+    title = "number of changed characteristics"
+    figure, axes = _figure(f"{cases[0].name}: {title}" if len(cases) == 1 else title, rows, columns,
+                           (6.4 if columns == 1 else 3.9 * columns, 0.5 + 3.3 * rows))
+    for axis, case, of_it in zip(axes.flat, cases, counts, strict=False):
+        sns.boxplot(of_it, x="j", y="count", ax=axis, color="#56b4e9", linecolor="black", linewidth=0.8, fliersize=3)
+        axis.set_xlabel("characteristics changed")
+        axis.set_ylabel(f"critical solutions per run\n({of_it['run'].nunique()} runs)")
+        axis.set_title(_plain(case.name) if len(cases) > 1 else "", fontsize=FONT)
+        _whole_numbers(axis.yaxis)
+    for axis in list(axes.flat)[len(cases):]:
+        axis.set_axis_off()
     return figure
 
 
@@ -57,7 +73,7 @@ def changed_characteristics(case: Case) -> Figure:
     order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
     grid = shares.pivot(index="characteristic", columns="j", values="percent").astype(float)
     grid = grid.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=_plain)
-    figure, ((axis,),) = _figure(case, "characteristics changed in critical solutions", 1, 1, (7.6, 1.4 + 0.3 * len(grid)))
+    figure, ((axis,),) = _figure(f"{case.name}: characteristics changed in critical solutions", 1, 1, (7.6, 1.4 + 0.3 * len(grid)))
     sns.heatmap(grid, ax=axis, cmap="cividis", vmin=0, vmax=100, annot=True, fmt=".0f", annot_kws={"fontsize": 7}, linewidths=0.5,
                 cbar_kws={"label": "critical solutions\nin which it is changed [%]"})
     axis.grid(visible=False)
@@ -79,7 +95,7 @@ def sizes_of_changes(case: Case) -> Figure:
     members = case.characteristics.members
     columns = min(4, len(members))
     rows = -(-len(members) // columns)
-    figure, axes = _figure(case, "changes in critical solutions", rows, columns, (9.0, 1.0 + 1.85 * rows))
+    figure, axes = _figure(f"{case.name}: changes in critical solutions", rows, columns, (9.0, 1.0 + 1.85 * rows))
     for axis, member in zip(axes.flat, members, strict=False):
         change = found.loc[found["characteristic"] == member.name, "change"]
         low, high = (float(f"{end - member.original:.9g}") for end in (member.lower, member.upper))
@@ -108,6 +124,8 @@ def sizes_of_changes(case: Case) -> Figure:
 def pareto_fronts(case: Case) -> Figure:
     """The non-dominated solutions of each algorithm, all its runs together, in the three pairs of objectives.
 
+    Beside them the original vehicle, and the line at and left of which a solution is a collision.
+
     Raises
     ------
     Unanswerable
@@ -121,11 +139,16 @@ def pareto_fronts(case: Case) -> Figure:
             fronts[algorithm] = nondominated(points) * [1, 100, 1]
     if not fronts:
         raise Unanswerable(case.name, "has no solution", "results with at least one finished run")
-    figure, (axes,) = _figure(case, "non-dominated solutions of each algorithm, all runs together", 1, 3, (9.6, 3.7))
+    figure, (axes,) = _figure(f"{case.name}: non-dominated solutions of each algorithm, all runs together", 1, 3, (9.6, 3.7))
+    original = (case.original["safety_degree"], 0.0, 0.0)
     for axis, (first, second) in zip(axes, combinations(range(3), 2), strict=True):
         for i, (algorithm, points) in enumerate(fronts.items()):
             axis.plot(points[:, first], points[:, second], linestyle="", marker=MARKERS[i % len(MARKERS)], markersize=4, alpha=0.6,
                       markeredgewidth=0, color=COLOURS[i % len(COLOURS)], label=f"{_title(algorithm)} ({len(points)})")
+        if not np.isnan(original[first]):
+            axis.plot(original[first], original[second], linestyle="", marker="*", markersize=9, color="black", label="original vehicle")
+        if names[first] == "f_safe":
+            axis.axvline(0, color="black", linewidth=0.8, linestyle="--", label="collision: 0 and left of it")
         axis.set_xlabel(OBJECTIVE_TITLES[names[first]])
         axis.set_ylabel(OBJECTIVE_TITLES[names[second]])
     _legend_below(figure, axes[0])
@@ -135,7 +158,7 @@ def pareto_fronts(case: Case) -> Figure:
 def hypervolume_growth(case: Case) -> Figure:
     """Convergence: the hypervolume of what was found against evaluations, median and range over the runs."""
     growth = convergence(case)
-    figure, ((axis,),) = _figure(case, "convergence", 1, 1, (6.4, 4.0))
+    figure, ((axis,),) = _figure(f"{case.name}: convergence", 1, 1, (6.4, 4.0))
     for i, (algorithm, of_it) in enumerate(growth.groupby("algorithm", sort=False)):
         over = of_it.groupby("evaluations")["hypervolume"].agg(["min", "median", "max"])
         colour = COLOURS[i % len(COLOURS)]
@@ -150,8 +173,8 @@ def hypervolume_growth(case: Case) -> Figure:
     return figure
 
 
-FIGURES: Mapping[str, Callable[[Case], Figure]] = {
-    "rq3.1-number-of-changes": number_of_changes,
+OF_ALL: Mapping[str, Callable[[Sequence[Case]], Figure]] = {"rq3.1-number-of-changes": number_of_changes}
+OF_A_CASE: Mapping[str, Callable[[Case], Figure]] = {
     "rq3.2-changed-characteristics": changed_characteristics,
     "rq3.3-sizes-of-changes": sizes_of_changes,
     "pareto-fronts": pareto_fronts,
@@ -159,35 +182,66 @@ FIGURES: Mapping[str, Callable[[Case], Figure]] = {
 }
 
 
+def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
+    """Every figure of the cases by name, and why some are not there; with several cases, a case's figures begin with its name.
+
+    Raises
+    ------
+    Unanswerable
+        If no figure can be drawn.
+    """
+    found, refused = {}, []
+    alone = len(cases) == 1
+    for name, of_all in OF_ALL.items():
+        able, unable = _able(cases)
+        refused += unable
+        if able:
+            found[name] = of_all(able)
+    for case in cases:
+        for name, of_it in OF_A_CASE.items():
+            try:
+                found[name if alone else f"{case.name}-{name}"] = of_it(case)
+            except Unanswerable as error:
+                refused.append(error)
+    if not found:
+        raise refused[0]
+    return found, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in refused))
+
+
+def _able(cases: Sequence[Case]) -> tuple[list[Case], list[Unanswerable]]:
+    """The cases that RQ3.1 can be asked of, and why the others cannot."""
+    able, refused = [], []
+    for case in cases:
+        try:
+            rq31(case)
+            able.append(case)
+        except Unanswerable as error:
+            refused.append(error)
+    return able, refused
+
+
 def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Path], list[str]]:
-    """Draw every picture of every case; returns the files, and why some pictures are not there.
+    """Draw every figure into a file; returns the files, and why some figures are not there.
 
     Raises
     ------
     InputError
-        If the directory cannot be written, or no picture can be drawn.
+        If the directory cannot be written, or no figure can be drawn.
     """
-    written, refused = [], []
-    for case in cases:
-        for name, draw in FIGURES.items():
-            try:
-                figure = draw(case)
-            except Unanswerable as error:
-                refused.append(error)
-                continue
-            path = directory / f"{_file_name(case.name)}-{name}.{kind}"
-            try:
-                directory.mkdir(parents=True, exist_ok=True)
-                figure.savefig(path, dpi=DPI)
-            except OSError as error:
-                raise InputError("--out", f"cannot write {path}: {error.strerror or error}", "a directory that can be written") from None
-            written.append(path)
-    if not written:
-        raise refused[0]
-    return written, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in refused))
+    figures, lacking = draw(cases)
+    written = []
+    for name, figure in figures.items():
+        path = directory / f"{_file_name(f'{cases[0].name}-{name}' if len(cases) == 1 else name)}.{kind}"
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            figure.savefig(path, dpi=DPI)
+        except OSError as error:
+            raise InputError(path, f"cannot be written: {error.strerror or error}", "a directory that can be written") from None
+        written.append(path)
+    return written, lacking
 
 
-def _figure(case: Case, what: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
+def _figure(title: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
     """A figure with its axes, shape (rows, columns), that no global state knows of."""
     import matplotlib.style
     from matplotlib.figure import Figure
@@ -196,7 +250,7 @@ def _figure(case: Case, what: str, rows: int, columns: int, size: tuple[float, f
     with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT, "axes.labelsize": FONT, "axes.titlesize": FONT}]):
         figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.1))
         axes = figure.subplots(rows, columns, squeeze=False)
-    figure.suptitle(f"{_plain(case.name)}: {what}", fontsize=FONT + 2)
+    figure.suptitle(_plain(title), fontsize=FONT + 2)
     return figure, axes
 
 

@@ -13,6 +13,7 @@ from safevar_sumo.cli.outputs import PICTURES, check_output
 from safevar_sumo.cli.program import commands
 from safevar_sumo.computing import available_cores, evaluate_all, local_pool
 from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.progress import counted, counted_trials
 from safevar_sumo.records import Evaluations
 from safevar_sumo.reference import (
     ReferenceData,
@@ -28,7 +29,6 @@ from safevar_sumo.reference import (
 from safevar_sumo.results import write_imported
 from safevar_sumo.simulation import assemble
 from safevar_sumo.study import Study, check_writable, load_study, write_study
-from safevar_sumo.terminal.progress import counted, counted_trials
 from safevar_sumo.terminal.reference import print_agreement, print_calibration
 from safevar_sumo.vehicles import CharacteristicSet
 

@@ -9,15 +9,13 @@ import click
 import msgspec
 from rich.console import Console
 
-from safevar_sumo.campaign import RunKey, algorithm_of, all_runs, carry_out, forecast
+from safevar_sumo.api.running import a_pool, carried_out, prepared
+from safevar_sumo.campaign import RunKey, all_runs, forecast
 from safevar_sumo.cli.program import commands
-from safevar_sumo.computing import available_cores, cluster_pool, local_pool
-from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.results import ResultsDirectory
-from safevar_sumo.simulation import assemble, network_fingerprint
+from safevar_sumo.errors import InputError
+from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.terminal.campaign import print_forecast, print_summary
-from safevar_sumo.terminal.progress import CampaignProgress
 
 
 @commands.command()
@@ -38,26 +36,22 @@ from safevar_sumo.terminal.progress import CampaignProgress
 def study(study: str, batch: int | None, out: Path | None, jobs: int | None, cluster: str | None, only: str | None, shard: str | None,
           quiet: bool, dry_run: bool, **options: Any) -> None:
     """Search STUDY; the same command again goes on where it was stopped."""
-    chosen = _with_options(load_study(study), **options)
-    system = assemble(chosen, study)
-    for name in chosen.search.algorithms:
-        algorithm_of(name, chosen)
+    chosen, system = prepared(_with_options(load_study(study), **options), study)
     keys = _selected(all_runs(chosen), only, shard)
-    limit = chosen.search.time_limit
-    with cluster_pool(cluster, limit) if cluster is not None else local_pool(jobs or available_cores(), limit) as pool:
+    directory = out or Path("results") / chosen.name
+    with a_pool(chosen, jobs, cluster) as pool:
         if dry_run:
             print_forecast(Console(), chosen, len(keys), forecast(chosen, len(keys), pool, batch))
             return
-        results = ResultsDirectory(out or Path("results") / chosen.name, chosen, network_fingerprint(system.scenario.network))
-        with CampaignProgress(Console(stderr=True), chosen, keys, quiet) as progress:
-            campaign = carry_out(chosen, keys, results, pool, progress, batch)
-    if campaign.busy:
-        raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: the same command later finishes the study")
-    if keys == all_runs(chosen):
-        results.finish(campaign.solutions)
+        try:
+            with CampaignProgress(Console(stderr=True), chosen, keys, quiet) as progress:
+                campaign = carried_out(chosen, system, keys, directory, pool, progress, batch)
+        except KeyboardInterrupt:
+            click.echo(f"what is computed is kept in {directory}: the same command goes on from there", err=True)
+            raise
     if not quiet:
-        print_summary(Console(), chosen, campaign, results.path)
-        Console().print(f"Results: {results.path}", soft_wrap=True)
+        print_summary(Console(), chosen, campaign, directory)
+        Console().print(f"Results: {directory}", soft_wrap=True, markup=False, highlight=False)
 
 
 def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import traceback
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from multiprocessing import connection, resource_tracker
+from types import ModuleType
 from typing import Any
 
 from safevar_sumo.computing.base import PoolLostError, WorkerLostError, evaluate_batch
@@ -19,6 +21,7 @@ from safevar_sumo.records import Evaluations, FloatArray
 
 START_LIMIT = 120.0
 """How long a worker process may take until it is ready for its first batch [s]."""
+_starting = threading.Lock()
 STARTS = 5
 """How many workers in a row may die before they are ready; no batch is to blame for that."""
 
@@ -113,7 +116,8 @@ class _Worker:
         try:
             self._pipe, theirs = context.Pipe()
             self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
-            self._process.start()
+            with _without_main():
+                self._process.start()
         except OSError as error:
             raise PoolLostError(f"no worker process can be started: {error.strerror}") from None
         theirs.close()
@@ -149,6 +153,18 @@ class _Worker:
         """Kill the process; whoever waits for its answer learns that it died."""
         self._process.kill()
         self._process.join()
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """A spawned process runs the caller's main module again: a script would need `if __name__ == "__main__"`. Ours needs no main module."""
+    with _starting:
+        main = sys.modules["__main__"]
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = main
 
 
 def _serve(pipe: connection.Connection[Any, Any]) -> None:

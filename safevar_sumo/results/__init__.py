@@ -4,8 +4,16 @@ from safevar_sumo.results.handle import CHOICES, HALF, Handle, chosen_handle, ha
 from safevar_sumo.results.imported import UNKNOWN, write_imported
 from safevar_sumo.results.journal import Journal, JournalBusy
 from safevar_sumo.results.load import Results, load
-from safevar_sumo.results.store import ResultsDirectory, evaluations_frame, make_directory, record, solutions_frame, write_whole
+from safevar_sumo.results.store import (
+    ResultsDirectory,
+    evaluations_frame,
+    make_directory,
+    read_manifest,
+    record,
+    solutions_frame,
+    write_whole,
+)
 
 __all__ = ["CHOICES", "HALF", "UNKNOWN", "Handle", "Journal", "JournalBusy", "Results", "ResultsDirectory", "chosen_handle",
-           "evaluations_frame", "handles", "load", "make_directory", "position_of", "record", "solutions_frame", "unsafe_rows",
-           "write_imported", "write_whole"]
+           "evaluations_frame", "handles", "load", "make_directory", "position_of", "read_manifest", "record",
+           "solutions_frame", "unsafe_rows", "write_imported", "write_whole"]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-import pandas as pd
+from typing import TYPE_CHECKING, NamedTuple
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 LEGAL = "ALGORITHM:RUN:N, the N-th row of that run in solutions.csv, from 0"
 HALF = 0.5
@@ -45,6 +46,8 @@ class Handle(NamedTuple):
 
 def handles(solutions: pd.DataFrame) -> list[Handle]:
     """The handle of every row of a frame of solutions, as `safevar_sumo.results.load` gives it."""
+    import pandas as pd
+
     run = solutions["run"] if "run" in solutions else pd.Series(0, index=solutions.index)
     row = solutions.groupby([solutions["algorithm"], run], sort=False).cumcount()
     return [Handle(str(algorithm), int(number), int(place))

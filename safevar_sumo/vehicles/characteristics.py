@@ -33,16 +33,16 @@ class Characteristic:
         width = self.upper - self.lower
         return next(share for least, share in FILTER_SHARES if width >= least) * width
 
-    def check(self, value: float, source: object) -> None:
-        """Refuse a value outside the domain.
+    def check(self, value: float, source: object, *, beyond: bool = False) -> None:
+        """Refuse a value outside the domain, or with `beyond` only what is no finite number.
 
         Raises
         ------
         InputError
             If the value is not in [lower, upper] or not a number.
         """
-        if not (math.isfinite(value) and self.lower <= value <= self.upper):
-            legal = f"a number in [{self.lower:g}, {self.upper:g}] {self.unit}"
+        if not (math.isfinite(value) and (beyond or self.lower <= value <= self.upper)):
+            legal = "a finite number" if beyond else f"a number in [{self.lower:g}, {self.upper:g}] {self.unit}"
             raise InputError(source, f"{self.name} = {value}", legal)
 
 
@@ -101,8 +101,8 @@ class CharacteristicSet:
         """f_numDiff, the number of characteristics changed, shape (N,) (method section 3)."""
         return np.asarray(np.count_nonzero(self.changed(filtered), axis=1), dtype=float)
 
-    def setting(self, values: Mapping[str, float], source: object) -> FloatArray:
-        """The original setting with some values replaced, checked; shape (n,).
+    def setting(self, values: Mapping[str, float], source: object, *, beyond: bool = False) -> FloatArray:
+        """The original setting with some values replaced, checked; shape (n,). With `beyond` any finite value will do.
 
         Raises
         ------
@@ -114,6 +114,6 @@ class CharacteristicSet:
             if name not in self.names:
                 raise InputError(source, f"there is no characteristic {name!r}", one_of(self.names))
             column = self.names.index(name)
-            self.members[column].check(value, source)
+            self.members[column].check(value, source, beyond=beyond)
             setting[column] = value
         return setting

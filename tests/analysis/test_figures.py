@@ -16,9 +16,17 @@ from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox, BboxBase
 
-from safevar_sumo.analysis import FIGURES, Case, draw_all
+from safevar_sumo.analysis import Case, draw, draw_all
 from safevar_sumo.analysis.case import Unanswerable
-from safevar_sumo.analysis.figures import hypervolume_growth, number_of_changes, pareto_fronts, sizes_of_changes
+from safevar_sumo.analysis.figures import (
+    OF_A_CASE,
+    OF_ALL,
+    changed_characteristics,
+    hypervolume_growth,
+    number_of_changes,
+    pareto_fronts,
+    sizes_of_changes,
+)
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -53,13 +61,38 @@ def case() -> Case:
 
 
 def test_there_is_a_figure_for_everything_promised() -> None:
-    assert len(FIGURES) == 5
+    assert len({**OF_ALL, **OF_A_CASE}) == 5
 
 
 @pytest.mark.parametrize("study", ["made-up", "sun", "lgsvl", "native"])
-@pytest.mark.parametrize("name", list(FIGURES))
+@pytest.mark.parametrize("name", [*OF_ALL, *OF_A_CASE])
 def test_axes_are_labelled_and_no_text_lies_on_another(name: str, study: str, case: Case) -> None:
-    figure = FIGURES[name](case if study == "made-up" else random_setting(study))
+    shown = case if study == "made-up" else random_setting(study)
+    figure = OF_ALL[name]([shown]) if name in OF_ALL else OF_A_CASE[name](shown)
+    _check_layout(figure, name)
+
+
+@pytest.mark.parametrize("number", [2, 5])
+def test_cases_stand_side_by_side_in_one_figure(number: int, case: Case) -> None:
+    cases = [dataclasses.replace(case, name=f"case {i}") for i in range(number)]
+    figure = number_of_changes(cases)
+    assert [axis.get_title() for axis in figure.axes if axis.axison] == [one.name for one in cases]
+    _check_layout(figure, "rq3.1-number-of-changes")
+    found, lacking = draw(cases)
+    assert [name for name in found if name.startswith("rq3.1")] == ["rq3.1-number-of-changes"]
+    assert "case 1-convergence" in found
+    assert not lacking
+
+
+def test_the_original_vehicle_and_the_line_of_collisions_are_in_the_fronts(case: Case) -> None:
+    for axis, marked in zip(pareto_fronts(case).axes, (True, True, False), strict=True):
+        told = {str(line.get_label()): line for line in axis.lines}
+        assert float(told["original vehicle"].get_xdata()[0]) == (case.original["safety_degree"] if marked else 0.0)  # type: ignore[index,arg-type]
+        assert ("collision: 0 and left of it" in told) == marked
+
+
+def _check_layout(figure: Figure, name: str) -> None:
+    """Every axis has labels and a scale, no text lies on another or is cut off."""
     FigureCanvasAgg(figure).draw()
     shared = {"rq3.3-sizes-of-changes"}
     for axis in figure.axes:
@@ -97,12 +130,12 @@ def _texts(figure: Figure) -> Iterator[Text]:
 
 
 def test_each_algorithm_has_its_own_colour_and_marker(case: Case) -> None:
-    lines = pareto_fronts(case).axes[0].lines
+    lines = [line for line in pareto_fronts(case).axes[0].lines if line.get_label().startswith(("NSGA", "RS"))]
     assert len({line.get_color() for line in lines}) == len({line.get_marker() for line in lines}) == 2
 
 
 def test_box_plots_are_of_the_runs(case: Case) -> None:
-    axis = number_of_changes(case).axes[0]
+    axis = number_of_changes([case]).axes[0]
     assert [label.get_text() for label in axis.get_xticklabels()] == ["1", "2", "3"]
     assert "2 runs" in axis.get_ylabel()
 
@@ -129,9 +162,9 @@ def test_what_cannot_be_drawn_says_why(tmp_path: Path) -> None:
     assert sorted(path.name for path in written) == [
         "made-up-pareto-fronts.svg", "made-up-rq3.2-changed-characteristics.svg", "made-up-rq3.3-sizes-of-changes.svg"]
     assert any("imported" in reason for reason in lacking)
-    for draw in (sizes_of_changes, FIGURES["rq3.2-changed-characteristics"]):
+    for one in (sizes_of_changes, changed_characteristics):
         with pytest.raises(Unanswerable, match="no critical solution"):
-            draw(made_up(row(sd=9)))
+            one(made_up(row(sd=9)))
     with pytest.raises(InputError, match="no finished run"):
         draw_all([made_up()], tmp_path, "png")
 

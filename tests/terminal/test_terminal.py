@@ -11,9 +11,9 @@ from rich.console import Console
 
 from safevar_sumo.campaign import RunKey, all_runs
 from safevar_sumo.metrics import METRICS
+from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study, load_study
-from safevar_sumo.terminal.progress import CampaignProgress
 
 
 @pytest.fixture

@@ -1,0 +1,9 @@
+"""The library as others use it: a study in, frames and figures out. The names here are those of `import safevar_sumo`."""
+
+from safevar_sumo.api.answers import Figures, Tables, figures, tables
+from safevar_sumo.api.once import Simulation, simulate
+from safevar_sumo.api.results import Results, load
+from safevar_sumo.api.running import run
+from safevar_sumo.api.settings import evaluate
+
+__all__ = ["Figures", "Results", "Simulation", "Tables", "evaluate", "figures", "load", "run", "simulate", "tables"]

@@ -1,0 +1,141 @@
+"""One setting of a study simulated, beside the original vehicle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from safevar_sumo.api.witness import Witness, trace_frame
+from safevar_sumo.records import Drives, Evaluations, FloatArray, Outcome
+from safevar_sumo.results import record
+from safevar_sumo.simulation import Engine, System, assemble, score
+from safevar_sumo.simulation import simulate as drive
+from safevar_sumo.study import Study, StudyLike, load_study
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulation:
+    """One simulated setting.
+
+    Attributes
+    ----------
+    study
+        That it was simulated in.
+    setting
+        What was simulated: every characteristic in its table unit, after the filter.
+    put_back
+        What was asked for and is too small a change for the filter: the value asked for, by name.
+    evaluation
+        Its outcome, metrics and objectives as arrays of one row.
+    drives
+        The simulation as it went, of one vehicle.
+    original
+        The original vehicle in the same study; of the original vehicle, itself.
+    """
+
+    study: Study
+    setting: Mapping[str, float]
+    put_back: Mapping[str, float]
+    evaluation: Evaluations
+    drives: Drives
+    _seen: Witness
+    _original: Simulation | None = None
+
+    @property
+    def original(self) -> Simulation:
+        return self._original or self
+
+    @property
+    def outcome(self) -> Outcome:
+        """How it ended."""
+        return Outcome(str(self.evaluation.outcome[0]))
+
+    @property
+    def collision_speed(self) -> float:
+        """Speed at which it collided [m/s]; NaN without a collision."""
+        return float(self.evaluation.collision_speed[0])
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Safety metrics by name, in the units that `list` tells; NaN where undefined."""
+        return {name: float(values[0]) for name, values in self.evaluation.metrics.items()}
+
+    @property
+    def objectives(self) -> dict[str, float]:
+        """f_safe [m, or -m/s on a collision], f_diff [fraction], f_num_diff [characteristics]; all are minimised."""
+        told = self.record()
+        return {name: float(told[name]) if told[name] is not None else np.nan for name in told if name.startswith("f_")}
+
+    @cached_property
+    def trace(self) -> pd.DataFrame:
+        """Step by step, one row each, units in the columns' names; empty (NaN) is what there is nothing to tell of."""
+        return trace_frame(self.drives, self._seen)
+
+    def record(self) -> dict[str, Any]:
+        """As plain values, as `simulate --json` prints it; undefined is None."""
+        return {"study": self.study.name, "vcs": dict(self.setting), **record(self.evaluation, 0)}
+
+    def __repr__(self) -> str:
+        told = ", ".join(f"{name}={value:.4g}" for name, value in self.metrics.items())
+        return f"<Simulation of {self.study.name}: {self.outcome}, {told}>"
+
+
+def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, filtered: bool = True, beyond: bool = False,
+             gui: bool = False) -> Simulation:
+    """Simulate one setting in this process, and the original vehicle for comparison.
+
+    Parameters
+    ----------
+    study
+        A study, or what `load_study` makes one of.
+    changes
+        Values by characteristic, in their table units; all others are the original's.
+    filtered
+        Put changes that are smaller than their thresholds back to the original, as every search does.
+    beyond
+        Take values outside the domains too.
+    gui
+        Show the setting in sumo-gui.
+
+    Raises
+    ------
+    InputError
+        If the study or a change cannot be used.
+    SimulationError
+        If SUMO fails.
+    """
+    chosen, system = assembled(study)
+    characteristics = system.characteristics
+    asked = characteristics.setting(changes or {}, "setting", beyond=beyond)
+    setting = characteristics.filter(asked) if filtered else asked
+    original = _simulated(chosen, system, characteristics.original, characteristics.original)
+    if np.array_equal(setting, characteristics.original) and not gui:
+        return replace(original, put_back=_put_back(system, asked, setting))
+    return replace(_simulated(chosen, system, asked, setting, Engine.GUI if gui else Engine.LIBSUMO), _original=original)
+
+
+def assembled(study: StudyLike, source: str = "") -> tuple[Study, System]:
+    """A study, and what its simulations are made of; errors call it `source`, or as it was given."""
+    chosen = load_study(study)
+    return chosen, assemble(chosen, source or (str(study) if isinstance(study, str | Path) else ""))
+
+
+def _simulated(study: Study, system: System, asked: FloatArray, setting: FloatArray, engine: Engine = Engine.LIBSUMO) -> Simulation:
+    seen = Witness(system.ads)
+    rows = setting[np.newaxis]
+    drives = drive(replace(system, ads=seen), rows, engine)
+    return Simulation(
+        study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
+        put_back=_put_back(system, asked, setting), evaluation=score(system, rows, drives), drives=drives, _seen=seen)
+
+
+def _put_back(system: System, asked: FloatArray, setting: FloatArray) -> dict[str, float]:
+    return {name: float(value) for name, value, used in zip(system.characteristics.names, asked, setting, strict=True) if value != used}

@@ -1,0 +1,151 @@
+"""The library as others use it: `import safevar_sumo as sv`."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import safevar_sumo as sv
+from safevar_sumo.study import load_study
+from safevar_sumo.vehicles import CharacteristicSet
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> sv.Results:
+    """A study searched through the library, which shows nothing."""
+    return sv.run("smoke", tmp_path_factory.mktemp("api") / "out", jobs=1)
+
+
+def test_every_public_name_is_there_and_nothing_else() -> None:
+    for name in sv.__all__:
+        assert getattr(sv, name) is not None
+    assert dir(sv) == sorted(sv.__all__)
+    assert sv.__version__ == version("safevar_sumo")
+    with pytest.raises(AttributeError, match="optimize"):
+        sv.optimize  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_changes_override_a_study_as_a_file_that_extends_it_would(in_tmp: Path) -> None:
+    changed = sv.load_study("rain", weather="fog", search={"runs": 2}, ads={"parameters": {"corridor": 3.0}})
+    Path("mine.toml").write_text('extends = "rain"\nname = "rain"\nweather = "fog"\n[search]\nruns = 2\n[ads.parameters]\ncorridor = 3.0\n')
+    same = sv.load_study("mine.toml")
+    assert (changed.weather, changed.search, changed.ads) == (same.weather, same.search, same.ads)
+    assert changed.search.evaluations == sv.load_study("rain").search.evaluations
+    assert sv.load_study(changed, search={"seed": 7}).search.runs == 2
+
+
+def test_a_study_needs_no_file() -> None:
+    tables = {"extends": "sun", "name": "mine", "weather": {"name": "ice", "road_friction": 0.2, "visibility": 0.9}}
+    mine = sv.load_study(tables, name="other")
+    assert (mine.name, mine.vehicle) == ("other", sv.load_study("sun").vehicle)
+    assert mine.weather == sv.Weather(name="ice", road_friction=0.2, visibility=0.9)
+    assert tables["name"] == "mine", "what was given is left as it was"
+    assert sv.simulate(mine).study.name == "other"
+
+
+@pytest.mark.parametrize(("changes", "told"), [
+    ({"wether": "fog"}, "wether"), ({"search": {"runs": 0}}, "search.runs = 0"), ({"search": 3}, "search = 3"),
+    ({"weather": {"name": "x", "road_friction": float("nan"), "visibility": 1.0}}, "road_friction"),
+])
+def test_a_bad_change_is_told_with_its_key(changes: dict[str, object], told: str) -> None:
+    with pytest.raises(sv.InputError, match=told):
+        sv.load_study("sun", **changes)
+
+
+def test_simulate_tells_of_the_setting_and_of_the_original_beside_it() -> None:
+    found = sv.simulate("rain", {"tireFric": 1.5, "mass": 2410.0})
+    assert found.setting["tireFric"] == 1.5
+    assert found.put_back == {"mass": 2410.0}
+    assert found.objectives["f_num_diff"] == 1
+    assert found.objectives["f_diff"] == pytest.approx(2 / 3.5)
+    assert found.metrics["safety_degree"] == found.objectives["f_safe"]
+    assert found.original.setting == {one.name: one.original for one in CharacteristicSet.of(found.study.vehicle.characteristics)}
+    assert found.original.original is found.original
+    assert found.original.metrics != found.metrics
+    assert sv.simulate("rain", {"mass": 2410.0}, filtered=False).objectives["f_num_diff"] == 1
+
+
+def test_a_trace_tells_where_the_obstacle_was_and_what_the_ads_saw_of_it() -> None:
+    """Hard rain has everything but the vehicle's own speed made out two steps late."""
+    trace = sv.simulate("rain").trace
+    assert (trace["seen speed [m/s]"] == trace["speed [m/s]"]).all()
+    late = trace["lateral [m]"].shift(2).bfill()
+    assert np.allclose(trace["seen lateral [m]"][3:], late[3:])
+    gaps = trace["seen gap [m]"].dropna()
+    assert gaps.size > 0
+    clear = sv.simulate("sun").trace
+    assert np.allclose(clear["seen lateral [m]"], clear["lateral [m]"])
+
+
+def test_values_beyond_the_domain_need_to_be_asked_for() -> None:
+    with pytest.raises(sv.InputError, match=r"tireFric = 0\.5"):
+        sv.simulate("sun", {"tireFric": 0.5})
+    assert sv.simulate("sun", {"tireFric": 0.5}, beyond=True).setting["tireFric"] == 0.5
+    with pytest.raises(sv.InputError, match="finite"):
+        sv.simulate("sun", {"tireFric": np.inf}, beyond=True)
+
+
+def test_evaluate_is_simulate_row_by_row() -> None:
+    asked = pd.DataFrame({"tireFric": [1.2, 3.45, 1.2], "mass": [2500.0, 2404.0, 2500.0]}, index=list("abc"))
+    frame = sv.evaluate("sun", asked, jobs=1)
+    assert list(frame.index) == list("abc")
+    assert frame.loc["b", "tireFric"] == 3.5, "too small a change is put back"
+    assert frame.loc["a"].equals(frame.loc["c"])
+    one = sv.simulate("sun", {"tireFric": 1.2, "mass": 2500.0})
+    for name, value in {**one.metrics, **one.objectives}.items():
+        assert frame.loc["a", name] == value
+    names = list(one.setting)
+    again = sv.evaluate("sun", frame[names].to_numpy(), jobs=1)
+    pd.testing.assert_frame_equal(again, frame.reset_index(drop=True))
+
+
+@pytest.mark.parametrize(("settings", "told"), [
+    (pd.DataFrame({"weight": [1.0]}), "weight"), (pd.DataFrame({"mass": ["heavy"]}), "heavy"), ([[1.0, 2.0]], r"shape \(1, 2\)"),
+    (pd.DataFrame({"mass": [2404.0, 9999.0]}), "row 1: mass = 9999"), (pd.DataFrame({"mass": [float("nan")]}), "mass = nan"),
+])
+def test_settings_that_cannot_be_used_are_told_before_any_is_simulated(settings: object, told: str) -> None:
+    with pytest.raises(sv.InputError, match=told):
+        sv.evaluate("sun", settings)  # type: ignore[arg-type]
+
+
+def test_no_setting_is_an_empty_frame_of_the_same_columns() -> None:
+    empty = sv.evaluate("sun", pd.DataFrame({"mass": []}))
+    assert len(empty) == 0
+    assert {"mass", "f_safe", "safety_degree", "collision_speed", "outcome"} <= set(empty.columns)
+
+
+def test_run_leaves_what_load_reads(results: sv.Results) -> None:
+    again = sv.load(results.directory)
+    pd.testing.assert_frame_equal(again.solutions, results.solutions)
+    assert again.study == load_study("smoke")
+    assert again.original["outcome"] == "stopped"
+    assert len(again.evaluations) > 300
+    assert set(again.finished) == {("nsga2", 0), ("nsga2", 1), ("rs", 0), ("rs", 1)}
+    stored = pd.read_csv(results.directory / "solutions.csv")
+    pd.testing.assert_frame_equal(again.solutions, stored, check_dtype=False)
+
+
+def test_tables_and_figures_are_frames_and_figures(results: sv.Results) -> None:
+    answers = sv.tables(results)
+    assert {"rq1", "rq2", "rq3.1", "collisions"} <= set(answers)
+    assert list(sv.tables(results.directory, question="rq1")) == ["rq1"]
+    assert "RQ1" in sv.tables(results, question="rq1")._repr_markdown_()
+    assert set(answers.notes) == set(answers)
+    assert {"pareto-fronts", "convergence"} <= set(sv.figures(results))
+    with pytest.raises(sv.InputError, match="rq9"):
+        sv.tables(results, question="rq9")
+
+
+def test_a_script_needs_no_main_guard(in_tmp: Path) -> None:
+    Path("script.py").write_text(
+        "import safevar_sumo as sv\nprint('begun')\n"
+        "results = sv.run(sv.load_study('smoke', search={'evaluations': 20}), 'out', jobs=2, progress=True)\n"
+        "print(len(sv.evaluate('smoke', results.solutions[['mass']], jobs=2)) == len(results.solutions))\n")
+    done = subprocess.run([sys.executable, "script.py"], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["begun", "True"]
