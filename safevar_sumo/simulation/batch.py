@@ -10,9 +10,8 @@ import numpy.typing as npt
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Drives, Evaluations, FloatArray, Outcome, Trace
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.simulation.network import copied_network
 from safevar_sumo.simulation.perception import Perception
-from safevar_sumo.simulation.sumo import Engine, SumoWorld, open_world
+from safevar_sumo.simulation.sumo import Engine, SumoWorld, world_on
 from safevar_sumo.simulation.system import System
 from safevar_sumo.vehicles import at_start
 
@@ -52,7 +51,7 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSU
     n = len(settings)
     if system.step_length is not None:
         options = ("--step-length", repr(system.step_length), *options)
-    with open_world(copied_network(system.scenario.network, n), n, engine, options) as world:
+    with world_on(system.scenario.network, n, engine, options) as world:
         return drive(system, settings, world, watch)
 
 

@@ -22,6 +22,7 @@ from safevar_sumo.shipped import NETWORKS
 
 SOURCES = ("network.nod.xml", "network.edg.xml", "network.con.xml")
 TRAFFIC = "traffic.rou.xml"
+NOBODY = "nobody.rou.xml"
 OPTIONS = "scenario.sumocfg"
 
 # Attributes that hold ids, by element; an attribute may hold several, separated by spaces.
@@ -63,9 +64,15 @@ def copied_network(folder: str, n: int) -> CopiedNetwork:
         If netconvert refuses the sources or the cache cannot be written.
     """
     place = _folder(folder)
-    roads = _cached(place, _round_up(n), SOURCES, "network.net.xml", _build_network)
+    roads = _cached(place, round_up(n), SOURCES, "network.net.xml", _build_network)
     traffic = _cached(place, n, (TRAFFIC,), TRAFFIC, _write_traffic)
     return CopiedNetwork(roads, traffic, place / OPTIONS)
+
+
+def empty_network(folder: str, n: int) -> CopiedNetwork:
+    """The same copies with the types and routes of the traffic in `n` of them, and nobody there; raises as `copied_network`."""
+    files, place = copied_network(folder, n), _folder(folder)
+    return files._replace(traffic=_cached(place, n, (TRAFFIC,), NOBODY, _write_nobody))
 
 
 def network_fingerprint(folder: str) -> str:
@@ -99,7 +106,7 @@ def _is_folder(place: Path) -> bool:
         return False
 
 
-def _round_up(n: int) -> int:
+def round_up(n: int) -> int:
     """1, 2, 5, 10, 20, 50, ...: a few sizes of network serve every batch."""
     size = 1
     while True:
@@ -156,6 +163,13 @@ def _prefixed(element: ElementTree.Element, copy: int) -> ElementTree.Element:
 
 def _write_traffic(place: Path, n: int, into: Path) -> None:
     _copies(place / TRAFFIC, n).write(into / TRAFFIC, encoding="utf-8", xml_declaration=True)
+
+
+def _write_nobody(place: Path, n: int, into: Path) -> None:
+    copies = _copies(place / TRAFFIC, n)
+    nobody = ElementTree.Element("routes")
+    nobody.extend(element for element in copies.iterfind("*") if element.tag not in ("vehicle", "person"))
+    ElementTree.ElementTree(nobody).write(into / NOBODY, encoding="utf-8", xml_declaration=True)
 
 
 def _build_network(place: Path, n: int, into: Path) -> None:

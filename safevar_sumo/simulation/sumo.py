@@ -21,7 +21,9 @@ import numpy as np
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.simulation.network import CopiedNetwork, copied_id
+from safevar_sumo.simulation.network import CopiedNetwork, copied_id, copied_network, empty_network, network_fingerprint, round_up
+from safevar_sumo.simulation.standing import StandingSumo
+from safevar_sumo.simulation.traffic import Traffic, repeatable_traffic
 from safevar_sumo.vehicles import SumoType
 
 # Speed mode: SUMO obeys every speed that is set and yields to nobody on a junction (TraCI "set speed mode", bit 5).
@@ -43,8 +45,8 @@ class Engine(StrEnum):
 class SumoWorld:
     """N copies of a network under simulation; made by `open_world`. Shapes: (N,) or (N, 2)."""
 
-    def __init__(self, api: Any, n: int, *, watched: bool = False) -> None:
-        self._api, self.n = api, n
+    def __init__(self, api: Any, n: int, *, watched: bool = False, enter: Callable[[int], None] = lambda n: None) -> None:
+        self._api, self.n, self._enter = api, n, enter
         self._ids: dict[str, list[str]] = {}
         self._positions: dict[str, FloatArray] = {}
         self._copy_of = {name: copy for copy, name in enumerate(self.ids(VUT))}
@@ -76,6 +78,7 @@ class SumoWorld:
         SimulationError
             If a vehicle under test found no place.
         """
+        self._enter(self.n)
         self._api.simulationStep()
         departed = set(self._api.vehicle.getIDList())
         for name in self.ids(VUT):
@@ -146,22 +149,61 @@ class SumoWorld:
 
 
 @contextmanager
-def open_world(files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, options: Sequence[str] = ()) -> Iterator[SumoWorld]:
-    """Start SUMO on `n` copies of a network, and close it whatever happens.
+def world_on(folder: str, n: int, engine: Engine = Engine.LIBSUMO, options: Sequence[str] = ()) -> Iterator[SumoWorld]:
+    """`n` copies of a network before their first step: in the SUMO that stays open where that serves, else in a fresh one.
 
     Raises
     ------
     SimulationError
         With SUMO's own words, if it cannot load or loses a step.
     """
+    traffic = repeatable_traffic(folder, options) if engine is Engine.LIBSUMO else None
+    if traffic is not None:
+        with _standing_world(folder, n, options, traffic) as world:
+            yield world
+    else:
+        with open_world(copied_network(folder, n), n, engine, options) as world:
+            yield world
+
+
+@contextmanager
+def open_world(files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, options: Sequence[str] = ()) -> Iterator[SumoWorld]:
+    """Start SUMO on `n` copies of a network with their traffic, and close it whatever happens; raises as `world_on`."""
     api = _api(engine)
     try:
         _start(api, engine, [*sumo_command(engine, files), *options])
         yield SumoWorld(api, n, watched=engine is Engine.GUI)
     except (api.TraCIException, api.FatalTraCIError) as error:
-        raise SimulationError(f"SUMO failed: {str(error).strip() or 'it closed the connection'}") from None
+        raise _failure(error) from None
     finally:
         _close(api)
+
+
+_standing: StandingSumo | None = None
+"""The libsumo of this process, if it is open."""
+
+
+@contextmanager
+def _standing_world(folder: str, n: int, options: Sequence[str], traffic: Traffic) -> Iterator[SumoWorld]:
+    """Worlds in the SUMO of this process, which stays open unless one fails."""
+    global _standing
+    api, wanted = _api(Engine.LIBSUMO), (network_fingerprint(folder), *options)
+    try:
+        if _standing is None or not _standing.serves(wanted, n):
+            copies = round_up(n)
+            _start(api, Engine.LIBSUMO, [*sumo_command(Engine.LIBSUMO, empty_network(folder, copies)), *options])
+            _standing = StandingSumo(api, wanted, copies, traffic)
+        yield SumoWorld(api, n, enter=_standing.enter)
+    except BaseException as error:
+        _standing = None
+        _close(api)
+        if isinstance(error, (api.TraCIException, api.FatalTraCIError)):
+            raise _failure(error) from None
+        raise
+
+
+def _failure(error: Exception) -> SimulationError:
+    return SimulationError(f"SUMO failed: {str(error).strip() or 'it closed the connection'}")
 
 
 def _api(engine: Engine) -> Any:
@@ -184,7 +226,9 @@ def sumo_command(engine: Engine, files: CopiedNetwork) -> list[str]:
 
 
 def _start(api: Any, engine: Engine, command: list[str]) -> None:
+    global _standing
     if engine is Engine.LIBSUMO:
+        _standing = None  # libsumo exists once in a process
         api.start(command)
         return
     if engine is Engine.GUI and sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):

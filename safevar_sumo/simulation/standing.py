@@ -1,0 +1,79 @@
+"""A SUMO that stays open: the actors of one batch are taken off the road, and those of the next put onto it.
+
+Loading a network takes as long as a batch drives on it. Whoever comes onto an empty road drives as after loading, to
+the last bit; `traffic.py` knows which traffic can be put back like that.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from safevar_sumo.simulation.network import copied_id
+from safevar_sumo.simulation.traffic import Car, Traffic, Walker
+
+BATCHES_PER_LOADING = 200
+"""So often a network is driven on before it is loaded anew: whatever might creep cannot creep far."""
+PARKING = 1
+"""Flag of a stop beside the lane (TraCI, "set stop")."""
+
+
+class StandingSumo:
+    """An open SUMO whose network nobody is on; `enter` puts the actors onto its first copies.
+
+    Parameters
+    ----------
+    loaded
+        The network's fingerprint and further options that SUMO was started with.
+    copies
+        How many copies of the network.
+    """
+
+    def __init__(self, api: Any, loaded: tuple[str, ...], copies: int, traffic: Traffic) -> None:
+        self._api, self._loaded, self._copies, self._traffic = api, loaded, copies, traffic
+        self._batches = 0
+        for copy in range(copies):
+            for actor in traffic:
+                if isinstance(actor, Car):
+                    api.route.add(_way(copy, actor), _copied(copy, actor.edges))
+
+    def serves(self, wanted: tuple[str, ...], n: int) -> bool:
+        """Whether the next batch, of `n` settings, may be driven here."""
+        return self._batches < BATCHES_PER_LOADING and n <= self._copies and wanted == self._loaded
+
+    def enter(self, n: int) -> None:
+        """Clear the road, and let everybody in `n` copies set off with the next step."""
+        if self._batches:
+            self._clear()
+        self._batches += 1
+        for copy in range(n):
+            for actor in self._traffic:
+                self._add_car(copy, actor) if isinstance(actor, Car) else self._add_walker(copy, actor)
+
+    def _clear(self) -> None:
+        for vehicle in self._api.vehicle.getLoadedIDList():
+            self._api.vehicle.remove(vehicle)
+        for person in self._api.person.getIDList():
+            self._api.person.removeStages(person)
+        self._api.simulationStep()
+
+    def _add_car(self, copy: int, car: Car) -> None:
+        name = copied_id(copy, car.name)
+        self._api.vehicle.add(name, _way(copy, car), copied_id(copy, car.type), **car.places)
+        for stop in car.stops:
+            edge, flags = copied_id(copy, stop.edge), PARKING * stop.parking
+            self._api.vehicle.setStop(name, edge, stop.end, stop.lane, stop.duration, flags, stop.start)
+
+    def _add_walker(self, copy: int, walker: Walker) -> None:
+        name = copied_id(copy, walker.name)
+        self._api.person.add(name, copied_id(copy, walker.walks[0].edges[0]), walker.place, typeID=copied_id(copy, walker.type))
+        for walk in walker.walks:
+            self._api.person.appendWalkingStage(name, _copied(copy, walk.edges), walk.end, speed=walk.speed)
+
+
+def _way(copy: int, car: Car) -> str:
+    """Id of a route; one that came with a vehicle in the traffic file has none, and would go with it."""
+    return copied_id(copy, f"{car.name}'s way")
+
+
+def _copied(copy: int, edges: tuple[str, ...]) -> list[str]:
+    return [copied_id(copy, edge) for edge in edges]
