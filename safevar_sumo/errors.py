@@ -35,6 +35,10 @@ class InputError(SafevarError):
         return f"{message}\nlegal: {self.legal}" if self.legal else message
 
 
+class ForeignError(InputError):
+    """Code from outside the package, which a study names, failed or returned what it must not."""
+
+
 class SimulationError(SafevarError):
     """SUMO, a network or an ADS failed while a simulation was prepared or ran."""
 

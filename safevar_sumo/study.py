@@ -97,6 +97,15 @@ class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     meaning: str
 
 
+class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where a study comes from; no part of what it is.
+
+    `places` are the folders of its file and of those that it extends, in which its plug-ins are looked up first.
+    """
+
+    places: tuple[str, ...] = ()
+
+
 class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole study as its TOML file gives it; `load_study` reads one.
 
@@ -116,6 +125,14 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     step_length: Annotated[float, Meta(ge=0.001, le=1)] | None = None
     published: dict[str, float] = {}
     calibration: dict[str, FreeParameter] = {}
+    origin: Origin = Origin()
+
+
+def tables_of(study: Study) -> dict[str, Any]:
+    """A study as plain tables, without where it comes from: what two equal studies have in common."""
+    tables: dict[str, Any] = msgspec.to_builtins(study)
+    del tables["origin"]
+    return tables
 
 
 StudyLike = str | Path | Mapping[str, Any] | Study
@@ -138,13 +155,13 @@ def study_path(study: str) -> Path:
     if study in study_names():
         return STUDIES / f"{study}.toml"
     path = Path(study)
-    if _is_file(path):
+    if is_file(path):
         return path
     legal = f"{one_of(study_names())}, or the path of a study file (TOML)"
     raise InputError("study", f"there is no study or file {study!r}", legal)
 
 
-def _is_file(path: Path) -> bool:
+def is_file(path: Path) -> bool:
     try:
         return path.is_file()
     except OSError:  # a name that is too long, say
@@ -167,21 +184,23 @@ def load_study(study: StudyLike, **changes: Any) -> Study:
     InputError
         Naming file, key, value and what is legal.
     """
-    source, raw = _given(study)
-    return _checked(source, _merged(raw, changes))
+    source, raw, places = _given(study)
+    return msgspec.structs.replace(_checked(source, _merged(raw, changes)), origin=Origin(places=places))
 
 
-def _given(study: StudyLike) -> tuple[object, dict[str, Any]]:
-    """What a study is called in errors, and its tables."""
+def _given(study: StudyLike) -> tuple[object, dict[str, Any], tuple[str, ...]]:
+    """What a study is called in errors, its tables, and the folders that they come from."""
     if isinstance(study, Study):
-        return f"study {study.name!r}", _without_nothing(msgspec.to_builtins(study))
+        return f"study {study.name!r}", _without_nothing(tables_of(study)), study.origin.places
     if isinstance(study, Mapping):
-        return "study", _extended(dict(study), Path("."), ())
+        return "study", *_extended(dict(study), Path("."), (), ())
     path = study_path(str(study))
-    return path, _read(path, seen=())
+    return path, *_read(path, seen=())
 
 
 def _checked(path: object, raw: dict[str, Any]) -> Study:
+    if "origin" in raw:
+        raise InputError(path, "origin: Object contains unknown field `origin`")
     for key, row in _characteristic_rows(raw):
         _converted(path, row, CharacteristicTable, key)  # before the whole: msgspec does not tell which row of a table is wrong
     parsed = _converted(path, raw, Study)
@@ -193,7 +212,7 @@ def _checked(path: object, raw: dict[str, Any]) -> Study:
     for name, number in parsed.published.items():
         if number == 0:
             raise InputError(path, f"published.{name} = 0", "a number other than 0")
-    _check_finite(path, msgspec.to_builtins(parsed), "")
+    _check_finite(path, tables_of(parsed), "")
     return parsed
 
 
@@ -224,8 +243,8 @@ def invalid(source: object, raw: object, error: msgspec.ValidationError, prefix:
     return InputError(source, f"{where}: {problem}" if where else problem)
 
 
-def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
-    """Read a TOML file; what it `extends` comes first, its own keys override table by table."""
+def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Read a TOML file, and the folders that it comes from; what it `extends` comes first, its own keys override table by table."""
     if path in seen:
         raise InputError(path, f"extends = {path.stem!r} leads back to this file", "a study that does not extend this one")
     try:
@@ -238,18 +257,19 @@ def _read(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
         raise InputError(path, f"is not UTF-8 text: {error}") from None
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
-    return _extended(raw, path, seen)
+    return _extended(raw, path, seen, () if path.parent == STUDIES else (str(path.resolve().parent),))
 
 
-def _extended(raw: dict[str, Any], path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
-    """The tables of the study that `raw` extends, overridden by its own."""
+def _extended(raw: dict[str, Any], path: Path, seen: tuple[Path, ...], places: tuple[str, ...]) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """The tables of the study that `raw` extends, overridden by its own, and the folders of both."""
     if "extends" not in raw:
-        return raw
+        return raw, places
     base = raw.pop("extends")
     if not isinstance(base, str):
         raise InputError(path, f"extends = {base!r}", "the name or path of a study")
     beside = path.parent / base
-    return _merged(_read(beside if _is_file(beside) else study_path(base), (*seen, path)), raw)
+    extended, further = _read(beside if is_file(beside) else study_path(base), (*seen, path))
+    return _merged(extended, raw), tuple(dict.fromkeys((*places, *further)))
 
 
 def write_study(path: Path, study: Study, comment: str) -> None:
@@ -260,7 +280,7 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     InputError
         If the file cannot be written.
     """
-    tables = {name: value for name, value in _without_nothing(msgspec.to_builtins(study)).items() if value != {}}
+    tables = {name: value for name, value in _without_nothing(tables_of(study)).items() if value != {}}
     printable = ("".join(character if character.isprintable() else "?" for character in line) for line in comment.splitlines())
     text = "".join(f"# {line}".rstrip() + "\n" for line in printable) + "\n" + tomli_w.dumps(tables)
     try:

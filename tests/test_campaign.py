@@ -16,7 +16,7 @@ from safevar_sumo.computing import PoolLostError, WorkerLostError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import Journal, ResultsDirectory, load
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import Study, load_study, tables_of
 from safevar_sumo.vehicles import CharacteristicSet
 
 SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
@@ -244,7 +244,7 @@ def test_every_evaluation_is_read_in_the_order_in_which_it_was_asked_for(study: 
     assert np.array_equal(frame["f_safe"], expected.f_safe)
     assert np.array_equal(frame["outcome"], expected.outcome)
     assert results.solutions.to_csv(index=False, lineterminator="\n").encode() == solutions(tmp_path)
-    assert results.manifest["study"] == msgspec.to_builtins(study)
+    assert results.manifest["study"] == tables_of(study)
 
 
 def test_an_unfinished_directory_is_read_too(study: Study, tmp_path: Path) -> None:

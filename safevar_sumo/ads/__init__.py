@@ -4,7 +4,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from safevar_sumo.ads.apollo import Apollo
-from safevar_sumo.ads.base import Ads, Checked, PerVehicle, ScalarAds
+from safevar_sumo.ads.base import Ads, ScalarAds
+from safevar_sumo.ads.guarded import ADS_CONTRACT, SCALAR_ADS_CONTRACT, GuardedAds, PerVehicle
 from safevar_sumo.ads.krauss import Krauss
 from safevar_sumo.ads.world_on_rails import WorldOnRails
 
@@ -14,4 +15,4 @@ ADS: Mapping[str, type[Any]] = {
     "world_on_rails": WorldOnRails,
 }
 
-__all__ = ["ADS", "Ads", "Checked", "PerVehicle", "ScalarAds"]
+__all__ = ["ADS", "ADS_CONTRACT", "SCALAR_ADS_CONTRACT", "Ads", "GuardedAds", "PerVehicle", "ScalarAds"]

@@ -8,14 +8,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results.store import MANIFEST, RUNS, SOLUTIONS, make_directory, read_manifest, solutions_frame, write_whole
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, tables_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,7 +47,7 @@ def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations
     if (path / RUNS).exists() or ((path / MANIFEST).exists() and "imported" not in read_manifest(path)):
         raise InputError("--out", f"{path} holds results of a campaign", "another directory")
     manifest: dict[str, Any] = {
-        "study": msgspec.to_builtins(study), "imported": {"files": dict(files)},
+        "study": tables_of(study), "imported": {"files": dict(files)},
         "versions": {"safevar_sumo": version("safevar_sumo")}, "original": dict(original)}
     frame = solutions_frame(tuple(study.vehicle.characteristics), [((name, 0), found) for name, found in solutions.items()])
     write_whole(path / SOLUTIONS, frame.drop(columns="run").to_csv(index=False, lineterminator="\n"))

@@ -11,14 +11,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 import numpy as np
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results.journal import Journal
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, tables_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,8 +48,8 @@ class ResultsDirectory:
 
     def __init__(self, path: Path, study: Study, network: str = "") -> None:
         self.path, self._study = path, study
-        self._manifest = {
-            "study": msgspec.to_builtins(study),
+        self._manifest: dict[str, Any] = {
+            "study": tables_of(study),
             "seed": study.search.seed,
             "network": network,
             "versions": {name: version(name) for name in VERSIONED},

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from safevar_sumo.scenarios.base import VUT, Scenario, Scene, World
+from safevar_sumo.scenarios.guarded import SCENARIO_CONTRACT, GuardedScenario
 from safevar_sumo.scenarios.lead_vehicle_stopped import LeadVehicleStopped
 from safevar_sumo.scenarios.pedestrian_crossing import PedestrianCrossing
 from safevar_sumo.scenarios.weather import WEATHERS, weather_of
@@ -13,4 +14,4 @@ SCENARIOS: Mapping[str, type[Any]] = {
     "lead_vehicle_stopped": LeadVehicleStopped,
 }
 
-__all__ = ["SCENARIOS", "VUT", "WEATHERS", "Scenario", "Scene", "World", "weather_of"]
+__all__ = ["SCENARIOS", "SCENARIO_CONTRACT", "VUT", "WEATHERS", "GuardedScenario", "Scenario", "Scene", "World", "weather_of"]

@@ -90,7 +90,7 @@ def netconvert_version() -> str:
 
 def _folder(folder: str) -> Path:
     for place in (NETWORKS / folder, Path(folder)):
-        if _is_folder(place):
+        if is_folder(place):
             for name in (*SOURCES, TRAFFIC, OPTIONS):
                 if not (place / name).is_file():
                     raise InputError(place, f"{name} is missing", f"a folder with {', '.join((*SOURCES, TRAFFIC, OPTIONS))}")
@@ -99,7 +99,7 @@ def _folder(folder: str) -> Path:
     raise InputError("scenario.parameters.network", f"there is no network {folder!r}", f"one of {', '.join(names)}, or a folder")
 
 
-def _is_folder(place: Path) -> bool:
+def is_folder(place: Path) -> bool:
     try:
         return place.is_dir()
     except OSError:  # a name that is too long, say

@@ -2,29 +2,43 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
-import os
-import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import msgspec
 
-from safevar_sumo.ads import ADS, Ads, Checked, PerVehicle, ScalarAds
-from safevar_sumo.errors import InputError, SafevarError, one_of, told
+from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
+from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.metrics import METRICS
+from safevar_sumo.plugins import Guard, Lookup, Member
 from safevar_sumo.records import Nominal
-from safevar_sumo.scenarios import SCENARIOS, Scenario, weather_of
+from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Scenario, weather_of
+from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.simulation.network import is_folder
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, invalid
-from safevar_sumo.vehicles import VEHICLES, CharacteristicSet, Vehicle, calibration_drive
+from safevar_sumo.vehicles import VEHICLE_CONTRACT, VEHICLES, CharacteristicSet, GuardedVehicle, Vehicle, calibration_drive
+
+
+class Models(NamedTuple):
+    """A study's models with their parameters, and how they were found."""
+
+    vehicle: Vehicle
+    ads: Ads
+    scenario: Scenario
+    weather: Weather
+    members: tuple[Member, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class System:
-    """What a simulation is made of; `step_length` [s] is None where the network's own counts."""
+    """What a simulation is made of.
+
+    `step_length` [s] is None where the network's own counts; `members` are how its models were found.
+    """
 
     characteristics: CharacteristicSet
     vehicle: Vehicle
@@ -33,6 +47,7 @@ class System:
     weather: Weather
     metrics: MetricsTable
     nominal: Nominal
+    members: tuple[Member, ...]
     step_length: float | None = None
 
 
@@ -45,97 +60,83 @@ def assemble(study: Study, source: str = "") -> System:
         Naming the study, the key, the value and what is legal.
     """
     source = source or f"study {study.name!r}"
-    vehicle, ads, scenario, weather = models_of(study, source)
-    _check_units(study, vehicle, source)
+    models = models_of(study, source)
+    _check_units(study, models.vehicle, models.members[0].guard is None, source)
     for name in study.published:
         if name not in METRICS:
             raise InputError(source, f"published.{name} is no metric", one_of(METRICS))
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     return System(
-        characteristics=characteristics, vehicle=vehicle, ads=ads, scenario=scenario, weather=weather, metrics=study.metrics,
-        nominal=calibration_drive(vehicle, characteristics), step_length=study.step_length)
+        characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
+        metrics=study.metrics, nominal=calibration_drive(models.vehicle, characteristics),  # type: ignore[arg-type]
+        members=models.members, step_length=study.step_length)
 
 
-def models_of(study: Study, source: str) -> tuple[Any, Ads, Scenario, Weather]:
+def models_of(study: Study, source: str) -> Models:
     """The study's models with their parameters; raises as `assemble`."""
-    return (_model(VEHICLES, study.vehicle, "vehicle", source), _ads(study.ads, source),
-            _model(SCENARIOS, study.scenario, "scenario", source), weather_of(study.weather, source))
+    lookup = Lookup(source, study.origin.places)
+    vehicle, ads, scenario = _vehicle(study.vehicle, lookup), _ads(study.ads, lookup), _scenario(study.scenario, lookup)
+    return Models(vehicle[0], ads[0], scenario[0], weather_of(study.weather, source), (vehicle[1], ads[1], scenario[1]))
 
 
-def _check_units(study: Study, vehicle: Vehicle, source: str) -> None:
+def _with_network(scenario: Any, places: Sequence[str]) -> Any:
+    """The scenario on the folder beside the study, if it names one that lies there and is none of ours."""
+    folder = scenario.network
+    found = next((str(Path(place, folder)) for place in places if is_folder(Path(place, folder))), folder)
+    if found == folder or is_folder(NETWORKS / folder):
+        return scenario
+    if isinstance(scenario, msgspec.Struct):
+        return msgspec.structs.replace(scenario, network=found)
+    scenario.network = found
+    return scenario
+
+
+def _check_units(study: Study, vehicle: Vehicle, ours: bool, source: str) -> None:
     given, known = study.vehicle.characteristics, vehicle.UNITS
     for name in given:
         if name not in known:
             raise InputError(source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", one_of(known))
         if given[name].unit != known[name]:
             raise InputError(source, f"vehicle.characteristics.{name}.unit = {given[name].unit!r}", repr(known[name]))
-        if type(vehicle) in VEHICLES.values() and given[name].lower <= 0:
+        if ours and given[name].lower <= 0:
             raise InputError(source, f"vehicle.characteristics.{name}.lower = {given[name].lower}", "a value above 0")
     for name in known:
         if name not in given:
             raise InputError(source, f"vehicle.characteristics.{name} is missing", f"all of {', '.join(known)}")
 
 
-def _model(models: Mapping[str, Any], choice: ModelTable | VehicleTable, key: str, source: str) -> Any:
-    """An instance of one of our models or of a user's `package.module:Name`."""
-    cls = _class(models, choice.model, f"{key}.model", source)
-    if cls in models.values():
+def _vehicle(choice: VehicleTable, lookup: Lookup) -> tuple[Vehicle, Member]:
+    member = lookup.class_of(VEHICLES, choice.model, "vehicle.model", VEHICLE_CONTRACT)
+    vehicle = _made(member, choice, "vehicle", lookup.source)
+    return (vehicle if member.guard is None else GuardedVehicle(vehicle, member.guard)), member
+
+
+def _scenario(choice: ModelTable, lookup: Lookup) -> tuple[Scenario, Member]:
+    member = lookup.class_of(SCENARIOS, choice.model, "scenario.model", SCENARIO_CONTRACT)
+    scenario = _made(member, choice, "scenario", lookup.source)
+    return _with_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.places), member
+
+
+def _ads(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
+    member = lookup.class_of(ADS, choice.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT)
+    driver = _made(member, choice, "ads", lookup.source)
+    if issubclass(member.what, ScalarAds):
+        guard = member.guard or Guard(lookup.source, f"ads.model = {choice.model!r}")
+        return PerVehicle(partial(_made, member, choice, "ads", lookup.source), guard), member
+    return (driver if member.guard is None else GuardedAds(driver, member.guard)), member
+
+
+def _made(member: Member, choice: ModelTable | VehicleTable, key: str, source: str) -> Any:
+    """An instance with its parameters."""
+    cls = member.what
+    if issubclass(cls, msgspec.Struct):
         try:
             return msgspec.convert(choice.parameters, cls)
         except msgspec.ValidationError as error:
             raise invalid(source, choice.parameters, error, f"{key}.parameters") from None
-    return _Guarded(_called(cls, choice, key, source), f"{key}.model = {choice.model!r}", source)
-
-
-class _Guarded:
-    """A model from outside the package: whatever it lacks or does wrong is told with its name."""
-
-    def __init__(self, inner: Any, name: str, source: str) -> None:
-        self._inner, self._name, self._source = inner, name, source
-
-    def __getattr__(self, attribute: str) -> Any:
-        try:
-            value = getattr(self._inner, attribute)
-        except AttributeError as error:
-            raise InputError(self._source, f"{self._name} lacks {attribute!r}: {error}") from error
-        return partial(self._call, attribute, value) if callable(value) else value
-
-    def _call(self, attribute: str, method: Callable[..., Any], *arguments: Any) -> Any:
-        try:
-            return method(*arguments)
-        except SafevarError:
-            raise
-        except (Exception, SystemExit, GeneratorExit) as error:
-            raise InputError(self._source, f"{self._name} raised in {attribute}: {told(error)}") from error
-
-
-def _ads(choice: ModelTable, source: str) -> Ads:
-    cls = _class(ADS, choice.model, "ads.model", source)
-    if inspect.isclass(cls) and issubclass(cls, ScalarAds):
-        _called(cls, choice, "ads", source)
-        return Checked(PerVehicle(partial(cls, **choice.parameters)), source, choice.model)
-    ads = _model(ADS, choice, "ads", source)
-    return ads if cls in ADS.values() else Checked(ads, source, choice.model)
-
-
-def _called(cls: Any, choice: ModelTable | VehicleTable, key: str, source: str) -> Any:
     try:
-        return cls(**choice.parameters)
-    except (Exception, SystemExit, GeneratorExit) as error:
-        problem = f"{key}.model = {choice.model!r} does not take parameters {choice.parameters}: {told(error)}"
-        raise InputError(source, problem) from error
-
-
-def _class(models: Mapping[str, Any], name: str, key: str, source: str) -> Any:
-    if name in models:
-        return models[name]
-    legal = f"{one_of(models)}, or package.module:Name"
-    module_name, colon, attribute = name.partition(":")
-    if not colon:
-        raise InputError(source, f"{key} = {name!r}", legal)
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
-    try:
-        return getattr(importlib.import_module(module_name), attribute)
-    except (Exception, SystemExit, GeneratorExit) as error:
-        raise InputError(source, f"{key} = {name!r} cannot be imported: {told(error)}", legal) from error
+        inspect.signature(cls).bind(**choice.parameters)
+    except TypeError as error:
+        raise InputError(source, f"{key}.model = {choice.model!r} does not take {key}.parameters = {choice.parameters}: {error}") from None
+    guard = member.guard or Guard(source, f"{key}.model = {choice.model!r}")
+    return guard.call("__init__", partial(cls, **choice.parameters))

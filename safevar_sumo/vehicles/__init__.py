@@ -7,6 +7,7 @@ from safevar_sumo.vehicles.base import SumoType, Vehicle, VehicleState, at_start
 from safevar_sumo.vehicles.calibration_drive import calibration_drive
 from safevar_sumo.vehicles.carla import Carla
 from safevar_sumo.vehicles.characteristics import Characteristic, CharacteristicSet
+from safevar_sumo.vehicles.guarded import VEHICLE_CONTRACT, GuardedVehicle
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.sumo import SumoVehicle
 
@@ -17,4 +18,5 @@ VEHICLES: Mapping[str, type[Any]] = {
 }
 
 __all__ = [
-    "VEHICLES", "Carla", "Characteristic", "CharacteristicSet", "SumoType", "Vehicle", "VehicleState", "at_start", "calibration_drive"]
+    "VEHICLES", "VEHICLE_CONTRACT", "Carla", "Characteristic", "CharacteristicSet", "GuardedVehicle", "SumoType", "Vehicle", "VehicleState",
+    "at_start", "calibration_drive"]

@@ -8,14 +8,16 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from safevar_sumo.ads import ADS, Ads, Checked, PerVehicle, ScalarAds
+from safevar_sumo.ads import ADS, Ads, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.ads.world_on_rails import WorldOnRails
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import ForeignError
+from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.simulation import assemble
 from safevar_sumo.study import load_study, study_names
 
 STEP = 0.05
+GUARD = Guard("study 'mine'", "ads.model = 'my_module:Wrong'", __file__)
 SYSTEMS = {load_study(name).ads.model: assemble(load_study(name)) for name in study_names()}
 KNOWN = assemble(load_study("sun")).nominal
 
@@ -95,14 +97,15 @@ class Timid(ScalarAds):
 
 
 def test_a_scalar_ads_drives_every_vehicle_with_an_instance_of_its_own() -> None:
-    ads = PerVehicle(Timid)
+    ads = PerVehicle(Timid, GUARD)
     memory = ads.start(3, KNOWN, STEP)
     gap = np.array([5.0, 50.0, 50.0])
     for expected in ([0.0, 0.1, 0.1], [0.0, 0.2, 0.2]):
         command, memory = ads.drive(observation(0.0, np.zeros(3), gap, np.zeros(3)), memory)
         assert command.throttle.tolist() == pytest.approx(expected)
         assert command.brake.tolist() == [1.0, 0.0, 0.0]
-    assert memory[0].nominal is KNOWN
+    assert memory[0].nominal.mass == KNOWN.mass
+    assert not memory[0].nominal.speeds.flags.writeable
     assert memory[0].step == STEP
 
 
@@ -124,11 +127,12 @@ class Wrong:
 
 @pytest.mark.parametrize(("throttle", "told"), [
     ("start", "raised in start: KeyError"), ("drive", "raised in drive: ZeroDivisionError"), (1.5, "throttle = 1.5"),
-    (float("nan"), "throttle = nan"), (-0.1, "throttle = -0.1"), ("much", "raised in drive"), ([0.1, 0.2, 0.3], "raised in drive"),
+    (float("nan"), "throttle = nan"), (-0.1, "throttle = -0.1"), ("much", "throttle = 'much'"), ([0.1, 0.2, 0.3], "shape (3,)"),
+    (None, "throttle = None"), ("0.5", "throttle = '0.5'"), (1j, "throttle = 1j"), ([[0.1], [0.2]], "shape (2, 1)"),
 ])
 def test_what_a_foreign_ads_does_wrong_is_told_with_its_name(throttle: object, told: str) -> None:
-    ads = Checked(Wrong(throttle), "study 'mine'", "my_module:Wrong")
-    with pytest.raises(InputError) as caught:
+    ads = GuardedAds(Wrong(throttle), GUARD)  # type: ignore[arg-type]
+    with pytest.raises(ForeignError) as caught:
         ads.drive(observation(0.0, np.zeros(2), np.zeros(2), np.zeros(2)), ads.start(2, KNOWN, STEP))
     assert told in str(caught.value)
     assert "my_module:Wrong" in str(caught.value)

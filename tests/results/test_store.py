@@ -14,7 +14,7 @@ import pytest
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory, record, solutions_frame
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import Study, load_study, tables_of
 
 NAMES = ("a", "b")
 
@@ -71,7 +71,7 @@ def test_what_is_undefined_stays_undefined() -> None:
 def test_the_manifest_tells_study_versions_and_original(tmp_path: Path, study: Study) -> None:
     written(tmp_path / "new" / "out", study)
     manifest = json.loads((tmp_path / "new" / "out" / "manifest.json").read_text())
-    assert manifest["study"] == msgspec.to_builtins(study)
+    assert manifest["study"] == tables_of(study)
     assert manifest["seed"] == study.search.seed
     assert manifest["original"]["safety_degree"] == 2.5
     assert manifest["versions"]["libsumo"] == "1.28.0"

@@ -1,0 +1,8 @@
+"""Other people's code: looked up by name, held to a contract, called through one guard."""
+
+from safevar_sumo.plugins.contract import Contract
+from safevar_sumo.plugins.guard import Guard
+from safevar_sumo.plugins.lending import lent
+from safevar_sumo.plugins.lookup import Lookup, Member, sources
+
+__all__ = ["Contract", "Guard", "Lookup", "Member", "lent", "sources"]

@@ -1,0 +1,70 @@
+"""A scenario from outside the package, held to its contract."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from safevar_sumo.plugins import Contract, Guard, lent
+from safevar_sumo.records import Encounter, Trace
+from safevar_sumo.scenarios.base import Scenario, Scene, World
+
+SCENARIO_CONTRACT = Contract.of(Scenario, "a scenario")
+LONGEST = 3600.0
+"""Of a run [s]."""
+
+
+class GuardedScenario:
+    """Gives the scenario copies, checks what it returns, and keeps copies of that."""
+
+    def __init__(self, scenario: Any, guard: Guard) -> None:
+        self._scenario, self._guard = scenario, guard
+        network = guard.field("__init__", scenario, "network")
+        if not isinstance(network, str):
+            raise guard.wrong("__init__", "network", network, "the name or path of a folder with a network")
+        self.network = network
+        duration = guard.numbers("__init__", "duration", guard.field("__init__", scenario, "duration"), (), 0.0, LONGEST, above=True)
+        self.duration = float(duration)
+
+    def begin(self, world: World) -> Any:
+        return self._guard.call("begin", self._scenario.begin, _LentWorld(world))
+
+    def observe(self, world: World, step: float, memory: Any) -> tuple[Scene, Any]:
+        n = len(world.vehicle_positions("vut"))
+        given = self._guard.call("observe", self._scenario.observe, _LentWorld(world), step, memory)
+        theirs, memory = self._guard.parts("observe", given, "(Scene, memory)")
+        values: dict[str, Any] = {}
+        for name in Scene._fields:
+            value = self._guard.field("observe", theirs, name)
+            if name in ("over", "visible"):
+                values[name] = self._guard.truths("observe", name, value, (n,))
+            else:
+                values[name] = self._guard.numbers("observe", name, value, (n,), infinite=name == "gap")
+        return Scene(**values), memory
+
+    def encounter(self, trace: Trace) -> Encounter:
+        given = self._guard.call("encounter", self._scenario.encounter, lent(trace))
+        shape = trace.speed.shape
+        values = {name: self._guard.field("encounter", given, name) for name in Encounter._fields}
+        in_conflict = self._guard.truths("encounter", "in_conflict", values.pop("in_conflict"), shape)
+        counts = in_conflict & trace.active
+        numbers = {name: self._guard.numbers("encounter", name, value, shape, infinite=True, undefined=True)
+                   for name, value in values.items()}
+        for name, found in numbers.items():
+            if np.isnan(found[counts]).any():
+                raise self._guard.wrong("encounter", name, float("nan"), "numbers wherever in_conflict is true")
+        return Encounter(**numbers, in_conflict=in_conflict)
+
+
+class _LentWorld:
+    """The world as the contract has it, and nothing else of it; whoever writes to a result writes to a copy."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or not hasattr(World, name):
+            raise AttributeError(f"a scenario's world has no {name!r}")
+        method = getattr(self._world, name)
+        return lambda *arguments: lent(method(*arguments))

@@ -1,0 +1,87 @@
+"""A vehicle model from outside the package, held to its contract."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from safevar_sumo.errors import ForeignError
+from safevar_sumo.plugins import Contract, Guard, lent
+from safevar_sumo.records import Command, FloatArray, Observation
+from safevar_sumo.vehicles.base import Characteristics, SumoType, Vehicle
+
+VEHICLE_CONTRACT = Contract.of(Vehicle, "a vehicle", optional=("at_speed",))
+FASTEST = 1000.0
+"""No vehicle is faster [m/s]; what is has diverged."""
+_BOUNDS = {"speed": (0.0, FASTEST), "throttle": (0.0, 1.0), "brake": (0.0, 1.0)}
+
+
+NOWHERE = ("gap", "lateral")
+"""What is infinite while nobody is detected."""
+
+
+class _Prepared(NamedTuple):
+    n: int
+    theirs: Any
+
+
+class _State(NamedTuple):
+    """What is read of a state, checked, and the state itself."""
+
+    speed: FloatArray
+    throttle: FloatArray
+    brake: FloatArray
+    gear: FloatArray
+    theirs: Any
+
+
+class GuardedVehicle:
+    """Gives the model copies, checks what it returns, and keeps copies of that."""
+
+    UNITS: Mapping[str, str]
+
+    def __init__(self, vehicle: Any, guard: Guard) -> None:
+        self._vehicle, self._guard = vehicle, guard
+        units = guard.field("__init__", vehicle, "UNITS")
+        if not isinstance(units, Mapping) or not all(isinstance(word, str) for pair in units.items() for word in pair):
+            raise guard.wrong("__init__", "UNITS", units, "a mapping from names of characteristics to their units")
+        self.UNITS = dict(units)
+
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> _Prepared:
+        n = len(next(iter(characteristics.values())))
+        return _Prepared(n, self._guard.call("prepare", self._vehicle.prepare, lent(characteristics), road_friction, step))
+
+    def sumo_type(self, prepared: _Prepared) -> SumoType:
+        given = self._guard.call("sumo_type", self._vehicle.sumo_type, prepared.theirs)
+        return SumoType(*(
+            self._guard.numbers("sumo_type", name, self._guard.field("sumo_type", given, name), (prepared.n,), 0.0, above=True)
+            for name in SumoType._fields))
+
+    def at_rest(self, prepared: _Prepared) -> _State:
+        return self._state("at_rest", prepared.n, self._guard.call("at_rest", self._vehicle.at_rest, prepared.theirs))
+
+    def at_speed(self, prepared: _Prepared, speed: FloatArray) -> _State:
+        if not hasattr(self._vehicle, "at_speed"):
+            problem = f"{self._guard.name} has no method at_speed(prepared, speed), and the traffic puts it onto the road in motion"
+            raise ForeignError(self._guard.source, problem, "a vehicle with it, or traffic that departs with speed 0")
+        return self._state("at_speed", prepared.n, self._guard.call("at_speed", self._vehicle.at_speed, prepared.theirs, lent(speed)))
+
+    def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
+        given = self._guard.call("sense", self._vehicle.sense, prepared.theirs, state.theirs, lent(seen))
+        theirs, after = self._guard.parts("sense", given, "(Observation, state)")
+        values: dict[str, Any] = {}
+        for name, value in seen._asdict().items():
+            what = self._guard.field("sense", theirs, name)
+            shape = (prepared.n,) if hasattr(value, "shape") else ()
+            found = self._guard.numbers("sense", name, what, shape, infinite=name in NOWHERE)
+            values[name] = found if shape else float(found)
+        return Observation(**values), self._state("sense", prepared.n, after)
+
+    def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
+        given = self._guard.call("advance", self._vehicle.advance, prepared.theirs, state.theirs, lent(command))
+        return self._state("advance", prepared.n, given)
+
+    def _state(self, method: str, n: int, theirs: Any) -> _State:
+        read = {name: self._guard.numbers(method, name, self._guard.field(method, theirs, name), (n,), *_BOUNDS.get(name, ()))
+                for name in _State._fields[:-1]}
+        return _State(**read, theirs=theirs)

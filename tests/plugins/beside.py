@@ -1,0 +1,11 @@
+"""What tests write beside a study file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from safevar_sumo.simulation import System
+
+Mine = Callable[..., System]
+SCALAR = "from safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"
+ADS = '[ads]\nmodel = "mine:Mine"\n'

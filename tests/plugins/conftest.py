@@ -1,0 +1,31 @@
+"""A study file with a module of its own beside it, in a folder that is not the working directory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from beside import ADS, Mine
+
+from safevar_sumo.simulation import System, assemble
+from safevar_sumo.study import load_study
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where study and module lie; the working directory is another, empty one."""
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "study").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    return tmp_path / "study"
+
+
+@pytest.fixture
+def mine(folder: Path) -> Mine:
+    """Write mine.py and mine.toml, which extends smoke, and put the system together."""
+    def made(module: str, table: str = ADS) -> System:
+        (folder / "mine.py").write_text(module)
+        (folder / "mine.toml").write_text(f'extends = "smoke"\nname = "mine"\n{table}')
+        return assemble(load_study(str(folder / "mine.toml")), "mine.toml")
+
+    return made

@@ -1,0 +1,147 @@
+"""Whatever other people's models raise or return wrongly is one kind of error; nothing they do alters what is measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from beside import SCALAR, Mine
+
+from safevar_sumo.errors import ForeignError
+from safevar_sumo.simulation import assemble, evaluate, simulate
+from safevar_sumo.study import load_study
+
+VEHICLE = '[vehicle]\nmodel = "mine:Mine"\n[vehicle.characteristics]\n{}\n[ads]\nmodel = "krauss"\n'
+SCENARIO = '[scenario]\nmodel = "mine:Mine"\n'
+NATIVE = load_study("native")
+ROWS = "\n".join(f'{name} = {{ unit = "{row.unit}", original = {row.original}, lower = {row.lower}, upper = {row.upper} }}'
+                 for name, row in NATIVE.vehicle.characteristics.items())
+
+
+def failing(system: object) -> str:
+    with pytest.raises(ForeignError) as caught:
+        evaluate(system, np.repeat(system.characteristics.original[None], 3, axis=0))  # type: ignore[arg-type, attr-defined]
+    assert len(str(caught.value).splitlines()) <= 2
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(("body", "told"), [
+    ("1 / 0", "raised in drive: ZeroDivisionError: division by zero"), ("raise SystemExit(0)", "raised in drive: SystemExit: 0"),
+    ("raise GeneratorExit", "raised in drive: GeneratorExit"), ("pass", "returned None from drive"),
+    ("return 0.5", "returned 0.5 from drive"), ("return 0.5, 0, 0", "returned (0.5, 0, 0) from drive"),
+    ("return '0.5', 0", "returned throttle = '0.5' from drive"), ("return 0, 2", "returned brake = 2.0 from drive"),
+    ("return float('nan'), 0", "returned throttle = nan"), ("return [0.1, 0.2], 0", "returned throttle of shape (2,)"),
+])
+def test_a_scalar_ads_that_is_wrong(body: str, told: str, mine: Mine, folder: Path) -> None:
+    message = failing(mine(SCALAR + f"    def drive(self, seen):\n        {body}\n"))
+    assert f"ads.model = 'mine:Mine' {told}" in message
+    if "raised" in told:
+        assert f"{folder / 'mine.py'}:6" in message
+
+
+ADS = "class Mine:\n    def start(self, n, nominal, step):\n        return n\n\n    def drive(self, seen, memory):\n"
+
+
+@pytest.mark.parametrize(("body", "told"), [
+    ("seen.speed[:] = 0", "ValueError: assignment destination is read-only"), ("return seen.speed", "from drive"),
+    ("return (seen.speed * 0, 0)", "from drive"), ("return (seen.speed * 0, seen.speed[:2]), memory", "brake of shape (2,)"),
+    ("return (0, 10**400), memory", "returned brake"),
+])
+def test_an_ads_over_arrays_that_is_wrong(body: str, told: str, mine: Mine) -> None:
+    assert told in failing(mine(ADS + f"        {body}\n"))
+
+
+def test_what_an_ads_does_to_what_it_was_given_changes_nothing_that_is_logged(mine: Mine) -> None:
+    honest = mine(ADS + "        return (0.5 + 0 * seen.speed, 0), memory\n")
+    liar = mine("import numpy as np\n" + ADS + "        for array in seen[1:6]:\n            array.setflags(write=True)\n"
+                "            array[:] = 99\n        return (np.full(memory, 0.5), 0), memory\n")
+    setting = honest.characteristics.original[None]
+    for one, other in zip(vars(simulate(honest, setting).trace).values(), vars(simulate(liar, setting).trace).values(), strict=True):
+        assert np.array_equal(one, other, equal_nan=True)
+
+
+def test_commands_that_are_changed_afterwards_are_logged_as_given(mine: Mine) -> None:
+    system = mine("import numpy as np\n" + ADS.replace("return n", "return np.zeros(n)")
+                  + "        memory[:] = 0.1 if seen.time == 0 else 0.9\n        return (memory, 0), memory\n")
+    assert simulate(system, system.characteristics.original[None]).trace.throttle[0, 0] == 0.1
+
+
+def vehicle(method: str, body: str) -> str:
+    return ("import numpy as np\nfrom safevar_sumo.vehicles.sumo import SumoVehicle\n\n\nclass Mine:\n    UNITS = SumoVehicle.UNITS\n\n"
+            "    def __init__(self):\n        self.inner = SumoVehicle(reference_mass=1500)\n\n"
+            "    def prepare(self, characteristics, road_friction, step):\n"
+            "        return self.inner.prepare(characteristics, road_friction, step)\n\n"
+            + "".join(f"    def {name}(self, {arguments}):\n        result = self.inner.{name}({arguments})\n"
+                      f"        {body if name == method else 'pass'}\n        return result\n\n"
+                      for name, arguments in (("sumo_type", "prepared"), ("at_rest", "prepared"), ("sense", "prepared, state, seen"),
+                                              ("advance", "prepared, state, command"))))
+
+
+@pytest.mark.parametrize(("method", "body", "told"), [
+    ("advance", "result = result._replace(speed=-result.speed - 1)", "returned speed = -"),
+    ("advance", "result = result._replace(speed=result.speed * np.nan)", "returned speed = nan from advance"),
+    ("advance", "result = result._replace(speed=result.speed + np.inf)", "returned speed = inf from advance"),
+    ("advance", "result = result._replace(speed='fast')", "returned speed = 'fast' from advance"),
+    ("advance", "result = result._replace(speed=np.zeros(7))", "returned speed of shape (7,) from advance"),
+    ("advance", "result = None", "returned None from advance"),
+    ("at_rest", "result = result._replace(speed=None)", "returned speed = None from at_rest"),
+    ("sense", "result = result[0]", "from sense"),
+    ("sense", "result = (result[0]._replace(gap=result[0].gap * np.nan), result[1])", "returned gap = nan from sense"),
+    ("sense", "result = (result[0]._replace(speed=result[0].gap + np.inf), result[1])", "returned speed = inf from sense"),
+    ("sumo_type", "result = result._replace(decel=0 * result.decel)", "returned decel = 0.0 from sumo_type"),
+    ("sumo_type", "result = result[0]", "from sumo_type"),
+])
+def test_a_vehicle_that_is_wrong(method: str, body: str, told: str, mine: Mine) -> None:
+    def tried() -> None:
+        system = mine(vehicle(method, body), VEHICLE.format(ROWS))
+        evaluate(system, np.repeat(system.characteristics.original[None], 3, axis=0))
+
+    with pytest.raises(ForeignError) as caught:
+        tried()
+    assert told in str(caught.value)
+    assert "vehicle.model = 'mine:Mine'" in str(caught.value)
+
+
+def test_a_foreign_vehicle_drives_to_the_bit_as_the_one_that_it_wraps(mine: Mine, folder: Path) -> None:
+    foreign = mine(vehicle("", ""), VEHICLE.format(ROWS))
+    (folder / "ours.toml").write_text('extends = "smoke"\nname = "ours"\n' + VEHICLE.format(ROWS).replace(
+        '"mine:Mine"', '"sumo"\nparameters = { reference_mass = 1500 }'))
+    ours = assemble(load_study(str(folder / "ours.toml")))
+    settings = np.random.default_rng(1).uniform(ours.characteristics.lower, ours.characteristics.upper, (4, len(ours.characteristics)))
+    one, other = evaluate(foreign, settings), evaluate(ours, settings)
+    assert all(np.array_equal(one.metrics[name], other.metrics[name], equal_nan=True) for name in one.metrics)
+
+
+def scenario(method: str, body: str) -> str:
+    return ("import numpy as np\nfrom safevar_sumo.scenarios import PedestrianCrossing\n\n\nclass Mine:\n"
+            "    network, duration = 'pedestrian_crossing', 2.0\n\n    def __init__(self):\n        self.inner = PedestrianCrossing()\n\n"
+            + "".join(f"    def {name}(self, {arguments}):\n        result = self.inner.{name}({arguments})\n"
+                      f"        {body if name == method else 'pass'}\n        return result\n\n"
+                      for name, arguments in (("begin", "world"), ("observe", "world, step, memory"), ("encounter", "trace"))))
+
+
+@pytest.mark.parametrize(("method", "body", "told"), [
+    ("begin", "world.person_positions('nobody')", "raised in begin"), ("begin", "world.advance([1.0])", "has no 'advance'"),
+    ("begin", "world.vehicle_positions('vut')[:] = 0", "read-only"),
+    ("observe", "result = None", "returned None from observe"),
+    ("observe", "result = (result[0]._replace(gap=result[0].gap * np.nan), result[1])", "returned gap = nan from observe"),
+    ("observe", "result = (result[0]._replace(lateral=result[0].gap + np.inf), result[1])", "returned lateral = inf from observe"),
+    ("observe", "result = (result[0]._replace(over=result[0].gap), result[1])", "returned over"),
+    ("observe", "result = (result[0]._replace(gap='near'), result[1])", "returned gap = 'near'"),
+    ("encounter", "result = result._replace(separation=result.separation[0])", "returned separation of shape (3,)"),
+    ("encounter", "result = result._replace(in_conflict=result.in_conflict | True, distance=result.distance * np.nan)",
+     "returned distance = nan"),
+    ("encounter", "trace.speed[:] = 0", "read-only"),
+])
+def test_a_scenario_that_is_wrong(method: str, body: str, told: str, mine: Mine) -> None:
+    message = failing(mine(scenario(method, body), SCENARIO))
+    assert told in message
+    assert "scenario.model = 'mine:Mine'" in message
+
+
+@pytest.mark.parametrize("values", ["network, duration = 7, 2.0", "network, duration = 'pedestrian_crossing', 'long'",
+                                    "network, duration = 'pedestrian_crossing', -1", "network = 'pedestrian_crossing'"])
+def test_a_scenario_without_a_network_or_a_duration_is_told(values: str, mine: Mine) -> None:
+    with pytest.raises(ForeignError, match=r"network|duration"):
+        mine(scenario("", "").replace("network, duration = 'pedestrian_crossing', 2.0", values), SCENARIO)

@@ -1,0 +1,124 @@
+"""Where a name in a study is looked up, and that nothing of it is called before it meets its contract."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from beside import ADS, SCALAR, Mine
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.plugins import sources
+from safevar_sumo.simulation import assemble, evaluate
+from safevar_sumo.study import load_study
+
+CHARACTERISTICS = "characteristics = { mass = { unit = 'kg', original = 1, lower = 0.5, upper = 2 } }\n"
+CONSTANT = SCALAR + "    def drive(self, seen):\n        return {}, 0.0\n"
+
+
+def throttle(study: Path) -> float:
+    system = assemble(load_study(str(study)))
+    evaluate(system, system.characteristics.original[None])
+    driver = system.ads.start(1, system.nominal, 0.05)[0]
+    return float(driver.drive(None)[0])
+
+
+def test_beside_the_study_comes_before_the_working_directory(mine: Mine, folder: Path) -> None:
+    Path("mine.py").write_text(CONSTANT.format(0.1))
+    mine(CONSTANT.format(0.9))
+    assert throttle(folder / "mine.toml") == 0.9
+    (folder / "mine.py").unlink()
+    assert throttle(folder / "mine.toml") == 0.1
+
+
+def test_a_study_finds_what_lies_beside_the_study_that_it_extends(mine: Mine, folder: Path) -> None:
+    mine(CONSTANT.format(0.7))
+    Path("child.toml").write_text(f'extends = "{folder / "mine.toml"}"\nname = "child"\n')
+    assert throttle(Path("child.toml")) == 0.7
+
+
+def test_two_studies_with_modules_of_one_name_get_their_own_whatever_the_order(tmp_path: Path) -> None:
+    for place, value in (("a", 0.2), ("b", 0.4)):
+        (tmp_path / place).mkdir()
+        (tmp_path / place / "mine.toml").write_text(f'extends = "smoke"\nname = "mine"\n{ADS}')
+        (tmp_path / place / "mine.py").write_text("from sibling import VALUE\n" + CONSTANT.format("VALUE"))
+        (tmp_path / place / "sibling.py").write_text(f"VALUE = {value}\n")
+    found = [throttle(tmp_path / place / "mine.toml") for place in ("a", "b", "a")]
+    assert found == [0.2, 0.4, 0.2]
+
+
+def test_a_module_that_was_edited_is_read_anew_and_so_is_what_it_imports(mine: Mine, folder: Path) -> None:
+    (folder / "sibling.py").write_text("VALUE = 0.2\n")
+    mine("from sibling import VALUE\n" + CONSTANT.format("VALUE"))
+    assert throttle(folder / "mine.toml") == 0.2
+    (folder / "sibling.py").write_text("VALUE = 0.6\n")  # as long as before, within the same second
+    assert throttle(folder / "mine.toml") == 0.6
+
+
+def test_the_sources_of_a_plug_in_are_its_file_and_what_it_imports_from_beside_it(mine: Mine, folder: Path) -> None:
+    (folder / "sibling.py").write_text("VALUE = 0.2\n")
+    (folder / "stranger.py").write_text("")
+    system = mine("import json\nfrom sibling import VALUE\n" + CONSTANT.format("VALUE"))
+    assert sources(system.members) == {"mine": folder / "mine.py", "sibling": folder / "sibling.py"}
+    assert sources(assemble(load_study("smoke")).members) == {}
+
+
+def test_a_file_with_the_name_of_an_installed_module_is_refused_where_it_is_meant_and_ignored_where_not(mine: Mine, folder: Path) -> None:
+    (folder / "scipy.py").write_text("raise RuntimeError('not scipy')")
+    mine("import numpy, scipy\n" + CONSTANT.format(0.1))
+    (folder / "numpy.py").write_text(CONSTANT.format(0.1))
+    with pytest.raises(InputError, match=r"numpy in .* has the name of .*numpy"):
+        mine("", '[ads]\nmodel = "numpy:Mine"\n')
+
+
+def test_nothing_is_left_behind_beside_the_study(mine: Mine, folder: Path) -> None:
+    mine(CONSTANT.format(0.1))
+    assert sorted(path.name for path in folder.iterdir()) == ["mine.py", "mine.toml"]
+
+
+@pytest.mark.parametrize(("model", "told"), [
+    ("os:system", "is a function, not a class"),
+    ("os:path", "is a module, not a class"),
+    ("subprocess:Popen", "has no method start(n, nominal, step)"),
+    ("mine:Mine", "has no method drive(seen)"),
+    ("mine:NotEnough", "has a method drive that does not take (seen, memory)"),
+    ("mine:Scalar", "has a method drive that does not take (seen)"),
+    ("mine:Odd", "has drive = 3 instead of a method drive(seen, memory)"),
+    ("mine:nothing", "has no 'nothing'"),
+    ("__main__:Mine", "cannot import from __main__"),
+    ("mine:", "mine:"), (":Mine", ":Mine"), ("no where:Mine", "no where:Mine"), ("mine:Mine.Inner", "mine:Mine.Inner"),
+])
+def test_what_does_not_meet_the_contract_is_refused_before_it_is_called(model: str, told: str, mine: Mine, folder: Path) -> None:
+    module = (SCALAR + "    pass\n\n\nclass Called:\n    def __init__(self):\n        open('called', 'w').close()\n\n"
+              "    def start(self, n, nominal, step): ...\n\n\nclass NotEnough(Called):\n    def drive(self, seen): ...\n\n\n"
+              "class Odd(Called):\n    drive = 3\n\n\nclass Scalar(ScalarAds):\n    def drive(self, seen, memory): ...\n")
+    with pytest.raises(InputError) as caught:
+        mine(module, f'[ads]\nmodel = "{model}"\nparameters = {{ command = "touch called" }}\n')
+    assert told in str(caught.value)
+    assert len(str(caught.value).splitlines()) <= 2
+    assert not Path("called").exists()
+
+
+@pytest.mark.parametrize("table", ["vehicle", "scenario"])
+def test_vehicles_and_scenarios_are_held_to_their_contracts_too(table: str, mine: Mine) -> None:
+    with pytest.raises(InputError, match=r"has no method (prepare|begin)"):
+        mine("class Mine: ...\n", f'[{table}]\nmodel = "mine:Mine"\n' + (CHARACTERISTICS if table == "vehicle" else ""))
+
+
+def test_parameters_that_a_class_does_not_take_are_told(mine: Mine) -> None:
+    with pytest.raises(InputError, match="unexpected keyword argument 'margin'"):
+        mine(CONSTANT.format(0.1), ADS + "parameters = { margin = 1 }\n")
+
+
+@pytest.mark.parametrize(("module", "told"), [
+    ("import nothing_of_that_name\n", "ModuleNotFoundError: No module named 'nothing_of_that_name' ({}:1)"),
+    ("\nraise SystemExit(3)\n", "SystemExit: 3 ({}:2)"), ("\n\n1 / 0\n", "ZeroDivisionError: division by zero ({}:3)"),
+    ("x = (\n", "SyntaxError: '(' was never closed"),
+])
+def test_a_module_that_fails_is_told_with_its_line_and_can_be_mended(module: str, told: str, mine: Mine, folder: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        mine(module)
+    assert told.format(folder / "mine.py") in str(caught.value)
+    assert mine(CONSTANT.format(0.3)).members[1].module == "mine"
+    assert "mine" in sys.modules
