@@ -17,6 +17,7 @@ COMMANDS = {
     "study": ("study", "Search a study; the same command again goes on where it was stopped."),
     "simulate": ("simulate", "Simulate a study once: how it ends, its safety metrics and objectives."),
     "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms and metrics."),
+    "explain": ("explain", "Explain failures: which changes did it, how little is enough, and why."),
     "tables": ("answers", "Answer the research questions as tables."),
     "figures": ("answers", "Draw the figures of results."),
     "import": ("reference", "Make results of solutions in the published package's CSV format."),

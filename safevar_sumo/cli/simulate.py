@@ -9,14 +9,15 @@ import click
 import numpy as np
 from rich.console import Console
 
+from safevar_sumo.cli.outputs import PICTURES, check_output
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.showing import Shown, showing_options
 from safevar_sumo.cli.target import Target, replay_options, target_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import time_to_collision
 from safevar_sumo.records import Drives, Evaluations, FloatArray
 from safevar_sumo.results import record
-from safevar_sumo.simulation import Engine, assemble, score, simulate
+from safevar_sumo.simulation import Engine, System, assemble, score, simulate
+from safevar_sumo.study import Study
 from safevar_sumo.terminal.simulation import print_evaluation
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -27,28 +28,28 @@ from safevar_sumo.vehicles import CharacteristicSet
 @click.option("--set", "changes", multiple=True, metavar="NAME=VALUE", help="A characteristic's value, in its unit; may be repeated.")
 @click.option("--no-filter", is_flag=True, help="Keep changes that are smaller than the filter's thresholds.")
 @click.option("--trace", type=click.Path(path_type=Path), metavar="FILE.csv", help="Write the run, step by step.")
-@showing_options
+@click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help="Draw it beside the original vehicle: png, pdf or svg.")
 @click.option("--gui", is_flag=True, help="Show it in sumo-gui.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def simulate_command(study: str, solution: str | None, choice: str | None, changes: tuple[str, ...], no_filter: bool, trace: Path | None,
-                     gui: bool, as_json: bool, **shown: Path | None) -> None:
+                     plot: Path | None, gui: bool, as_json: bool) -> None:
     """Simulate STUDY once, or a solution of the results directory DIR with the study as recorded there."""
-    target, showing = target_of(study, solution, choice), Shown(**shown)
+    target = target_of(study, solution, choice)
     chosen = target.study
     system = assemble(chosen, target.source)
     setting = _setting(system.characteristics, target, changes)[np.newaxis]
     if not no_filter:
         setting = system.characteristics.filter(setting)
-    if showing.asked:
-        showing.check()
+    if plot is not None:
+        check_output(plot, "--plot", PICTURES)
     run = simulate(system, setting, Engine.GUI if gui else Engine.LIBSUMO)
     evaluations = score(system, setting, run)
     if target.recorded is not None and not changes:
         _warn_of_differences(target, evaluations)
     if trace is not None:
         _write_trace(trace, run)
-    if showing.asked:
-        showing.show(chosen, system, setting[0])
+    if plot is not None:
+        _draw(plot, chosen, system, setting[0])
     values = dict(zip(system.characteristics.names, setting[0].tolist(), strict=True))
     result = {"study": chosen.name, "vcs": values, **record(evaluations, 0)}
     if target.handle is not None:
@@ -75,6 +76,12 @@ def _warn_of_differences(target: Target, evaluations: Evaluations) -> None:
     assert target.recorded is not None
     for one in differences(evaluations, target.recorded):
         click.echo(f"warning: {target.handle} of {target.source}: {one}; other versions or code than those of the study?", err=True)
+
+
+def _draw(path: Path, study: Study, system: System, setting: FloatArray) -> None:
+    from safevar_sumo.showing import compare, draw_comparison, write_figure
+
+    write_figure(draw_comparison(compare(study, system, setting)), path)
 
 
 def _assignments(changes: tuple[str, ...]) -> dict[str, float]:

@@ -1,0 +1,12 @@
+"""What an engineer asks of a finding: which changes did it, how far may each go, how likely is it, in which region."""
+
+from safevar_sumo.answers.because import Because, Braking, Course
+from safevar_sumo.answers.explanation import explain
+from safevar_sumo.answers.figures import necessity_figure, save
+from safevar_sumo.answers.findings import Cause, Explained, Explanation
+from safevar_sumo.answers.robustness import Robustness
+from safevar_sumo.answers.unsafe import Unsafe
+from safevar_sumo.answers.words import changes, command, number_of, sentence
+
+__all__ = ["Because", "Braking", "Cause", "Course", "Explained", "Explanation", "Robustness", "Unsafe", "changes", "command", "explain",
+           "necessity_figure", "number_of", "save", "sentence"]

@@ -1,0 +1,133 @@
+"""Explain failures: which of the changes did it, how little of them is enough, why, and whether it hangs on a hair."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from safevar_sumo.analysis import Case
+from safevar_sumo.answers.because import because, courses
+from safevar_sumo.answers.bench import Bench, Progress, open_bench, silent
+from safevar_sumo.answers.boundary import boundaries
+from safevar_sumo.answers.causes import MinimalCause, affordable, minimal_causes, necessary, number
+from safevar_sumo.answers.failures import Failures, failures_of
+from safevar_sumo.answers.findings import Cause, Explained, Explanation
+from safevar_sumo.answers.necessity import distinct_causes, key_of, necessity
+from safevar_sumo.answers.robustness import robustness
+from safevar_sumo.answers.unsafe import Unsafe
+from safevar_sumo.computing import Pool
+from safevar_sumo.records import Evaluations
+from safevar_sumo.results import Handle
+from safevar_sumo.study import Study
+
+TOP = 8
+"""Failures that are explained in full, if nobody says how many."""
+LIMIT = 40_000
+"""Simulations, about, that the minimal causes of all failures may take; of more failures a random sample is looked into."""
+REASONS = {"fewest": "fewest changes", "smallest": "smallest changes", "most_severe": "most severe"}
+Causes = Mapping[int, list[MinimalCause]]
+Reasons = tuple[str, ...]
+
+
+def explain(source: Study | Case, *, solutions: Sequence[str] = (), unsafe: str | None = None, top: int = TOP, limit: int = LIMIT,
+            pool: Pool | None = None, jobs: int | None = None, progress: Progress = silent) -> Explained:
+    """Explain the failures that matter among the solutions of results, or among settings all over a study's domain.
+
+    Parameters
+    ----------
+    source
+        Results, or a study without any.
+    solutions
+        Handles of the solutions to explain; by default those with the fewest and the smallest changes, the most severe
+        one, and one of each distinct minimal cause, the most frequent first.
+    unsafe
+        `collision` or `below=X`; by default a collision if there is one, else half of the original's safety degree.
+    top
+        How many failures are explained in full at the most.
+    limit
+        Simulations, about, that the minimal causes of all failures may take: of more, a random sample is looked into.
+    pool, jobs
+        Where to simulate: a pool, or that many worker processes (by default one for each core).
+    progress
+        Is told what is done.
+
+    Raises
+    ------
+    InputError
+        If `unsafe` or a handle cannot be read, or the study cannot be assembled.
+    """
+    study = source if isinstance(source, Study) else source.study
+    means, named = Unsafe.given(unsafe), [Handle.parse(text) for text in solutions]
+    with open_bench(study, pool, jobs, progress) as bench:
+        original = bench.original()
+        found = failures_of(source, bench, original, named, means)
+        sample = found.rows if solutions else [found.rows[i] for i in affordable(found.evaluations.settings[found.rows], bench, limit)]
+        reasons = dict.fromkeys(found.rows[:len(solutions)], ("asked for",)) if solutions else _that_matter(found)
+        rows = sorted({*sample, *reasons})
+        causes = dict(zip(rows, minimal_causes(bench, found.evaluations.settings[rows], found.unsafe), strict=True))
+        if not solutions:
+            reasons = _with_one_of_each_cause(found, bench, {row: causes[row] for row in sample}, reasons, causes, top)
+        explanations = _explained(found, bench, original, causes, reasons)
+    changed = bench.characteristics.changed(found.evaluations.settings[sample])
+    of_sample = [causes[row] for row in sample]
+    return Explained(
+        study=study, unsafe=found.unsafe, original=original, explanations=explanations,
+        necessity=necessity(bench.characteristics, changed, of_sample), distinct=distinct_causes(bench.characteristics, of_sample),
+        looked_at=len(found.evaluations), failures=len(found.rows), analysed=len(sample), otherwise=found.otherwise)
+
+
+def _that_matter(found: Failures) -> dict[int, Reasons]:
+    """The failures of the fewest and the smallest changes and the most severe one, and which of these each is."""
+    reasons: dict[int, Reasons] = {}
+    for choice, reason in REASONS.items():
+        if found.rows:
+            row = found.least(choice)
+            reasons[row] = (*reasons.get(row, ()), reason)
+    return reasons
+
+
+def _with_one_of_each_cause(found: Failures, bench: Bench, sample: Causes, reasons: Mapping[int, Reasons], causes: Causes,
+                            top: int) -> dict[int, Reasons]:
+    """Add one failure of each distinct minimal cause that is not there yet, the simplest that has it, up to `top` in all."""
+    chosen = dict(list(reasons.items())[:top])
+    keys = {row: {key_of(bench.characteristics, cause) for cause in of_it} for row, of_it in causes.items()}
+    for key in distinct_causes(bench.characteristics, list(sample.values()))["cause"]:
+        if len(chosen) >= top:
+            break
+        if not any(key in keys[row] for row in chosen):
+            of_it = [row for row in sample if key in keys[row]]
+            simplest = min(of_it, key=lambda row: (found.evaluations.f_num_diff[row], found.evaluations.f_diff[row], row))
+            chosen[simplest] = ("a cause of its own",)
+    return chosen
+
+
+def _explained(found: Failures, bench: Bench, original: Evaluations, causes: Causes,
+               reasons: Mapping[int, Reasons]) -> tuple[Explanation, ...]:
+    """The chosen failures explained in full."""
+    if not reasons:
+        return ()
+    rows = list(reasons)
+    here, names = found.evaluations.take(rows), bench.characteristics.names
+    drives = bench.drives(np.concatenate([original.settings, here.settings]))
+    first, *others = courses(drives, np.concatenate([original.f_safe, here.f_safe]))
+    hair = robustness(bench, here.settings, drives.trace.step, found.unsafe)
+    shrunk = iter(boundaries(bench, [cause for row in rows for cause in causes[row]], found.unsafe))
+    explanations = []
+    for i, row in enumerate(rows):
+        of_it = []
+        for cause in causes[row]:
+            boundary = next(shrunk)
+            of_it.append(Cause(
+                changes={names[column]: float(cause.setting[column]) for column in cause.columns},
+                boundary={names[column]: float(boundary.setting[column]) for column in cause.columns}, fraction=boundary.fraction,
+                alone={names[column]: value for column, value in boundary.alone.items()}, outcome=cause.outcome,
+                safety_degree=cause.safety_degree))
+        changed = bench.characteristics.changed(here.settings[i])
+        explanations.append(Explanation(
+            handle=found.handles[row], reasons=reasons[row], setting=dict(zip(names, here.settings[i].tolist(), strict=True)),
+            outcome=str(here.outcome[i]), safety_degree=number(here.f_safe[i]),
+            changed=tuple(name for name, is_changed in zip(names, changed, strict=True) if is_changed),
+            necessary=tuple(names[column] for column in sorted(necessary(causes[row]))), causes=tuple(of_it), robustness=hair[i],
+            because=because(first, others[i])))
+    return tuple(explanations)

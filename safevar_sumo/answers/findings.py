@@ -1,0 +1,122 @@
+"""What `explain` returns: records, frames, and what they are as JSON."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from safevar_sumo.answers.because import Because
+from safevar_sumo.answers.robustness import Robustness
+from safevar_sumo.answers.unsafe import Unsafe
+from safevar_sumo.answers.words import sentence
+from safevar_sumo.records import Evaluations
+from safevar_sumo.results import Handle
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cause:
+    """A smallest subset of a failure's changes that is unsafe by itself, all else as in the original vehicle.
+
+    Attributes
+    ----------
+    changes
+        The failure's values of these characteristics, in their units.
+    boundary
+        The same, shrunk by a common factor as far as they stay unsafe: at `fraction` of the changes.
+    alone
+        How far each value alone can be taken back, the others as in `changes`.
+    outcome, safety_degree
+        What `changes` do [m, or -m/s].
+    """
+
+    changes: dict[str, float]
+    boundary: dict[str, float]
+    fraction: float
+    alone: dict[str, float]
+    outcome: str
+    safety_degree: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explanation:
+    """One failure explained; `handle` is None for what did not come from results, `reasons` tell why it was chosen.
+
+    `safety_degree` is in m, or -m/s; `changed` and `necessary` are names; `causes` are all minimal ones.
+    """
+
+    handle: Handle | None
+    reasons: tuple[str, ...]
+    setting: dict[str, float]
+    outcome: str
+    safety_degree: float | None
+    changed: tuple[str, ...]
+    necessary: tuple[str, ...]
+    causes: tuple[Cause, ...]
+    robustness: Robustness
+    because: Because
+
+    def record(self) -> dict[str, Any]:
+        """As `explain --json` prints it."""
+        return {
+            "algorithm": self.handle.algorithm if self.handle else None, "run": self.handle.run if self.handle else None,
+            "index": self.handle.row if self.handle else None, "setting": self.setting, "outcome": self.outcome,
+            "safety_degree": self.safety_degree, "changed": list(self.changed),
+            "minimal_causes": [{name: getattr(cause, name) for name in ("changes", "boundary", "fraction", "outcome", "safety_degree")}
+                               for cause in self.causes],
+            "robustness": self.robustness.share, "because": sentence(self.because)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explained:
+    """Failures explained, and what all of them have in common.
+
+    Attributes
+    ----------
+    explanations
+        The failures that were chosen.
+    necessity, distinct
+        Frames over all failures looked into, of `safevar_sumo.answers.necessity`.
+    looked_at, failures, analysed
+        How many settings were looked at, how many of them are unsafe, and over how many of these the two frames are.
+    otherwise
+        How many solutions do not end as the results say.
+    """
+
+    study: Study
+    unsafe: Unsafe
+    original: Evaluations
+    explanations: tuple[Explanation, ...]
+    necessity: pd.DataFrame
+    distinct: pd.DataFrame
+    looked_at: int
+    failures: int
+    analysed: int
+    otherwise: int
+
+    def records(self) -> list[dict[str, Any]]:
+        """As `explain --json` prints them: one for each failure, and a summary."""
+        of_it = self.necessity.set_index("characteristic")
+        shares = {name: dict(zip(of_it.index, of_it[name].tolist(), strict=True)) for name in ("necessary", "changed")}
+        return [*(one.record() for one in self.explanations), {"summary": shares}]
+
+    def frame(self) -> pd.DataFrame:
+        """One row for each change of each minimal cause of each explanation.
+
+        Columns: `failure`, counted from 0, `algorithm`, `run`, `index`, `cause`, counted from 0, `characteristic`, `unit`,
+        `original`, `value`, `boundary`, `alone` [unit], `fraction`, `outcome`, `safety_degree` [m or -m/s], `robustness`.
+        """
+        rows = []
+        for i, one in enumerate(self.explanations):
+            algorithm, run, index = one.handle or (None, None, None)
+            for j, cause in enumerate(one.causes):
+                for member in CharacteristicSet.of(self.study.vehicle.characteristics):
+                    if member.name in cause.changes:
+                        rows.append((i, algorithm, run, index, j, member.name, member.unit, member.original, cause.changes[member.name],
+                                     cause.boundary[member.name], cause.alone[member.name], cause.fraction, cause.outcome,
+                                     cause.safety_degree, one.robustness.share))
+        return pd.DataFrame(rows, columns=["failure", "algorithm", "run", "index", "cause", "characteristic", "unit", "original", "value",
+                                           "boundary", "alone", "fraction", "outcome", "safety_degree", "robustness"])

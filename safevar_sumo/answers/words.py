@@ -1,0 +1,96 @@
+"""Findings in words, the same on the terminal, in JSON and in reports."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from shlex import quote
+
+from safevar_sumo.answers.because import REMAINDER, Because, Course
+from safevar_sumo.records import Outcome
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+
+WORTH_A_WORD = 0.005
+"""A part of a distance that rounds to less than a centimetre is left out of a sentence [m]."""
+ENDS = {
+    Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is still under way at the end",
+    Outcome.NEVER_MOVED: "never moves", Outcome.SIMULATOR_ERROR: "could not be simulated"}
+PARTS = {"place": ("it begins to brake nearer", "it begins to brake farther away"), "speed": ("it is faster", "it is slower"),
+         "delay": ("it brakes in full later", "it brakes in full sooner"), "deceleration": ("it brakes more weakly", "it brakes harder")}
+"""What costs distance, and what gains some."""
+
+
+def change(member: Characteristic, value: float) -> str:
+    """One change, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
+    return f"{member.name} {member.original:g} -> {value:.6g}{unit(member)} ({(value - member.original) / abs(member.original):+.1%})"
+
+
+def changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
+    """All changes of some values, in the study's order."""
+    told = [change(member, values[member.name]) for member in characteristics
+            if values.get(member.name, member.original) != member.original]
+    return ", ".join(told) or "no change at all"
+
+
+def unit(member: Characteristic) -> str:
+    return "" if member.unit == "-" else f" {member.unit}"
+
+
+def direction(member: Characteristic, value: float) -> str:
+    """Which way a characteristic is changed, such as `mass up`."""
+    return f"{member.name} {'up' if value > member.original else 'down'}"
+
+
+def command(study: str, values: Mapping[str, float]) -> str:
+    """The command that simulates these changes of a study."""
+    told = (f"--set {quote(f'{name}={value!r}')}" for name, value in values.items())
+    return " ".join(["python -m safevar_sumo simulate", quote(study), *told])
+
+
+def joined(parts: Iterable[str]) -> str:
+    """Parts of a sentence as one speaks them."""
+    *first, last = parts
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def how(course: Course) -> str:
+    """How a drive ended."""
+    if course.outcome == Outcome.COLLISION:
+        return f"hits at {course.collision_speed:.2f} m/s"
+    end = ENDS.get(Outcome(course.outcome), course.outcome)
+    return end if course.safety_degree != course.safety_degree else f"{end}, safety degree {course.safety_degree:.2f} m"
+
+
+def sentence(told: Because) -> str:
+    """Why the changed vehicle is less safe than the original, in one sentence or two."""
+    ends = f"The original {how(told.original)}; this one {how(told.changed)}."
+    one, other = told.original.braking, told.changed.braking
+    if one is None and other is None:
+        return f"{ends} Neither of them brakes."
+    if not told.parts:
+        return f"{ends} {'The original' if one is None else 'It'} does not brake."
+    unbraked = "" if other is not None else " without braking"
+    pieces = [f"{abs(told.parts[name]):.2f} m {'' if told.parts[name] > 0 else 'gained '}because {PARTS[name][told.parts[name] < 0]}"
+              f"{_numbers(told, name)}"
+              for name in sorted(PARTS, key=lambda name: -told.parts[name]) if abs(told.parts[name]) >= WORTH_A_WORD]
+    if abs(told.parts["remainder"]) > REMAINDER:
+        pieces.append(f"{told.parts['remainder']:+.2f} m that this does not explain")
+    if not pieces:
+        return f"{ends} They brake alike."
+    return f"{ends} Of the {told.lost:.2f} m lost{unbraked}: {joined(pieces)}."
+
+
+def _numbers(told: Because, part: str) -> str:
+    """What a part was, and what it is with the original."""
+    one, other = told.original.braking, told.changed.braking
+    if one is None or other is None:
+        return ""
+    pairs = {"place": (other.gap, one.gap, "m before"), "speed": (other.full_speed, one.full_speed, "m/s"),
+             "delay": (other.delay, one.delay, "s after the command"),
+             "deceleration": (other.deceleration, one.deceleration, "m/s^2")}
+    there, here, name = pairs[part]
+    return f" ({there:.2f} instead of {here:.2f} {name})"
+
+
+def number_of(count: int, what: str) -> str:
+    """`1 change`, `2 changes`."""
+    return f"{count} {what}{'' if count == 1 else 's'}"

@@ -1,0 +1,48 @@
+"""The command that explains failures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+from rich.console import Console
+
+from safevar_sumo.cli.program import commands
+from safevar_sumo.cli.simulating import jobs_option, json_option, results_or_study, unsafe_option
+from safevar_sumo.results import make_directory, write_whole
+
+
+@commands.command()
+@click.argument("place", metavar="DIR|STUDY")
+@click.option("--solution", "solutions", multiple=True, metavar="ALG:RUN:N",
+              help="Explain the N-th solution of a run, from 0; may be repeated.  [default: the failures that matter]")
+@unsafe_option
+@click.option("--top", type=click.IntRange(1, 1000), default=8, show_default=True, help="How many failures are explained in full.")
+@click.option("--limit", type=click.IntRange(min=1), default=40_000, show_default=True, metavar="N",
+              help="Simulations, about, for the minimal causes of all failures; of more failures a random sample is looked into.")
+@jobs_option
+@json_option
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write causes.json, causes.csv and a picture there.")
+def explain(place: str, solutions: tuple[str, ...], unsafe: str | None, top: int, limit: int, jobs: int | None, as_json: bool,
+            out: Path | None) -> None:
+    """Explain failures of results in DIR, or all over the domain of STUDY: which changes did it, how little is enough, why."""
+    from safevar_sumo import answers
+    from safevar_sumo.terminal.explanation import print_explained
+    from safevar_sumo.terminal.stages import stages
+
+    source = results_or_study(place)
+    if out is not None:
+        make_directory(out)
+    with stages(Console(stderr=True)) as progress:
+        told = answers.explain(source, solutions=solutions, unsafe=unsafe, top=top, limit=limit, jobs=jobs, progress=progress)
+    records = json.dumps(told.records(), indent=2, allow_nan=False)
+    if as_json:
+        click.echo(records)
+    else:
+        print_explained(Console(), place, told)
+    if out is not None:
+        write_whole(out / "causes.json", records + "\n")
+        write_whole(out / "causes.csv", told.frame().to_csv(index=False, lineterminator="\n"))
+        answers.save(answers.necessity_figure(told), out / "necessity.png")
+        click.echo(f"Causes: {out}", err=as_json)

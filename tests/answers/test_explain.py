@@ -1,0 +1,113 @@
+"""Explanations of simulated failures, everything they say simulated afresh."""
+
+from __future__ import annotations
+
+import json
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from slippery import Here
+
+from safevar_sumo.analysis import Case, load_cases
+from safevar_sumo.answers import Explained, explain
+from safevar_sumo.answers.bench import Bench
+from safevar_sumo.answers.boundary import RESOLUTION
+from safevar_sumo.cli.program import commands
+from safevar_sumo.errors import InputError
+from safevar_sumo.results import handles
+
+
+@pytest.fixture(scope="module")
+def case(slippery: Path) -> Case:
+    return load_cases([slippery])[0]
+
+
+@pytest.fixture(scope="module")
+def told(case: Case) -> Explained:
+    return explain(case, top=3, pool=Here())
+
+
+def collides(case: Case, settings: list[dict[str, float]]) -> list[bool]:
+    members = case.characteristics
+    rows = np.array([members.setting(values, "test") for values in settings])
+    assert (members.filter(rows) == rows).all(), "a value that the filter takes for no change"
+    return list(Bench(case.study, Here()).evaluate(rows, "afresh").collided)
+
+
+def test_every_minimal_cause_is_unsafe_and_no_proper_subset_of_it_is(case: Case, told: Explained) -> None:
+    assert str(told.unsafe) == "collision"
+    causes = [cause.changes for one in told.explanations for cause in one.causes]
+    assert causes
+    assert all(collides(case, causes))
+    proper = [dict(subset) for changes in causes for size in range(len(changes)) for subset in combinations(changes.items(), size)]
+    assert not any(collides(case, proper))
+
+
+def test_every_boundary_is_unsafe_and_just_below_it_is_safe(case: Case, told: Explained) -> None:
+    causes = [cause for one in told.explanations for cause in one.causes]
+    assert all(collides(case, [cause.boundary for cause in causes]))
+    original = dict(zip(case.characteristics.names, case.characteristics.original, strict=True))
+    below = [{name: original[name] + (cause.fraction - 2 * RESOLUTION) * (value - original[name]) for name, value in cause.changes.items()}
+             for cause in causes]
+    assert not any(collides(case, below))
+
+
+def test_the_records_are_those_of_the_solutions(case: Case, told: Explained) -> None:
+    *records, last = json.loads(json.dumps(told.records(), allow_nan=False))
+    known = [str(handle) for handle in handles(case.solutions)]
+    for one in records:
+        assert list(one) == ["algorithm", "run", "index", "setting", "outcome", "safety_degree", "changed", "minimal_causes", "robustness",
+                             "because"]
+        row = case.solutions.iloc[known.index(f"{one['algorithm']}:{one['run']}:{one['index']}")]
+        assert one["setting"] == row[list(case.characteristics.names)].to_dict()
+        assert (one["outcome"], one["safety_degree"]) == (row["outcome"], row["safety_degree"])
+        for cause in one["minimal_causes"]:
+            assert list(cause) == ["changes", "boundary", "fraction", "outcome", "safety_degree"]
+            assert set(cause["changes"]) <= set(one["changed"])
+            assert all(one["setting"][name] == value for name, value in cause["changes"].items())
+        assert 0 <= one["robustness"] <= 1
+        assert one["because"].startswith("The original stops")
+    assert list(last) == ["summary"]
+    assert list(last["summary"]) == ["necessary", "changed"]
+    assert all(share <= last["summary"]["changed"][name] for name, share in last["summary"]["necessary"].items())
+
+
+def test_the_failures_that_matter_come_first(case: Case, told: Explained) -> None:
+    crashes = case.solutions[case.solutions["outcome"] == "collision"]
+    reasons = {reason: one for one in told.explanations for reason in one.reasons}
+    assert len(reasons["fewest changes"].changed) == crashes["f_num_diff"].min()
+    assert reasons["most severe"].safety_degree == crashes["safety_degree"].min()
+    assert told.failures == told.analysed == len(crashes[list(case.characteristics.names)].drop_duplicates())
+
+
+def test_the_lost_distance_adds_up(told: Explained) -> None:
+    for one in told.explanations:
+        first, other = one.because.original, one.because.changed
+        assert first.braking is not None
+        assert other.braking is not None
+        assert one.because.lost == pytest.approx(first.safety_degree - other.braking.margin, abs=0.05)
+
+
+def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
+    safe = case.solutions["f_safe"].idxmax()
+    handle = str(handles(case.solutions)[safe])
+    (one,) = explain(case, solutions=[handle], unsafe="collision", pool=Here()).explanations
+    assert (str(one.handle), one.causes, one.reasons) == (handle, (), ("asked for",))
+    with pytest.raises(InputError, match="nsga2:7:0"):
+        explain(case, solutions=["nsga2:7:0"], pool=Here())
+
+
+def test_nothing_unsafe_is_an_answer(slippery: Path) -> None:
+    done = CliRunner().invoke(commands, ["explain", str(slippery), "--unsafe", "below=-9", "--jobs", "1", "--json"])
+    assert (done.exit_code, json.loads(done.stdout)) == (0, [{"summary": {"necessary": {}, "changed": {}}}])
+
+
+@pytest.mark.parametrize(("arguments", "says"), [
+    (["--unsafe", "bad"], "below=X"), (["--unsafe", "below=nan"], "below=X"), (["--solution", "nsga2"], "ALGORITHM:RUN:N")])
+def test_what_cannot_be_read_is_refused(slippery: Path, arguments: list[str], says: str) -> None:
+    done = CliRunner().invoke(commands, ["explain", str(slippery), "--jobs", "1", *arguments])
+    assert isinstance(done.exception, InputError)
+    assert says in str(done.exception)
