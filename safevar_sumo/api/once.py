@@ -20,6 +20,10 @@ from safevar_sumo.study import Study, StudyLike, load_study
 if TYPE_CHECKING:
     import pandas as pd
 
+WORDS = {
+    Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is under way when the time is up",
+    Outcome.NEVER_MOVED: "never moves"}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
@@ -79,6 +83,14 @@ class Simulation:
         """Step by step, one row each, units in the columns' names; empty (NaN) is what there is nothing to tell of."""
         return trace_frame(self.drives, self._seen)
 
+    @property
+    def verdict(self) -> str:
+        """How it ended, in words."""
+        if self.outcome is Outcome.COLLISION:
+            return f"collides at {self.collision_speed:.2f} m/s"
+        least = self.metrics["safety_degree"]
+        return WORDS[self.outcome] + ("" if np.isnan(least) else f", at the nearest {least:.2f} m from a collision")
+
     def record(self) -> dict[str, Any]:
         """As plain values, as `simulate --json` prints it; undefined is None."""
         return {"study": self.study.name, "vcs": dict(self.setting), **record(self.evaluation, 0)}
@@ -113,8 +125,13 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
         If SUMO fails.
     """
     chosen, system = assembled(study)
+    asked = system.characteristics.setting(changes or {}, "changes", beyond=beyond)
+    return beside_the_original(chosen, system, asked, filtered=filtered, gui=gui)
+
+
+def beside_the_original(chosen: Study, system: System, asked: FloatArray, *, filtered: bool = True, gui: bool = False) -> Simulation:
+    """Simulate a setting that is asked for, shape (n,), and the original vehicle."""
     characteristics = system.characteristics
-    asked = characteristics.setting(changes or {}, "setting", beyond=beyond)
     setting = characteristics.filter(asked) if filtered else asked
     original = _simulated(chosen, system, characteristics.original, characteristics.original)
     if np.array_equal(setting, characteristics.original) and not gui:

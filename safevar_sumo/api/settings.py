@@ -16,7 +16,7 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.progress import counted
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import evaluations_frame
-from safevar_sumo.study import StudyLike
+from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
@@ -62,12 +62,16 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | npt.ArrayLike, *, filter
     asked, index = _table(settings, characteristics)
     _check(asked, characteristics, beyond)
     rows = characteristics.filter(asked) if filtered else asked
+    return _described(characteristics, evaluated(chosen, rows, jobs, progress)).set_axis(index)
+
+
+def evaluated(study: Study, rows: FloatArray, jobs: int | None = None, progress: bool = False) -> Evaluations:
+    """Simulate settings, shape (M, n), in worker processes."""
     if not len(rows):
-        return _described(characteristics, Evaluations.none(len(characteristics), METRICS)).set_axis(index)
+        return Evaluations.none(rows.shape[1], METRICS)
     showing: Any = counted(Console(stderr=True), "settings", len(np.unique(rows, axis=0))) if progress else nullcontext(_silent)
-    with local_pool(jobs or available_cores(), chosen.search.time_limit) as pool, showing as done:
-        found = evaluate_all(chosen, rows, pool, done)
-    return _described(characteristics, found).set_axis(index)
+    with local_pool(jobs or available_cores(), study.search.time_limit) as pool, showing as done:
+        return evaluate_all(study, rows, pool, done)
 
 
 def _table(settings: pd.DataFrame | npt.ArrayLike, characteristics: CharacteristicSet) -> tuple[FloatArray, Any]:

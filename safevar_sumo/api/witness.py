@@ -8,7 +8,7 @@ import numpy as np
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.metrics import time_to_collision
-from safevar_sumo.records import TIME_DECIMALS, Command, Drives, Nominal, Observation
+from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Command, Drives, Nominal, Observation
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,16 +37,17 @@ def trace_frame(drives: Drives, witness: Witness) -> pd.DataFrame:
     """One row per step of the only vehicle while its simulation counts.
 
     Where the obstacle was (`gap` along the vehicle's path, `lateral` from the middle of its lane) and what the ADS saw of
-    it; `ttc` is empty while nothing is closing, a gap while there is no obstacle ahead.
+    it; `ttc` is empty while nothing is closing, as a standing vehicle is not, a gap while there is no obstacle ahead.
     """
     import pandas as pd  # takes longer to load than the simulation
 
     trace = drives.trace
     shown = trace.active[:, 0]
+    closing = np.where(trace.speed > STANDSTILL, time_to_collision(drives), np.inf)
     columns = {
         "time [s]": trace.time, "position [m]": trace.position[:, 0], "speed [m/s]": trace.speed[:, 0],
         "acceleration [m/s^2]": np.diff(trace.speed[:, 0], prepend=trace.speed[:1, 0]) / trace.step, "gap [m]": trace.gap[:, 0],
-        "ttc [s]": time_to_collision(drives)[:, 0], "throttle [-]": trace.throttle[:, 0], "brake [-]": trace.brake[:, 0],
+        "ttc [s]": closing[:, 0], "throttle [-]": trace.throttle[:, 0], "brake [-]": trace.brake[:, 0],
         "gear [-]": trace.gear[:, 0], "lateral [m]": trace.lateral[:, 0], "lateral speed [m/s]": trace.lateral_speed[:, 0]}
     frame = pd.DataFrame({name: values[shown] for name, values in columns.items()})
     seen = pd.DataFrame([{"time [s]": round(float(one.time), TIME_DECIMALS),

@@ -21,3 +21,19 @@ def check_output(path: Path, flag: str, endings: tuple[str, ...]) -> None:
     if path.suffix.lower() not in endings:
         raise InputError(flag, str(path), f"a file that ends in {', '.join(endings)}")
     check_writable(path, flag)
+
+
+def refuse_inputs(path: Path, flag: str, *inputs: str | Path) -> None:
+    """Refuse to write over what a command reads: a file, or a file of a results directory.
+
+    Raises
+    ------
+    InputError
+        Naming the flag and the file.
+    """
+    if not path.exists():
+        return
+    for one in map(Path, inputs):
+        read = [one, *one.glob("*.*"), *one.glob("runs/*")] if one.is_dir() else [one]
+        if any(place.exists() and path.samefile(place) for place in read if place.suffix not in PICTURES):
+            raise InputError(flag, f"{path} is what the command reads", "another file")

@@ -92,8 +92,12 @@ def test_simulate_agrees_with_the_study_that_found_the_setting(in_tmp: Path) -> 
 def test_trace_has_every_quantity_with_its_unit(study: str, in_tmp: Path) -> None:
     run("simulate", study, "--trace", "trace.csv")
     frame = pd.read_csv("trace.csv")
-    assert list(frame.columns) == ["time [s]", "position [m]", "speed [m/s]", "acceleration [m/s^2]", "gap [m]", "ttc [s]", "throttle [-]",
-                                   "brake [-]", "gear [-]"]
+    assert list(frame.columns) == [
+        "time [s]", "position [m]", "speed [m/s]", "acceleration [m/s^2]", "gap [m]", "ttc [s]", "throttle [-]", "brake [-]", "gear [-]",
+        "lateral [m]", "lateral speed [m/s]", "seen speed [m/s]", "seen gap [m]", "seen closing speed [m/s]", "seen lateral [m]",
+        "seen lateral speed [m/s]"]
+    assert frame.loc[frame["speed [m/s]"] < 1e-3, "ttc [s]"].isna().all(), "a standing vehicle closes nothing"
+    assert frame["ttc [s]"].notna().any()
     step = np.diff(frame["time [s]"])
     assert np.allclose(step, step[0])
     assert np.allclose(np.diff(frame["speed [m/s]"]) / step, frame["acceleration [m/s^2]"][1:])

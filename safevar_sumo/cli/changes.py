@@ -1,0 +1,69 @@
+"""What `--set` says: a value, a share of the original more or less, or a sweep over several values."""
+
+from __future__ import annotations
+
+import re
+from itertools import product
+
+import numpy as np
+
+from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.records import FloatArray
+from safevar_sumo.vehicles import CharacteristicSet
+
+NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+SHARE = re.compile(r"([+-](?:\d+\.?\d*|\.\d+))%")
+SWEEP = re.compile(rf"({NUMBER})\.\.({NUMBER})(?::(\d{{1,6}}))?")
+SWEPT = 11
+"""Values of a sweep that does not say how many."""
+MOST = 10_000
+"""Settings of all sweeps together."""
+LEGAL = "NAME=VALUE in the characteristic's unit, NAME=+10% of the original, or NAME=FROM..TO, NAME=FROM..TO:NUMBER"
+
+
+def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, beyond: bool) -> dict[str, list[float]]:
+    """The values that each named characteristic is to take, one after the other.
+
+    Raises
+    ------
+    InputError
+        If a change has another form, a name is unknown or given twice, or a value is outside its domain.
+    """
+    found: dict[str, list[float]] = {}
+    for change in changes:
+        name, sign, text = (part.strip() for part in change.partition("="))
+        if not sign:
+            raise InputError("--set", repr(change), LEGAL)
+        if name in found:
+            raise InputError("--set", f"{name} is set twice", "each characteristic once")
+        if name not in characteristics.names:
+            raise InputError("--set", f"there is no characteristic {name!r}", one_of(characteristics.names))
+        member = characteristics.members[characteristics.names.index(name)]
+        found[name] = _values(change, text, member.original)
+        for value in found[name]:
+            member.check(value, "--set", beyond=beyond)
+    if np.prod([len(values) for values in found.values()], dtype=float) > MOST:
+        raise InputError("--set", f"{' '.join(changes)}: more than {MOST} settings", "shorter sweeps, FROM..TO:NUMBER")
+    return found
+
+
+def settings_of(changes: dict[str, list[float]], base: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
+    """Every combination of the values, over a setting of shape (n,); shape (M, n)."""
+    columns = [characteristics.names.index(name) for name in changes]
+    rows = []
+    for values in product(*changes.values()):
+        row = base.copy()
+        row[columns] = values
+        rows.append(row)
+    return np.array(rows)
+
+
+def _values(change: str, text: str, original: float) -> list[float]:
+    if share := SHARE.fullmatch(text):
+        return [original + abs(original) * float(share[1]) / 100]
+    if sweep := SWEEP.fullmatch(text):
+        return np.linspace(float(sweep[1]), float(sweep[2]), max(1, int(sweep[3] or SWEPT))).tolist()  # type: ignore[no-any-return]
+    try:
+        return [float(text)]
+    except ValueError:
+        raise InputError("--set", repr(change), LEGAL) from None

@@ -1,0 +1,94 @@
+"""What `simulate` is told, and what it tells."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from safevar_sumo.cli.changes import read_changes, settings_of
+from safevar_sumo.cli.program import commands
+from safevar_sumo.errors import InputError
+from safevar_sumo.study import load_study
+from safevar_sumo.vehicles import CharacteristicSet
+
+SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+
+
+def simulate(*arguments: str) -> Result:
+    return CliRunner(env={"COLUMNS": "80"}).invoke(commands, ["simulate", *arguments])
+
+
+@pytest.mark.parametrize(("change", "values"), [
+    ("mass=2500", [2500.0]), ("mass=+10%", [2644.4]), ("mass=-5%", [2283.8]), ("tireFric=1.0..1.5:3", [1.0, 1.25, 1.5]),
+    ("tireFric=1.5..1:2", [1.5, 1.0]), ("tireFric = 1.0..2.0", [1 + i / 10 for i in range(11)]), ("mass=2.5e3", [2500.0]),
+])
+def test_a_change_is_a_value_a_share_or_a_sweep(change: str, values: list[float]) -> None:
+    (found,) = read_changes((change,), SUN, beyond=False).values()
+    assert found == pytest.approx(values)
+
+
+@pytest.mark.parametrize(("changes", "told"), [
+    (("mass",), "NAME=VALUE"), (("mass=",), "NAME=VALUE"), (("mass=10%",), "NAME=VALUE"), (("mass=1..",), "NAME=VALUE"),
+    (("mass=2300", "mass=2400"), "mass is set twice"), (("weight=1",), "weight"), (("mass=+50%",), "mass = 3606"),
+    (("mass=2100..9000",), "mass = 2790"), (("mass=2100..2200:999", "tireFric=1..2:999"), "more than 10000 settings"),
+    (("mass=nan",), "nan"),
+])
+def test_a_change_that_cannot_be_used_is_told(changes: tuple[str, ...], told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        read_changes(changes, SUN, beyond=False)
+
+
+def test_sweeps_are_combined_over_the_base() -> None:
+    rows = settings_of({"mass": [2100.0, 2200.0], "tireFric": [1.0, 2.0]}, SUN.original, SUN)
+    assert rows.shape == (4, 12)
+    assert rows[:, [6, 8]].tolist() == [[2100, 1], [2100, 2], [2200, 1], [2200, 2]]
+    assert np.array_equal(np.delete(rows, [6, 8], axis=1), np.repeat(np.delete(SUN.original, [6, 8])[np.newaxis], 4, axis=0))
+
+
+def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them() -> None:
+    told = simulate("rain", "--set", "tireFric=1.1", "--set", "mass=2600", "--set", "dragCoeff=0.301")
+    assert "original" in told.stdout
+    assert "The original vehicle stops, at the nearest 2.2" in told.stdout
+    assert "less safe than the original" in told.stdout
+    assert "note: dragCoeff = 0.301 is so near the original that the filter put 0.3 back" in told.stderr
+    assert "changed vehicle" not in simulate("rain").stdout
+
+
+def test_a_sweep_is_a_table_under_the_original_or_a_list() -> None:
+    told = simulate("rain", "--set", "tireFric=1.0..1.5:3", "--json")
+    records = json.loads(told.stdout)
+    assert [one["vcs"]["tireFric"] for one in records] == [1.0, 1.25, 1.5]
+    single = json.loads(simulate("rain", "--set", "tireFric=1.25", "--json").stdout)
+    assert records[1] == single
+    rows = [line.split("│") for line in simulate("rain", "--set", "tireFric=1.0..1.5:3").stdout.splitlines() if line.startswith("│")]
+    assert [float(row[1]) for row in rows] == [3.5, 1.0, 1.25, 1.5]
+
+
+def test_values_beyond_the_domain_are_taken_when_asked_for() -> None:
+    assert isinstance(simulate("sun", "--set", "tireFric=0.8").exception, InputError)
+    assert "0.8 (beyond)" in simulate("sun", "--set", "tireFric=0.8", "--beyond").stdout
+
+
+def test_nothing_that_is_read_is_written_over(in_tmp: Path) -> None:
+    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n')
+    for flag in ("--trace", "--plot"):
+        refused = simulate("mine.toml", flag, "mine.toml")
+        assert isinstance(refused.exception, InputError)
+        assert flag in str(refused.exception)
+    assert Path("mine.toml").read_text().startswith("extends")
+    assert isinstance(simulate("sun", "--set", "mass=2100..2200", "--trace", "x.csv").exception, InputError)
+    assert not Path("x.csv").exists()
+
+
+@pytest.mark.parametrize("width", ["20", "40", "80"])
+@pytest.mark.parametrize("title", ["[/m]", "[bold]x[/red] \\\\", "a\\u001b[31mb\\nc"])
+def test_titles_are_no_markup_and_control_nothing(title: str, width: str, in_tmp: Path) -> None:
+    Path("mine.toml").write_text(f'extends = "smoke"\nname = "mine"\ntitle = "{title}"\n')
+    told = CliRunner(env={"COLUMNS": width}).invoke(commands, ["simulate", "mine.toml"])
+    assert told.exception is None
+    assert "\x1b" not in told.stdout
+    assert max(map(len, told.stdout.partition("The original")[0].splitlines())) <= int(width)
