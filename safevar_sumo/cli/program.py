@@ -20,6 +20,7 @@ COMMANDS = {
     "explain": ("explain", "Explain failures: which changes did it, how little is enough, and why."),
     "tables": ("answers", "Answer the research questions as tables."),
     "figures": ("answers", "Draw the figures of results."),
+    "report": ("report", "Write one page about results: verdict, causes, replays, tables, figures."),
     "import": ("reference", "Make results of solutions in the published package's CSV format."),
     "validate": ("reference", "Compare a study with reference data, row by row."),
     "calibrate": ("reference", "Fit a study's free parameters to reference data."),

@@ -13,8 +13,9 @@ from safevar_sumo.api import Simulation
 from safevar_sumo.api.once import beside_the_original
 from safevar_sumo.api.settings import evaluated
 from safevar_sumo.cli.changes import read_changes, settings_of
-from safevar_sumo.cli.outputs import PICTURES, check_output, refuse_inputs
+from safevar_sumo.cli.outputs import refuse_inputs
 from safevar_sumo.cli.program import commands
+from safevar_sumo.cli.showing import Shown, showing_options
 from safevar_sumo.cli.target import Target, replay_options, target_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
@@ -32,21 +33,21 @@ from safevar_sumo.terminal.simulation import print_simulation, print_sweep
 @click.option("--no-filter", is_flag=True, help="Keep changes that are smaller than the filter's thresholds.")
 @click.option("--beyond", is_flag=True, help="Take values beyond the domains too.")
 @click.option("--trace", type=click.Path(path_type=Path), metavar="FILE.csv", help="Write the simulation step by step.")
-@click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help="Draw it beside the original vehicle: png, pdf or svg.")
+@showing_options
 @click.option("--gui", is_flag=True, help="Show it in sumo-gui.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def simulate_command(study: str, solution: str | None, choice: str | None, changes: tuple[str, ...], no_filter: bool, beyond: bool,
-                     trace: Path | None, plot: Path | None, gui: bool, as_json: bool) -> None:
+                     trace: Path | None, gui: bool, as_json: bool, **shown: Path | None) -> None:
     """Simulate STUDY once, or a solution of the results directory DIR with the study as recorded there."""
-    target = target_of(study, solution, choice)
+    target, showing = target_of(study, solution, choice), Shown(**shown)
     system = assemble(target.study, target.source)
     swept = read_changes(changes, system.characteristics, beyond)
     base = system.characteristics.original if target.setting is None else target.setting
     asked = settings_of(swept, base, system.characteristics)
-    _check_outputs(study, trace, plot)
+    _check_outputs(study, trace, showing)
     if any(len(values) > 1 for values in swept.values()):
-        if trace is not None or plot is not None or gui:
-            raise InputError("--set", f"{' '.join(changes)} is a sweep", "one value for each with --trace, --plot or --gui")
+        if trace is not None or showing.asked or gui:
+            raise InputError("--set", f"{' '.join(changes)} is a sweep", "one value for each with --trace, --plot, --animate or --gui")
         _sweep(target, system, asked, tuple(swept), not no_filter, as_json)
         return
     found = beside_the_original(target.study, system, asked[0], filtered=not no_filter, gui=gui)
@@ -54,20 +55,17 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
         _warn_of_differences(target, found)
     if trace is not None:
         _write_trace(trace, found)
-    if plot is not None:
-        _draw(plot, system, found)
+    if showing.asked:
+        showing.show(target.study, system, found.evaluation.settings[0])
     _tell(target, found, as_json)
 
 
-def _check_outputs(study: str, trace: Path | None, plot: Path | None) -> None:
+def _check_outputs(study: str, trace: Path | None, showing: Shown) -> None:
     if trace is not None:
         refuse_inputs(trace, "--trace", study)
         check_writable(trace, "--trace")
-    if plot is not None:
-        refuse_inputs(plot, "--plot", study)
-        check_output(plot, "--plot", PICTURES)
-        if trace is not None and plot.resolve() == trace.resolve():
-            raise InputError("--plot", f"{plot} is what --trace writes", "another file")
+    if showing.asked:
+        showing.check(study)
 
 
 def _sweep(target: Target, system: System, asked: FloatArray, names: tuple[str, ...], filtered: bool, as_json: bool) -> None:
@@ -104,12 +102,6 @@ def _warn_of_differences(target: Target, found: Simulation) -> None:
     assert target.recorded is not None
     for one in differences(found.evaluation, target.recorded):
         click.echo(f"warning: {target.handle} of {target.source}: {one}; other versions or code than those of the study?", err=True)
-
-
-def _draw(path: Path, system: System, found: Simulation) -> None:
-    from safevar_sumo.showing import compare, draw_comparison, write_figure
-
-    write_figure(draw_comparison(compare(found.study, system, found.evaluation.settings[0])), path)
 
 
 def _write_trace(path: Path, found: Simulation) -> None:

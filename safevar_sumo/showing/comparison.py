@@ -51,7 +51,7 @@ class Comparison:
         return changes_in_words(self.characteristics, self.evaluations.settings[CHANGED])
 
     def verdict(self, row: int) -> str:
-        """How a drive ended, in words: hits at 3.9 m/s, or stops 2.22 m before."""
+        """How a drive ended, in words: hits at 3.9 m/s, or stops with 2.22 m to spare."""
         drives = self.film.drives
         if not math.isnan(drives.collision_speed[row]):
             return f"hits at {drives.collision_speed[row]:.1f} m/s"
@@ -59,13 +59,13 @@ class Comparison:
         word = WORDS[Outcome(str(drives.outcome[row]))]
         if nearest is None or drives.outcome[row] != Outcome.STOPPED:
             return word
-        return f"{word} {drives.trace.gap[nearest, row]:.2f} m before"
+        return f"{word} with {drives.trace.gap[nearest, row]:.2f} m to spare"
 
 
 def changes_in_words(characteristics: CharacteristicSet, setting: FloatArray) -> list[str]:
     """What differs from the original: `tireFric 3.5 → 1.1 (-69 %)`."""
     return [f"{member.name} {number(member.original)} → {number(value)}{spaced(member.unit)} "
-            f"({(value - member.original) / abs(member.original) * 100:+.0f} %)"
+            f"({(value - member.original) / abs(member.original) * 100:+.0f}\N{NO-BREAK SPACE}%)"
             for member, value in zip(characteristics, setting.tolist(), strict=True) if value != member.original]
 
 

@@ -123,7 +123,7 @@ def test_moments_of_a_drive(case: Case) -> None:
     assert not trace.brake[trace.time < trace.time[original.brake], 0].any()
     assert trace.gap[original.nearest, 0] == comparison.evaluations.f_safe[0]
     assert hit.nearest == hit.end
-    assert comparison.verdict(0) == f"stops {comparison.evaluations.f_safe[0]:.2f} m before"
+    assert comparison.verdict(0) == f"stops with {comparison.evaluations.f_safe[0]:.2f} m to spare"
     assert comparison.verdict(1) == f"hits at {-comparison.evaluations.f_safe[1]:.1f} m/s"
     apart = divergence(drives)
     assert apart is not None

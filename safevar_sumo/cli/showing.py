@@ -1,0 +1,59 @@
+"""The options of `simulate` that show a vehicle beside the original."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+
+from safevar_sumo.cli.outputs import PICTURES, check_output, refuse_inputs
+from safevar_sumo.records import FloatArray
+from safevar_sumo.simulation import System
+from safevar_sumo.study import Study
+
+Command = Callable[..., Any]
+FILE = click.Path(path_type=Path)
+
+
+class Shown(NamedTuple):
+    """What is to be shown, and where."""
+
+    plot: Path | None
+    animate: Path | None
+
+    @property
+    def asked(self) -> bool:
+        return any(self)
+
+    def check(self, study: str) -> None:
+        """Refuse what cannot be written or is read from `study`, before anything is simulated; raises InputError."""
+        from safevar_sumo.showing import ANIMATIONS, check_animation
+
+        if self.plot is not None:
+            refuse_inputs(self.plot, "--plot", study)
+            check_output(self.plot, "--plot", PICTURES)
+        if self.animate is not None:
+            refuse_inputs(self.animate, "--animate", study)
+            check_output(self.animate, "--animate", tuple(ANIMATIONS))
+            check_animation(self.animate)
+
+    def show(self, study: Study, system: System, setting: FloatArray) -> None:
+        """Simulate a filtered setting, shape (n,), beside the original vehicle, and show both."""
+        from safevar_sumo.showing import animate, compare, draw_comparison, write_figure
+
+        comparison = compare(study, system, setting)
+        if self.plot is not None:
+            write_figure(draw_comparison(comparison), self.plot)
+        if self.animate is not None:
+            animate(comparison, self.animate)
+
+
+def showing_options(command: Command) -> Command:
+    """The options that `Shown` is made of."""
+    for option in (
+            click.option("--animate", type=FILE, metavar="FILE", help="Show both from above, moving: gif, mp4 or html."),
+            click.option("--plot", type=FILE, metavar="FILE", help="Draw it beside the original vehicle: png, pdf or svg.")):
+        command = option(command)
+    return command

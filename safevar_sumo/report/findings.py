@@ -1,0 +1,103 @@
+"""The findings: failures with their minimal causes, and the solutions that are worth a look, each with its replay."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from safevar_sumo.analysis.quality import nondominated
+from safevar_sumo.report.material import Material
+from safevar_sumo.results import Handle, chosen_handle, unsafe_rows
+from safevar_sumo.showing.comparison import changes_in_words
+
+Found = list[dict[str, Any]]
+"""What `explain --json` prints."""
+REPLAYS = 10
+"""Solutions that a report shows, at the most; explained ones come on top."""
+FIRST = ("fewest", "smallest", "most_severe")
+"""What is shown before anything else."""
+OBJECTIVES = ["f_safe", "f_diff", "f_num_diff"]
+
+
+def causes(found: Found, material: Material) -> list[dict[str, Any]]:
+    """The distinct minimal causes, the one of the fewest and smallest changes first, each with its replay at the boundary."""
+    distinct: dict[tuple[str, ...], dict[str, Any]] = {}
+    for failure in found:
+        for cause in failure.get("minimal_causes", []):
+            key = tuple(cause["changes"])
+            if key not in distinct or _size(material, cause) < _size(material, distinct[key]["cause"]):
+                distinct[key] = {"cause": cause, "because": failure["because"], "robustness": failure["robustness"],
+                                 "handle": handle_of(failure)}
+    ordered = sorted(distinct.values(), key=lambda one: _size(material, one["cause"]))
+    return [_told(material, place, one) for place, one in enumerate(ordered[:REPLAYS], 1)]
+
+
+def smallest_cause(found: Found) -> dict[str, Any] | None:
+    """The minimal cause of the fewest changes, of those the one at the smallest fraction."""
+    all_of_them = [cause for failure in found for cause in failure.get("minimal_causes", [])]
+    return min(all_of_them, key=lambda cause: (len(cause["changes"]), cause["fraction"]), default=None)
+
+
+def handle_of(failure: dict[str, Any]) -> str:
+    """The handle of an explained failure, nothing if it did not come from a solution."""
+    return "" if failure["algorithm"] is None else f"{failure['algorithm']}:{failure['run']}:{failure['index']}"
+
+
+def _size(material: Material, cause: dict[str, Any]) -> tuple[int, float]:
+    setting = material.setting_with(cause["boundary"])
+    return len(cause["changes"]), float(material.case.characteristics.largest_change(setting[np.newaxis])[0])
+
+
+def _told(material: Material, place: int, one: dict[str, Any]) -> dict[str, Any]:
+    cause = one["cause"]
+    setting, boundary = material.setting_with(cause["changes"]), material.setting_with(cause["boundary"])
+    members = {member.name: member for member in material.case.characteristics}
+    rows = [{"name": name, "unit": "" if members[name].unit == "-" else members[name].unit, "original": members[name].original,
+             "boundary": cause["boundary"][name], "value": value} for name, value in cause["changes"].items()]
+    comparison = material.compared(setting)
+    return {"title": f"Cause {place}: {', '.join(cause['changes'])}", "anchor": material.anchor("cause", place), "rows": rows,
+            "end": comparison.verdict(comparison.rows[-1]), "because": one["because"], "robustness": one["robustness"],
+            "handle": one["handle"], "boundary": changes_in_words(material.case.characteristics, boundary),
+            "fraction": cause["fraction"], "replay": material.replay(setting)}
+
+
+def replays(material: Material, explained: Found | None) -> list[dict[str, Any]]:
+    """The solutions worth a look: the chosen ones, the explained ones, and unsafe ones that no other beats in every objective."""
+    rows, told = material.solutions, []
+    for place, handle in enumerate(_chosen(material, explained)):
+        row, setting = rows[handle], material.setting_of(Handle.parse(handle))
+        one = {"handle": handle, "anchor": material.anchor("replay", handle), "f_safe": row["f_safe"], "f_diff": row["f_diff"],
+               "f_num_diff": row["f_num_diff"], "outcome": row["outcome"], "open": place == 0 and not explained,
+               "changes": changes_in_words(material.case.characteristics, setting)}
+        told.append(one if material.system is None else {**one, "replay": material.replay(setting)})
+    return sorted(told, key=lambda one: (one["f_safe"], one["handle"]))
+
+
+def _chosen(material: Material, explained: Found | None) -> list[str]:
+    """Their handles, each once."""
+    solutions, degree = material.case.solutions, material.case.original["safety_degree"]
+    if solutions.empty:
+        return []
+    unsafe = unsafe_rows(solutions, degree).tolist()
+    choices = FIRST if any(unsafe) else FIRST[-1:]
+    chosen = [str(chosen_handle(solutions, degree, choice, material.place)) for choice in choices]
+    chosen += [handle_of(failure) for failure in explained or [] if failure.get("algorithm") is not None]
+    best = best_of([row for row, is_unsafe in zip(material.solutions.values(), unsafe, strict=True) if is_unsafe])
+    chosen += [best[place]["handle"] for place in spread(len(best), REPLAYS)]
+    return list(dict.fromkeys(chosen))[:max(REPLAYS, len(choices) + len(explained or []))]
+
+
+def best_of(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The solutions that no other one beats in all three objectives, each point once."""
+    if not rows:
+        return []
+    points = np.array([[row[name] for name in OBJECTIVES] for row in rows], dtype=float)
+    best = {tuple(point) for point in nondominated(points).tolist()}
+    by_point = {tuple(point): row for point, row in zip(points.tolist(), rows, strict=True) if tuple(point) in best}
+    return list(by_point.values())
+
+
+def spread(number: int, most: int) -> list[int]:
+    """At most so many places, evenly over all of them."""
+    return sorted({round(place) for place in np.linspace(0, number - 1, min(number, most)).tolist()})

@@ -1,0 +1,93 @@
+"""What a report is made of: each study's results, the system that they are about, and replays of settings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from safevar_sumo.analysis import Case, load_cases
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import FloatArray
+from safevar_sumo.results import Handle, handles
+from safevar_sumo.results.store import read_manifest
+from safevar_sumo.showing import Comparison, compare
+from safevar_sumo.showing.page import player_data
+from safevar_sumo.showing.scene import scene_of
+from safevar_sumo.simulation import System, assemble
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """One study of a report.
+
+    `place` is its results directory as it was given, `number` its place among the studies, from 1; `system` is None where
+    what the study names cannot be simulated here, and `lacking` says why.
+    """
+
+    number: int
+    place: Path
+    case: Case
+    manifest: Mapping[str, Any]
+    system: System | None
+    lacking: str = ""
+    _compared: dict[bytes, Comparison] = field(default_factory=dict)
+
+    @cached_property
+    def solutions(self) -> dict[str, dict[str, Any]]:
+        """Every solution's row by its handle, which it holds too."""
+        named = zip(handles(self.case.solutions), self.case.solutions.to_dict("records"), strict=True)
+        return {str(handle): {**{str(name): value for name, value in row.items()}, "handle": str(handle)} for handle, row in named}
+
+    def setting_of(self, handle: Handle) -> FloatArray:
+        """A solution's setting, shape (n,)."""
+        row = self.solutions[str(handle)]
+        return np.array([row[name] for name in self.case.characteristics.names], dtype=float)
+
+    def setting_with(self, changes: Mapping[str, float]) -> FloatArray:
+        """The original setting with some values in place of its own, shape (n,)."""
+        setting = self.case.characteristics.original.copy()
+        for name, value in changes.items():
+            setting[self.case.characteristics.names.index(name)] = value
+        return setting
+
+    def compared(self, setting: FloatArray) -> Comparison:
+        """A setting simulated beside the original vehicle, once."""
+        assert self.system is not None
+        key = setting.tobytes()
+        if key not in self._compared:
+            self._compared[key] = compare(self.case.study, self.system, setting)
+        return self._compared[key]
+
+    def replay(self, setting: FloatArray) -> dict[str, Any]:
+        """A setting's animation, as the template `player` takes it."""
+        return player_data(scene_of(self.compared(setting)))
+
+    def anchor(self, *parts: object) -> str:
+        """A name for a place in the page that belongs to this study."""
+        words = "-".join(str(part) for part in ("study", self.number, *parts))
+        return "".join(sign if sign.isascii() and sign.isalnum() else "-" for sign in words)
+
+
+def gather(directories: Iterable[str | Path]) -> list[Material]:
+    """Read results directories.
+
+    Raises
+    ------
+    InputError
+        If one is no results directory, is damaged or is given twice.
+    """
+    places = [Path(directory) for directory in directories]
+    found = []
+    for number, (place, case) in enumerate(zip(places, load_cases(places), strict=True), 1):
+        system, lacking = None, ""
+        try:
+            system = assemble(case.study, str(place))
+        except InputError as error:
+            lacking = f"What this study is about cannot be simulated here: {error.source}: {error.problem}."
+        found.append(Material(number=number, place=place, case=case, manifest=read_manifest(place), system=system, lacking=lacking))
+    return found

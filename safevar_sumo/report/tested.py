@@ -1,0 +1,46 @@
+"""What was tested: vehicle, driving system, scenario, weather, search and versions."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+from safevar_sumo.ads import ADS
+from safevar_sumo.analysis.case import ALGORITHM_TITLES
+from safevar_sumo.report.material import Material
+from safevar_sumo.scenarios import SCENARIOS
+from safevar_sumo.showing.comparison import number
+from safevar_sumo.vehicles import VEHICLES
+
+
+def tested(material: Material) -> dict[str, Any]:
+    """Two sentences, and the characteristics that were varied."""
+    case, study = material.case, material.case.study
+    number_of = len(case.characteristics)
+    return {
+        "who": f"A vehicle ({_described(VEHICLES, study.vehicle.model)}) of which {number_of} characteristics may vary is driven by "
+               f"{study.ads.model} ({_described(ADS, study.ads.model)}) in the scenario {study.scenario.model} "
+               f"({_described(SCENARIOS, study.scenario.model)}), weather: {case.weather.name}.",
+        "how": _how(material),
+        "characteristics": [
+            {"name": one.name, "unit": "" if one.unit == "-" else one.unit, "original": number(one.original), "lower": number(one.lower),
+             "upper": number(one.upper), "threshold": number(one.threshold)} for one in case.characteristics],
+        "remarks": [*case.remarks, *([material.lacking] if material.lacking else [])]}
+
+
+def _how(material: Material) -> str:
+    case, search = material.case, material.case.study.search
+    versions = ", ".join(f"{name} {value}" for name, value in material.manifest["versions"].items())
+    if not case.has_runs:
+        return f"Its {len(case.solutions)} solutions were found elsewhere and imported ({versions})."
+    runs = Counter(algorithm for algorithm, _ in case.finished)
+    who = ", ".join(f"{ALGORITHM_TITLES.get(name, name)} ({count} runs)" for name, count in runs.items()) or "no finished run"
+    return (f"Searched by {who} of at most {search.evaluations} simulations each, {len(case.evaluations)} different vehicles in all, "
+            f"from seed {search.seed}, with {versions}.")
+
+
+def _described(models: Mapping[str, Any], name: str) -> str:
+    """The first sentence of a model's description, the name alone for one that comes from outside."""
+    sentence = (models[name].__doc__ or "").strip().partition("\n")[0].rstrip(".") if name in models else name
+    return sentence[:1].lower() + sentence[1:] if not sentence[1:2].isupper() else sentence

@@ -1,0 +1,59 @@
+"""What was not tested, how far to trust it, and how every number is made again."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Sequence
+from typing import Any
+
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.records import Outcome
+from safevar_sumo.report.findings import Found
+from safevar_sumo.report.material import Material
+
+RUN = "python -m safevar_sumo"
+NOT_MODELLED = (
+    "A search finds failures; that it finds none proves nothing about what it did not try.",
+    "One vehicle in its lane: no steering beyond lane keeping, no single wheels and axles, no suspension, no wind, no sensor "
+    "noise, no traffic beyond the scenario's own, unless the study says otherwise.",
+    "Driving system and vehicle are models. docs/trust.md tells how far the ones of the published settings agree with its raw data.",
+)
+
+
+def trust(material: Material, explained: Found | None) -> dict[str, Any]:
+    """What a reader should hold against the findings of one study."""
+    case = material.case
+    rows = [{"name": name, "published": case.study.published[name], "here": case.original[name]}
+            for name in METRICS if name in case.study.published and not math.isnan(case.original[name])]
+    told = []
+    failed = int((case.evaluations["outcome"] == str(Outcome.SIMULATOR_ERROR)).sum())
+    if failed:
+        told.append(f"{failed} of {len(case.evaluations)} settings could not be simulated; they are in no result.")
+    if explained:
+        shares = [failure["robustness"] for failure in explained if failure.get("robustness") is not None]
+        if shares:
+            fragile = sum(share < 0.8 for share in shares)
+            told.append(f"Of {len(shares)} failures looked into, {fragile} hang on a hair: "
+                        "fewer than 80 % of their neighbours are unsafe too.")
+    if not rows:
+        told.append("No published values of the original vehicle are known to hold the study against.")
+    return {"published": rows, "told": told, "general": NOT_MODELLED}
+
+
+def reproduce(materials: Sequence[Material], parts: Sequence[str]) -> list[dict[str, str]]:
+    """Commands that make the numbers of this page again."""
+    places = " ".join(shlex.quote(str(material.place)) for material in materials)
+    commands = []
+    for material in materials:
+        place, study = shlex.quote(str(material.place)), material.case.study
+        if material.case.has_runs:
+            commands.append({"what": f"The study {study.name}, as its manifest.json records it whole", "command":
+                             f"{RUN} study {study.name} --seed {study.search.seed} --runs {study.search.runs} "
+                             f"--evaluations {study.search.evaluations} --out {place}"})
+        commands.append({"what": "A replay, with figure and animation",
+                         "command": f"{RUN} simulate {place} --most-severe --plot it.png --animate it.html"})
+        commands += [{"what": f"The part {part}", "command": f"{RUN} {part} {place}"} for part in parts]
+    commands.append({"what": "The tables of RQ1 to RQ3", "command": f"{RUN} tables {places}"})
+    commands.append({"what": "The figures", "command": f"{RUN} figures {places} --out figures"})
+    return commands
