@@ -27,6 +27,11 @@ class Shown(NamedTuple):
     def asked(self) -> bool:
         return any(self)
 
+    @property
+    def files(self) -> list[Path]:
+        """What is written, as whole paths."""
+        return [path.resolve() for path in (self.plot, self.animate) if path is not None]
+
     def check(self, study: str) -> None:
         """Refuse what cannot be written or is read from `study`, before anything is simulated; raises InputError."""
         from safevar_sumo.showing import ANIMATIONS, check_animation

@@ -66,6 +66,8 @@ def _check_outputs(study: str, trace: Path | None, showing: Shown) -> None:
         check_writable(trace, "--trace")
     if showing.asked:
         showing.check(study)
+        if trace is not None and trace.resolve() in showing.files:
+            raise InputError("--trace", f"{trace} is what --plot or --animate writes", "another file")
 
 
 def _sweep(target: Target, system: System, asked: FloatArray, names: tuple[str, ...], filtered: bool, as_json: bool) -> None:
