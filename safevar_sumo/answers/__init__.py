@@ -2,11 +2,13 @@
 
 from safevar_sumo.answers.because import Because, Braking, Course
 from safevar_sumo.answers.explanation import explain
-from safevar_sumo.answers.figures import necessity_figure, save
+from safevar_sumo.answers.figures import necessity_figure, pairs_figure, profiles_figure, save
 from safevar_sumo.answers.findings import Cause, Explained, Explanation
 from safevar_sumo.answers.robustness import Robustness
+from safevar_sumo.answers.tolerance import Tolerance, tolerance
 from safevar_sumo.answers.unsafe import Unsafe
 from safevar_sumo.answers.words import changes, command, number_of, sentence
 
-__all__ = ["Because", "Braking", "Cause", "Course", "Explained", "Explanation", "Robustness", "Unsafe", "changes", "command", "explain",
-           "necessity_figure", "number_of", "save", "sentence"]
+__all__ = ["Because", "Braking", "Cause", "Course", "Explained", "Explanation", "Robustness", "Tolerance", "Unsafe", "changes", "command",
+           "explain", "necessity_figure", "number_of", "pairs_figure",
+           "profiles_figure", "save", "sentence", "tolerance"]

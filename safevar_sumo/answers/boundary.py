@@ -38,7 +38,7 @@ def boundaries(bench: Bench, causes: list[MinimalCause], unsafe: Unsafe) -> list
     """
     together = [(cause, cause.columns) for cause in causes]
     alone = [(cause, (column,)) for cause in causes for column in cause.columns]
-    lines = [_Line.of(bench, cause, columns) for cause, columns in [*together, *alone]]
+    lines = [Line.moving(bench, cause, columns) for cause, columns in [*together, *alone]]
     fractions = first_unsafe(bench, lines, unsafe)
     single = iter(zip(lines[len(causes):], fractions[len(causes):], strict=True))
     shrunk = []
@@ -54,7 +54,7 @@ def boundaries(bench: Bench, causes: list[MinimalCause], unsafe: Unsafe) -> list
     return shrunk
 
 
-class _Line(NamedTuple):
+class Line(NamedTuple):
     """Settings from `start` to `end`, shape (n,) each; those at the share `lowest` of it and below do not count."""
 
     start: FloatArray
@@ -62,14 +62,14 @@ class _Line(NamedTuple):
     lowest: float
 
     @classmethod
-    def of(cls, bench: Bench, cause: MinimalCause, columns: tuple[int, ...]) -> _Line:
+    def moving(cls, bench: Bench, cause: MinimalCause, columns: tuple[int, ...]) -> Line:
         """The line on which some columns of a cause go from the original to their values."""
         members = bench.characteristics
-        moving = list(columns)
+        which = list(columns)
         start = cause.setting.copy()
-        start[moving] = members.original[moving]
-        ways = np.abs(cause.setting - members.original)[moving]
-        return cls(start, cause.setting, float(np.max(members.threshold[moving] / ways, initial=0.0)))
+        start[which] = members.original[which]
+        ways = np.abs(cause.setting - members.original)[which]
+        return cls(start, cause.setting, float(np.max(members.threshold[which] / ways, initial=0.0)))
 
     def at(self, shares: FloatArray) -> FloatArray:
         """Settings at shares of the line, shape (K, n)."""
@@ -77,7 +77,7 @@ class _Line(NamedTuple):
         return np.where(part >= 1, self.end, self.start + part * (self.end - self.start))
 
 
-def first_unsafe(bench: Bench, lines: list[_Line], unsafe: Unsafe) -> FloatArray:
+def first_unsafe(bench: Bench, lines: list[Line], unsafe: Unsafe, what: str = "boundaries") -> FloatArray:
     """The first unsafe share of every line, whose end is unsafe; exact to `RESOLUTION` of what counts of it."""
     low, high = np.array([line.lowest for line in lines]), np.ones(len(lines))
     for parts in (GRID, *(FINER,) * ROUNDS):
@@ -85,7 +85,7 @@ def first_unsafe(bench: Bench, lines: list[_Line], unsafe: Unsafe) -> FloatArray
         shares[:, -1] = high
         inner = np.concatenate([line.at(of_it[:-1]) for line, of_it in zip(lines, shares, strict=True)]) if lines else np.zeros((0, 0))
         is_unsafe = np.ones(shares.shape, dtype=bool)
-        is_unsafe[:, :-1] = unsafe.of(bench.evaluate(inner, "boundaries")).reshape(len(lines), parts - 1)
+        is_unsafe[:, :-1] = unsafe.of(bench.evaluate(inner, what)).reshape(len(lines), parts - 1)
         first = np.argmax(is_unsafe, axis=1)
         rows = np.arange(len(lines))
         low, high = np.where(first > 0, shares[rows, np.maximum(first - 1, 0)], low), shares[rows, first]

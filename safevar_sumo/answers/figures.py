@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from safevar_sumo.answers.alone import Alone
 from safevar_sumo.answers.findings import Explained
+from safevar_sumo.answers.pairs import Pair
+from safevar_sumo.answers.tolerance import Tolerance
 from safevar_sumo.errors import InputError
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure
 
 DPI = 200
 FONT = 8
+DEGREE = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"
+UNSAFE = "#d55e00"
 CHANGED, INVOLVED, NECESSARY = "#bbbbbb", "#56b4e9", "#0072b2"
 """Grey and Okabe and Ito's blues: of different lightness, so that they stay apart without colour."""
 
@@ -35,6 +43,81 @@ def necessity_figure(told: Explained) -> Figure:
     return figure
 
 
+def profiles_figure(told: Tolerance) -> Figure:
+    """The safety degree over the domain of each characteristic alone; the original marked, what is unsafe shaded."""
+    columns = min(4, len(told.alone))
+    rows = -(-len(told.alone) // columns)
+    title = f"{told.study.name}: one characteristic at a time (unsafe: {told.unsafe})"
+    figure, axes = new_figure(title, rows, columns, (max(2.3 * columns, 4.6), 1.0 + 1.75 * rows))
+    for axis, one in zip(axes.flat, told.alone, strict=False):
+        _profile(axis, one)
+    for axis in list(axes.flat)[len(told.alone):]:
+        axis.set_axis_off()
+    figure.supylabel(DEGREE, fontsize=FONT, ha="center")
+    figure.supxlabel("dot: the original vehicle; hatched: unsafe; below the dashed line: collisions", fontsize=FONT)
+    return figure
+
+
+def _profile(axis: Axes, one: Alone) -> None:
+    member, profile = one.characteristic, one.profile
+    axis.plot(profile["value"], profile["safety_degree"], color=NECESSARY, linewidth=1.2)
+    for low, high in one.unsafe:
+        axis.axvspan(low, high, facecolor=UNSAFE, alpha=0.35, hatch="////", edgecolor="white", linewidth=0)
+    at_original = profile.loc[profile["value"] == member.original, "safety_degree"]
+    axis.plot([member.original], at_original, marker="o", color="black", markersize=4)
+    if profile["safety_degree"].min() <= 0:
+        axis.axhline(0, color="black", linewidth=0.8, linestyle="--")
+    axis.set_xlim(member.lower, member.upper)
+    axis.set_title(plain(member.name), fontsize=FONT)
+    axis.set_xlabel(f"[{raised(member.unit)}]")
+    axis.locator_params(axis="x", nbins=4)
+
+
+def pairs_figure(told: Tolerance, most: int = 6) -> Figure:
+    """The planes of the worst pairs: those with the largest unsafe share, or the least safety degree where nothing is unsafe.
+
+    Raises
+    ------
+    InputError
+        If pairs were not looked at.
+    """
+    if not told.pairs:
+        raise InputError("--pairs", "there is no pair to draw", "at least two characteristics, looked at in pairs")
+    worst = sorted(told.pairs, key=lambda pair: (-pair.unsafe_share, np.nanmin(pair.safety_degree)))[:most]
+    degrees = np.concatenate([pair.safety_degree.ravel() for pair in worst])
+    columns = min(3, len(worst))
+    rows = -(-len(worst) // columns)
+    title = f"{told.study.name}: the worst pairs (unsafe: {told.unsafe})"
+    figure, axes = new_figure(title, rows, columns, (max(3.0 * columns, 4.6), 1.1 + 2.4 * rows))
+    for axis, pair in zip(axes.flat, worst, strict=False):
+        colours = _plane(axis, pair, (float(np.nanmin(degrees)), float(np.nanmax(degrees))))
+    for axis in list(axes.flat)[len(worst):]:
+        axis.set_axis_off()
+    bar = figure.colorbar(colours, ax=axes, shrink=0.9)
+    bar.set_label(DEGREE, fontsize=FONT)
+    bar.ax.tick_params(labelsize=FONT)
+    figure.supxlabel("dot: the original vehicle; hatched: unsafe; cross: the unsafe setting that is nearest to the original", fontsize=FONT)
+    return figure
+
+
+def _plane(axis: Axes, pair: Pair, limits: tuple[float, float]) -> QuadMesh:
+    """One plane, the first characteristic across."""
+    first, second = pair.characteristics
+    colours = axis.pcolormesh(*pair.values, pair.safety_degree.T, cmap="cividis", vmin=limits[0], vmax=limits[1], shading="nearest")
+    if pair.unsafe.any():
+        axis.contourf(*pair.values, pair.unsafe.T.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
+        axis.contour(*pair.values, pair.unsafe.T.astype(float), levels=[0.5], colors=UNSAFE, linewidths=1.2)
+    axis.plot(first.original, second.original, marker="o", color="white", markeredgecolor="black", markersize=5)
+    if pair.nearest is not None:
+        axis.plot(*pair.nearest, marker="X", color=UNSAFE, markeredgecolor="white", markersize=7)
+    axis.set_xlabel(f"{plain(first.name)} [{raised(first.unit)}]")
+    axis.set_ylabel(f"{plain(second.name)} [{raised(second.unit)}]")
+    axis.set_xlim(first.lower, first.upper)
+    axis.set_ylim(second.lower, second.upper)
+    axis.grid(visible=False)
+    return colours
+
+
 def new_figure(title: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
     """A figure that no global state knows of, and its axes, shape (rows, columns); `size` in inches."""
     import matplotlib.style
@@ -48,7 +131,7 @@ def new_figure(title: str, rows: int, columns: int, size: tuple[float, float]) -
     return figure, axes
 
 
-def save(figure: Figure, path: Path) -> None:
+def save(figure: Figure, path: Path, flag: str = "--out") -> None:
     """Write a figure to a file: png, pdf or svg.
 
     Raises
@@ -59,9 +142,14 @@ def save(figure: Figure, path: Path) -> None:
     try:
         figure.savefig(path, dpi=DPI)
     except OSError as error:
-        raise InputError("--out", f"cannot write {path}: {error.strerror or error}", "a directory that can be written") from None
+        raise InputError(flag, f"cannot write {path}: {error.strerror or error}", "a directory that can be written") from None
 
 
 def plain(name: str) -> str:
     """A name in which matplotlib sees no formula."""
     return name.replace("$", r"\$")
+
+
+def raised(unit: str) -> str:
+    """A unit with its powers raised."""
+    return re.sub(r"\^(-?\d+)", r"$^{\1}$", plain(unit))

@@ -18,6 +18,7 @@ COMMANDS = {
     "simulate": ("simulate", "Simulate a study once: how it ends, its safety metrics and objectives."),
     "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms and metrics."),
     "explain": ("explain", "Explain failures: which changes did it, how little is enough, and why."),
+    "tolerance": ("tolerance", "Find how far each characteristic may go: alone, in pairs, and all together."),
     "tables": ("answers", "Answer the research questions as tables."),
     "figures": ("answers", "Draw the figures of results."),
     "report": ("report", "Write one page about results: verdict, causes, replays, tables, figures."),
