@@ -11,7 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from safevar_sumo.campaign import RUNS_PER_WORKER, Campaign, RunKey, all_runs, carry_out, forecast, run_generator
+from safevar_sumo.campaign import Campaign, RunKey, all_runs, carry_out, forecast, run_generator
+from safevar_sumo.campaign.gathering import BATCHES_PER_WORKER
 from safevar_sumo.computing import PoolLostError, WorkerLostError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
@@ -105,6 +106,29 @@ def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches(study: St
         pd.testing.assert_frame_equal(load(tmp_path / name).evaluations, load(tmp_path / "a").evaluations)
 
 
+class Sizes(FormulaPool):
+    """Keeps the batches' sizes."""
+
+    def __init__(self, workers: int) -> None:
+        super().__init__(workers)
+        self.sizes: list[int] = []
+
+    def submit(self, study: bytes, settings: np.ndarray) -> Future[Evaluations]:
+        self.sizes.append(len(settings))
+        return super().submit(study, settings)
+
+
+def test_runs_share_batches_and_one_run_is_shared_out(study: Study, tmp_path: Path) -> None:
+    large = with_search(study, population=40, evaluations=400, runs=10, algorithms=["rs"])
+    together, alone = Sizes(workers=2), Sizes(workers=2)
+    carried_out(large, tmp_path / "together", together)
+    carried_out(large, tmp_path / "alone", alone, keys=[RunKey("rs", 3)])
+    assert np.mean(together.sizes[1:]) > 3 * large.search.population
+    assert alone.sizes[1:3] == [20, 20]
+    one, other = (load(tmp_path / name).evaluations.query("algorithm == 'rs' and run == 3") for name in ("together", "alone"))
+    pd.testing.assert_frame_equal(one.reset_index(drop=True), other.reset_index(drop=True))
+
+
 def test_another_seed_finds_other_solutions(study: Study, tmp_path: Path) -> None:
     carried_out(study, tmp_path / "a")
     carried_out(with_search(study, seed=2), tmp_path / "b")
@@ -117,11 +141,11 @@ def test_a_campaign_that_breaks_down_anywhere_is_resumed_where_it_was(study: Stu
     for lasts in (1, 2, 3, 7, 20, 41):
         out, first, second = tmp_path / str(lasts), FormulaPool(lasts=lasts), FormulaPool()
         with pytest.raises(PoolLostError, match="broken down"):
-            carried_out(study, out, first)
+            carried_out(study, out, first, batch=study.search.population)
         carried_out(study, out, second)
         assert solutions(out) == solutions(tmp_path / "whole")
         assert set(first.simulated + second.simulated) == set(whole.simulated)
-        under_way = RUNS_PER_WORKER * study.search.population
+        under_way = BATCHES_PER_WORKER * study.search.population
         assert len(first.simulated) + len(second.simulated) <= len(whole.simulated) + under_way
 
 
@@ -250,7 +274,7 @@ def test_every_evaluation_is_read_in_the_order_in_which_it_was_asked_for(study: 
 def test_an_unfinished_directory_is_read_too(study: Study, tmp_path: Path) -> None:
     pool = FormulaPool(lasts=15)
     with pytest.raises(PoolLostError):
-        carried_out(study, tmp_path, pool)
+        carried_out(study, tmp_path, pool, batch=study.search.population)
     results = load(tmp_path)
     in_flight = study.search.population
     assert len(pool.simulated) - 1 - in_flight <= len(results.evaluations) <= len(pool.simulated) - 1, "all but the original vehicle's"

@@ -40,7 +40,7 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     only
         These runs alone, as (algorithm, number from 0); the results are whole once every run is finished.
     batch
-        Settings per SUMO simulation, by default the population's size; never changes a result.
+        Settings per SUMO simulation, at the most, gathered from several runs; never changes a result.
 
     Raises
     ------

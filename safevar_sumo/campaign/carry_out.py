@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
-from concurrent.futures import Future
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
+from safevar_sumo.campaign.gathering import BATCH, Gathering
 from safevar_sumo.campaign.interrupts import interrupts_between_waits
 from safevar_sumo.campaign.keys import RunKey, algorithm_of, run_generator
 from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.computing import PersistentPool, Pool, packed
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations
 from safevar_sumo.results import JournalBusy, ResultsDirectory
 from safevar_sumo.search import Problem
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
-
-RUNS_PER_WORKER = 2
-"""How many runs are under way for each worker: one is computed while another is searched and journalled."""
 
 
 class Campaign(NamedTuple):
@@ -48,7 +45,7 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
     pool
         Computes batches.
     batch
-        Settings per SUMO simulation, the population's size by default.
+        Settings per SUMO simulation at the most, gathered from several runs.
 
     Raises
     ------
@@ -61,11 +58,11 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
     results.begin(original)
     problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations)
     campaign = Campaign(original, {}, 0, [])
-    waiting, active = deque(keys), dict[Future[Evaluations], Run]()
-    runs: set[Run] = set()
+    waiting, runs = deque(keys), set[Run]()
+    gathering = Gathering(persistent, work, batch or BATCH)
 
     def go_on(run: Run) -> None:
-        """Let a run go as far as it can, then have computed what it misses."""
+        """Let a run go as far as it can, then ask for what it misses."""
         nonlocal campaign
         if run.advance():
             campaign.solutions[run.key] = run.result
@@ -73,13 +70,12 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
             runs.discard(run)
             run.close()
         else:
-            for settings in _batches(run.missing, batch or study.search.population):
-                active[persistent.submit(work, settings)] = run
+            gathering.ask(run, run.missing)
 
     try:
         with interrupts_between_waits() as first_of:
-            while waiting or active:
-                while waiting and len(runs) < RUNS_PER_WORKER * persistent.workers:
+            while waiting or runs:
+                while waiting and len(runs) < gathering.runs_wanted(study.search.population):
                     key = waiting.popleft()
                     try:
                         journal = results.journal(str(key))
@@ -89,10 +85,11 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
                     search = algorithm_of(key.algorithm, study).search(problem, run_generator(study, key))
                     runs.add(run := Run(key, search, journal, observer))
                     go_on(run)
-                for future in first_of(active):
-                    run = active.pop(future)
-                    if run.take(future.result()):
-                        go_on(run)
+                gathering.send()
+                for future in first_of(gathering.under_way):
+                    for run, evaluations in gathering.take(future):
+                        if run.take(evaluations):
+                            go_on(run)
     finally:
         for run in runs:
             run.close()
@@ -116,8 +113,3 @@ def _original(work: bytes, characteristics: CharacteristicSet, results: ResultsD
         return journal.evaluations
     finally:
         journal.close()
-
-
-def _batches(settings: FloatArray, size: int) -> Iterator[FloatArray]:
-    for start in range(0, len(settings), size):
-        yield settings[start:start + size]

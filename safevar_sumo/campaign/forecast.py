@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from safevar_sumo.campaign.gathering import BATCH
 from safevar_sumo.computing import PersistentPool, Pool, packed
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.study import Study
@@ -29,7 +30,7 @@ class Forecast(NamedTuple):
 
 def forecast(study: Study, runs: int, pool: Pool, batch: int | None = None) -> Forecast:
     """What carrying out `runs` runs takes at the most, after a short probe of the pool that will do it."""
-    characteristics, size = CharacteristicSet.of(study.vehicle.characteristics), batch or study.search.population
+    characteristics, size = CharacteristicSet.of(study.vehicle.characteristics), batch or min(BATCH, runs * study.search.population)
     persistent, work, rng = PersistentPool(pool, characteristics), packed(study), np.random.default_rng(study.search.seed)
 
     def probe(number: int) -> float:

@@ -10,7 +10,7 @@ import msgspec
 from rich.console import Console
 
 from safevar_sumo.api.running import a_pool, carried_out, prepared
-from safevar_sumo.campaign import RunKey, all_runs, forecast
+from safevar_sumo.campaign import BATCH, RunKey, all_runs, forecast
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.progress import CampaignProgress
@@ -25,7 +25,7 @@ from safevar_sumo.terminal.campaign import print_forecast, print_summary
 @click.option("--algorithms", help="Which algorithms, separated by commas.")
 @click.option("--seed", type=click.IntRange(min=0, max=2**63 - 1), help="Seed of the whole study.")
 @click.option("--batch", type=click.IntRange(1, 10_000),
-              help="Settings per SUMO simulation; never changes a result.  [default: the population's size]")
+              help=f"Settings per SUMO simulation at the most, of several runs; never changes a result.  [default: {BATCH}]")
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the results.  [default: results/STUDY]")
 @click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes.  [default: the cores of this machine]")
 @click.option("--cluster", metavar="ADDRESS", help="Compute on the workers of this Dask scheduler instead.")

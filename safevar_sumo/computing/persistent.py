@@ -1,4 +1,4 @@
-"""A pool that does not give up because a worker did: again, then one setting at a time, then without that setting."""
+"""A pool that does not give up because a worker did: again, then in ever smaller parts, then without the setting that is left."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 ATTEMPTS = 2
 """How often a batch is tried as a whole, and a setting alone: somebody else may have killed the worker."""
+PARTS = 8
+"""Into how many parts a failing batch is split: of 200 settings, one that takes a worker with it costs five workers' time limits."""
 FAILURES_IN_A_ROW = 20
 """So many settings that fail one after the other are a fault of the study, not of the settings."""
 
@@ -49,7 +51,7 @@ class PersistentPool:
             elif attempts > 1:
                 self._attempt(study, settings, attempts - 1, into, must_succeed)
             elif len(settings) > 1:
-                self._one_by_one(study, settings, into)
+                self._in_parts(study, settings, into)
             else:
                 self._give_up(settings, error, into, must_succeed)
 
@@ -60,26 +62,28 @@ class PersistentPool:
         else:
             attempt.add_done_callback(done)
 
-    def _one_by_one(self, study: bytes, settings: FloatArray, into: Future[Evaluations]) -> None:
+    def _in_parts(self, study: bytes, settings: FloatArray, into: Future[Evaluations]) -> None:
+        """Part a batch that fails, and the parts that fail again: the others cost what they would have."""
+        parts = np.array_split(settings, min(PARTS, len(settings)))
         found: dict[int, Evaluations] = {}
         lock = threading.Lock()
 
-        def done(row: int, single: Future[Evaluations]) -> None:
+        def done(number: int, part: Future[Evaluations]) -> None:
             with lock:
                 if into.done():
                     return
-                if single.exception() is not None:
-                    into.set_exception(single.exception())
+                if part.exception() is not None:
+                    into.set_exception(part.exception())
                     return
-                found[row] = single.result()
-                if len(found) == len(settings):
-                    into.set_result(Evaluations.concatenate([found[row] for row in range(len(settings))]))
+                found[number] = part.result()
+                if len(found) == len(parts):
+                    into.set_result(Evaluations.concatenate([found[number] for number in range(len(parts))]))
 
-        for row in range(len(settings)):
+        for number, rows in enumerate(parts):
             if not into.done():
-                single: Future[Evaluations] = Future()
-                single.add_done_callback(partial(done, row))
-                self._attempt(study, settings[row:row + 1], ATTEMPTS, single, must_succeed=False)
+                part: Future[Evaluations] = Future()
+                part.add_done_callback(partial(done, number))
+                self._attempt(study, rows, ATTEMPTS if len(rows) == 1 else 1, part, must_succeed=False)
 
     def _give_up(self, setting: FloatArray, error: SafevarError, into: Future[Evaluations], must_succeed: bool) -> None:
         self._in_a_row += 1
