@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -120,6 +120,11 @@ class Trace:
     gear: FloatArray
     active: BoolArray
     obstacle_speed: FloatArray = field(default_factory=lambda: NOTHING)
+
+    def of(self, vehicles: slice) -> Trace:
+        """The trace of some of the vehicles."""
+        columns = {one.name: getattr(self, one.name) for one in fields(self)}
+        return replace(self, **{name: values[:, vehicles] for name, values in columns.items() if np.ndim(values) == 2})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
+from safevar_sumo.ads.pedals import looked_up
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
@@ -109,16 +110,9 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def _pedals(self, seen: Observation, memory: _Memory) -> Command:
         """Through the calibration table of the original vehicle."""
         nominal = memory.nominal
-        coasting = _looked_up(nominal.coasting, nominal.speeds, seen.speed)
-        full = _looked_up(nominal.full_throttle, nominal.speeds, seen.speed)
+        coasting = looked_up(nominal.coasting, nominal.speeds, seen.speed)
+        full = looked_up(nominal.full_throttle, nominal.speeds, seen.speed)
         beyond = memory.asked + coasting
         throttle = np.minimum(np.maximum(beyond / (full + coasting), 0.0), 1.0)
         brake = np.minimum(np.maximum(-beyond / nominal.braking, 0.0), 1.0)
         return Command(np.where(memory.stops, 0.0, throttle), np.where(memory.stops, brake, 0.0))
-
-
-def _looked_up(table: FloatArray, speeds: FloatArray, speed: FloatArray) -> FloatArray:
-    """Linear between the rows of a table over equally spaced speeds."""
-    place = np.minimum(speed / speeds[1], len(speeds) - 1.001)
-    row = place.astype(np.intp)
-    return np.asarray(table[row] + (table[row + 1] - table[row]) * (place - row))

@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from safevar_sumo.scenarios.base import VUT, Scenario, Scene, World
+from safevar_sumo.scenarios.base import VUT, Lane, Point, Scenario, Scene, World
+from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.guarded import SCENARIO_CONTRACT, GuardedScenario
 from safevar_sumo.scenarios.lead_vehicle_stopped import LeadVehicleStopped
 from safevar_sumo.scenarios.pedestrian_crossing import PedestrianCrossing
@@ -11,7 +12,9 @@ from safevar_sumo.scenarios.weather import WEATHERS, weather_of
 
 SCENARIOS: Mapping[str, type[Any]] = {
     "pedestrian_crossing": PedestrianCrossing,
+    "crossing": Crossing,
     "lead_vehicle_stopped": LeadVehicleStopped,
 }
 
-__all__ = ["SCENARIOS", "SCENARIO_CONTRACT", "VUT", "WEATHERS", "GuardedScenario", "Scenario", "Scene", "World", "weather_of"]
+__all__ = [
+    "SCENARIOS", "SCENARIO_CONTRACT", "VUT", "WEATHERS", "GuardedScenario", "Lane", "Point", "Scenario", "Scene", "World", "weather_of"]

@@ -2,12 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 from safevar_sumo.records import EVERYWHERE, NOTHING, BoolArray, Encounter, FloatArray, Trace
+from safevar_sumo.study import Weather
 
 VUT = "vut"
 """Id of the vehicle under test in every network's traffic."""
+Coordinates = tuple[float, float]
+Actors = Mapping[str, Mapping[str, str] | None]
+"""Changes to a network's traffic file: attributes to set, or None to leave it out, by the XPath of an element below its root."""
+
+
+class Lane(NamedTuple):
+    """First and last point of a lane's middle line [m]."""
+
+    start: Coordinates
+    end: Coordinates
+
+
+class Roads(Protocol):
+    """A network without anybody on it."""
+
+    def lane(self, lane: str) -> Lane:
+        """A lane by its id."""
+
 
 
 class World(Protocol):
@@ -25,8 +45,17 @@ class World(Protocol):
     def lane_start(self, lane: str) -> tuple[float, float]:
         """First point of a lane's middle line, the same in all copies [m]."""
 
+    def lane(self, lane: str) -> Lane:
+        """A lane by its id, the same in all copies."""
+
     def person_width(self, actor: str) -> float:
         """Width of a person [m]."""
+
+    def walk(self, person: str, speed: float) -> None:
+        """Let a person walk on at a speed [m/s], in all copies."""
+
+    def drive(self, vehicle: str, speed: float) -> None:
+        """Let a vehicle reach a speed [m/s] within the coming step, in all copies."""
 
     def turn_back(self, person: str) -> None:
         """Let a person turn round where it is and walk back to the edge that it came from, as fast as before."""
@@ -51,6 +80,9 @@ class Scenario(Protocol):
 
     `network` is a folder of `sumo_nets/`, or the path of a folder with the same files;
     `duration` is the length of a run [s].
+
+    It may have `actors(roads) -> Actors`, what its parameters make of the network's traffic, and `remarks() -> list[str]`,
+    what a user should know of them.
     """
 
     network: str
@@ -64,3 +96,12 @@ class Scenario(Protocol):
 
     def encounter(self, trace: Trace) -> Encounter:
         """The geometry that the metrics are computed from."""
+
+
+class Point(NamedTuple):
+    """A scenario in a weather; `name` is what a study calls it, `place` what tells it from the study's other points."""
+
+    scenario: Scenario
+    weather: Weather
+    name: str = ""
+    place: tuple[tuple[str, Any], ...] = ()

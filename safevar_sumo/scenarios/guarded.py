@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from safevar_sumo.plugins import Contract, Guard, lent
 from safevar_sumo.records import Encounter, Trace
-from safevar_sumo.scenarios.base import Scenario, Scene, World
+from safevar_sumo.scenarios.base import Actors, Roads, Scenario, Scene, World
 
 SCENARIO_CONTRACT = Contract.of(Scenario, "a scenario")
 LONGEST = 3600.0
@@ -26,6 +27,18 @@ class GuardedScenario:
         self.network = network
         duration = guard.numbers("__init__", "duration", guard.field("__init__", scenario, "duration"), (), 0.0, LONGEST, above=True)
         self.duration = float(duration)
+
+    def actors(self, roads: Roads) -> Actors:
+        """What it makes of the network's traffic; nothing, if it says nothing of that."""
+        given = self._guard.call("actors", getattr(self._scenario, "actors", lambda roads: {}), roads)
+        if not isinstance(given, Mapping):
+            raise self._guard.wrong("actors", "changes", given, "a mapping from XPaths of the traffic file to attributes")
+        return {str(path): change if change is None else {str(name): str(value) for name, value in change.items()}
+                for path, change in given.items()}
+
+    def remarks(self) -> list[str]:
+        """What a user should know of its parameters."""
+        return [str(remark) for remark in self._guard.call("remarks", getattr(self._scenario, "remarks", list))]
 
     def begin(self, world: World) -> Any:
         return self._guard.call("begin", self._scenario.begin, _LentWorld(world))

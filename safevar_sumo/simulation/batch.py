@@ -10,7 +10,8 @@ import numpy.typing as npt
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Drives, Evaluations, FloatArray, Outcome, Trace
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.simulation.perception import Perception
+from safevar_sumo.simulation.parts import Parts
+from safevar_sumo.simulation.staging import staged
 from safevar_sumo.simulation.sumo import Engine, SumoWorld, world_on
 from safevar_sumo.simulation.system import System
 from safevar_sumo.vehicles import at_start
@@ -51,13 +52,14 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSU
     n = len(settings)
     if system.step_length is not None:
         options = ("--step-length", repr(system.step_length), *options)
-    with world_on(system.scenario.network, n, engine, options) as world:
+    first, *others = [staged(point.scenario) for point in system.points]
+    with world_on(first, n, engine, options, others) as world:
         return drive(system, settings, world, watch)
 
 
 def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher | None = None) -> Drives:
     """Drive the vehicles of an open world that nobody has stepped yet; see `simulate`."""
-    vehicle, scenario, step, n = system.vehicle, system.scenario, world.step_length, len(settings)
+    vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = vehicle.prepare(characteristics, system.weather.road_friction, step)
     world.set_types(vehicle.sumo_type(prepared))
@@ -65,17 +67,16 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
 
     state = at_start(vehicle, prepared, world.speeds())
     driver = system.ads.start(n, system.nominal, step)
-    perception = Perception(system.weather, step)
-    memory = scenario.begin(world)
-    log = _Log(n, round(scenario.duration / step) + 1)
+    parts = Parts(system.points, world, n)
+    log = _Log(n, int(parts.last.max()) + 1)
     verdict = _Verdict(n)
     for sample in range(log.length):
         if watch is not None:
             watch(world)
         speed = world.speeds()
-        scene, memory = scenario.observe(world, step, memory)
-        active = verdict.judge(speed, scene.over, world.collisions(), last=sample == log.length - 1)
-        seen = perception.observe(sample * step, speed, scene)._replace(throttle=state.throttle)
+        scene = parts.scene()
+        active = verdict.judge(speed, scene.over, world.collisions(), last=sample >= parts.last)
+        seen = parts.seen(sample * step, speed, scene)._replace(throttle=state.throttle)
         seen, state = vehicle.sense(prepared, state, seen)
         command, driver = system.ads.drive(seen, driver)
         log.write(sample, position=world.vehicle_positions(VUT)[:, 0], speed=speed, gap=scene.gap, lateral=scene.lateral,
@@ -86,7 +87,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
         state = vehicle.advance(prepared, state, command)
         world.advance(np.where(verdict.open, state.speed, 0.0))
     trace = log.trace(sample + 1, step, world.vehicle_length(VUT))
-    return Drives(trace=trace, encounter=scenario.encounter(trace), outcome=verdict.outcome(), collision_speed=verdict.collision_speed)
+    return Drives(trace=trace, encounter=parts.encounter(trace), outcome=verdict.outcome(), collision_speed=verdict.collision_speed)
 
 
 class _Log:
@@ -117,7 +118,7 @@ class _Verdict:
         self._stood = np.zeros(n, dtype=bool)
         self._over = np.zeros(n, dtype=bool)
 
-    def judge(self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: bool) -> BoolArray:
+    def judge(self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: BoolArray | bool) -> BoolArray:
         """Take in one sample; returns for which vehicles it still belongs to the run."""
         active = self.open & ~over
         for copy, collision_speed in collisions.items():
@@ -128,7 +129,7 @@ class _Verdict:
         self._stood |= self.open & self._moved & standing
         self._moved |= self.open & ~standing
         self._over |= self.open & over
-        self.open &= ~over & (not last)
+        self.open &= ~over & ~np.asarray(last)
         return active
 
     def outcome(self) -> npt.NDArray[np.str_]:

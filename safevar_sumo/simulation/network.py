@@ -11,7 +11,8 @@ import os
 import subprocess
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from functools import cache
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,7 +30,7 @@ OPTIONS = "scenario.sumocfg"
 _IDS = {
     "node": ("id",), "edge": ("id", "from", "to"), "connection": ("from", "to"), "crossing": ("node", "edges"),
     "walkingArea": ("node", "edges"), "vType": ("id",), "person": ("id", "type"), "walk": ("edges", "from", "to"),
-    "vehicle": ("id", "type"), "route": ("id", "edges"), "stop": ("lane", "edge"),
+    "vehicle": ("id", "type", "route"), "route": ("id", "edges"), "stop": ("lane", "edge"),
 }
 
 
@@ -53,8 +54,10 @@ def copy_and_name(copied: str) -> tuple[int, str]:
     return int(copy), colon + name
 
 
-def copied_network(folder: str, n: int) -> CopiedNetwork:
+def copied_network(folder: str, n: int, *others: str) -> CopiedNetwork:
     """At least `n` copies of a network of `sumo_nets/` (or of a folder given by path) with traffic in `n` of them.
+
+    With `others`, folders that differ from it in the traffic alone, the next `n` copies have the traffic of the next of them.
 
     Raises
     ------
@@ -63,22 +66,30 @@ def copied_network(folder: str, n: int) -> CopiedNetwork:
     SimulationError
         If netconvert refuses the sources or the cache cannot be written.
     """
-    place = _folder(folder)
-    roads = _cached(place, round_up(n), SOURCES, "network.net.xml", _build_network)
-    traffic = _cached(place, n, (TRAFFIC,), TRAFFIC, _write_traffic)
+    places = [folder_of(one) for one in (folder, *others)]
+    place = places[0]
+    roads = _cached(place, round_up(n * len(places)), [place / source for source in SOURCES], "network.net.xml", _build_network)
+    traffic = _cached(place, n, [one / TRAFFIC for one in places], TRAFFIC, partial(_write_traffic, places))
     return CopiedNetwork(roads, traffic, place / OPTIONS)
 
 
 def empty_network(folder: str, n: int) -> CopiedNetwork:
     """The same copies with the types and routes of the traffic in `n` of them, and nobody there; raises as `copied_network`."""
-    files, place = copied_network(folder, n), _folder(folder)
-    return files._replace(traffic=_cached(place, n, (TRAFFIC,), NOBODY, _write_nobody))
+    files, place = copied_network(folder, n), folder_of(folder)
+    return files._replace(traffic=_cached(place, n, [place / TRAFFIC], NOBODY, _write_nobody))
 
 
 def network_fingerprint(folder: str) -> str:
     """Tells networks of different content apart: sources, traffic and options."""
-    place = _folder(folder)
+    place = folder_of(folder)
     return _digest(tuple((place / name).read_bytes() for name in (*SOURCES, TRAFFIC, OPTIONS)), 0)
+
+
+def empty_fingerprint(folder: str) -> str:
+    """Tells networks apart by everything but who is on them: sources, options, types and routes."""
+    place = folder_of(folder)
+    types = ElementTree.tostring(_nobody(parsed(place / TRAFFIC)))
+    return _digest((types, *((place / name).read_bytes() for name in (*SOURCES, OPTIONS))), 0)
 
 
 def netconvert_version() -> str:
@@ -88,7 +99,8 @@ def netconvert_version() -> str:
     return version("eclipse-sumo")
 
 
-def _folder(folder: str) -> Path:
+def folder_of(folder: str) -> Path:
+    """A network's folder; raises as `copied_network`."""
     for place in (NETWORKS / folder, Path(folder)):
         if is_folder(place):
             for name in (*SOURCES, TRAFFIC, OPTIONS):
@@ -116,8 +128,8 @@ def round_up(n: int) -> int:
         size *= 10
 
 
-def _cached(place: Path, n: int, sources: tuple[str, ...], name: str, build) -> Path:  # type: ignore[no-untyped-def]
-    contents = tuple((place / source).read_bytes() for source in sources)
+def _cached(place: Path, n: int, sources: list[Path], name: str, build: Callable[[Path, int, Path], None]) -> Path:
+    contents = tuple(source.read_bytes() for source in sources)
     digest = _digest(contents, n)
     target = platformdirs.user_cache_path("safevar_sumo") / "networks" / f"{place.name}-{n}-{digest}" / name
     if not target.is_file():
@@ -139,17 +151,27 @@ def _digest(contents: tuple[bytes, ...], n: int) -> str:
     return digest.hexdigest()[:16]
 
 
-def _copies(source: Path, n: int) -> ElementTree.ElementTree:
-    """The file's root with its children n times, every id prefixed with the copy's number."""
+def parsed(source: Path) -> ElementTree.Element:
+    """The root of an XML file.
+
+    Raises
+    ------
+    InputError
+        If it is not XML.
+    """
     try:
-        original = ElementTree.parse(source).getroot()
+        return ElementTree.parse(source).getroot()
     except ElementTree.ParseError as error:
         raise InputError(source, f"is not XML: {error}") from None
-    root = ElementTree.Element(original.tag, original.attrib)
-    for copy in range(n):
-        for child in original:
-            root.append(_prefixed(child, copy))
-    return ElementTree.ElementTree(root)
+
+
+def _copies(sources: Sequence[Path], n: int) -> ElementTree.Element:
+    """The children of each file's root n times, one file after the other, every id prefixed with the copy's number."""
+    originals = [parsed(source) for source in sources]
+    root = ElementTree.Element(originals[0].tag, originals[0].attrib)
+    for copy, original in enumerate(original for original in originals for _ in range(n)):
+        root.extend(_prefixed(child, copy) for child in original)
+    return root
 
 
 def _prefixed(element: ElementTree.Element, copy: int) -> ElementTree.Element:
@@ -161,22 +183,30 @@ def _prefixed(element: ElementTree.Element, copy: int) -> ElementTree.Element:
     return result
 
 
-def _write_traffic(place: Path, n: int, into: Path) -> None:
-    _copies(place / TRAFFIC, n).write(into / TRAFFIC, encoding="utf-8", xml_declaration=True)
+def _write(root: ElementTree.Element, file: Path) -> None:
+    ElementTree.ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
+
+
+def _write_traffic(places: Sequence[Path], place: Path, n: int, into: Path) -> None:
+    _write(_copies([one / TRAFFIC for one in places], n), into / TRAFFIC)
 
 
 def _write_nobody(place: Path, n: int, into: Path) -> None:
-    copies = _copies(place / TRAFFIC, n)
+    _write(_nobody(_copies([place / TRAFFIC], n)), into / NOBODY)
+
+
+def _nobody(traffic: ElementTree.Element) -> ElementTree.Element:
+    """Traffic without vehicles and persons."""
     nobody = ElementTree.Element("routes")
-    nobody.extend(element for element in copies.iterfind("*") if element.tag not in ("vehicle", "person"))
-    ElementTree.ElementTree(nobody).write(into / NOBODY, encoding="utf-8", xml_declaration=True)
+    nobody.extend(element for element in traffic if element.tag not in ("vehicle", "person"))
+    return nobody
 
 
 def _build_network(place: Path, n: int, into: Path) -> None:
     import sumo
 
     for source in SOURCES:
-        _copies(place / source, n).write(into / source, encoding="utf-8", xml_declaration=True)
+        _write(_copies([place / source], n), into / source)
     nodes, edges, connections = (str(into / source) for source in SOURCES)
     done = subprocess.run(
         [str(Path(sumo.SUMO_HOME) / "bin" / "netconvert"), "-n", nodes, "-e", edges, "-x", connections,

@@ -6,6 +6,7 @@ the last bit; `traffic.py` knows which traffic can be put back like that.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from safevar_sumo.simulation.network import copied_id
@@ -28,26 +29,35 @@ class StandingSumo:
         How many copies of the network.
     """
 
-    def __init__(self, api: Any, loaded: tuple[str, ...], copies: int, traffic: Traffic) -> None:
-        self._api, self._loaded, self._copies, self._traffic = api, loaded, copies, traffic
+    def __init__(self, api: Any, loaded: tuple[str, ...], copies: int) -> None:
+        self._api, self._loaded, self._copies = api, loaded, copies
+        self._traffic: Sequence[Traffic] = ()
+        self._ways: set[str] = set()
         self._batches = 0
-        for copy in range(copies):
-            for actor in traffic:
-                if isinstance(actor, Car):
-                    api.route.add(_way(copy, actor), _copied(copy, actor.edges))
 
     def serves(self, wanted: tuple[str, ...], n: int) -> bool:
         """Whether the next batch, of `n` settings, may be driven here."""
         return self._batches < BATCHES_PER_LOADING and n <= self._copies and wanted == self._loaded
 
-    def enter(self, n: int) -> None:
-        """Clear the road, and let everybody in `n` copies set off with the next step."""
+    def expect(self, traffic: Sequence[Traffic]) -> None:
+        """Take note of the actors of the next batch, in each of its copies."""
+        self._traffic = traffic
+
+    def enter(self) -> None:
+        """Clear the road, and let everybody who is expected set off with the next step."""
         if self._batches:
             self._clear()
         self._batches += 1
-        for copy in range(n):
-            for actor in self._traffic:
+        for copy, traffic in enumerate(self._traffic):
+            for actor in traffic:
                 self._add_car(copy, actor) if isinstance(actor, Car) else self._add_walker(copy, actor)
+
+    def shift(self) -> None:
+        """Put those who have departed beside the middle of their lane where they belong there."""
+        for copy, traffic in enumerate(self._traffic):
+            for actor in traffic:
+                if isinstance(actor, Car) and actor.left:
+                    self._api.vehicle.setLateralLanePosition(copied_id(copy, actor.name), actor.left)
 
     def _clear(self) -> None:
         for vehicle in self._api.vehicle.getLoadedIDList():
@@ -57,8 +67,11 @@ class StandingSumo:
         self._api.simulationStep()
 
     def _add_car(self, copy: int, car: Car) -> None:
-        name = copied_id(copy, car.name)
-        self._api.vehicle.add(name, _way(copy, car), copied_id(copy, car.type), **car.places)
+        name, way = copied_id(copy, car.name), _way(copy, car)
+        if way not in self._ways:
+            self._api.route.add(way, _copied(copy, car.edges))
+            self._ways.add(way)
+        self._api.vehicle.add(name, way, copied_id(copy, car.type), **car.places)
         for stop in car.stops:
             edge, flags = copied_id(copy, stop.edge), PARKING * stop.parking
             self._api.vehicle.setStop(name, edge, stop.end, stop.lane, stop.duration, flags, stop.start)
@@ -71,8 +84,8 @@ class StandingSumo:
 
 
 def _way(copy: int, car: Car) -> str:
-    """Id of a route; one that came with a vehicle in the traffic file has none, and would go with it."""
-    return copied_id(copy, f"{car.name}'s way")
+    """Id of a route of ours; one that came with a vehicle in the traffic file has none, and would go with it."""
+    return copied_id(copy, f"way over {'-'.join(car.edges)}")
 
 
 def _copied(copy: int, edges: tuple[str, ...]) -> list[str]:

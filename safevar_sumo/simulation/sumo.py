@@ -20,8 +20,8 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import FloatArray
-from safevar_sumo.scenarios import VUT
-from safevar_sumo.simulation.network import CopiedNetwork, copied_id, copied_network, empty_network, network_fingerprint, round_up
+from safevar_sumo.scenarios import VUT, Lane
+from safevar_sumo.simulation.network import CopiedNetwork, copied_id, copied_network, empty_fingerprint, empty_network, round_up
 from safevar_sumo.simulation.standing import StandingSumo
 from safevar_sumo.simulation.traffic import Traffic, repeatable_traffic
 from safevar_sumo.vehicles import SumoType
@@ -45,8 +45,9 @@ class Engine(StrEnum):
 class SumoWorld:
     """N copies of a network under simulation; made by `open_world`. Shapes: (N,) or (N, 2)."""
 
-    def __init__(self, api: Any, n: int, *, watched: bool = False, enter: Callable[[int], None] = lambda n: None) -> None:
-        self._api, self.n, self._enter = api, n, enter
+    def __init__(self, api: Any, n: int, *, first: int = 0, watched: bool = False, standing: StandingSumo | None = None) -> None:
+        self._api, self.n, self._first, self._standing = api, n, first, standing
+        self._parts: list[SumoWorld] = []
         self._ids: dict[str, list[str]] = {}
         self._positions: dict[str, FloatArray] = {}
         self._copy_of = {name: copy for copy, name in enumerate(self.ids(VUT))}
@@ -56,7 +57,7 @@ class SumoWorld:
     def ids(self, name: str) -> list[str]:
         """The ids of an actor in its copies."""
         if name not in self._ids:
-            self._ids[name] = [copied_id(copy, name) for copy in range(self.n)]
+            self._ids[name] = [copied_id(copy, name) for copy in range(self._first, self._first + self.n)]
         return self._ids[name]
 
     def set_types(self, types: SumoType) -> None:
@@ -78,8 +79,11 @@ class SumoWorld:
         SimulationError
             If a vehicle under test found no place.
         """
-        self._enter(self.n)
+        if self._standing is not None:
+            self._standing.enter()
         self._api.simulationStep()
+        if self._standing is not None:
+            self._standing.shift()
         departed = set(self._api.vehicle.getIDList())
         for name in self.ids(VUT):
             if name not in departed:
@@ -93,7 +97,8 @@ class SumoWorld:
         for name, speed in zip(self.ids(VUT), speeds.tolist(), strict=True):
             set_speed(name, speed)
         self._api.simulationStep()
-        self._positions.clear()
+        for world in (self, *self._parts):
+            world._positions.clear()
         if self._pause:
             time.sleep(self._pause)
 
@@ -133,12 +138,34 @@ class SumoWorld:
     def vehicle_length(self, actor: str) -> float:
         return float(self._api.vehicle.getLength(self.ids(actor)[0]))
 
+    def vehicle_width(self, actor: str) -> float:
+        return float(self._api.vehicle.getWidth(self.ids(actor)[0]))
+
+    def lane(self, lane: str) -> Lane:
+        shape = self._api.lane.getShape(copied_id(0, lane))
+        return Lane(shape[0], shape[-1])
+
     def lane_start(self, lane: str) -> tuple[float, float]:
         x, y = self._api.lane.getShape(copied_id(0, lane))[0]
         return x, y
 
     def person_width(self, actor: str) -> float:
         return float(self._api.person.getWidth(self.ids(actor)[0]))
+
+    def walk(self, person: str, speed: float) -> None:
+        for name in self.ids(person):
+            self._api.person.setSpeed(name, speed)
+
+    def drive(self, vehicle: str, speed: float) -> None:
+        for name in self.ids(vehicle):
+            self._api.vehicle.setSpeedMode(name, OBEY)
+            self._api.vehicle.setSpeed(name, speed)
+
+    def part(self, first: int, n: int) -> SumoWorld:
+        """The world of `n` copies alone, from the `first`."""
+        part = SumoWorld(self._api, n, first=first)
+        self._parts.append(part)
+        return part
 
     def turn_back(self, person: str) -> None:
         api = self._api.person
@@ -149,20 +176,25 @@ class SumoWorld:
 
 
 @contextmanager
-def world_on(folder: str, n: int, engine: Engine = Engine.LIBSUMO, options: Sequence[str] = ()) -> Iterator[SumoWorld]:
-    """`n` copies of a network before their first step: in the SUMO that stays open where that serves, else in a fresh one.
+def world_on(folder: str, n: int, engine: Engine = Engine.LIBSUMO, options: Sequence[str] = (),
+             others: Sequence[str] = ()) -> Iterator[SumoWorld]:
+    """Copies of a network before their first step, `n` and another `n` for each of `others`, which differ in the traffic alone.
+
+    In the SUMO that stays open where that serves, else in a fresh one.
 
     Raises
     ------
     SimulationError
         With SUMO's own words, if it cannot load or loses a step.
     """
-    traffic = repeatable_traffic(folder, options) if engine is Engine.LIBSUMO else None
-    if traffic is not None:
-        with _standing_world(folder, n, options, traffic) as world:
+    folders = (folder, *others)
+    traffic = [repeatable_traffic(one, options) if engine is Engine.LIBSUMO else None for one in folders]
+    expected = [one for one in traffic if one is not None]
+    if len(expected) == len(folders):
+        with _standing_world(folder, [one for one in expected for _ in range(n)], options) as world:
             yield world
     else:
-        with open_world(copied_network(folder, n), n, engine, options) as world:
+        with open_world(copied_network(folder, n, *others), n * len(folders), engine, options) as world:
             yield world
 
 
@@ -184,16 +216,17 @@ _standing: StandingSumo | None = None
 
 
 @contextmanager
-def _standing_world(folder: str, n: int, options: Sequence[str], traffic: Traffic) -> Iterator[SumoWorld]:
+def _standing_world(folder: str, traffic: Sequence[Traffic], options: Sequence[str]) -> Iterator[SumoWorld]:
     """Worlds in the SUMO of this process, which stays open unless one fails."""
     global _standing
-    api, wanted = _api(Engine.LIBSUMO), (network_fingerprint(folder), *options)
+    api, n, wanted = _api(Engine.LIBSUMO), len(traffic), (empty_fingerprint(folder), *options)
     try:
         if _standing is None or not _standing.serves(wanted, n):
             copies = round_up(n)
             _start(api, Engine.LIBSUMO, [*sumo_command(Engine.LIBSUMO, empty_network(folder, copies)), *options])
-            _standing = StandingSumo(api, wanted, copies, traffic)
-        yield SumoWorld(api, n, enter=_standing.enter)
+            _standing = StandingSumo(api, wanted, copies)
+        _standing.expect(traffic)
+        yield SumoWorld(api, n, standing=_standing)
     except BaseException as error:
         _standing = None
         _close(api)

@@ -16,7 +16,7 @@ from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins import Guard, Lookup, Member
 from safevar_sumo.records import Nominal
-from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Scenario, weather_of
+from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, weather_of
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.simulation.network import is_folder
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, invalid
@@ -49,6 +49,12 @@ class System:
     nominal: Nominal
     members: tuple[Member, ...]
     step_length: float | None = None
+    matrix: tuple[Point, ...] = ()
+
+    @property
+    def points(self) -> tuple[Point, ...]:
+        """Where a setting is simulated: the matrix, or the study's one scenario."""
+        return self.matrix or (Point(self.scenario, self.weather),)
 
 
 def assemble(study: Study, source: str = "") -> System:

@@ -19,7 +19,7 @@ _TYPE = frozenset({
     "id", "vClass", "length", "width", "height", "minGap", "maxSpeed", "accel", "decel", "emergencyDecel", "tau", "mass", "sigma",
     "speedDev", "speedFactor", "color", "guiShape"})
 _PLACES = frozenset({"departLane", "departPos", "departSpeed", "arrivalLane", "arrivalPos", "arrivalSpeed"})
-_VEHICLE = _PLACES | {"id", "type", "route", "depart", "color"}
+_VEHICLE = _PLACES | {"id", "type", "route", "depart", "departPosLat", "color"}
 _PERSON = frozenset({"id", "type", "depart", "departPos", "color"})
 _ROUTE = frozenset({"id", "edges"})
 _STOP = frozenset({"lane", "startPos", "endPos", "duration", "parking"})
@@ -47,12 +47,16 @@ class Stop(NamedTuple):
 
 
 class Car(NamedTuple):
-    """A vehicle of any kind; it departs at once, where and how fast the SUMO attributes in `places` say."""
+    """A vehicle of any kind; it departs at once, where and how fast the SUMO attributes in `places` say.
+
+    `left` is how far it stands to the left of its lane's middle [m].
+    """
 
     name: str
     type: str
     edges: tuple[str, ...]
     places: dict[str, str]
+    left: float
     stops: tuple[Stop, ...]
 
 
@@ -133,7 +137,7 @@ def _car(element: ElementTree.Element, routes: dict[str | None, ElementTree.Elem
     places = {name: value for name, value in element.attrib.items() if name in _PLACES}
     _demand(float(element.attrib["depart"]) == 0 and not any(value.startswith("random") for value in places.values()))
     return Car(element.attrib["id"], element.attrib["type"], tuple(route.attrib["edges"].split()), places,
-               tuple(_stop(stop) for stop in element.findall("stop")))
+               float(element.get("departPosLat", 0)), tuple(_stop(stop) for stop in element.findall("stop")))
 
 
 def _stop(element: ElementTree.Element) -> Stop:

@@ -1,0 +1,103 @@
+"""Automatic emergency braking by braking distance, as production systems and Autoware have it, on top of a cruise control."""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.ads.pedals import pedals, trim
+from safevar_sumo.ads.way import in_the_way
+from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
+
+Positive = Annotated[float, Meta(gt=0, le=1e3)]
+NotNegative = Annotated[float, Meta(ge=0, le=1e3)]
+LEAST_DECELERATION = 0.5
+"""Of somebody ahead who counts as braking [m/s^2]."""
+
+
+class _Memory(NamedTuple):
+    """The original vehicle; time between calls [s]; speed to hold and pedal that holds it, of the first look; stage 0 to 2,
+    whether it has ever braked; the obstacle's speed a call ago [m/s].
+    """
+
+    nominal: Nominal
+    step: float
+    cruise: tuple[FloatArray, FloatArray] | None
+    stage: FloatArray
+    intervened: BoolArray
+    obstacle_speed: FloatArray
+
+
+class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Holds its speed; brakes in part, then fully, when the gap to somebody in its way falls below its braking distances.
+
+    distance = v rt + max(v_rel^2 / (2 b), v^2 / (2 b) - u^2 / (2 b_u)) + margin, with b_u the deceleration of the one ahead.
+    Once it has braked it drives no more.
+
+    Parameters
+    ----------
+    cruise_speed, cruise_gain
+        Speed that it holds [m/s], by default the one that it starts with, and acceleration per error of it [1/s].
+    response_time
+        Time that it plans to lose before it brakes [s].
+    braking_share
+        Share of the original's greatest deceleration that it plans with [-].
+    margin
+        Gap that it means to keep [m].
+    partial_share, partial_time
+        Pedal of the partial stage [-], and by how much earlier than the full one it begins [s].
+    corridor
+        Half the width of its way [m].
+    reach
+        Its sensors' range in clear weather [m].
+    """
+
+    cruise_speed: Positive | None = None
+    cruise_gain: Positive = 1.0
+    response_time: NotNegative = 0.15
+    braking_share: Annotated[float, Meta(gt=0, le=1)] = 0.95
+    margin: NotNegative = 0.5
+    partial_share: Annotated[float, Meta(ge=0, le=1)] = 0.4
+    partial_time: NotNegative = 0.15
+    corridor: Positive = 1.4
+    reach: Positive = 100.0
+
+    def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
+        nothing = np.zeros(n)
+        return _Memory(nominal, step, None, nothing, nothing > 0, nothing)
+
+    def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
+        nominal = memory.nominal
+        speed, pedal = memory.cruise or (self._speed_to_hold(seen), trim(nominal, seen))
+        stage = self._stage(seen, memory)
+        intervened = memory.intervened | (stage > 0)
+        cruising = pedals(nominal, seen.speed, self.cruise_gain * (speed - seen.speed), pedal)
+        command = Command(
+            np.where(intervened, 0.0, cruising.throttle),
+            np.where(stage == 2, 1.0, np.where(stage == 1, self.partial_share, np.where(intervened, 0.0, cruising.brake))))
+        return command, _Memory(nominal, memory.step, (speed, pedal), stage, intervened, _obstacle_speed(seen))
+
+    def _speed_to_hold(self, seen: Observation) -> FloatArray:
+        return seen.speed if self.cruise_speed is None else np.full_like(seen.speed, self.cruise_speed)
+
+    def _stage(self, seen: Observation, memory: _Memory) -> FloatArray:
+        """A stage once begun lasts as long as somebody is in the way or about to leave it."""
+        speed, obstacle_speed = seen.speed, _obstacle_speed(seen)
+        deceleration = self.braking_share * memory.nominal.decel
+        theirs = (memory.obstacle_speed - obstacle_speed) / memory.step
+        both = speed * speed / (2 * deceleration) - obstacle_speed * obstacle_speed / (2 * np.maximum(theirs, LEAST_DECELERATION))
+        closing = np.maximum(seen.closing_speed, 0.0)
+        braking = np.maximum(closing * closing / (2 * deceleration), np.where(theirs > LEAST_DECELERATION, both, 0.0))
+        full = speed * self.response_time + braking + self.margin
+        threat = in_the_way(seen, self.corridor, self.reach) & (closing > 0)
+        wanted = np.where(threat & (seen.gap < full), 2.0, np.where(threat & (seen.gap < full + speed * self.partial_time), 1.0, 0.0))
+        stays = np.isfinite(seen.gap) & (seen.gap > 0) & (closing > 0) & (
+            (np.abs(seen.lateral) <= self.corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0))
+        stands = speed <= 0
+        return np.where(stays | stands, np.maximum(wanted, memory.stage), wanted)
+
+
+def _obstacle_speed(seen: Observation) -> FloatArray:
+    return np.broadcast_to(seen.obstacle_speed, seen.speed.shape)

@@ -1,0 +1,58 @@
+"""What N vehicles meet when they are not all in the same scenario: every part of a batch has a point of the study to itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
+
+from safevar_sumo.records import Encounter, FloatArray, Observation, Trace
+from safevar_sumo.scenarios import Point, Scene
+from safevar_sumo.simulation.perception import Perception
+from safevar_sumo.simulation.sumo import SumoWorld
+
+R = TypeVar("R", Scene, Observation)
+
+
+class Parts:
+    """A batch whose k-th part of equally many vehicles is in the k-th point."""
+
+    def __init__(self, points: Sequence[Point], world: SumoWorld, n: int) -> None:
+        self._size = size = n // len(points)
+        self._points, self._step = points, world.step_length
+        self._rows = [slice(k * size, (k + 1) * size) for k in range(len(points))]
+        self._worlds = [world] if len(points) == 1 else [world.part(rows.start, size) for rows in self._rows]
+        self._perceptions = [Perception(point.weather, self._step) for point in points]
+        self._memories = [point.scenario.begin(part) for point, part in zip(points, self._worlds, strict=True)]
+        self.last = np.repeat([round(point.scenario.duration / self._step) for point in points], size)
+
+    def scene(self) -> Scene:
+        """Where the obstacles of all vehicles are now."""
+        scenes = []
+        for k, (point, world) in enumerate(zip(self._points, self._worlds, strict=True)):
+            scene, self._memories[k] = point.scenario.observe(world, self._step, self._memories[k])
+            scenes.append(scene)
+        return scenes[0] if len(scenes) == 1 else _joined(scenes, self._size)
+
+    def seen(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
+        """What all vehicles see of it."""
+        if len(self._points) == 1:
+            return self._perceptions[0].observe(time, speed, scene)
+        observations = [
+            perception.observe(time, speed[rows], Scene._make(values[rows] for values in scene))
+            for perception, rows in zip(self._perceptions, self._rows, strict=True)]
+        return _joined(observations, self._size)._replace(time=time)
+
+    def encounter(self, trace: Trace) -> Encounter:
+        """The geometry that the metrics are computed from."""
+        if len(self._points) == 1:
+            return self._points[0].scenario.encounter(trace)
+        parts = [point.scenario.encounter(trace.of(rows)) for point, rows in zip(self._points, self._rows, strict=True)]
+        return Encounter(*(np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True)))
+
+
+def _joined(records: Sequence[R], size: int) -> R:
+    """Records of arrays of shape (size,), or of what stands for one, as a record of longer arrays."""
+    columns = [[np.broadcast_to(values, (size,)) for values in column] for column in zip(*records, strict=True)]
+    return type(records[0])._make(map(np.concatenate, columns))
