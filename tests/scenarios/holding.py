@@ -1,0 +1,45 @@
+"""A driver who does nothing: what a vehicle meets that nobody brakes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from safevar_sumo.records import Command, Drives, FloatArray, Nominal, Observation
+from safevar_sumo.scenarios import Scenario
+from safevar_sumo.simulation import System, assemble, simulate
+from safevar_sumo.study import load_study
+
+CARLA = assemble(load_study("sun"))
+NATIVE = assemble(load_study("native"))
+
+
+class Hold:
+    """Keeps the accelerator where it is; brakes vehicle i fully from `brakes_at[i]` on [s]."""
+
+    def __init__(self, brakes_at: FloatArray | None = None) -> None:
+        self._brakes_at = np.inf if brakes_at is None else brakes_at
+
+    def start(self, n: int, nominal: Nominal, step: float) -> Any:
+        return None
+
+    def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
+        memory = seen.throttle if memory is None else memory
+        brakes = np.broadcast_to(seen.time >= self._brakes_at, seen.speed.shape)
+        return Command(np.where(brakes, 0.0, memory), np.where(brakes, 1.0, 0.0)), memory
+
+
+def driven(scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = CARLA) -> Drives:
+    """The original vehicle of CARLA, or settings, in a scenario; held at its speed unless an ADS is given."""
+    system = replace(system, scenario=scenario, ads=ads or Hold())
+    return simulate(system, system.characteristics.original[np.newaxis] if settings is None else settings)
+
+
+def at_contact(run: Drives, values: FloatArray, vehicle: int = 0) -> float:
+    """A value when the bumper reaches the obstacle, linear between the two samples around it."""
+    gap = run.trace.gap[:, vehicle]
+    after = int(np.argmax(gap <= 1e-9))
+    share = gap[after - 1] / (gap[after - 1] - gap[after])
+    return float(values[after - 1] + share * (values[after] - values[after - 1]))
