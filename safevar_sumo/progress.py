@@ -16,6 +16,10 @@ from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study
 
 SECONDS_BETWEEN_LINES = 30.0
+BAR = 10
+"""Letters that a bar takes."""
+LEAST_ROOM = 26
+"""Letters beside the bar, below which there is none."""
 
 
 class CampaignProgress:
@@ -24,14 +28,16 @@ class CampaignProgress:
     def __init__(self, console: Console, study: Study, keys: list[RunKey], quiet: bool) -> None:
         self._console, self._quiet = console, quiet
         shown = console.is_terminal and not quiet
-        self._bar = Progress(
-            TextColumn("{task.description}"), BarColumn(bar_width=8), TextColumn("{task.fields[told]}"),
-            console=console, disable=not shown)
+        self._room = console.width - max(map(len, study.search.algorithms)) - 1
+        bar = [BarColumn(bar_width=BAR)] if self._room - BAR - 1 >= LEAST_ROOM else []
+        self._room -= len(bar) * (BAR + 1)
+        self._bar = Progress(TextColumn("{task.description}", markup=False), *bar, TextColumn("{task.fields[told]}", markup=False),
+                             console=console, disable=not shown)
         self._lines = {}
         for name in study.search.algorithms:
             runs = sum(key.algorithm == name for key in keys)
             if runs:
-                task = self._bar.add_task(name, total=runs * study.search.evaluations, told=f"runs 0/{runs}")
+                task = self._bar.add_task(name, total=runs * study.search.evaluations, told="not begun")
                 self._lines[name] = _Line(name, runs, study.search.evaluations, task)
         self._asked: dict[RunKey, int] = {}
         self._spoke = time.monotonic()
@@ -56,7 +62,7 @@ class CampaignProgress:
         self._console.print(f"warning: {message}", soft_wrap=True, markup=False, highlight=False)
 
     def _tell(self, line: _Line) -> None:
-        self._bar.update(line.task, completed=line.done, total=line.total, told=line.told())
+        self._bar.update(line.task, completed=line.done, total=line.total, told=line.told_within(self._room))
         now = time.monotonic()
         if not self._console.is_terminal and not self._quiet and now - self._spoke >= SECONDS_BETWEEN_LINES:
             self._spoke = now
@@ -92,8 +98,20 @@ class _Line:
         self.done += asked - seen
         self.total -= self._evaluations - asked
 
+    def told_within(self, room: int) -> str:
+        """In no more than so many letters, without what has no place: what comes first matters most."""
+        found = [] if np.isinf(self._best) else [f"{self._collisions} collisions"]
+        best = [] if np.isinf(self._best) else [f"best SD {self._best:.2f}"]
+        told = ""
+        for part in (f"{self._rate():.0f}/s", self._left(), *found, f"runs {self._finished}/{self._runs}", *best):
+            longer = f"{told}, {part}" if told else part
+            if len(longer) > room:
+                break
+            told = longer
+        return told
+
     def told(self) -> str:
-        """What comes last may be cut off on a narrow terminal."""
+        """In a line of its own."""
         found = "" if np.isinf(self._best) else f", best SD {self._best:.2f}, collisions {self._collisions}"
         return f"runs {self._finished}/{self._runs}, {self._rate():.0f} evaluations/s, {self._left()}{found}"
 

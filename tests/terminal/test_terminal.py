@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from io import StringIO
 
 import msgspec
@@ -55,10 +56,19 @@ def test_elsewhere_a_line_for_every_algorithm_every_30_seconds(study: Study, clo
         "safe_fuzzer: runs 0/2, 0 evaluations/s, not begun"]
 
 
-def test_on_a_terminal_what_matters_of_every_algorithm_fits_in_its_line(study: Study, clock: list[float]) -> None:
-    lines = shown(study, clock, terminal_width=80).splitlines()
+@pytest.mark.parametrize(("width", "told"), [
+    (120, "10/s, 0:01:40 left, 500 collisions, runs 1/2, best SD -5.63"), (80, "10/s, 0:01:40 left, 500 collisions, runs 1/2"),
+    (50, "10/s, 0:01:40 left"), (30, "10/s, 0:01:40 left"), (20, "10/s"),
+])
+def test_on_a_terminal_what_matters_fits_in_its_line_and_no_word_is_cut(
+        width: int, told: str, study: Study, clock: list[float]) -> None:
+    """The run that ended early leaves one run of 1000."""
+    lines = [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", line).rstrip() for line in shown(study, clock, terminal_width=width).splitlines()]
     last = [line for line in lines if "nsga2" in line][-1]
-    assert "runs 1/2, 10 evaluations/s, 0:01:40 left, best SD -5.63" in last, "the run that ended early leaves one run of 1000"
+    assert last.endswith(told)
+    assert ("━" in last) == (width >= 50)
+    assert max(map(len, lines)) <= width
+    assert not [line for line in lines if "…" in line]
 
 
 def test_quiet_says_nothing(study: Study, clock: list[float]) -> None:
