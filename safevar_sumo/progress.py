@@ -37,7 +37,7 @@ class CampaignProgress:
         for name in study.search.algorithms:
             runs = sum(key.algorithm == name for key in keys)
             if runs:
-                task = self._bar.add_task(name, total=runs * study.search.evaluations, told="not begun")
+                task = self._bar.add_task(name, total=runs * study.search.evaluations, told="waiting")
                 self._lines[name] = _Line(name, runs, study.search.evaluations, task)
         self._asked: dict[RunKey, int] = {}
         self._spoke = time.monotonic()

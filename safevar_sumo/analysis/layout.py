@@ -40,11 +40,15 @@ class Table(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def lay_out(answer: Answer) -> list[Table]:
-    """The paper's tables of an answer; without any case that has it, one that says why."""
+Layouts = Mapping[str, Callable[[pd.DataFrame], list[Table]]]
+"""What turns an answer's frame into tables, by the answer's name."""
+
+
+def lay_out(answer: Answer, layouts: Layouts) -> list[Table]:
+    """The tables of an answer; without any case that has it, one that says why."""
     if answer.frame.empty:
         return [Table(TITLES[answer.name], (), [], 0, (), answer.notes)]
-    tables = LAYOUTS[answer.name](answer.frame)
+    tables = layouts[answer.name](answer.frame)
     return [*tables[:-1], tables[-1]._replace(notes=(*tables[-1].notes, *answer.notes))]
 
 
@@ -53,7 +57,7 @@ def _tests(frame: pd.DataFrame, who: str, name: str, notes: tuple[str, ...]) -> 
     cases = list(dict.fromkeys(frame["setting"]))
     cells = {(row[who], row["metric"], row["setting"]): row for row in frame.to_dict("records")}
     parts = ("p", "A12", "magnitude", "n1", "n2") if len(cases) == 1 else ("p", "A12", "magnitude")
-    rows = [(_algorithm(algorithm), METRIC_TITLES[metric],
+    rows = [(algorithm_title(algorithm), METRIC_TITLES[metric],
              *(cell for case in cases for cell in _test(cells.get((algorithm, metric, case)), len(parts))))
             for algorithm, metric in dict.fromkeys(zip(frame[who], frame["metric"], strict=True))]
     methods = [f"p{' with e' if method == EXACT else ''}: {method}." for method in (ASYMPTOTIC, EXACT) if method in set(frame["method"])]
@@ -64,7 +68,7 @@ def _tests(frame: pd.DataFrame, who: str, name: str, notes: tuple[str, ...]) -> 
 def _test(row: Mapping[Any, Any] | None, width: int) -> tuple[str, ...]:
     if row is None or pd.isna(row["p_value"]):
         return (UNDEFINED,) * width
-    p, effect = _p_value(row["p_value"]) + ("e" if row["method"] == EXACT else ""), f"{row['effect_size']:.3f}"
+    p, effect = p_value(row["p_value"]) + ("e" if row["method"] == EXACT else ""), f"{row['effect_size']:.3f}"
     p, effect = Bold(p) if row["p_value"] < ALPHA else p, Bold(effect) if row["magnitude"] in NOTABLE else effect
     return (p, effect, row["magnitude"], str(row["n1"]), str(row["n2"]))[:width]
 
@@ -76,7 +80,7 @@ def _rq1(frame: pd.DataFrame) -> list[Table]:
     cases = list(dict.fromkeys(frame["setting"]))
     means = {(row["setting"], row["algorithm"], row["metric"]): row["mean"] for row in frame.to_dict("records")}
     means |= {(row["setting"], "original", row["metric"]): row["original"] for row in frame.to_dict("records")}
-    rows = [(_algorithm(name), *(_number(means.get((case, name, metric)), ".2f") for case in cases for metric in MORE_IS_UNSAFE))
+    rows = [(algorithm_title(name), *(_number(means.get((case, name, metric)), ".2f") for case in cases for metric in MORE_IS_UNSAFE))
             for name in ("original", *dict.fromkeys(frame["algorithm"]))]
     heads = tuple(METRIC_TITLES[metric] for metric in MORE_IS_UNSAFE)
     spans = tuple((case, len(heads)) for case in cases)
@@ -164,7 +168,7 @@ def _collisions(frame: pd.DataFrame) -> list[Table]:
     cases = list(dict.fromkeys(frame["setting"]))
     cells = {(row["algorithm"], row["setting"]): (str(row["solutions"]), str(row["collisions"]), _number(row["share"], ".1%"))
              for row in frame.to_dict("records")}
-    rows = [(_algorithm(name), *(cell for case in cases for cell in cells.get((name, case), (UNDEFINED,) * 3)))
+    rows = [(algorithm_title(name), *(cell for case in cases for cell in cells.get((name, case), (UNDEFINED,) * 3)))
             for name in dict.fromkeys(frame["algorithm"])]
     return [Table(TITLES["collisions"], ("algorithm", *("solutions", "collisions", "share") * len(cases)), rows, 1,
                   tuple((case, 3) for case in cases))]
@@ -198,7 +202,7 @@ def _js(frame: pd.DataFrame) -> tuple[str, ...]:
     return tuple(dict.fromkeys(frame["j"]))
 
 
-def _algorithm(name: str) -> str:
+def algorithm_title(name: str) -> str:
     return ALGORITHM_TITLES.get(name, name)
 
 
@@ -206,7 +210,7 @@ def _number(value: Any, form: str) -> str:
     return UNDEFINED if value is None or pd.isna(value) else format(int(value) if form == "d" else float(value), form)
 
 
-def _p_value(value: float) -> str:
+def p_value(value: float) -> str:
     return "<0.001" if value < 0.001 else f"{value:.3f}"
 
 
@@ -223,6 +227,6 @@ TITLES = {
     "combinations": "The most frequent combinations of four changes",
     "weather": "One weather against another",
 }
-LAYOUTS: Mapping[str, Callable[[pd.DataFrame], list[Table]]] = {
+LAYOUTS: Layouts = {
     "rq1": _rq1, "rq2": _rq2, "rq3.1": _rq31, "rq3.2": _rq32, "rq3.3": _rq33, SAFETY: _safety, "collisions": _collisions,
     "combinations": _combinations, "weather": _weather}

@@ -10,9 +10,11 @@ from typing import Any
 
 import pandas as pd
 
-from safevar_sumo.analysis.layout import Bold, Table, lay_out
+from safevar_sumo.analysis.layout import LAYOUTS, Bold, Layouts, Table, lay_out
+from safevar_sumo.analysis.paper import PAPER
 from safevar_sumo.analysis.questions import Answer
 
+MINUS = "\N{MINUS SIGN}"
 _LATEX = {
     "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "%": r"\%", "_": r"\_",
     "^": r"\textasciicircum{}",
@@ -20,37 +22,28 @@ _LATEX = {
     '"': r"\textquotedbl{}", "'": r"\textquotesingle{}", "`": r"\textasciigrave{}",
     "\N{DEGREE SIGN}": r"\textdegree{}", "\N{MICRO SIGN}": r"\textmu{}", "\N{GREEK SMALL LETTER MU}": r"\textmu{}",
     "\N{SUPERSCRIPT TWO}": r"\textsuperscript{2}", "\N{SUPERSCRIPT THREE}": r"\textsuperscript{3}",
-    "\N{MIDDLE DOT}": r"\textperiodcentered{}"}
+    "\N{MIDDLE DOT}": r"\textperiodcentered{}", MINUS: r"\textminus{}"}
 """How LaTeX has the characters that mean something to it, and some that units are made of."""
 _LAST_PLAIN = "\N{LATIN SMALL LETTER Z WITH CARON}"
 """Up to here, LaTeX's T1 fonts have nearly every letter."""
-LATEX_DOCUMENT = r"""\documentclass{article}
-\usepackage[T1]{fontenc}
-\usepackage[utf8]{inputenc}
-\usepackage{textcomp}
-\usepackage{booktabs}
-\usepackage{graphicx}
-\usepackage[margin=15mm]{geometry}
-\begin{document}
-%s
-\end{document}
-"""
+LATEX_NEEDS = r"% In the preamble: \usepackage[T1]{fontenc} \usepackage{textcomp} \usepackage{booktabs} \usepackage{graphicx}"
 
 
-def text(answers: Sequence[Answer]) -> str:
+def text(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
     """For a terminal: columns aligned, bold cells with an asterisk."""
-    return "\n".join(_text(table) for answer in answers for table in lay_out(answer))
+    return "\n".join(_text(table) for answer in answers for table in lay_out(answer, layouts))
 
 
-def markdown(answers: Sequence[Answer]) -> str:
+def markdown(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
     """Markdown tables; a heading over several columns stands in each of theirs."""
-    return "\n".join(_markdown(table) for answer in answers for table in lay_out(answer))
+    return "\n".join(_markdown(table) for answer in answers for table in lay_out(answer, layouts))
 
 
-def latex(answers: Sequence[Answer]) -> str:
-    """A document of booktabs tables, as pdflatex takes it."""
-    parts = ["\n".join(_latex(table) for table in lay_out(answer)) for answer in answers]
-    return LATEX_DOCUMENT % "\\clearpage\n".join(parts)
+def latex(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
+    r"""Booktabs tables for `\input`, each with a label: `tab:rq1`, and `tab:rq1-2` for the second of an answer."""
+    tables = [_latex(table, f"{answer.name}-{i}" if i > 1 else answer.name)
+              for answer in answers for i, table in enumerate(lay_out(answer, layouts), 1)]
+    return "\n".join([LATEX_NEEDS, *tables])
 
 
 def csv(answers: Sequence[Answer]) -> str:
@@ -78,8 +71,10 @@ def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
     return [{name: value for name, value in row.items() if not (name == "rank" and value is None)} for row in rows]
 
 
-FORMATS: Mapping[str, Callable[[Sequence[Answer]], str]] = {
-    "text": text, "markdown": markdown, "latex": latex, "csv": csv, "json": as_json}
+LAYOUTS_BY_NAME: Mapping[str, Layouts] = {"full": LAYOUTS, "paper": PAPER}
+LAID_OUT: Mapping[str, Callable[..., str]] = {"text": text, "markdown": markdown, "latex": latex}
+"""Formats for readers, whose functions take layouts; the others hold the frames."""
+FORMATS: Mapping[str, Callable[..., str]] = {**LAID_OUT, "csv": csv, "json": as_json}
 ENDINGS = {"text": "txt", "markdown": "md", "latex": "tex", "csv": "csv", "json": "json"}
 
 
@@ -126,8 +121,8 @@ def _marked(plain: str) -> str:
     return re.sub(r"([\\`*_|<>\[\]~^#$])", r"\\\1", plain.replace("\n", " "))
 
 
-def _latex(table: Table) -> str:
-    lines = [r"\begin{table}[htbp]", r"\centering", rf"\caption{{{escaped(table.title)}}}"]
+def _latex(table: Table, label: str) -> str:
+    lines = [r"\begin{table}[htbp]", r"\centering", rf"\caption{{{escaped(table.title)}}}", rf"\label{{tab:{label}}}"]
     if table.heads:
         lines += [r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%", *_tabular(table), "}"]
     lines += [rf"\par\smallskip{{\footnotesize {' '.join(escaped(note) for note in table.notes)}\par}}"] if table.notes else []
@@ -149,8 +144,9 @@ def _tabular(table: Table) -> list[str]:
 
 def escaped(plain: str) -> str:
     """Plain text as LaTeX; a character that its fonts may lack becomes its code point."""
-    powers = re.split(r"\^(\d+)", " ".join(plain.split()))
-    found = "".join(rf"\textsuperscript{{{part}}}" if i % 2 else "".join(map(_letter, part)) for i, part in enumerate(powers))
+    powers = re.split(r"\^(-?\d+)", re.sub(r"(?<![\w)^-])-(?=\.?\d)", MINUS, " ".join(plain.split())))
+    found = "".join(rf"\textsuperscript{{{''.join(map(_letter, part.replace('-', MINUS)))}}}" if i % 2 else "".join(map(_letter, part))
+                    for i, part in enumerate(powers))
     return found.replace("--", "-{}-")
 
 

@@ -31,8 +31,9 @@ def mistakes(document: str) -> list[str]:
                 found.append(f"{cells} cells in {len(columns)} columns: {row}")
             if re.match(r"[\[*]", row):
                 found.append(f"taken for an option of the row before: {row}")
-    text = document.split(r"\begin{document}", 1)[-1]
-    for line in text.splitlines():
+    for line in document.splitlines():
+        if line.startswith("%"):
+            continue
         plain = re.sub(r"\\[\\{}$&#%_]", "", line.removesuffix("%"))
         if re.search(r"[$#%~^_]", plain) or not line.isprintable():
             found.append(f"a character that is not escaped: {line}")

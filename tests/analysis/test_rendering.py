@@ -5,17 +5,21 @@ from __future__ import annotations
 import csv as csv_files
 import io
 import json
+import re
 import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import pandas as pd
 import pytest
 from latex_syntax import mistakes
 from made_up import made_up, made_up_study, row
 
 from safevar_sumo.analysis import Case, answer
+from safevar_sumo.analysis.layout import LAYOUTS, Layouts
+from safevar_sumo.analysis.paper import PAPER
 from safevar_sumo.analysis.tables import FORMATS, as_json, csv, escaped, latex, markdown, text
 from safevar_sumo.study import CharacteristicTable
 
@@ -49,15 +53,33 @@ def cases(request: pytest.FixtureRequest) -> list[Case]:
         request.param]
 
 
-def test_latex_has_no_mistakes(cases: list[Case]) -> None:
-    document = latex(answer(cases))
+DOCUMENT = r"""\documentclass{article}
+\usepackage[T1]{fontenc}
+\usepackage[utf8]{inputenc}
+\usepackage{textcomp}
+\usepackage{booktabs}
+\usepackage{graphicx}
+\begin{document}
+%s
+\end{document}
+"""
+
+
+@pytest.mark.parametrize("layouts", [LAYOUTS, PAPER])
+def test_latex_has_no_mistakes(cases: list[Case], layouts: Layouts) -> None:
+    document = latex(answer(cases), layouts)
+    labels = re.findall(r"\\label\{(.*?)\}", document)
+    assert len(set(labels)) == len(labels) == document.count(r"\caption")
+    assert {"tab:rq1", "tab:rq2", "tab:rq3.1"} <= set(labels)
+    assert r"\documentclass" not in document
     assert mistakes(document) == []
     assert document.count(r"\toprule") == document.count(r"\bottomrule") > 5
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX here; the syntax is checked without")
 def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
-    (tmp_path / "tables.tex").write_text(latex(answer(cases)), encoding="utf-8")
+    document = DOCUMENT % (latex(answer(cases)) + latex(answer(cases), PAPER).replace("tab:", "tab:paper-"))
+    (tmp_path / "tables.tex").write_text(document, encoding="utf-8")
     done = subprocess.run(["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "tables.tex"], cwd=tmp_path, capture_output=True,
                           text=True, errors="replace", check=False)
     assert done.returncode == 0, done.stdout[-2000:]
@@ -73,7 +95,9 @@ def test_the_syntax_check_finds_mistakes() -> None:
 
 @pytest.mark.parametrize(("plain", "latex_form"), [
     ("a_b", r"a\_b"), ("50 %", r"50 \%"), ("m/s^2", r"m/s\textsuperscript{2}"), ("^", r"\textasciicircum{}"), ("[x]", "{[}x{]}"),
-    ("v''", r"v\textquotesingle{}\textquotesingle{}"), ("two\nlines", "two lines"), ("é", "é"), ("Δ", "U+0394"), ("--", "-{}-"),
+    ("-0.5", r"\textminus{}0.5"), ("2-3", "2-3"), ("(-1)", r"(\textminus{}1)"), ("s^-1", r"s\textsuperscript{\textminus{}1}"),
+    ("NSGA-2", "NSGA-2"), ("v''", r"v\textquotesingle{}\textquotesingle{}"), ("two\nlines", "two lines"),
+    ("é", "é"), ("Δ", "U+0394"), ("--", "-{}-"),
     ("\\", r"\textbackslash{}")])
 def test_special_characters_are_escaped(plain: str, latex_form: str) -> None:
     assert escaped(plain) == latex_form
@@ -144,3 +168,23 @@ def test_significant_and_notable_cells_stand_out() -> None:
 def test_what_cannot_be_told_is_never_a_nan(kind: str) -> None:
     cases = [made_up(row(sd=-1), row("rs", tet=None, ave_dece=None), original={"safety_degree": 0.5})]
     assert "nan" not in FORMATS[kind](answer(cases)).lower()
+
+
+def test_the_papers_layout_has_cases_by_metrics_and_cells_of_p_and_a12() -> None:
+    cases = [made_up(*(row(sd=1 - i / 100) for i in range(30))), rich_setting(name="wet", weather="hard_rain")]
+    told = text(answer(cases, "rq1"), PAPER)
+    head = next(line for line in told.splitlines() if line.startswith("case"))
+    assert head.split() == ["case", "algorithm", "SD", "TET", "TIT", "aveDece"]
+    assert "<0.001 / 0.000*" in told
+    for one in answer(cases, "rq1")[0].frame.to_dict("records"):
+        if one["p_value"] is not None and one["p_value"] >= 0.001:
+            assert f"{one['p_value']:.3f} / {one['effect_size']:.3f}" in told
+
+
+def test_the_papers_layout_marks_what_is_part_of_a_combination() -> None:
+    frame = pd.DataFrame({"setting": ["sun", "sun", "rain"], "rank": [1, 2, 1], "characteristics": [["a", "b"], ["b", "c"], ["c", "a"]],
+                          "percent": [50.0, 25.0, 100.0]})
+    (table,) = PAPER["combinations"](frame)
+    assert table.heads == ("characteristic", "#1", "#2", "#1")
+    assert table.spans == (("sun", 2), ("rain", 1))
+    assert table.rows == [("a", "x", "", "x"), ("b", "x", "x", ""), ("c", "", "x", "x"), ("% of solutions", "50.0", "25.0", "100.0")]

@@ -109,7 +109,9 @@ def test_all_tables_at_once_and_into_files(results: Path, in_tmp: Path) -> None:
     run("tables", str(results), "--out", "tables", "--format", "latex")
     names = {path.name for path in Path("tables").iterdir()}
     assert names >= {"rq1.tex", "rq2.tex", "rq3.1.tex", "rq3.2.tex", "rq3.3.tex", "rq3.3-safety.tex", "collisions.tex"}
-    assert all(path.read_text().startswith(r"\documentclass") for path in Path("tables").iterdir())
+    assert all(r"\label{tab:" in path.read_text() for path in Path("tables").iterdir())
+    assert "/ 0." in run("tables", str(results), "--layout", "paper", "--rq", "rq1").stdout
+    refused("tables", str(results), "--layout", "paper", "--format", "csv", told=("--layout", "text, markdown, latex"))
 
 
 def test_settings_stand_side_by_side(results: Path, imported: Path) -> None:
