@@ -143,7 +143,8 @@ class Evaluations:
 
     `settings` has shape (M, n) and holds the filtered values in their table units, all else (M,).
     `metrics` has the columns of `safevar_sumo.metrics.METRICS`; an undefined value is NaN.
-    `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count.
+    `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count. `reasons` tells of settings, by their
+    bytes, why they could not be simulated.
     """
 
     settings: FloatArray
@@ -152,6 +153,7 @@ class Evaluations:
     metrics: Mapping[str, FloatArray]
     f_diff: FloatArray
     f_num_diff: FloatArray
+    reasons: Mapping[bytes, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.settings)
@@ -175,12 +177,16 @@ class Evaluations:
         """Where the simulation ended in a way that can be scored."""
         return np.asarray(self.outcome != Outcome.SIMULATOR_ERROR)
 
+    def reason(self, row: int) -> str:
+        """Why a setting that is not valid could not be scored."""
+        return self.reasons.get(self.settings[row].tobytes(), "nobody told why")
+
     def take(self, rows: Sequence[int] | npt.NDArray[np.intp] | BoolArray) -> Evaluations:
         """The evaluations of `rows`, in that order."""
         return Evaluations(
             settings=self.settings[rows], outcome=self.outcome[rows], collision_speed=self.collision_speed[rows],
             metrics={name: values[rows] for name, values in self.metrics.items()},
-            f_diff=self.f_diff[rows], f_num_diff=self.f_num_diff[rows])
+            f_diff=self.f_diff[rows], f_num_diff=self.f_num_diff[rows], reasons=self.reasons)
 
     @classmethod
     def none(cls, n: int, metrics: Iterable[str]) -> Evaluations:
@@ -198,4 +204,5 @@ class Evaluations:
         return cls(
             settings=joined("settings"), outcome=joined("outcome"), collision_speed=joined("collision_speed"),
             metrics={name: np.concatenate([part.metrics[name] for part in parts]) for name in parts[0].metrics},
-            f_diff=joined("f_diff"), f_num_diff=joined("f_num_diff"))
+            f_diff=joined("f_diff"), f_num_diff=joined("f_num_diff"),
+            reasons={setting: reason for part in parts for setting, reason in part.reasons.items()})

@@ -6,10 +6,10 @@ from concurrent.futures import Future
 from pathlib import Path
 
 from safevar_sumo.campaign import all_runs, carry_out
-from safevar_sumo.computing import evaluate_batch
+from safevar_sumo.computing import evaluate_batch, identity_of
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import ResultsDirectory
-from safevar_sumo.simulation import network_fingerprint
+from safevar_sumo.simulation import assemble
 from safevar_sumo.study import load_study
 
 STUDY = """
@@ -53,7 +53,7 @@ def make_results(out: Path, title: str = "Crossing on wet leaves") -> Path:
     out.mkdir(parents=True, exist_ok=True)
     (out / "slippery.toml").write_text(STUDY.format(title=title))
     study = load_study(str(out / "slippery.toml"))
-    results = ResultsDirectory(out / "results", study, network_fingerprint("pedestrian_crossing"))
+    results = ResultsDirectory(out / "results", study, identity_of(study, assemble(study)))
     campaign = carry_out(study, all_runs(study), results, Here(), Silent())
     results.finish(campaign.solutions)
     return results.path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -14,9 +15,11 @@ import pytest
 from safevar_sumo.campaign import Campaign, RunKey, all_runs, carry_out, forecast, run_generator
 from safevar_sumo.campaign.gathering import BATCHES_PER_WORKER
 from safevar_sumo.computing import PoolLostError, WorkerLostError
+from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import Journal, ResultsDirectory, load
+from safevar_sumo.results.frames import encoded, read_frames
 from safevar_sumo.study import Study, load_study, tables_of
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -154,7 +157,7 @@ def test_a_finished_campaign_answers_without_simulating(study: Study, tmp_path: 
     before = solutions(tmp_path)
     again, told_again = carried_out(study, tmp_path, FormulaPool(lasts=0))
     assert solutions(tmp_path) == before
-    assert again.failures == first.failures == 0
+    assert again.failures == first.failures == []
     assert told_again.simulated == 0
     assert told_again.finished_runs == told.finished_runs == dict.fromkeys(all_runs(study), study.search.evaluations)
 
@@ -240,7 +243,7 @@ def test_failures_are_counted_kept_out_and_not_met_again(study: Study, tmp_path:
     campaign, _ = carried_out(study, tmp_path, Deadly())
     frame = load(tmp_path).evaluations
     failed = frame["outcome"] == "simulator-error"
-    assert failed.sum() == campaign.failures > 0
+    assert failed.sum() == len(campaign.failures) > 0
     assert np.array_equal(failed, frame["tireFric"] < 1.3)
     assert not (load(tmp_path).solutions["tireFric"] < 1.3).any()
     before = solutions(tmp_path)
@@ -252,6 +255,94 @@ def test_failures_are_counted_kept_out_and_not_met_again(study: Study, tmp_path:
     again, _ = carried_out(study, tmp_path, FormulaPool(lasts=0))
     assert again.failures == campaign.failures
     assert solutions(tmp_path) == before
+
+
+@pytest.mark.parametrize("budgets", [(60, 100), (55, 130), (100, 60), (550, 800)])
+def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_others(
+        study: Study, tmp_path: Path, budgets: tuple[int, int]) -> None:
+    first, second = (with_search(study, evaluations=budget, runs=1) for budget in budgets)
+    pools = [FormulaPool() for _ in range(3)]
+    carried_out(first, tmp_path / "out", pools[0])
+    carried_out(second, tmp_path / "out", pools[1])
+    carried_out(second, tmp_path / "fresh", pools[2])
+    assert solutions(tmp_path / "out") == solutions(tmp_path / "fresh")
+    found, fresh = load(tmp_path / "out"), load(tmp_path / "fresh")
+    pd.testing.assert_frame_equal(found.evaluations, fresh.evaluations)
+    pd.testing.assert_frame_equal(found.solutions, fresh.solutions)
+    assert len(set(pools[0].simulated)) + len(set(pools[1].simulated)) == len(set(pools[0].simulated) | set(pools[1].simulated))
+    carried_out(first, tmp_path / "out", FormulaPool(lasts=0))
+
+
+def test_while_there_are_more_evaluations_to_come_a_run_is_unfinished(study: Study, tmp_path: Path) -> None:
+    carried_out(study, tmp_path)
+    with pytest.raises(PoolLostError):
+        carried_out(with_search(study, evaluations=300), tmp_path, FormulaPool(lasts=3))
+    found = load(tmp_path)
+    assert found.finished == ()
+    assert not (tmp_path / "solutions.csv").exists()
+
+
+def test_the_manifest_tells_what_counts(study: Study, tmp_path: Path) -> None:
+    carried_out(with_search(study, runs=3), tmp_path)
+    carried_out(with_search(study, runs=1, algorithms=["nsga2", "rs"]), tmp_path, FormulaPool(lasts=0))
+    found = load(tmp_path)
+    assert found.finished == (("nsga2", 0), ("rs", 0))
+    assert set(found.evaluations["run"]) == {0}
+    assert found.solutions.to_csv(index=False, lineterminator="\n").encode() == solutions(tmp_path)
+
+
+def test_a_journal_from_elsewhere_is_refused_by_readers(study: Study, tmp_path: Path) -> None:
+    carried_out(study, tmp_path / "a")
+    carried_out(with_search(study, seed=2), tmp_path / "b")
+    shutil.copy(tmp_path / "b" / "runs" / "rs-01.journal", tmp_path / "a" / "runs")
+    with pytest.raises(InputError, match=r"rs-01\.journal: belongs to another study, run or version"):
+        load(tmp_path / "a")
+
+
+def test_an_algorithm_that_asks_for_other_settings_than_its_journal_holds_is_told(study: Study, tmp_path: Path) -> None:
+    one = with_search(study, algorithms=["rs"], runs=1)
+    carried_out(one, tmp_path)
+    path = tmp_path / "runs" / "rs-00.journal"
+    frames, _ = read_frames(path.read_bytes(), path)
+    other = msgspec.structs.replace(frames[1], settings=(np.frombuffer(frames[1].settings) * 1.01).tobytes())  # type: ignore[union-attr]
+    path.write_bytes(b"".join(encoded(frame) for frame in [frames[0], other]))
+    with pytest.raises(InputError, match="holds other settings than this search asks for"):
+        carried_out(one, tmp_path)
+
+
+def test_failed_settings_are_tried_again_when_that_is_asked_for(study: Study, tmp_path: Path) -> None:
+    class Outage(FormulaPool):
+        """Cannot simulate low tyre friction today."""
+
+        def submit(self, work: bytes, settings: np.ndarray) -> Future[Evaluations]:
+            if np.any(settings[:, 8] < 1.3):
+                future: Future[Evaluations] = Future()
+                future.set_exception(SimulationError("SUMO failed: it has its day off"))
+                return future
+            return super().submit(work, settings)
+
+    failed, _ = carried_out(study, tmp_path / "out", Outage())
+    results = load(tmp_path / "out")
+    assert list(results.failures) == failed.failures != []
+    assert {one.reason for one in failed.failures} == {"SUMO failed: it has its day off"}
+    with pytest.raises(PoolLostError):  # a retry that breaks down is gone on with
+        carry_out(study, all_runs(study), ResultsDirectory(tmp_path / "out", study), FormulaPool(lasts=7), Told(), retry_failed=True)
+    pool = FormulaPool()
+    campaign = carry_out(study, all_runs(study), ResultsDirectory(tmp_path / "out", study), pool, Told(), retry_failed=True)
+    ResultsDirectory(tmp_path / "out", study).finish(campaign.solutions)
+    carried_out(study, tmp_path / "whole")
+    assert campaign.failures == []
+    assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")
+    pd.testing.assert_frame_equal(load(tmp_path / "out").evaluations, load(tmp_path / "whole").evaluations)
+
+
+def test_a_torn_journal_of_the_original_is_told_too(study: Study, tmp_path: Path) -> None:
+    carried_out(study, tmp_path)
+    torn = tmp_path / "runs" / "original.journal"
+    torn.write_bytes(torn.read_bytes()[:-5])
+    _, told = carried_out(study, tmp_path)
+    assert len(told.warnings) == 1
+    assert str(torn) in told.warnings[0]
 
 
 def test_every_evaluation_is_read_in_the_order_in_which_it_was_asked_for(study: Study, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import pandas as pd
 from safevar_sumo.errors import InputError, told
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import FloatArray, Outcome
-from safevar_sumo.results import load
+from safevar_sumo.results import Failure, failure_lines, load
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Study, Weather, invalid
 from safevar_sumo.vehicles import CharacteristicSet
@@ -51,6 +51,8 @@ class Case:
         Algorithm and number of every finished run.
     has_runs
         False for imported solutions, of which nobody knows the run.
+    failures
+        Settings that could not be simulated.
     """
 
     name: str
@@ -60,6 +62,7 @@ class Case:
     evaluations: pd.DataFrame
     finished: tuple[tuple[str, int], ...]
     has_runs: bool
+    failures: tuple[Failure, ...] = ()
 
     @property
     def characteristics(self) -> CharacteristicSet:
@@ -112,6 +115,9 @@ class Case:
             short = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.algorithms if done[name] < planned]
             if short:
                 told.append(f"{self.name}: unfinished, {', '.join(short)}; made of what is finished.")
+        if self.failures:
+            told.append(f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) and are in no result: "
+                        f"{'; '.join(failure_lines(self.failures))}. study --retry-failed simulates them again.")
         return told
 
 
@@ -153,7 +159,7 @@ def _loaded(place: Path) -> Case:
 
 def load_case(directory: Path) -> Case:
     """Read one results directory."""
-    manifest, evaluations, solutions, finished = load(directory)
+    manifest, evaluations, solutions, finished, failures = load(directory)
     try:
         study = msgspec.convert(manifest["study"], Study)
     except msgspec.ValidationError as error:
@@ -161,12 +167,12 @@ def load_case(directory: Path) -> Case:
     original = manifest.get("original")
     if not isinstance(original, dict):
         raise InputError(directory / "manifest.json", "tells nothing of the original vehicle", "what the command study has written")
-    return case_of(study, original, solutions, evaluations, finished, "imported" not in manifest)
+    return case_of(study, original, solutions, evaluations, finished, "imported" not in manifest, failures)
 
 
 def case_of(study: Study, original: Mapping[str, Any], solutions: pd.DataFrame, evaluations: pd.DataFrame,
-               finished: Sequence[tuple[str, int]], has_runs: bool = True) -> Case:
+               finished: Sequence[tuple[str, int]], has_runs: bool = True, failures: Sequence[Failure] = ()) -> Case:
     """Put a case together; in `original` an undefined metric is None or missing."""
     metrics = {name: np.nan if original.get(name) is None else float(original[name]) for name in METRICS}
     return Case(name=study.name, study=study, original=metrics, solutions=solutions, evaluations=evaluations,
-                   finished=tuple(finished), has_runs=has_runs)
+                   finished=tuple(finished), has_runs=has_runs, failures=tuple(failures))

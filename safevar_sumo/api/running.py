@@ -13,16 +13,17 @@ from rich.console import Console
 from safevar_sumo.api.once import assembled
 from safevar_sumo.api.results import Results, load
 from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, carry_out
-from safevar_sumo.computing import Pool, available_cores, cluster_pool, local_pool
+from safevar_sumo.computing import Pool, available_cores, cluster_pool, identity_of, local_pool
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.results import ResultsDirectory
-from safevar_sumo.simulation import System, network_fingerprint
+from safevar_sumo.simulation import System
 from safevar_sumo.study import Study, StudyLike
 
 
 def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = None, cluster: str | None = None,
-        progress: bool | Observer = False, only: Sequence[tuple[str, int]] | None = None, batch: int | None = None) -> Results:
+        progress: bool | Observer = False, only: Sequence[tuple[str, int]] | None = None, batch: int | None = None,
+        retry_failed: bool = False) -> Results:
     """Search a study; called again with the same study and directory, it goes on where it was stopped.
 
     Parameters
@@ -41,6 +42,8 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
         These runs alone, as (algorithm, number from 0); the results are whole once every run is finished.
     batch
         Settings per SUMO simulation, at the most, gathered from several runs; never changes a result.
+    retry_failed
+        Whether settings that could not be simulated before are tried again.
 
     Raises
     ------
@@ -55,7 +58,7 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     bars: Any = CampaignProgress(Console(stderr=True), chosen, keys, quiet=False)
     showing = bars if progress is True else nullcontext(progress or Unheard())
     with a_pool(chosen, jobs, cluster) as pool, showing as observer:
-        carried_out(chosen, system, keys, directory, pool, observer, batch)
+        carried_out(chosen, system, keys, directory, pool, observer, batch, retry_failed=retry_failed)
     return load(directory)
 
 
@@ -74,7 +77,7 @@ def prepared(study: StudyLike, source: str = "") -> tuple[Study, System]:
 
 
 def carried_out(study: Study, system: System, keys: list[RunKey], directory: Path, pool: Pool, observer: Observer,
-                batch: int | None) -> Campaign:
+                batch: int | None, *, retry_failed: bool = False) -> Campaign:
     """Carry out runs of a study in a directory; with all of them finished, its solutions are written.
 
     Raises
@@ -82,8 +85,8 @@ def carried_out(study: Study, system: System, keys: list[RunKey], directory: Pat
     SafevarError
         If another process works on one of the runs, or as `carry_out`.
     """
-    results = ResultsDirectory(directory, study, network_fingerprint(system.scenario.network))
-    campaign = carry_out(study, keys, results, pool, observer, batch)
+    results = ResultsDirectory(directory, study, identity_of(study, system))
+    campaign = carry_out(study, keys, results, pool, observer, batch, retry_failed=retry_failed)
     if campaign.busy:
         raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: the same again later finishes the study")
     if keys == all_runs(study):

@@ -14,7 +14,7 @@ from safevar_sumo.campaign.keys import RunKey, algorithm_of, run_generator
 from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.computing import PersistentPool, Pool, packed
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import JournalBusy, ResultsDirectory
+from safevar_sumo.results import ORIGINAL, Failure, JournalBusy, ResultsDirectory
 from safevar_sumo.search import Problem
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -23,17 +23,17 @@ from safevar_sumo.vehicles import CharacteristicSet
 class Campaign(NamedTuple):
     """What runs of a study found: the original vehicle's evaluation and the solutions of every finished run.
 
-    `failures` settings could not be simulated; `busy` runs are in the hands of another process.
+    `failures` are settings that could not be simulated; `busy` runs are in the hands of another process.
     """
 
     original: Evaluations
     solutions: dict[RunKey, Evaluations]
-    failures: int
+    failures: list[Failure]
     busy: list[RunKey]
 
 
 def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, pool: Pool, observer: Observer,
-              batch: int | None = None) -> Campaign:
+              batch: int | None = None, *, retry_failed: bool = False) -> Campaign:
     """Carry out runs of a study, or finish what of them is unfinished.
 
     Parameters
@@ -46,6 +46,8 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
         Computes batches.
     batch
         Settings per SUMO simulation at the most, gathered from several runs.
+    retry_failed
+        Whether settings that could not be simulated before are tried again.
 
     Raises
     ------
@@ -53,20 +55,19 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
         If a journal cannot be written or the study itself is at fault.
     """
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    persistent, work = PersistentPool(pool, characteristics), packed(study)
-    original = _original(work, characteristics, results, persistent)
+    persistent, work = PersistentPool(pool, characteristics), packed(study, results.manifest)
+    original = _original(work, characteristics, results, persistent, observer)
     results.begin(original)
     problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations)
-    campaign = Campaign(original, {}, 0, [])
+    campaign = Campaign(original, {}, [], [])
     waiting, runs = deque(keys), set[Run]()
     gathering = Gathering(persistent, work, batch or BATCH)
 
     def go_on(run: Run) -> None:
         """Let a run go as far as it can, then ask for what it misses."""
-        nonlocal campaign
         if run.advance():
             campaign.solutions[run.key] = run.result
-            campaign = campaign._replace(failures=campaign.failures + run.failures)
+            campaign.failures.extend(run.failures)
             runs.discard(run)
             run.close()
         else:
@@ -83,7 +84,7 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
                         campaign.busy.append(key)
                         continue
                     search = algorithm_of(key.algorithm, study).search(problem, run_generator(study, key))
-                    runs.add(run := Run(key, search, journal, observer))
+                    runs.add(run := Run(key, search, journal, observer, study.search.evaluations, retry=retry_failed))
                     go_on(run)
                 gathering.send()
                 for future in first_of(gathering.under_way):
@@ -93,23 +94,27 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
     finally:
         for run in runs:
             run.close()
-    return campaign._replace(solutions={key: campaign.solutions[key] for key in sorted(campaign.solutions)})
+    return campaign._replace(solutions={key: campaign.solutions[key] for key in sorted(campaign.solutions)},
+                             failures=sorted(campaign.failures))
 
 
-def _original(work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: PersistentPool) -> Evaluations:
+def _original(work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: PersistentPool,
+              observer: Observer) -> Evaluations:
     """The original vehicle's evaluation, simulated once; where it fails, the study is at fault."""
     def simulated() -> Evaluations:
         return pool.submit(work, characteristics.original[np.newaxis], must_succeed=True).result()
 
     try:
-        journal = results.journal("original")
+        journal = results.journal(ORIGINAL)
     except JournalBusy:  # another process, of a job array say, is about to write the same
         return simulated()
     try:
-        if journal.evaluations is None:
-            evaluations = simulated()
-            journal.append([0], evaluations)
-            return evaluations
-        return journal.evaluations
+        if journal.cut:
+            observer.warned(f"{journal.path}: the last {journal.cut} bytes were torn; what they held is simulated again")
+        if journal.content.evaluations is not None:
+            return journal.content.evaluations
+        evaluations = simulated()
+        journal.append([0], evaluations)
+        return evaluations
     finally:
         journal.close()

@@ -7,8 +7,9 @@ from typing import Protocol
 import numpy as np
 
 from safevar_sumo.campaign.keys import RunKey
+from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import Journal
+from safevar_sumo.results import SPARE, Failure, Journal
 from safevar_sumo.search import Search
 
 
@@ -26,19 +27,30 @@ class Observer(Protocol):
 
 
 class Run:
-    """A search, what it asks for, and what of that is known."""
+    """A search, what it asks for, and what of that is known.
 
-    def __init__(self, key: RunKey, search: Search, journal: Journal, observer: Observer) -> None:
-        self.key, self._search, self._journal, self._observer = key, search, journal, observer
+    Parameters
+    ----------
+    budget
+        How many evaluations the search may ask for.
+    retry
+        Whether settings that could not be simulated are tried again.
+    """
+
+    def __init__(self, key: RunKey, search: Search, journal: Journal, observer: Observer, budget: int, *, retry: bool = False) -> None:
+        self.key, self._search, self._journal, self._observer, self._budget = key, search, journal, observer, budget
         self._known: dict[bytes, tuple[int, Evaluations, int]] = {}
-        self.failures = self._asked = 0
+        self._taken: set[int] = set()
+        self._asked = 0
         self._settings: FloatArray | None = None
         self._fresh = 0
         self.result: Evaluations
         if journal.cut:
             observer.warned(f"{journal.path}: the last {journal.cut} bytes were torn; what they held is simulated again")
-        if journal.evaluations is not None:
-            self._learn(journal.positions, journal.evaluations)
+        if retry and journal.content.evaluations is not None and not journal.content.evaluations.valid.all():
+            journal.retry()
+        if journal.content.evaluations is not None:
+            self._learn(journal.content.positions, journal.content.evaluations)
 
     @property
     def missing(self) -> FloatArray:
@@ -46,15 +58,24 @@ class Run:
         assert self._settings is not None
         return np.array(list({row.tobytes(): row for row in self._settings if row.tobytes() not in self._known}.values()))
 
+    @property
+    def failures(self) -> list[Failure]:
+        """Settings of this run that could not be simulated."""
+        return [Failure(self.key.algorithm, self.key.run, position, evaluations.reason(i))
+                for position, evaluations, i in sorted(self._known.values(), key=lambda known: known[0])
+                if 0 <= position < self._budget and not evaluations.valid[i]]
+
     def advance(self) -> bool:
         """Answer the search as long as everything it asks for is known; whether it has ended."""
-        if self._journal.result is not None:
-            self.result = self._by_position(self._journal.result)
-            self._observer.finished(self.key, self._journal.asked)
+        done = self._journal.content.result(self._budget)
+        if done is not None:
+            self.result = self._journal.content.by_position(done.positions)
+            self._observer.finished(self.key, done.asked)
             return True
         if self._settings is None:
             self._settings = next(self._search)
         while not len(self.missing):
+            self._place_spares()
             evaluations = self._recalled(self._settings)
             self._observer.evaluated(self.key, evaluations, self._fresh)
             self._asked, self._fresh = self._asked + len(evaluations), 0
@@ -62,18 +83,14 @@ class Run:
                 self._settings = self._search.send(evaluations)
             except StopIteration as end:
                 self.result = end.value
-                self._journal.finish([self._known[row.tobytes()][0] for row in self.result.settings], self._asked)
+                self._journal.finish([self._known[row.tobytes()][0] for row in self.result.settings], self._asked, self._budget)
                 self._observer.finished(self.key, self._asked)
                 return True
         return False
 
     def take(self, evaluations: Evaluations) -> bool:
         """Journal and learn a computed batch; whether that was all that was missing."""
-        assert self._settings is not None
-        places = {row.tobytes(): self._asked + i for i, row in reversed(list(enumerate(self._settings)))}
-        positions = [places[row.tobytes()] for row in evaluations.settings]
-        self._journal.append(positions, evaluations)
-        self._learn(positions, evaluations)
+        self._place(evaluations)
         self._fresh += len(evaluations)
         return not len(self.missing)
 
@@ -81,18 +98,29 @@ class Run:
         """Give the journal back."""
         self._journal.close()
 
+    def _place_spares(self) -> None:
+        """Journal where in the run evaluations stand that were known before it asked for them."""
+        assert self._settings is not None
+        spares = {row.tobytes(): row for row in self._settings if self._known[row.tobytes()][0] == SPARE}
+        if spares:
+            self._place(self._recalled(np.array(list(spares.values()))))
+
+    def _place(self, evaluations: Evaluations) -> None:
+        """Journal and learn evaluations that the search asks for now."""
+        assert self._settings is not None
+        places = {row.tobytes(): self._asked + i for i, row in reversed(list(enumerate(self._settings)))}
+        positions = [places[row.tobytes()] for row in evaluations.settings]
+        if not self._taken.isdisjoint(positions):
+            raise InputError(self._journal.path, "holds other settings than this search asks for", "another --out")
+        self._journal.append(positions, evaluations)
+        self._learn(positions, evaluations)
+
     def _learn(self, positions: list[int], evaluations: Evaluations) -> None:
-        self.failures += int(np.count_nonzero(~evaluations.valid))
-        if self._journal.result is None:
-            for i, position in enumerate(positions):
-                self._known[evaluations.settings[i].tobytes()] = (position, evaluations, i)
+        self._taken.update(position for position in positions if position != SPARE)
+        for i, position in enumerate(positions):
+            self._known[evaluations.settings[i].tobytes()] = (position, evaluations, i)
 
     def _recalled(self, settings: FloatArray) -> Evaluations:
         """The evaluations of known settings, in their order."""
         found = [self._known[row.tobytes()] for row in settings]
         return Evaluations.concatenate([evaluations.take([i]) for _, evaluations, i in found])
-
-    def _by_position(self, positions: list[int]) -> Evaluations:
-        assert self._journal.evaluations is not None
-        row_of = {position: row for row, position in enumerate(self._journal.positions)}
-        return self._journal.evaluations.take([row_of[position] for position in positions])

@@ -31,10 +31,11 @@ from safevar_sumo.terminal.campaign import print_forecast, print_summary
 @click.option("--cluster", metavar="ADDRESS", help="Compute on the workers of this Dask scheduler instead.")
 @click.option("--only", metavar="ALGORITHM:RUN", help="This run alone, the first run is 0.")
 @click.option("--shard", metavar="K/N", help="Every N-th run, from the K-th (1..N): for job arrays that share --out.")
+@click.option("--retry-failed", is_flag=True, help="Simulate again what could not be simulated before (simulator-error).")
 @click.option("--quiet", is_flag=True, help="Print errors and warnings alone.")
 @click.option("--dry-run", is_flag=True, help="Tell what would run, how long and how much disk it would take.")
 def study(study: str, batch: int | None, out: Path | None, jobs: int | None, cluster: str | None, only: str | None, shard: str | None,
-          quiet: bool, dry_run: bool, **options: Any) -> None:
+          retry_failed: bool, quiet: bool, dry_run: bool, **options: Any) -> None:
     """Search STUDY; the same command again goes on where it was stopped."""
     chosen, system = prepared(_with_options(load_study(study), **options), study)
     keys = _selected(all_runs(chosen), only, shard)
@@ -45,7 +46,7 @@ def study(study: str, batch: int | None, out: Path | None, jobs: int | None, clu
             return
         try:
             with CampaignProgress(Console(stderr=True), chosen, keys, quiet) as progress:
-                campaign = carried_out(chosen, system, keys, directory, pool, progress, batch)
+                campaign = carried_out(chosen, system, keys, directory, pool, progress, batch, retry_failed=retry_failed)
         except KeyboardInterrupt:
             click.echo(f"what is computed is kept in {directory}: the same command goes on from there", err=True)
             raise

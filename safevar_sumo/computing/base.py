@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import Future
 from functools import lru_cache
-from typing import Protocol
+from typing import Any, Protocol
 
 import msgspec
 
-from safevar_sumo.errors import SafevarError
+from safevar_sumo.computing.identity import Inputs, changed, inputs_of
+from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.simulation import System, assemble, evaluate
+from safevar_sumo.simulation import System, assemble, evaluate, network_files
 from safevar_sumo.study import Study
+
+SHARED = ("network", "sources", "code")
+"""Layers of a study's identity that every worker must have alike."""
 
 
 class WorkerLostError(SafevarError):
@@ -33,16 +38,53 @@ class Pool(Protocol):
         """Evaluate filtered settings, shape (k, n), of a packed study."""
 
 
-def packed(study: Study) -> bytes:
-    """A study as it travels to a worker."""
-    return msgspec.msgpack.encode(study)
+class _Work(msgspec.Struct, frozen=True):
+    """A study as it travels to a worker, and the digests of the files that it is to be computed with."""
+
+    study: Study
+    inputs: Inputs
 
 
-def evaluate_batch(study: bytes, settings: FloatArray) -> Evaluations:
-    """What a worker does: (study, settings) -> evaluations."""
-    return evaluate(_system(study), settings)
+def packed(study: Study, inputs: Mapping[str, Any] | None = None) -> bytes:
+    """A study as it travels to a worker.
+
+    Parameters
+    ----------
+    inputs
+        Layers of the study's identity by name; workers that have other files compute nothing. By default the files as
+        they are now.
+    """
+    if inputs is None:
+        inputs = inputs_of(study, assemble(study))
+    return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED if layer in inputs}))
+
+
+def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
+    """What a worker does: (study, settings) -> evaluations.
+
+    Raises
+    ------
+    InputError
+        If the study's files are not those that the campaign began with.
+    """
+    system, network = _system(work)
+    _refuse_changes(network, {"network": network_files(system.scenario.network)})
+    evaluations = evaluate(system, settings)
+    _refuse_changes(network, {"network": network_files(system.scenario.network)})
+    return evaluations
 
 
 @lru_cache(maxsize=4)
-def _system(study: bytes) -> System:
-    return assemble(msgspec.msgpack.decode(study, type=Study))
+def _system(packed_work: bytes) -> tuple[System, Inputs]:
+    """The system that a study names and what its network is to be; code that is loaded stays, whatever becomes of its files."""
+    work = msgspec.msgpack.decode(packed_work, type=_Work)
+    system = assemble(work.study)
+    _refuse_changes(work.inputs, inputs_of(work.study, system))
+    return system, {layer: files for layer, files in work.inputs.items() if layer == "network"}
+
+
+def _refuse_changes(expected: Inputs, here: Inputs) -> None:
+    files = changed(expected, here)
+    if files:
+        raise InputError(files[0], "is not the file that this study began with: it was changed meanwhile, or a worker has another one",
+                         "the file as it was, and the same command; or another --out")

@@ -90,11 +90,12 @@ class PersistentPool:
         if must_succeed or self._in_a_row >= FAILURES_IN_A_ROW:
             into.set_exception(error)
         else:
-            into.set_result(self._failed(setting))
+            into.set_result(self._failed(setting, error))
 
-    def _failed(self, setting: FloatArray) -> Evaluations:
+    def _failed(self, setting: FloatArray, error: SafevarError) -> Evaluations:
         undefined = np.full(1, np.nan)
         return Evaluations(
             settings=setting, outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"), collision_speed=undefined,
             metrics=dict.fromkeys(METRICS, undefined), f_diff=self._characteristics.largest_change(setting),
-            f_num_diff=self._characteristics.number_changed(setting))
+            f_num_diff=self._characteristics.number_changed(setting),
+            reasons={setting[0].tobytes(): " ".join(str(error).split())})

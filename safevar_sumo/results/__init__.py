@@ -1,19 +1,15 @@
 """Results of campaigns: journalled, written, and read back."""
 
+from safevar_sumo.results.files import make_directory, write_whole
+from safevar_sumo.results.frames import SPARE
 from safevar_sumo.results.handle import CHOICES, HALF, Handle, chosen_handle, handles, position_of, unsafe_rows
 from safevar_sumo.results.imported import UNKNOWN, write_imported
 from safevar_sumo.results.journal import Journal, JournalBusy
-from safevar_sumo.results.load import Results, load
-from safevar_sumo.results.store import (
-    ResultsDirectory,
-    evaluations_frame,
-    make_directory,
-    read_manifest,
-    record,
-    solutions_frame,
-    write_whole,
-)
+from safevar_sumo.results.load import Failure, Results, failure_lines, load
+from safevar_sumo.results.manifest import fixed, read_manifest
+from safevar_sumo.results.store import ORIGINAL, ResultsDirectory, evaluations_frame, record, solutions_frame
 
-__all__ = ["CHOICES", "HALF", "UNKNOWN", "Handle", "Journal", "JournalBusy", "Results", "ResultsDirectory", "chosen_handle",
-           "evaluations_frame", "handles", "load", "make_directory", "position_of", "read_manifest", "record",
-           "solutions_frame", "unsafe_rows", "write_imported", "write_whole"]
+__all__ = [
+    "CHOICES", "HALF", "ORIGINAL", "SPARE", "UNKNOWN", "Failure", "Handle", "Journal", "JournalBusy", "Results", "ResultsDirectory",
+    "chosen_handle", "evaluations_frame", "failure_lines", "fixed", "handles", "load", "make_directory", "position_of",
+    "read_manifest", "record", "solutions_frame", "unsafe_rows", "write_imported", "write_whole"]

@@ -13,7 +13,9 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results.store import MANIFEST, RUNS, SOLUTIONS, make_directory, read_manifest, solutions_frame, write_whole
+from safevar_sumo.results.files import make_directory, refuse_other_than_file, write_whole
+from safevar_sumo.results.manifest import FORMAT, MANIFEST, read_manifest
+from safevar_sumo.results.store import RUNS, SOLUTIONS, solutions_frame
 from safevar_sumo.study import Study, tables_of
 
 if TYPE_CHECKING:
@@ -47,7 +49,7 @@ def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations
     if (path / RUNS).exists() or ((path / MANIFEST).exists() and "imported" not in read_manifest(path)):
         raise InputError("--out", f"{path} holds results of a campaign", "another directory")
     manifest: dict[str, Any] = {
-        "study": tables_of(study), "imported": {"files": dict(files)},
+        "format": FORMAT, "study": tables_of(study), "imported": {"files": dict(files)},
         "versions": {"safevar_sumo": version("safevar_sumo")}, "original": dict(original)}
     frame = solutions_frame(tuple(study.vehicle.characteristics), [((name, 0), found) for name, found in solutions.items()])
     write_whole(path / SOLUTIONS, frame.drop(columns="run").to_csv(index=False, lineterminator="\n"))
@@ -66,6 +68,7 @@ def read_imported(path: Path, characteristics: tuple[str, ...]) -> pd.DataFrame:
 
     file = path / SOLUTIONS
     numbers = [*characteristics, "f_safe", "f_diff", "f_num_diff", *METRICS]
+    refuse_other_than_file(file)
     try:
         frame = pd.read_csv(file, dtype=str, keep_default_na=False)[["algorithm", *numbers, "outcome"]]
         found = frame.replace({name: {"": "nan"} for name in numbers}).astype(dict.fromkeys(numbers, float))

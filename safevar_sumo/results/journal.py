@@ -1,58 +1,36 @@
 """The journal of one run: every evaluated batch, appended and synced before the search goes on.
 
-A journal is a file of frames: magic, length and CRC-32 of a payload, then the payload in MessagePack. The first
-frame tells whose journal it is, the last one of a finished run which evaluations are its result. A torn tail, as a
-kill or a full disk leaves it, is cut off; damage before intact frames is an error.
+The first frame tells whose journal it is, the last one of a finished run which evaluations are its result. A torn tail,
+as a kill or a full disk leaves it, is cut off; damage before intact frames is an error.
 """
 
 from __future__ import annotations
 
+import errno
 import os
-import struct
-import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
-import msgspec
-import numpy as np
 import portalocker
 
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.records import Evaluations, FloatArray, Outcome
-
-FORMAT = 1
-MAGIC = b"SVJ\n"
-HEAD = struct.Struct("<4sII")
-OUTCOMES = list(Outcome)
-_CODE = {outcome.value: code for code, outcome in enumerate(OUTCOMES)}
-
-
-class _Owner(msgspec.Struct, frozen=True, tag="owner"):
-    """Whose journal this is."""
-
-    format: int
-    study: str
-    run: str
-
-
-class _Batch(msgspec.Struct, frozen=True, tag="batch"):
-    """Evaluations; `positions` (int32) are their places in the run's order, numbers are float64 by column."""
-
-    positions: bytes
-    outcome: bytes
-    settings: bytes
-    numbers: dict[str, bytes]
-
-
-class _Result(msgspec.Struct, frozen=True, tag="result"):
-    """The result of a finished run by the positions of its evaluations, and how many the run asked for."""
-
-    positions: list[int]
-    asked: int
-
-
-_Frame = _Owner | _Batch | _Result
+from safevar_sumo.records import Evaluations
+from safevar_sumo.results.files import make_durable, refuse_other_than_file, sync_directory
+from safevar_sumo.results.frames import (
+    FORMAT,
+    MAGIC,
+    READABLE,
+    Batch,
+    Content,
+    Frame,
+    Owner,
+    Result,
+    Retry,
+    batch_of,
+    content_of,
+    encoded,
+    read_frames,
+)
 
 
 class JournalBusy(SafevarError):
@@ -65,18 +43,14 @@ class Journal:
     Parameters
     ----------
     path
-        The file; it is made if it does not exist.
+        The file; it is made if it does not exist. One without evaluations changes its owner.
     study, run
         Whose journal it is.
 
     Attributes
     ----------
-    positions, evaluations
-        What it held when it was opened; None if there was nothing.
-    result
-        Positions of the result, None while the run is unfinished.
-    asked
-        How many evaluations the finished run asked for.
+    content
+        What it held when it was opened.
     cut
         How many bytes of a torn tail were cut off.
 
@@ -92,53 +66,60 @@ class Journal:
         self.path, self.cut = path, 0
         self._file = _opened(path)
         try:
-            self.positions, self.evaluations, self.result, self.asked = self._take_in(study, run)
+            self.content = self._take_in(Owner(format=FORMAT, study=study, run=run))
+        except OSError as error:
+            self.close()
+            raise SafevarError(f"{path}: cannot be read: {error.strerror}; what was written before stays valid") from None
         except BaseException:
             self.close()
             raise
 
     def append(self, positions: list[int], evaluations: Evaluations) -> None:
         """Add a batch and sync it to the disk."""
-        numbers = {"collision_speed": evaluations.collision_speed, "f_diff": evaluations.f_diff, "f_num_diff": evaluations.f_num_diff,
-                   **evaluations.metrics}
-        self._write(_Batch(
-            positions=np.array(positions, dtype="<i4").tobytes(), outcome=bytes(_CODE[str(one)] for one in evaluations.outcome),
-            settings=evaluations.settings.astype("<f8").tobytes(),
-            numbers={name: values.astype("<f8").tobytes() for name, values in numbers.items()}))
+        self._write(batch_of(positions, evaluations))
 
-    def finish(self, positions: list[int], asked: int) -> None:
-        """Add the result."""
-        self._write(_Result(positions=positions, asked=asked))
+    def finish(self, positions: list[int], asked: int, budget: int) -> None:
+        """Add the result of the run with a budget of evaluations."""
+        self._write(Result(positions=positions, asked=asked, budget=budget))
+
+    def retry(self) -> None:
+        """Let failed evaluations count no more, and all that the search made of them."""
+        self._write(Retry())
+        self._file.seek(0)
+        self.content = content_of(read_frames(self._file.read(), self.path)[0])
 
     def close(self) -> None:
         """Give the lock back."""
         self._file.close()
 
-    def _take_in(self, study: str, run: str) -> tuple[list[int], Evaluations | None, list[int] | None, int]:
-        size = os.fstat(self._file.fileno()).st_size
-        frames, end = read_frames(self._file.read(), self.path)
+    def _take_in(self, owner: Owner) -> Content:
+        data = self._file.read()
+        size = len(data)
+        frames, end = read_frames(data, self.path)
+        if not frames and data.strip(b"\0") and not data.startswith(MAGIC[:len(data)]):
+            raise InputError(self.path, "is no journal", "another --out")
+        if frames and frames[0] != owner:
+            if any(isinstance(frame, Batch) for frame in frames):
+                raise InputError(self.path, "belongs to another study, run or version", "another --out")
+            frames, end, size = [], 0, end
+            self._cut_at(0)
         if end < size:
             self.cut = size - end
-            self._file.truncate(end)
-            self._file.seek(end)
+            self._cut_at(end)
         if not frames:
-            self._write(_Owner(format=FORMAT, study=study, run=run))
-        elif frames[0] != _Owner(format=FORMAT, study=study, run=run):
-            raise InputError(self.path, "belongs to another study, run or version", "another --out")
-        positions, evaluations = merged(frames)
-        result = next((frame for frame in frames if isinstance(frame, _Result)), None)
-        return positions, evaluations, result.positions if result else None, result.asked if result else 0
+            self._write(owner)
+            sync_directory(self.path.parent)
+        return content_of(frames)
 
-    def _write(self, frame: _Frame) -> None:
-        payload = msgspec.msgpack.encode(frame)
+    def _write(self, frame: Frame) -> None:
         start = self._file.tell()
         try:
-            rest = memoryview(HEAD.pack(MAGIC, len(payload), zlib.crc32(payload)) + payload)
+            rest = memoryview(encoded(frame))
             while rest:
                 rest = rest[self._file.write(rest):]
             os.fsync(self._file.fileno())
             if not self.path.exists():
-                raise OSError(2, "the file is gone")
+                raise OSError(errno.ENOENT, "the file is gone")
         except OSError as error:
             self._undo(start)
             raise SafevarError(f"{self.path}: cannot be written: {error.strerror}; what was written before stays valid") from None
@@ -146,93 +127,59 @@ class Journal:
     def _undo(self, start: int) -> None:
         """Cut a half-written frame off again; where that fails too, the next reader does it."""
         try:
-            self._file.truncate(start)
-            self._file.seek(start)
+            self._cut_at(start)
         except OSError:
             return
 
-
-def read_journal(path: Path) -> tuple[list[int], Evaluations | None, list[int] | None]:
-    """Positions, evaluations and the result's positions of a journal that somebody may still write to."""
-    try:
-        frames, _ = read_frames(path.read_bytes(), path)
-    except OSError as error:
-        raise InputError(path, f"cannot be read: {error.strerror}") from None
-    positions, evaluations = merged(frames)
-    return positions, evaluations, next((frame.positions for frame in frames if isinstance(frame, _Result)), None)
+    def _cut_at(self, end: int) -> None:
+        self._file.truncate(end)
+        self._file.seek(end)
 
 
-def read_frames(data: bytes, path: Path) -> tuple[list[_Frame], int]:
-    """All intact frames, and where the last of them ends.
+def read_journal(path: Path, study: str, run: str) -> Content:
+    """What a journal holds that somebody may still write to.
 
     Raises
     ------
     InputError
-        If a frame is damaged and intact ones follow it.
+        If it cannot be read, is damaged, or belongs to another study or run.
     """
-    frames: list[_Frame] = []
-    offset = 0
-    while offset < len(data):
-        frame, end = _frame_at(data, offset, path)
-        if frame is None:
-            if any(_frame_at(data, later, path)[0] is not None for later in _occurrences(data, offset + 1)):
-                raise InputError(path, f"is damaged at byte {offset}, and intact frames follow",
-                                 "restore the file, or remove it to simulate the run again")
-            break
-        frames.append(frame)
-        offset = end
-    return frames, offset
+    frames = _frames_of(path)
+    if frames and not (isinstance(frames[0], Owner) and frames[0].format in READABLE):
+        raise InputError(path, "is of a format that this version does not read", "the version that wrote it")
+    if frames and frames[0] not in [Owner(format=known, study=study, run=run) for known in READABLE]:
+        raise InputError(path, "belongs to another study, run or version than the manifest beside it", "the journals of this study alone")
+    return content_of(frames)
 
 
-def merged(frames: list[_Frame]) -> tuple[list[int], Evaluations | None]:
-    """The evaluations of all batches, and their positions."""
-    batches = [frame for frame in frames if isinstance(frame, _Batch)]
-    positions = [position for batch in batches for position in np.frombuffer(batch.positions, dtype="<i4").tolist()]
-    return positions, Evaluations.concatenate([_unpacked(batch) for batch in batches]) if batches else None
+def owner_of(path: Path) -> str | None:
+    """The study that a journal in other hands belongs to; None while that is not written yet."""
+    frames = _frames_of(path)
+    return frames[0].study if frames and isinstance(frames[0], Owner) else None
+
+
+def _frames_of(path: Path) -> list[Frame]:
+    try:
+        refuse_other_than_file(path)
+        return read_frames(path.read_bytes(), path)[0]
+    except OSError as error:
+        raise InputError(path, f"cannot be read: {error.strerror}") from None
 
 
 def _opened(path: Path) -> IO[bytes]:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        refuse_other_than_file(path)
+        make_durable(path.parent)
         file = open(path, "a+b", buffering=0)  # noqa: SIM115
     except OSError as error:
         raise SafevarError(f"{path}: cannot be opened: {error.strerror}") from None
     try:
         portalocker.lock(file, portalocker.LOCK_EX | portalocker.LOCK_NB)
-    except portalocker.LockException:
+    except portalocker.AlreadyLocked:
         file.close()
         raise JournalBusy(f"{path}: another process works on this run") from None
+    except portalocker.LockException as error:
+        file.close()
+        raise SafevarError(f"{path}: cannot be locked: {error.strerror or error}; results need a disk whose files can be locked") from None
     file.seek(0)
     return file
-
-
-def _frame_at(data: bytes, offset: int, path: Path) -> tuple[_Frame | None, int]:
-    if offset + HEAD.size > len(data):
-        return None, offset
-    magic, length, checksum = HEAD.unpack_from(data, offset)
-    payload = data[offset + HEAD.size:offset + HEAD.size + length]
-    if magic != MAGIC or len(payload) != length or zlib.crc32(payload) != checksum:
-        return None, offset
-    try:
-        return msgspec.msgpack.decode(payload, type=_Frame), offset + HEAD.size + length
-    except msgspec.DecodeError as error:
-        raise InputError(path, f"holds at byte {offset} what this version does not know: {error}", "the version that wrote it") from None
-
-
-def _occurrences(data: bytes, start: int) -> Iterator[int]:
-    """Where the magic stands after `start`."""
-    found = data.find(MAGIC, start)
-    while found >= 0:
-        yield found
-        found = data.find(MAGIC, found + 1)
-
-
-def _unpacked(batch: _Batch) -> Evaluations:
-    numbers = {name: _floats(values) for name, values in batch.numbers.items()}
-    named = {name: numbers.pop(name) for name in ("collision_speed", "f_diff", "f_num_diff")}
-    outcome = np.array([OUTCOMES[code].value for code in batch.outcome], dtype="U16")
-    return Evaluations(settings=_floats(batch.settings).reshape(len(outcome), -1), outcome=outcome, metrics=numbers, **named)
-
-
-def _floats(values: bytes) -> FloatArray:
-    return np.frombuffer(values, dtype="<f8").astype(float)

@@ -2,16 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.results.frames import NOTHING
 from safevar_sumo.results.imported import read_imported
 from safevar_sumo.results.journal import read_journal
-from safevar_sumo.results.store import MANIFEST, RUNS, evaluations_frame, read_manifest, solutions_frame
+from safevar_sumo.results.manifest import MANIFEST, owner, read_manifest
+from safevar_sumo.results.store import RUNS, evaluations_frame, solutions_frame
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+class Failure(NamedTuple):
+    """A setting that could not be simulated: whose it was, its place in the run, and why."""
+
+    algorithm: str
+    run: int
+    evaluation: int
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.algorithm}:{self.run}, evaluation {self.evaluation}: {self.reason}"
+
+
+def failure_lines(failures: Sequence[Failure]) -> list[str]:
+    """Failures told by their reasons: of each how many, and the first of them."""
+    reasons: dict[str, list[Failure]] = {}
+    for one in failures:
+        reasons.setdefault(one.reason, []).append(one)
+    return [str(found[0]) if len(found) == 1 else f"{found[0]} (and {len(found) - 1} more)" for found in reasons.values()]
 
 
 class Results(NamedTuple):
@@ -28,44 +51,52 @@ class Results(NamedTuple):
         One row per solution of every finished run; the same columns but `evaluation`. Imported ones belong to no run.
     finished
         Algorithm and number of every finished run.
+    failures
+        Every setting that could not be simulated.
     """
 
     manifest: dict[str, Any]
     evaluations: pd.DataFrame
     solutions: pd.DataFrame
     finished: tuple[tuple[str, int], ...] = ()
+    failures: tuple[Failure, ...] = ()
 
 
 def load(directory: str | Path) -> Results:
-    """Read a results directory, finished or not.
+    """Read a results directory, finished or not: what its manifest's study asks for.
 
     Raises
     ------
     InputError
-        If it is none, or a file in it is damaged.
+        If it is none, or a file in it is damaged or belongs to another study.
     """
     place = Path(directory)
     manifest = read_manifest(place)
     try:
         characteristics = tuple(manifest["study"]["vehicle"]["characteristics"])
-    except (KeyError, TypeError):
-        raise InputError(place / MANIFEST, "tells of no vehicle with characteristics", "what the command study has written") from None
+        search = manifest["study"]["search"]
+        wanted = [(name, run) for name in dict.fromkeys(search["algorithms"]) for run in range(search["runs"])]
+        budget = int(search["evaluations"])
+    except (KeyError, TypeError, ValueError):
+        raise InputError(place / MANIFEST, "tells of no characteristics or of no search", "what the command study has written") from None
     if "imported" in manifest:
         return Results(manifest, evaluations_frame(characteristics, []).assign(evaluation=0), read_imported(place, characteristics))
-    everything, solved, positions = [], [], []
-    for path in sorted((place / RUNS).glob("*-*.journal")):
-        algorithm, _, run = path.stem.rpartition("-")
-        if not run.isdecimal():
+    everything, solved, positions, failures = [], [], [], []
+    study = owner(manifest)
+    for algorithm, run in wanted:
+        path = place / RUNS / f"{algorithm}-{run:02d}.journal"
+        content = read_journal(path, study, path.stem) if path.exists() else NOTHING
+        if content.evaluations is None:
             continue
-        places, evaluations, result = read_journal(path)
-        if evaluations is None:
-            continue
-        order = sorted(range(len(places)), key=places.__getitem__)
-        everything.append(((algorithm, int(run)), evaluations.take(order)))
-        positions += [places[row] for row in order]
+        asked = sorted((position, row) for row, position in enumerate(content.positions) if 0 <= position < budget)
+        evaluations = content.evaluations.take([row for _, row in asked])
+        everything.append(((algorithm, run), evaluations))
+        positions += [position for position, _ in asked]
+        failures += [Failure(algorithm, run, position, evaluations.reason(row))
+                     for row, (position, _) in enumerate(asked) if not evaluations.valid[row]]
+        result = content.result(budget)
         if result is not None:
-            row_of = {position: row for row, position in enumerate(places)}
-            solved.append(((algorithm, int(run)), evaluations.take([row_of[position] for position in result])))
+            solved.append(((algorithm, run), content.by_position(result.positions)))
     frame = evaluations_frame(characteristics, everything)
     frame.insert(2, "evaluation", positions)
-    return Results(manifest, frame, solutions_frame(characteristics, solved), tuple(key for key, _ in solved))
+    return Results(manifest, frame, solutions_frame(characteristics, solved), tuple(key for key, _ in solved), tuple(failures))

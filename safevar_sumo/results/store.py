@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
+import time
 from collections.abc import Iterable, Mapping
-from hashlib import sha256
-from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,16 +14,19 @@ import numpy as np
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results.journal import Journal
-from safevar_sumo.study import Study, tables_of
+from safevar_sumo.results.files import make_directory, sync_directory, write_whole
+from safevar_sumo.results.journal import Journal, JournalBusy, owner_of
+from safevar_sumo.results.manifest import MANIFEST, counted, difference, manifest_of, owner, read_manifest
+from safevar_sumo.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd
 
-MANIFEST, SOLUTIONS, RUNS = "manifest.json", "solutions.csv", "runs"
-VERSIONED = ("safevar_sumo", "libsumo", "deap", "numpy")
-FREE_OPTIONS = ("runs", "algorithms")
-"""Keys of a study's search table that may change between two calls into the same directory."""
+SOLUTIONS, RUNS = "solutions.csv", "runs"
+ORIGINAL = "original"
+"""Name of the original vehicle's journal. Who writes it first owns the directory."""
+SECONDS_TO_CLAIM = 10.0
+"""How long another process may take to write into a new journal whose it is."""
 
 
 class ResultsDirectory:
@@ -37,37 +38,37 @@ class ResultsDirectory:
         Is made if it does not exist.
     study
         The study as it is run, options applied.
-    network
-        Fingerprint of the network that it is run on.
+    identity
+        What its results depend on beside its file: see `safevar_sumo.computing.identity_of`.
 
     Raises
     ------
     InputError
-        If the directory cannot be written or belongs to another study or version.
+        If the directory cannot be written, holds other things, or belongs to another study or version.
     """
 
-    def __init__(self, path: Path, study: Study, network: str = "") -> None:
+    def __init__(self, path: Path, study: Study, identity: Mapping[str, Any] = MappingProxyType({})) -> None:
         self.path, self._study = path, study
-        self._manifest: dict[str, Any] = {
-            "study": tables_of(study),
-            "seed": study.search.seed,
-            "network": network,
-            "versions": {name: version(name) for name in VERSIONED},
-        }
+        self.manifest = manifest_of(study, identity)
         make_directory(path)
         self._refuse_another_study()
 
     def journal(self, run: str) -> Journal:
         """Open and lock the journal of a run, such as nsga2-03."""
-        fixed = {key: value for key, value in self._manifest["study"]["search"].items() if key not in FREE_OPTIONS}
-        study = {**self._manifest["study"], "search": fixed}
-        identity = json.dumps([study, self._manifest["versions"], self._manifest["network"]], sort_keys=True)
-        return Journal(self.path / RUNS / f"{run}.journal", sha256(identity.encode()).hexdigest(), run)
+        path = self.path / RUNS / f"{run}.journal"
+        try:
+            return Journal(path, owner(self.manifest), run)
+        except JournalBusy:
+            self._refuse_another_owner(path)
+            raise
 
     def begin(self, original: Evaluations) -> None:
-        """Write the manifest, with the original vehicle's evaluation."""
-        manifest = {**self._manifest, "original": record(original, 0)}
+        """Write the manifest, with the original vehicle's evaluation; solutions of fewer or other runs are not kept beside it."""
+        manifest = {**self.manifest, "original": record(original, 0)}
+        outdated = (self.path / MANIFEST).exists() and counted(read_manifest(self.path)) != counted(manifest)
         write_whole(self.path / MANIFEST, json.dumps(manifest, indent=2, allow_nan=False) + "\n")
+        if outdated:
+            self._remove(self.path / SOLUTIONS)
 
     def finish(self, solutions: Mapping[Any, Evaluations]) -> None:
         """Write the solutions of every run, by (algorithm, run)."""
@@ -75,72 +76,31 @@ class ResultsDirectory:
         write_whole(self.path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
 
     def _refuse_another_study(self) -> None:
-        file = self.path / MANIFEST
-        if not file.exists():
+        if not (self.path / MANIFEST).exists():
+            foreign = sorted(one.name for one in self.path.iterdir() if one.name not in (RUNS, SOLUTIONS) and not one.name.startswith("."))
+            if foreign:
+                raise InputError("--out", f"{self.path} holds other things: {foreign[0]}", "an empty directory, or one of this study")
             return
         stored = read_manifest(self.path)
-        differs = (_difference(stored["study"], self._manifest["study"])
-                   or _difference(stored["versions"], self._manifest["versions"], "version of")
-                   or _difference(stored.get("network"), self._manifest["network"], "fingerprint of the network"))
-        if differs:
-            raise InputError(self.path, f"holds results of another study: {differs}", "another --out, or the same study and options")
+        told, way_back = ("they are imported", "") if "imported" in stored else difference(stored, self.manifest)
+        if told:
+            legal = f"another --out, or {way_back}" if way_back else "another --out"
+            raise InputError(self.path, f"holds results of another study: {told}", legal)
 
+    def _refuse_another_owner(self, path: Path) -> None:
+        """Whose a journal in other hands is, as soon as that is written."""
+        end = time.monotonic() + SECONDS_TO_CLAIM
+        while (theirs := owner_of(path)) is None and time.monotonic() < end:
+            time.sleep(SECONDS_TO_CLAIM / 1000)
+        if theirs != owner(self.manifest):
+            raise InputError(self.path, "is taken by another study that runs just now", "another --out")
 
-def make_directory(path: Path) -> None:
-    """Make a directory for results, if there is none.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
-            pass
-    except OSError as error:
-        raise InputError("--out", f"cannot write to {path}: {error.strerror}", "a directory that can be written") from None
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file as a whole or not at all."""
-    try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".tmp")
+    def _remove(self, path: Path) -> None:
         try:
-            with open(handle, "w", encoding="utf-8", newline="") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        except BaseException:
-            os.unlink(temporary)
-            raise
-    except OSError as error:
-        raise SafevarError(f"{path}: cannot be written: {error.strerror}; what was written before stays valid") from None
-
-
-def read_manifest(directory: Path) -> dict[str, Any]:
-    """The manifest of a results directory.
-
-    Raises
-    ------
-    InputError
-        If there is none, or the file is something else.
-    """
-    file = directory / MANIFEST
-    legal = "a directory that the command study has written"
-    try:
-        manifest = json.loads(file.read_text(encoding="utf-8"))
-        if isinstance(manifest["study"], dict) and isinstance(manifest["versions"], dict):
-            return dict(manifest)
-    except FileNotFoundError:
-        raise InputError(directory, f"is no results directory: there is no {MANIFEST}", legal) from None
-    except OSError as error:
-        raise InputError(file, f"cannot be read: {error.strerror}") from None
-    except (ValueError, KeyError, TypeError, RecursionError):
-        pass
-    raise InputError(file, "is not a manifest of this program", legal)
+            path.unlink(missing_ok=True)
+            sync_directory(self.path)
+        except OSError as error:
+            raise SafevarError(f"{path}: cannot be removed: {error.strerror}; it is outdated") from None
 
 
 def solutions_frame(characteristics: tuple[str, ...], solutions: Iterable[tuple[tuple[str, int], Evaluations]]) -> pd.DataFrame:
@@ -182,17 +142,3 @@ def record(evaluations: Evaluations, row: int) -> dict[str, Any]:
         "outcome": str(evaluations.outcome[row]), "collision": bool(evaluations.collided[row]),
         **{name: None if np.isnan(value) else float(value) for name, value in numbers.items()},
         "f_num_diff": int(evaluations.f_num_diff[row])}
-
-
-def _difference(stored: Any, new: Any, key: str = "") -> str:
-    """The first key in which two studies differ, told with both values; free options do not count."""
-    if isinstance(stored, dict) and isinstance(new, dict):
-        for name in sorted({*stored, *new}):
-            inner = f"{key}.{name}" if key else name
-            if inner in [f"search.{option}" for option in FREE_OPTIONS]:
-                continue
-            told = _difference(stored.get(name), new.get(name), inner)
-            if told:
-                return told
-        return ""
-    return "" if stored == new else f"{key} is {stored!r} there and {new!r} here"

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from safevar_sumo.campaign import Campaign, Forecast
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import record, solutions_frame
+from safevar_sumo.results import failure_lines, record, solutions_frame
 from safevar_sumo.study import Study
 from safevar_sumo.terminal.heads import METRIC_HEADS
 from safevar_sumo.vehicles import CharacteristicSet
@@ -52,7 +52,9 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     console.print(table)
     console.print(SAFETY_NOTE)
     if campaign.failures:
-        console.print(f"{campaign.failures} settings could not be simulated (simulator-error); they are in no result.")
+        console.print(f"{len(campaign.failures)} settings could not be simulated (simulator-error); they are in no result:")
+        for line in failure_lines(campaign.failures):
+            console.print(f"  {line}", soft_wrap=True, markup=False, highlight=False)
     _print_most_critical(console, study, campaign)
     names = tuple(study.vehicle.characteristics)
     solutions = solutions_frame(names, campaign.solutions.items())

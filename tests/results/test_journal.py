@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
+import errno
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import portalocker
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.records import Evaluations
+from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.results import Journal, JournalBusy
-from safevar_sumo.results.journal import HEAD, MAGIC, read_journal
+from safevar_sumo.results.frames import HEAD, MAGIC, OUTCOMES, SPARE, Content, Result, batch_of
+from safevar_sumo.results.journal import owner_of, read_journal
 
 BATCHES = 4
 ROWS = 3
 RESULT = [1, 5]
+BUDGET = 99
 in_one_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=100)
 
 
@@ -45,7 +50,7 @@ def write(path: Path, batches: int = BATCHES, finished: bool = True) -> list[int
         journal.append(places(number), batch(number))
         ends.append(path.stat().st_size)
     if finished:
-        journal.finish(RESULT, 99)
+        journal.finish(RESULT, 99, BUDGET)
         ends.append(path.stat().st_size)
     journal.close()
     return ends
@@ -57,8 +62,9 @@ def same(one: Evaluations, other: Evaluations) -> bool:
     return bool(all(np.array_equal(a, b, equal_nan=True) for a, b in numbers) and np.array_equal(one.outcome, other.outcome))
 
 
-def holds_the_first(batches: int, positions: list[int], evaluations: Evaluations | None) -> bool:
+def holds_the_first(batches: int, content: Content) -> bool:
     """Whether exactly what was written first is there."""
+    positions, evaluations, _ = content
     if not batches:
         return positions == [] and evaluations is None
     expected = Evaluations.concatenate([batch(number) for number in range(batches)])
@@ -69,12 +75,14 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     path = tmp_path / "runs" / "a.journal"
     write(path)
     journal = Journal(path, "study", "nsga2-00")
-    assert holds_the_first(BATCHES, journal.positions, journal.evaluations)
-    assert (journal.result, journal.asked, journal.cut) == (RESULT, 99, 0)
+    assert holds_the_first(BATCHES, journal.content)
+    assert journal.content.result(BUDGET) == Result(positions=RESULT, asked=99, budget=BUDGET)
+    assert journal.cut == 0
     journal.close()
-    positions, evaluations, result = read_journal(path)
-    assert holds_the_first(BATCHES, positions, evaluations)
-    assert result == RESULT
+    content = read_journal(path, "study", "nsga2-00")
+    assert holds_the_first(BATCHES, content)
+    assert content.result(BUDGET) == Result(positions=RESULT, asked=99, budget=BUDGET)
+    assert content.result(BUDGET + 1) is None
 
 
 @in_one_folder
@@ -87,14 +95,14 @@ def test_any_truncation_loads_what_was_whole_and_goes_on(tmp_path: Path, data: s
     os.truncate(path, left)
     whole = sum(end <= left for end in ends)
     journal = Journal(path, "study", "nsga2-00")
-    assert holds_the_first(max(0, whole - 1), journal.positions, journal.evaluations)
-    assert journal.result is None
+    assert holds_the_first(max(0, whole - 1), journal.content)
+    assert not journal.content.results
     assert journal.cut == left - max([0, *(end for end in ends if end <= left)])
     for number in range(max(0, whole - 1), BATCHES):
         journal.append(places(number), batch(number))
     journal.close()
-    positions, evaluations, _ = read_journal(path)
-    assert holds_the_first(BATCHES, positions, evaluations)
+    content = read_journal(path, "study", "nsga2-00")
+    assert holds_the_first(BATCHES, content)
 
 
 @in_one_folder
@@ -109,9 +117,9 @@ def test_any_changed_byte_is_a_cut_tail_or_an_error_that_tells_where(tmp_path: P
     path.write_bytes(content)
     start = max([0, *(end for end in ends if end <= place)])
     if start == ends[-2]:
-        positions, evaluations, result = read_journal(path)
-        assert holds_the_first(BATCHES, positions, evaluations)
-        assert result is None
+        content = read_journal(path, "study", "nsga2-00")
+        assert holds_the_first(BATCHES, content)
+        assert not content.results
     else:
         with pytest.raises(InputError) as told:
             Journal(path, "study", "nsga2-00")
@@ -127,7 +135,7 @@ def test_a_tail_of_zeros_as_a_power_cut_leaves_it_is_cut_off(tmp_path: Path) -> 
         file.write(bytes(5000))
     journal = Journal(path, "study", "nsga2-00")
     assert journal.cut == 5000
-    assert holds_the_first(BATCHES, journal.positions, journal.evaluations)
+    assert holds_the_first(BATCHES, journal.content)
     journal.close()
 
 
@@ -140,7 +148,7 @@ def test_a_frame_of_a_later_version_is_an_error(tmp_path: Path) -> None:
     with path.open("ab") as file:
         file.write(HEAD.pack(MAGIC, len(payload), zlib.crc32(payload)) + payload)
     with pytest.raises(InputError, match=f"byte {ends[-1]}"):
-        read_journal(path)
+        read_journal(path, "study", "nsga2-00")
 
 
 @pytest.mark.parametrize(("study", "run"), [("other", "nsga2-00"), ("study", "nsga2-01")])
@@ -194,8 +202,90 @@ def test_a_full_disk_leaves_what_was_there_and_can_go_on(tmp_path: Path, monkeyp
     journal._file = file
     journal.append(places(2), batch(2))
     journal.close()
-    positions, evaluations, _ = read_journal(path)
-    assert holds_the_first(3, positions, evaluations)
+    content = read_journal(path, "study", "nsga2-00")
+    assert holds_the_first(3, content)
+
+
+def test_outcomes_are_written_as_ever() -> None:
+    assert {str(outcome): code for outcome, code in OUTCOMES.items()} == {
+        "stopped": 0, "passed": 1, "collision": 2, "timeout": 3, "never-moved": 4, "simulator-error": 5}
+    assert set(OUTCOMES) == set(Outcome), "a new outcome needs a number of its own"
+
+
+def test_a_reason_is_kept_with_its_setting_and_costs_others_nothing(tmp_path: Path) -> None:
+    failed = batch(0)
+    told = dataclasses.replace(failed, reasons={failed.settings[2].tobytes(): "SUMO failed: it said so"})
+    sizes = []
+    for name, one in (("without", failed), ("with", told)):
+        journal = Journal(tmp_path / name, "study", "nsga2-00")
+        journal.append(places(0), one)
+        journal.close()
+        sizes.append((tmp_path / name).stat().st_size)
+    content = read_journal(tmp_path / "with", "study", "nsga2-00")
+    assert content.evaluations is not None
+    assert content.evaluations.reason(2) == "SUMO failed: it said so"
+    assert batch_of(places(0), failed).reasons == {}
+    assert sizes[1] > sizes[0]
+
+
+def test_what_comes_after_a_failure_is_spare_once_it_is_tried_again(tmp_path: Path) -> None:
+    path = tmp_path / "a.journal"
+    write(path, batches=2)
+    journal = Journal(path, "study", "nsga2-00")
+    journal.retry()
+    for content in (journal.content, read_journal(path, "study", "nsga2-00")):
+        assert content.positions == [0, 1, SPARE, SPARE], "the third and the sixth have failed"
+        assert content.evaluations is not None
+        assert content.evaluations.f_diff.tolist() == [0.0, 1 / 3, 10 / 3, 11 / 3]
+        assert content.result(BUDGET) is None
+    journal.close()
+
+
+def test_a_journal_without_evaluations_belongs_to_whoever_comes(tmp_path: Path) -> None:
+    Journal(tmp_path / "a.journal", "study", "nsga2-00").close()
+    Journal(tmp_path / "a.journal", "other", "nsga2-00").close()
+    assert owner_of(tmp_path / "a.journal") == "other"
+    with pytest.raises(InputError, match="belongs to another study"):
+        read_journal(tmp_path / "a.journal", "study", "nsga2-00")
+
+
+def test_what_is_no_journal_is_refused_and_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "a.journal"
+    path.write_text("my notes")
+    with pytest.raises(InputError, match="is no journal"):
+        Journal(path, "study", "nsga2-00")
+    assert path.read_text() == "my notes"
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(InputError, match="is no regular file"):
+        Journal(path, "study", "nsga2-00")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="POSIX alone has named pipes")
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.journal")
+    with pytest.raises(InputError, match="is no regular file"):
+        Journal(tmp_path / "a.journal", "study", "nsga2-00")
+    with pytest.raises(InputError, match="is no regular file"):
+        read_journal(tmp_path / "a.journal", "study", "nsga2-00")
+
+
+def test_a_disk_without_locks_is_not_told_as_another_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise portalocker.LockException(OSError(errno.ENOLCK, "No locks available"), "No locks available")
+
+    monkeypatch.setattr(portalocker, "lock", refuse)
+    with pytest.raises(SafevarError, match="cannot be locked: No locks available") as told:
+        Journal(tmp_path / "a.journal", "study", "nsga2-00")
+    assert not isinstance(told.value, JournalBusy)
+
+
+def test_a_new_journal_and_its_folder_are_known_to_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[Path] = []
+    monkeypatch.setattr("safevar_sumo.results.files.sync_directory", synced.append)
+    monkeypatch.setattr("safevar_sumo.results.journal.sync_directory", synced.append)
+    Journal(tmp_path / "new" / "runs" / "a.journal", "study", "nsga2-00").close()
+    assert synced == [tmp_path / "new", tmp_path, tmp_path / "new" / "runs"]
 
 
 def test_a_journal_that_somebody_removed_is_told(tmp_path: Path) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import stat
 from pathlib import Path
 
 import msgspec
@@ -13,8 +15,9 @@ import pytest
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import ResultsDirectory, record, solutions_frame
-from safevar_sumo.study import Study, load_study, tables_of
+from safevar_sumo.results import JournalBusy, ResultsDirectory, record, solutions_frame
+from safevar_sumo.results.manifest import owner
+from safevar_sumo.study import ModelTable, Study, load_study, tables_of
 
 NAMES = ("a", "b")
 
@@ -90,8 +93,88 @@ def test_results_of_another_study_are_not_overwritten(tmp_path: Path, study: Stu
 
 def test_another_network_is_another_study(tmp_path: Path, study: Study) -> None:
     written(tmp_path, study)
-    with pytest.raises(InputError, match="fingerprint of the network"):
-        ResultsDirectory(tmp_path, study, "abc")
+    with pytest.raises(InputError, match=r"traffic\.rou\.xml was not there since"):
+        ResultsDirectory(tmp_path, study, {"network": {"traffic.rou.xml": "abc"}})
+
+
+def test_the_file_that_has_changed_is_named_and_the_two_ways_on(tmp_path: Path, study: Study) -> None:
+    ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc", "my_map.py": "def"}}).begin(evaluations(2.5))
+    with pytest.raises(InputError) as told:
+        ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc", "my_map.py": "012"}})
+    assert "my_map.py has changed since" in str(told.value)
+    assert told.value.legal == "another --out, or the file as it was"
+    with pytest.raises(InputError, match=r"my_map\.py is not there any more"):
+        ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc"}})
+
+
+def test_what_changes_no_result_locks_nobody_out(tmp_path: Path, study: Study) -> None:
+    written(tmp_path, study)
+    for other in (msgspec.structs.replace(study, title="Another title", published={}, calibration={}),
+                  with_search(study, time_limit=7, runs=3, evaluations=900),
+                  msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, algorithms=["rs"]))):
+        directory = ResultsDirectory(tmp_path, other)
+        assert owner(directory.manifest) == owner(ResultsDirectory(tmp_path, study).manifest)
+
+
+def test_a_whole_number_is_not_the_same_as_one_with_a_point(tmp_path: Path, study: Study) -> None:
+    one, other = (msgspec.structs.replace(study, ads=ModelTable(model="my_ads:Mine", parameters={"margin": margin})) for margin in (2, 2.0))
+    ResultsDirectory(tmp_path, one).begin(evaluations(2.5))
+    with pytest.raises(InputError, match=r"ads\.parameters\.margin is 2 there and 2\.0 here"):
+        ResultsDirectory(tmp_path, other)
+
+
+def test_solutions_of_other_runs_are_not_kept_beside_the_manifest(tmp_path: Path, study: Study) -> None:
+    written(tmp_path, study)
+    ResultsDirectory(tmp_path, study).begin(evaluations(2.5))
+    assert (tmp_path / "solutions.csv").exists()
+    ResultsDirectory(tmp_path, with_search(study, evaluations=900)).begin(evaluations(2.5))
+    assert not (tmp_path / "solutions.csv").exists()
+
+
+def test_a_folder_that_holds_other_things_is_refused(tmp_path: Path, study: Study) -> None:
+    (tmp_path / "thesis.tex").write_text("")
+    with pytest.raises(InputError, match=r"holds other things: thesis\.tex"):
+        ResultsDirectory(tmp_path, study)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["thesis.tex"]
+
+
+def test_a_first_try_that_failed_locks_nobody_out(tmp_path: Path, study: Study) -> None:
+    ResultsDirectory(tmp_path, study).journal("original").close()
+    ResultsDirectory(tmp_path, with_search(study, seed=2)).journal("original").close()
+
+
+def test_a_directory_belongs_to_who_comes_first(tmp_path: Path, study: Study) -> None:
+    first = ResultsDirectory(tmp_path, study)
+    second, same = ResultsDirectory(tmp_path, with_search(study, seed=2)), ResultsDirectory(tmp_path, study)
+    journal = first.journal("original")
+    with pytest.raises(InputError, match="is taken by another study that runs just now"):
+        second.journal("original")
+    with pytest.raises(JournalBusy):
+        same.journal("original")
+    journal.append([0], wide(study))
+    journal.close()
+    with pytest.raises(InputError, match="belongs to another study"):
+        second.journal("original")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="modes as POSIX has them")
+def test_modes_follow_the_umask(tmp_path: Path, study: Study) -> None:
+    before = os.umask(0o027)
+    try:
+        written(tmp_path / "out", study).journal("original").close()
+    finally:
+        os.umask(before)
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "out").rglob("*")}
+    assert modes == {"manifest.json": 0o640, "solutions.csv": 0o640, "runs": 0o750, "original.journal": 0o640}
+
+
+def test_what_is_written_is_known_to_the_disk(tmp_path: Path, study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[str] = []
+    replaced = os.replace
+    monkeypatch.setattr("os.fsync", lambda handle: steps.append("directory" if stat.S_ISDIR(os.fstat(handle).st_mode) else "file"))
+    monkeypatch.setattr("os.replace", lambda *paths: (steps.append("rename"), replaced(*paths)))
+    ResultsDirectory(tmp_path, study).begin(evaluations(2.5))
+    assert steps == ["file", "rename", "directory"]
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", "null", "{\"study\": 3", "\x00"])

@@ -1,0 +1,86 @@
+"""Files and directories of results: written whole or not at all, and still there after a power cut."""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import tempfile
+from pathlib import Path
+
+from safevar_sumo.errors import InputError, SafevarError
+
+
+def make_directory(path: Path) -> None:
+    """Make a directory for results, if there is none.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    try:
+        make_durable(path)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise InputError("--out", f"cannot write to {path}: {error.strerror}", "a directory that can be written") from None
+
+
+def make_durable(path: Path) -> None:
+    """Make a directory and those above it, and have the disk know of each."""
+    missing = [one for one in (path, *path.parents) if not one.is_dir()]
+    path.mkdir(parents=True, exist_ok=True)
+    for one in missing:
+        sync_directory(one.parent)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file as a whole or not at all.
+
+    Raises
+    ------
+    SafevarError
+        If it cannot be written.
+    """
+    temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp"
+    try:
+        refuse_other_than_file(path)
+        try:
+            with open(temporary, "x", encoding="utf-8", newline="") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+        sync_directory(path.parent)
+    except OSError as error:
+        raise SafevarError(f"{path}: cannot be written: {error.strerror}; what was written before stays valid") from None
+
+
+def sync_directory(path: Path) -> None:
+    """Have the disk know what was made or renamed in a directory; where directories cannot be synced, they need not be."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
+    handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
+    finally:
+        os.close(handle)
+
+
+def refuse_other_than_file(path: Path) -> None:
+    """Refuse what exists and is no regular file: a pipe would be waited for, for ever.
+
+    Raises
+    ------
+    InputError
+        If it is something else.
+    """
+    if path.exists() and not path.is_file():
+        raise InputError(path, "is no regular file", "a file")

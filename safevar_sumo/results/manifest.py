@@ -1,0 +1,119 @@
+"""The manifest of a results directory: whose results these are, and in what another study differs from theirs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.results.files import refuse_other_than_file
+from safevar_sumo.study import Study, tables_of
+
+MANIFEST = "manifest.json"
+FORMAT = 2
+VERSIONED = ("safevar_sumo", "libsumo", "eclipse-sumo", "deap", "numpy")
+FREE = ("title", "published", "calibration")
+"""Keys of a study that change no result of a campaign."""
+FREE_OF_SEARCH = ("runs", "algorithms", "evaluations", "time_limit")
+"""Keys of its search table that change no evaluation: which runs there are, how far they go, how long one may take."""
+LAYERS = {
+    "resolved": "the same study and options", "network": "the network's file as it was", "sources": "the file as it was",
+    "code": "the package as it was", "versions": "those versions", "platform": "such a machine"}
+"""What results depend on, as far as a manifest tells, and the way back where it differs."""
+
+
+def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
+    """The manifest of a study, but for the original vehicle.
+
+    Parameters
+    ----------
+    study
+        As it is run, options applied.
+    identity
+        What its results depend on beside its file, by `LAYERS`: see `safevar_sumo.computing.identity_of`.
+    """
+    return {
+        "format": FORMAT, "study": tables_of(study), "seed": study.search.seed, "resolved": fixed(study), **identity,
+        "versions": {name: version(name) for name in VERSIONED}}
+
+
+def fixed(study: Study) -> dict[str, Any]:
+    """What of a study's file every evaluation depends on."""
+    everything: dict[str, Any] = tables_of(study)
+    search = {key: value for key, value in everything["search"].items() if key not in FREE_OF_SEARCH}
+    return {**{key: value for key, value in everything.items() if key not in FREE}, "search": search}
+
+
+def owner(manifest: Mapping[str, Any]) -> str:
+    """The digest that the journals of a manifest's study carry."""
+    if "format" in manifest:
+        return _digest({layer: manifest.get(layer) for layer in LAYERS})
+    search = {key: value for key, value in manifest["study"]["search"].items() if key not in ("runs", "algorithms")}
+    return _digest([{**manifest["study"], "search": search}, manifest["versions"], manifest.get("network")])
+
+
+def difference(stored: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str]:
+    """In what two manifests differ so that results may, and the way back; two empty texts if in nothing."""
+    if "format" not in stored:
+        return f"version {stored['versions'].get('safevar_sumo')} wrote them", "that version"
+    for layer, way_back in LAYERS.items():
+        for told in _differences(layer, stored.get(layer, {}), new.get(layer, {})):
+            return told, way_back
+    return "", ""
+
+
+def counted(manifest: Mapping[str, Any]) -> Any:
+    """What of the journals counts: algorithms, runs, evaluations of each."""
+    search = manifest["study"]["search"]
+    return [search["algorithms"], search["runs"], search["evaluations"]]
+
+
+def read_manifest(directory: Path) -> dict[str, Any]:
+    """The manifest of a results directory.
+
+    Raises
+    ------
+    InputError
+        If there is none, or the file is something else.
+    """
+    file = directory / MANIFEST
+    legal = "a directory that the command study has written"
+    try:
+        refuse_other_than_file(file)
+        manifest = json.loads(file.read_text(encoding="utf-8"))
+        if isinstance(manifest["study"], dict) and isinstance(manifest["versions"], dict) and manifest.get("format", FORMAT) == FORMAT:
+            return dict(manifest)
+    except FileNotFoundError:
+        raise InputError(directory, f"is no results directory: there is no {MANIFEST}", legal) from None
+    except OSError as error:
+        raise InputError(file, f"cannot be read: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError, RecursionError):
+        pass
+    raise InputError(file, "is not a manifest of this version of the program", legal)
+
+
+def _differences(layer: str, stored: Any, new: Any) -> Iterator[str]:
+    """Everything in which a layer of two manifests differs, told for a person."""
+    for key, there, here in _pairs(stored, new):
+        if layer in ("network", "sources", "code"):
+            what = "is not there any more" if here is None else "was not there" if there is None else "has changed"
+            yield f"{key} {what} since"
+        else:
+            yield f"{'version of ' if layer == 'versions' else ''}{key} is {there!r} there and {here!r} here"
+
+
+def _pairs(stored: Any, new: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """The innermost keys at which two values differ, with both; 2 and 2.0 are different."""
+    if isinstance(stored, dict) and isinstance(new, dict):
+        for name in sorted({*stored, *new}):
+            yield from _pairs(stored.get(name), new.get(name), f"{key}.{name}" if key else name)
+    elif json.dumps(stored, sort_keys=True) != json.dumps(new, sort_keys=True):
+        yield key, stored, new
+
+
+def _digest(what: Any) -> str:
+    return sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
