@@ -40,7 +40,11 @@ class ForeignError(InputError):
 
 
 class SimulationError(SafevarError):
-    """SUMO, a network or an ADS failed while a simulation was prepared or ran."""
+    """SUMO failed while a simulation ran."""
+
+
+class EnvironmentFault(SafevarError):
+    """What a simulation needs beside its setting failed: a disk, memory, netconvert, SUMO's start."""
 
 
 def told(error: BaseException) -> str:

@@ -58,7 +58,8 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     bars: Any = CampaignProgress(Console(stderr=True), chosen, keys, quiet=False)
     showing = bars if progress is True else nullcontext(progress or Unheard())
     with a_pool(chosen, jobs, cluster) as pool, showing as observer:
-        carried_out(chosen, system, keys, directory, pool, observer, batch, retry_failed=retry_failed)
+        carried_out(chosen, system, keys, directory, pool, observer, batch, retry_failed=retry_failed,
+                    source=str(study) if isinstance(study, str | Path) else "")
     return load(directory)
 
 
@@ -77,8 +78,8 @@ def prepared(study: StudyLike, source: str = "") -> tuple[Study, System]:
 
 
 def carried_out(study: Study, system: System, keys: list[RunKey], directory: Path, pool: Pool, observer: Observer,
-                batch: int | None, *, retry_failed: bool = False) -> Campaign:
-    """Carry out runs of a study in a directory; with all of them finished, its solutions are written.
+                batch: int | None, *, retry_failed: bool = False, source: str = "") -> Campaign:
+    """Carry out runs of a study in a directory; with all of them finished, its solutions are written. See `carry_out`.
 
     Raises
     ------
@@ -86,7 +87,7 @@ def carried_out(study: Study, system: System, keys: list[RunKey], directory: Pat
         If another process works on one of the runs, or as `carry_out`.
     """
     results = ResultsDirectory(directory, study, identity_of(study, system))
-    campaign = carry_out(study, keys, results, pool, observer, batch, retry_failed=retry_failed)
+    campaign = carry_out(study, keys, results, pool, observer, batch, retry_failed=retry_failed, source=source)
     if campaign.busy:
         raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: the same again later finishes the study")
     if keys == all_runs(study):

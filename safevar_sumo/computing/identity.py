@@ -30,7 +30,8 @@ def identity_of(study: Study, system: System) -> dict[str, Any]:
     resolved = fixed(study)
     for table, model in (("vehicle", system.vehicle), ("ads", system.ads), ("scenario", system.scenario)):
         if isinstance(model, msgspec.Struct):
-            resolved[table] = {**resolved[table], "parameters": msgspec.to_builtins(model)}
+            names = {key: value for key, value in resolved[table]["parameters"].items() if isinstance(value, str)}
+            resolved[table] = {**resolved[table], "parameters": {**msgspec.to_builtins(model), **names}}
     resolved["weather"] = msgspec.to_builtins(system.weather)
     return {"resolved": resolved, **inputs_of(study, system), "platform": _platform()}
 

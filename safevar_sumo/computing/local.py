@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from safevar_sumo.computing.base import PoolLostError, WorkerLostError, evaluate_batch
-from safevar_sumo.errors import SafevarError
+from safevar_sumo.errors import EnvironmentFault, SafevarError, told
 from safevar_sumo.records import Evaluations, FloatArray
 
 START_LIMIT = 120.0
@@ -184,6 +184,8 @@ def _answer(study: bytes, settings: FloatArray) -> Evaluations | Exception:
         return evaluate_batch(study, settings)
     except SafevarError as error:
         return error
+    except (OSError, MemoryError) as error:
+        return EnvironmentFault(f"a batch cannot be computed: {told(error)}")
     except Exception:
         return RuntimeError(f"in a worker process\n{traceback.format_exc()}")  # not every exception survives the pipe
 

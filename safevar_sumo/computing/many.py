@@ -11,7 +11,6 @@ from safevar_sumo.computing.base import Pool, packed
 from safevar_sumo.computing.persistent import PersistentPool
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
-from safevar_sumo.vehicles import CharacteristicSet
 
 BATCH = 100
 """Settings per SUMO simulation."""
@@ -22,7 +21,7 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
 
     `done` is called with the number of settings of every batch that is finished.
     """
-    persistent, work = PersistentPool(pool, CharacteristicSet.of(study.vehicle.characteristics)), packed(study)
+    persistent, work = PersistentPool(pool, study), packed(study)
     unique, row_of = np.unique(settings, axis=0, return_inverse=True)
     starts = range(0, len(unique), BATCH)
     futures = {persistent.submit(work, unique[start:start + BATCH]): start for start in starts}

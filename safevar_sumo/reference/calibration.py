@@ -200,7 +200,7 @@ class _Trial:
     def __init__(self, study: Study, names: list[str], references: Mapping[str, ReferenceData], pool: Pool) -> None:
         self._study, self._names, self._references = study, names, references
         self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-        self._pool = PersistentPool(pool, self._characteristics)
+        self._pool = PersistentPool(pool, study)
         settings = [self._characteristics.original[np.newaxis], *(data.settings for data in references.values())]
         self._settings, self._row_of = np.unique(np.concatenate(settings), axis=0, return_inverse=True)
 

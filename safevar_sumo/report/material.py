@@ -14,7 +14,7 @@ from safevar_sumo.analysis import Case, load_cases
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import Handle, handles
-from safevar_sumo.results.store import read_manifest
+from safevar_sumo.results.manifest import read_manifest
 from safevar_sumo.showing import Comparison, compare
 from safevar_sumo.showing.page import player_data
 from safevar_sumo.showing.scene import scene_of

@@ -11,7 +11,8 @@ from typing import Any
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.report.material import Material
 from safevar_sumo.results import write_whole
-from safevar_sumo.results.store import MANIFEST, SOLUTIONS
+from safevar_sumo.results.manifest import MANIFEST
+from safevar_sumo.results.store import SOLUTIONS
 
 FOLDER = "answers"
 """Of a results directory."""

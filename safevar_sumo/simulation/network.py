@@ -7,24 +7,24 @@ folder by the content that they are made of.
 from __future__ import annotations
 
 import hashlib
-import os
 import subprocess
-import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
-import platformdirs
-
-from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.errors import EnvironmentFault, InputError
 from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.simulation.cache import cached
 
 SOURCES = ("network.nod.xml", "network.edg.xml", "network.con.xml")
 TRAFFIC = "traffic.rou.xml"
+ROADS = "network.net.xml"
 NOBODY = "nobody.rou.xml"
 OPTIONS = "scenario.sumocfg"
+RECIPE = ("--precision", "4", "--xml-validation", "never")
+"""Options of netconvert."""
 
 # Attributes that hold ids, by element; an attribute may hold several, separated by spaces.
 _IDS = {
@@ -63,12 +63,12 @@ def copied_network(folder: str, n: int, *others: str) -> CopiedNetwork:
     ------
     InputError
         If the folder or one of its sources is missing or is not XML.
-    SimulationError
+    EnvironmentFault
         If netconvert refuses the sources or the cache cannot be written.
     """
     places = [folder_of(one) for one in (folder, *others)]
     place = places[0]
-    roads = _cached(place, round_up(n * len(places)), [place / source for source in SOURCES], "network.net.xml", _build_network)
+    roads = _cached(place, round_up(n * len(places)), [place / source for source in SOURCES], ROADS, _build_network)
     traffic = _cached(place, n, [one / TRAFFIC for one in places], TRAFFIC, partial(_write_traffic, places))
     return CopiedNetwork(roads, traffic, place / OPTIONS)
 
@@ -135,22 +135,13 @@ def round_up(n: int) -> int:
 
 def _cached(place: Path, n: int, sources: list[Path], name: str, build: Callable[[Path, int, Path], None]) -> Path:
     contents = tuple(source.read_bytes() for source in sources)
-    digest = _digest(contents, n)
-    target = platformdirs.user_cache_path("safevar_sumo") / "networks" / f"{place.name}-{n}-{digest}" / name
-    if not target.is_file():
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-                build(place, n, Path(folder))
-                os.replace(Path(folder) / name, target)
-        except OSError as error:
-            raise SimulationError(f"{target}: cannot write the cache of networks: {error.strerror}") from None
-    return target
+    return cached(f"{place.name}-{n}-{_digest(contents, n)}", name, partial(build, place, n))
 
 
 @cache
 def _digest(contents: tuple[bytes, ...], n: int) -> str:
-    digest = hashlib.sha256(f"{n} {netconvert_version()}".encode())
+    """Of all that copies are made from: sources, their number, netconvert and its recipe, and the code below."""
+    digest = hashlib.sha256(f"{n} {netconvert_version()} {RECIPE}".encode() + Path(__file__).read_bytes())
     for content in contents:
         digest.update(len(content).to_bytes(8, "big") + content)
     return digest.hexdigest()[:16]
@@ -215,8 +206,19 @@ def _build_network(place: Path, n: int, into: Path) -> None:
     nodes, edges, connections = (str(into / source) for source in SOURCES)
     done = subprocess.run(
         [str(Path(sumo.SUMO_HOME) / "bin" / "netconvert"), "-n", nodes, "-e", edges, "-x", connections,
-         "-o", str(into / "network.net.xml"), "--precision", "4", "--xml-validation", "never"],
+         "-o", str(into / ROADS), *RECIPE],
         capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        told = (done.stderr.strip() or "no message").splitlines()[0]
-        raise SimulationError(f"{place}: netconvert refuses the network: {told}")
+        told = (done.stderr.strip() or f"exit code {done.returncode}").splitlines()[0]
+        raise EnvironmentFault(f"{place}: netconvert refuses the network: {told}")
+    _keep_the_net_alone(into / ROADS)
+
+
+def _keep_the_net_alone(file: Path) -> None:
+    """Without the head, which tells time and place of its making; a file that is not whole is an error."""
+    try:
+        text = file.read_text(encoding="utf-8")
+        ElementTree.fromstring(text)
+    except (ElementTree.ParseError, UnicodeDecodeError) as error:
+        raise EnvironmentFault(f"{file}: netconvert left half a network: {error}") from None
+    file.write_text(text[text.index("<net "):], encoding="utf-8")

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import VUT, Lane
 from safevar_sumo.simulation.network import CopiedNetwork, copied_id, copied_network, empty_fingerprint, empty_network, round_up
@@ -262,7 +262,10 @@ def _start(api: Any, engine: Engine, command: list[str]) -> None:
     global _standing
     if engine is Engine.LIBSUMO:
         _standing = None  # libsumo exists once in a process
-        api.start(command)
+        try:
+            api.start(command)
+        except (api.TraCIException, api.FatalTraCIError) as error:
+            raise EnvironmentFault(f"SUMO does not start: {str(error).strip()}") from None
         return
     if engine is Engine.GUI and sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise InputError("--gui", "sumo-gui has no display to open its window on", "a desktop session, or DISPLAY in the environment")

@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import Future
 
+import msgspec
 import numpy as np
 import pytest
 
 from safevar_sumo.computing import PersistentPool, PoolLostError, WorkerLostError
-from safevar_sumo.computing.persistent import ATTEMPTS, FAILURES_IN_A_ROW
-from safevar_sumo.errors import InputError
+from safevar_sumo.computing.persistent import ATTEMPTS
+from safevar_sumo.errors import EnvironmentFault, ForeignError, InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, Outcome
-from safevar_sumo.study import load_study
+from safevar_sumo.study import ModelTable, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 
-SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+STUDY = load_study("sun")
+SUN = CharacteristicSet.of(STUDY.vehicle.characteristics)
+FOREIGN = msgspec.structs.replace(STUDY, ads=ModelTable(model="my_ads:Mine"))
 
 
 def settings(number: int) -> np.ndarray:
@@ -65,57 +68,99 @@ def deadly(*values: float) -> Callable[[np.ndarray, int], Exception | None]:
 
 def test_a_batch_that_lost_its_worker_once_is_tried_again() -> None:
     pool = ToldPool(lambda rows, before: None if before else died())
-    found = PersistentPool(pool, SUN).submit(b"", settings(8)).result(timeout=5)
+    found = PersistentPool(pool, STUDY).submit(b"", settings(8)).result(timeout=5)
     assert pool.tried == [8, 8]
     assert found.valid.all()
 
 
 def test_the_setting_that_kills_its_worker_alone_is_told_from_the_others() -> None:
     pool = ToldPool(deadly(4302, 4305))
-    found = PersistentPool(pool, SUN).submit(b"", settings(8)).result(timeout=5)
+    found = PersistentPool(pool, STUDY).submit(b"", settings(8)).result(timeout=5)
     assert np.array_equal(found.settings, settings(8))
     assert np.array_equal(found.valid, ~np.isin(settings(8)[:, 0], (4302, 4305)))
     assert found.outcome[2] == Outcome.SIMULATOR_ERROR
     assert np.isnan(found.objectives[2, 0])
     assert np.array_equal(found.f_safe[found.valid], settings(8)[found.valid, 0] / 3)
     assert np.array_equal(found.f_num_diff, SUN.number_changed(settings(8)))
-    assert pool.tried.count(1) == 6 + 2 * ATTEMPTS
+    assert pool.tried.count(1) == 6 + 2 * (ATTEMPTS + 2), "each twice alone, the original in between, and once more"
 
 
 def test_a_setting_alone_gets_a_second_chance_too() -> None:
     pool = ToldPool(lambda rows, before: died() if len(rows) > 1 or not before else None)
-    assert PersistentPool(pool, SUN).submit(b"", settings(3)).result(timeout=5).valid.all()
+    assert PersistentPool(pool, STUDY).submit(b"", settings(3)).result(timeout=5).valid.all()
 
 
-def test_what_the_study_is_at_fault_for_ends_early_with_that_fault() -> None:
-    pool = ToldPool(lambda rows, before: InputError("study", "ads.model = 'x' raised"))
-    with pytest.raises(InputError, match="raised"):
-        PersistentPool(pool, SUN).submit(b"", settings(1000)).result(timeout=5)
-    assert len(pool.tried) <= ATTEMPTS * (1 + FAILURES_IN_A_ROW) + FAILURES_IN_A_ROW, "whole, in parts, alone"
+def test_what_the_study_is_at_fault_for_ends_at_once_with_that_fault() -> None:
+    pool = ToldPool(lambda rows, before: InputError("study", "ads.model = 'x' cannot be imported"))
+    with pytest.raises(InputError, match="cannot be imported"):
+        PersistentPool(pool, STUDY).submit(b"", settings(1000)).result(timeout=5)
+    assert len(pool.tried) == 1
+
+
+@pytest.mark.parametrize("fault", [SimulationError("SUMO failed: no place"), WorkerLostError("died")])
+def test_a_setting_is_blamed_only_if_the_original_vehicle_can_be_simulated(fault: Exception) -> None:
+    with pytest.raises(EnvironmentFault, match=f"{fault}; the original vehicle cannot be simulated either"):
+        PersistentPool(ToldPool(lambda rows, before: fault), STUDY).submit(b"", settings(4)).result(timeout=5)
+
+
+def test_an_outage_that_ends_in_time_is_nobodys_fault() -> None:
+    down = iter([True] * 4)
+    pool = ToldPool(lambda rows, before: SimulationError("outage") if next(down, False) else None)
+    assert PersistentPool(pool, STUDY).submit(b"", settings(3)).result(timeout=5).valid.all()
+
+
+def test_a_fault_of_the_surroundings_is_an_error_and_no_outcome() -> None:
+    pool = ToldPool(lambda rows, before: EnvironmentFault("the disk is full") if np.isin(rows[:, 0], 4302).any() else None)
+    with pytest.raises(EnvironmentFault, match="the disk is full"):
+        PersistentPool(pool, STUDY).submit(b"", settings(4)).result(timeout=5)
+    assert pool.tried == [4, 4]
+
+
+def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> None:
+    def fault(rows: np.ndarray, before: int) -> Exception | None:
+        return ForeignError("study", "ads.model = 'my_ads:Mine' raised in drive: ZeroDivisionError") if 4313 in rows[:, 0] else None
+
+    pool = ToldPool(fault)
+    with pytest.raises(ForeignError) as told:
+        PersistentPool(pool, FOREIGN, "my study.toml").submit(b"", settings(50)).result(timeout=5)
+    assert "ZeroDivisionError; again by: python -m safevar_sumo simulate 'my study.toml' --set " in str(told.value)
+    assert f"--set {SUN.names[0]}=4313.0" in str(told.value)
+    assert str(told.value).count("--set") == 1, "what is not changed need not be set"
+    assert len(pool.tried) < 15
+
+
+def test_a_process_that_ends_with_a_users_code_in_it_is_an_error() -> None:
+    with pytest.raises(ForeignError, match=r"exit code -9\), again and again, with my_ads:Mine in it; again by: .* --set \w+=4302\.0"):
+        PersistentPool(ToldPool(deadly(4302)), FOREIGN).submit(b"", settings(8)).result(timeout=5)
+
+
+def test_why_a_setting_could_not_be_simulated_is_kept() -> None:
+    found = PersistentPool(ToldPool(deadly(4301)), STUDY).submit(b"", settings(3)).result(timeout=5)
+    assert found.reason(1) == "the worker process died (exit code -9)"
 
 
 def test_failures_between_successes_are_no_fault_of_the_study() -> None:
     every_second = 4300 + np.arange(0, 200, 2)
-    found = PersistentPool(ToldPool(deadly(*every_second)), SUN).submit(b"", settings(200)).result(timeout=5)
+    found = PersistentPool(ToldPool(deadly(*every_second)), STUDY).submit(b"", settings(200)).result(timeout=5)
     assert np.count_nonzero(~found.valid) == 100
 
 
 def test_the_original_vehicle_must_succeed() -> None:
     with pytest.raises(WorkerLostError):
-        PersistentPool(ToldPool(deadly(4300)), SUN).submit(b"", settings(1), must_succeed=True).result(timeout=5)
+        PersistentPool(ToldPool(deadly(4300)), STUDY).submit(b"", settings(1), must_succeed=True).result(timeout=5)
 
 
 def test_a_batch_of_one_has_as_many_chances_as_a_setting_of_a_larger_one() -> None:
     pool = ToldPool(lambda rows, before: died() if before < 2 * ATTEMPTS - 1 else None)
-    assert PersistentPool(pool, SUN).submit(b"", settings(1)).result(timeout=5).valid.all()
-    assert not PersistentPool(ToldPool(deadly(4300)), SUN).submit(b"", settings(1)).result(timeout=5).valid.any()
+    assert PersistentPool(pool, STUDY).submit(b"", settings(1)).result(timeout=5).valid.all()
+    assert not PersistentPool(ToldPool(deadly(4300)), STUDY).submit(b"", settings(1)).result(timeout=5).valid.any()
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError("a bug"), PoolLostError("gone")])
 def test_a_bug_and_a_lost_pool_are_not_tried_again(error: Exception) -> None:
     pool = ToldPool(lambda rows, before: error)
     with pytest.raises(type(error), match=str(error)):
-        PersistentPool(pool, SUN).submit(b"", settings(5)).result(timeout=5)
+        PersistentPool(pool, STUDY).submit(b"", settings(5)).result(timeout=5)
     assert pool.tried == [5]
 
 
@@ -127,7 +172,7 @@ def test_a_pool_that_takes_nothing_any_more_ends_the_wait() -> None:
             return super().submit(study, settings)
 
     with pytest.raises(PoolLostError, match="closed"):
-        PersistentPool(Closed(lambda rows, before: died()), SUN).submit(b"", settings(5)).result(timeout=5)
+        PersistentPool(Closed(lambda rows, before: died()), STUDY).submit(b"", settings(5)).result(timeout=5)
 
 
 def test_a_cancelled_batch_ends_the_wait() -> None:
@@ -139,4 +184,4 @@ def test_a_cancelled_batch_ends_the_wait() -> None:
             return future
 
     with pytest.raises(PoolLostError, match="cancelled"):
-        PersistentPool(Cancelling(died), SUN).submit(b"", settings(5)).result(timeout=5)  # type: ignore[arg-type]
+        PersistentPool(Cancelling(died), STUDY).submit(b"", settings(5)).result(timeout=5)  # type: ignore[arg-type]

@@ -5,13 +5,17 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import sumo
 
-from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.errors import EnvironmentFault, InputError
 from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.simulation import network
 from safevar_sumo.simulation.network import copied_network
 
 FOLDERS = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
@@ -54,6 +58,58 @@ def test_a_network_is_built_once() -> None:
     assert first.network.stat().st_mtime_ns == written
 
 
+@pytest.mark.parametrize("spoil", [
+    lambda path: path.write_text(path.read_text().replace('id="0', 'id="00')), lambda path: path.write_text("<net><edge id='x'/></net>"),
+    lambda path: path.write_bytes(path.read_bytes()[:-500]), lambda path: path.write_bytes(b""), Path.unlink])
+@pytest.mark.parametrize("which", ["network", "traffic"])
+def test_a_cached_file_that_is_not_what_was_built_is_built_again(spoil: Callable[[Path], None], which: str) -> None:
+    file: Path = getattr(copied_network("lead_vehicle_stopped", 2), which)
+    built = file.read_bytes()
+    spoil(file)
+    assert getattr(copied_network("lead_vehicle_stopped", 2), which) == file
+    assert file.read_bytes() == built
+    assert sorted(path.name for path in file.parent.iterdir()) == [file.name, f"{file.name}.sha256"]
+
+
+@pytest.mark.parametrize(("loss", "n"), [("half", 12), ("nothing", 25), ("error", 60)])
+def test_a_disk_that_is_full_while_a_network_is_built_leaves_nothing_behind(loss: str, n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran = subprocess.run
+
+    def full(command: list[str], **options: Any) -> Any:
+        done = ran(command, **options)
+        made = Path(command[command.index("-o") + 1])
+        if loss == "error":
+            made.unlink()
+            return subprocess.CompletedProcess(command, 1, "", "Error: Could not write the network")
+        made.write_bytes(made.read_bytes()[:len(made.read_bytes()) // 2 if loss == "half" else 0])
+        return done
+
+    monkeypatch.setattr(subprocess, "run", full)
+    with pytest.raises(EnvironmentFault, match="netconvert"):
+        copied_network("lead_vehicle_stopped", n)
+    monkeypatch.undo()
+    ElementTree.parse(copied_network("lead_vehicle_stopped", n).network)
+
+
+def test_another_recipe_or_builder_is_another_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = copied_network("lead_vehicle_stopped", 1).network
+    monkeypatch.setattr(network, "RECIPE", ("--precision", "3", "--xml-validation", "never"))
+    network._digest.cache_clear()
+    assert copied_network("lead_vehicle_stopped", 1).network != before
+    monkeypatch.setattr(network, "netconvert_version", lambda: "1.99.0")
+    network._digest.cache_clear()
+    assert "lead" in str(copied_network("lead_vehicle_stopped", 1).network)
+    monkeypatch.undo()
+    network._digest.cache_clear()
+
+
+def test_a_cache_that_cannot_be_written_is_the_surroundings_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path / "file")
+    with pytest.raises(EnvironmentFault, match="cannot write the cache of networks"):
+        copied_network("lead_vehicle_stopped", 1)
+
+
 def test_a_users_folder_serves_as_well_and_its_content_counts(tmp_path: Path) -> None:
     mine = tmp_path / "mine"
     shutil.copytree(NETWORKS / "lead_vehicle_stopped", mine)
@@ -74,7 +130,7 @@ def test_sources_that_netconvert_refuses_are_an_error(tmp_path: Path) -> None:
     mine = tmp_path / "mine"
     shutil.copytree(NETWORKS / "lead_vehicle_stopped", mine)
     (mine / "network.edg.xml").write_text('<edges><edge id="road" from="west" to="nowhere"/></edges>')
-    with pytest.raises(SimulationError, match="netconvert refuses"):
+    with pytest.raises(EnvironmentFault, match="netconvert refuses"):
         copied_network(str(mine), 1)
     (mine / "network.edg.xml").write_text("<edges>")
     with pytest.raises(InputError, match="is not XML"):

@@ -1,0 +1,63 @@
+"""Built files that are kept in the user's cache folder: by all that they are made from, whole, and checked before use."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import platformdirs
+
+from safevar_sumo.errors import EnvironmentFault
+
+CHECKSUM = ".sha256"
+
+
+def cached(folder: str, name: str, build: Callable[[Path], None]) -> Path:
+    """A file of the cache, built if it is not there as it was built.
+
+    Parameters
+    ----------
+    folder
+        Where in the cache; tells contents apart.
+    build
+        Writes the file of that name, always the same bytes, into the directory that it is given.
+
+    Raises
+    ------
+    EnvironmentFault
+        If the cache cannot be written.
+    """
+    target = platformdirs.user_cache_path("safevar_sumo") / "networks" / folder / name
+    if not _intact(target):
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=target.parent) as made:
+                build(Path(made))
+                built = Path(made) / name
+                checksum = built.with_name(name + CHECKSUM)
+                checksum.write_text(_sha256(built))
+                for file in (built, checksum):
+                    _sync(file)
+                    os.replace(file, target.with_name(file.name))
+        except OSError as error:
+            raise EnvironmentFault(f"{target}: cannot write the cache of networks: {error.strerror or error}") from None
+    return target
+
+
+def _intact(target: Path) -> bool:
+    try:
+        return target.with_name(target.name + CHECKSUM).read_text() == _sha256(target)
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _sha256(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def _sync(file: Path) -> None:
+    with file.open("r+b") as handle:
+        os.fsync(handle.fileno())
