@@ -44,11 +44,11 @@ Layouts = Mapping[str, Callable[[pd.DataFrame], list[Table]]]
 """What turns an answer's frame into tables, by the answer's name."""
 
 
-def lay_out(answer: Answer, layouts: Layouts) -> list[Table]:
+def lay_out(answer: Answer, layouts: Layouts | None = None) -> list[Table]:
     """The tables of an answer; without any case that has it, one that says why."""
     if answer.frame.empty:
         return [Table(TITLES[answer.name], (), [], 0, (), answer.notes)]
-    tables = layouts[answer.name](answer.frame)
+    tables = (layouts or LAYOUTS)[answer.name](answer.frame)
     return [*tables[:-1], tables[-1]._replace(notes=(*tables[-1].notes, *answer.notes))]
 
 

@@ -105,16 +105,19 @@ def calibrate_command(study: str, references: tuple[Path, ...], trials: int, see
 @commands.command(name="import")
 @click.argument("study")
 @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory of the results.")
-@click.option("--nsga2", type=click.Path(path_type=Path), required=True, metavar="FILE.csv", help="Solutions of NSGA-II.")
+@click.option("--nsga2", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of NSGA-II.")
 @click.option("--rs", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of random search.")
 @click.option("--safe-fuzzer", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of SafeFuzzer.")
 @click.option("--original", metavar="sd=2.7,tet=1.2,tit=0.44,ave_dece=5.97",
               help="The original vehicle's metrics.  [default: those published for STUDY]")
 def import_command(study: str, out: Path, original: str | None, **given: Path | None) -> None:
-    """Make results of STUDY from solutions in the published package's CSV format."""
+    """Make results of STUDY from solutions in the published package's CSV format, or add those of another algorithm to them."""
     chosen = load_study(study)
     files = {algorithm: path for algorithm, path in given.items() if path is not None}
-    metrics = original_metrics(original, chosen.published)
+    if not files:
+        raise InputError("import", "no file is given", "at least one of --nsga2, --rs, --safe-fuzzer")
+    adds = original is None and (out / "manifest.json").exists()
+    metrics = None if adds else original_metrics(original, chosen.published)
     characteristics = CharacteristicSet.of(chosen.vehicle.characteristics)
     solutions = {}
     for algorithm, path in files.items():

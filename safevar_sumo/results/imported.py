@@ -25,35 +25,55 @@ UNKNOWN = "unknown"
 """Outcome of an imported solution that did not collide: how it ended is not told."""
 
 
-def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations], original: Mapping[str, float | None],
-                   files: Mapping[str, str]) -> None:
+def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations],
+                   original: Mapping[str, float | None] | None, files: Mapping[str, str]) -> None:
     """Write a results directory of imported solutions.
 
     Parameters
     ----------
     path
-        Is made if it does not exist; what an earlier import has left there is replaced.
+        Is made if it does not exist; what an earlier import of the same study has left there of other algorithms stays.
     solutions
         By algorithm.
     original
-        The original vehicle's metrics, by name.
+        The original vehicle's metrics, by name; nothing keeps those of an earlier import.
     files
         The name of the file that the solutions come from, by algorithm.
 
     Raises
     ------
     InputError
-        If the directory cannot be written or holds results of a campaign.
+        If the directory cannot be written, or holds results of a campaign or of another study.
     """
+    import pandas as pd
+
     make_directory(path)
-    if (path / RUNS).exists() or ((path / MANIFEST).exists() and "imported" not in read_manifest(path)):
-        raise InputError("--out", f"{path} holds results of a campaign", "another directory")
+    tables, names = tables_of(study), tuple(study.vehicle.characteristics)
+    earlier = _earlier(path, tables)
+    frame = solutions_frame(names, [((name, 0), found) for name, found in solutions.items()]).drop(columns="run")
+    if earlier:
+        there = read_imported(path, names)
+        frame = pd.concat([there[~there["algorithm"].isin(list(solutions))], frame], ignore_index=True)
+        frame = frame.sort_values(["algorithm", "f_safe", "f_diff", "f_num_diff", *names], kind="stable", ignore_index=True)
+    known = earlier.get("original", {}) if original is None else original
     manifest: dict[str, Any] = {
-        "format": FORMAT, "study": tables_of(study), "imported": {"files": dict(files)},
-        "versions": {"safevar_sumo": version("safevar_sumo")}, "original": dict(original)}
-    frame = solutions_frame(tuple(study.vehicle.characteristics), [((name, 0), found) for name, found in solutions.items()])
-    write_whole(path / SOLUTIONS, frame.drop(columns="run").to_csv(index=False, lineterminator="\n"))
+        "format": FORMAT, "study": tables, "imported": {"files": {**earlier.get("imported", {}).get("files", {}), **files}},
+        "versions": {"safevar_sumo": version("safevar_sumo")}, "original": dict(known)}
+    write_whole(path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
     write_whole(path / MANIFEST, json.dumps(manifest, indent=2, allow_nan=False) + "\n")
+
+
+def _earlier(path: Path, study: dict[str, Any]) -> dict[str, Any]:
+    """The manifest that an earlier import of the study has left, if there is one."""
+    if not (path / RUNS).exists() and not (path / MANIFEST).exists():
+        return {}
+    manifest = read_manifest(path) if (path / MANIFEST).exists() else {}
+    if (path / RUNS).exists() or "imported" not in manifest:
+        raise InputError(path, "holds results of a campaign", "another directory")
+    if manifest["study"] != study:
+        raise InputError(path, f"holds solutions of another study or another version of it, {manifest['study'].get('name')!r}",
+                         "another directory")
+    return manifest
 
 
 def read_imported(path: Path, characteristics: tuple[str, ...]) -> pd.DataFrame:

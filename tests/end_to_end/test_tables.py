@@ -175,11 +175,25 @@ def test_the_original_can_be_given(in_tmp: Path) -> None:
     run("import", "sun", "--out", "a", "--nsga2", "a.csv", "--original", "sd=2.5,tet=1.1")
     assert json.loads(Path("a/manifest.json").read_text())["original"] == {
         "safety_degree": 2.5, "tet": 1.1, "tit": 0.44, "ave_dece": 5.97}
-    run("import", "sun", "--out", "a", "--nsga2", "a.csv", "--safe-fuzzer", "a.csv")
+    run("import", "sun", "--out", "a", "--safe-fuzzer", "a.csv")
     assert set(pd.read_csv("a/solutions.csv")["algorithm"]) == {"nsga2", "safe_fuzzer"}
+    assert json.loads(Path("a/manifest.json").read_text())["original"]["safety_degree"] == 2.5, "an addition keeps what was given"
     for wrong in ("sd", "sd=x", "ttc=1", "sd=nan", ""):
         refused("import", "sun", "--out", "b", "--nsga2", "a.csv", "--original", wrong, told=("--original", "sd=NUMBER"))
     assert not Path("b").exists()
+
+
+def test_any_file_comes_first_and_the_others_later(in_tmp: Path) -> None:
+    for i, name in enumerate(("nsga2", "rs")):
+        package_csv(in_tmp / f"{name}.csv", 10 + i, i)
+    run("import", "sun", "--out", "whole", "--nsga2", "nsga2.csv", "--rs", "rs.csv")
+    run("import", "sun", "--out", "parts", "--rs", "rs.csv")
+    run("import", "sun", "--out", "parts", "--nsga2", "rs.csv")
+    run("import", "sun", "--out", "parts", "--nsga2", "nsga2.csv")
+    assert Path("whole/solutions.csv").read_bytes() == Path("parts/solutions.csv").read_bytes()
+    assert json.loads(Path("whole/manifest.json").read_text()) == json.loads(Path("parts/manifest.json").read_text())
+    refused("import", "rain", "--out", "parts", "--rs", "rs.csv", told=("parts", "another study"))
+    refused("import", "sun", "--out", "parts", told=("--nsga2, --rs, --safe-fuzzer",))
 
 
 def test_an_import_never_mixes_with_a_campaign(results: Path, imported: Path) -> None:
