@@ -17,6 +17,7 @@ from safevar_sumo.shipped import STUDIES
 
 Positive = Annotated[float, Meta(gt=0, le=1e6)]
 PositiveInt = Annotated[int, Meta(ge=1)]
+Weight = Annotated[float, Meta(ge=0, le=1e6)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
 LARGEST = 1e12
@@ -106,12 +107,36 @@ class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     places: tuple[str, ...] = ()
 
 
+class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How free parameters are found: what counts for how much, which rows are used, and from where the search starts.
+
+    The loss is `original` * mean_m(w_m (miss / (`tolerance` * published))^2) of the original vehicle
+    + mean over the files of sum_m(w_m (`rank` (1 - rho) + mean |error| / standard deviation)) + `collisions` * share of rows that
+    collide on one side alone, w_m being `weights` by metric. Of every `hold_out` rows one is used for nothing but to be reported.
+    `trials` sets of parameters are tried, in generations of `population`: half of them in searches from `starts` random places in
+    the bounds, the rest from the better of what these found and the study's own values. `seed` is the seed of all that.
+    """
+
+    trials: PositiveInt = 1200
+    seed: Annotated[int, Meta(ge=0, le=2**31)] = 1
+    starts: Annotated[int, Meta(ge=0, le=1000)] = 0
+    population: Annotated[int, Meta(ge=4, le=1000)] = 14
+    hold_out: Annotated[int, Meta(ge=2, le=1000)] = 2
+    tolerance: Annotated[float, Meta(gt=0, le=1)] = 0.05
+    original: Weight = 1.0
+    rank: Weight = 5.0
+    collisions: Weight = 10.0
+    weights: dict[str, Weight] = msgspec.field(
+        default_factory=lambda: {"safety_degree": 1.0, "tet": 0.3, "tit": 0.3, "ave_dece": 0.5})
+
+
 class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole study as its TOML file gives it; `load_study` reads one.
 
     `step_length` is the simulation's time step [s], by default the one of the network's options;
     `published` are the original vehicle's metrics in the published study, by name, as far as there are any;
-    `calibration` tells which parameters are free, by their keys in the file, such as `ads.parameters.corridor`.
+    `repeatability` are standard deviations of repeats of one setting there;
+    `calibration` tells which parameters are free, by their keys in the file, such as `ads.parameters.corridor`, `fit` how they are found.
     """
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z")]
@@ -124,6 +149,8 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     search: SearchTable
     step_length: Annotated[float, Meta(ge=0.001, le=1)] | None = None
     published: dict[str, float] = {}
+    repeatability: dict[str, Annotated[float, Meta(gt=0, le=1e6)]] = {}
+    fit: FitTable = msgspec.field(default_factory=FitTable)
     calibration: dict[str, FreeParameter] = {}
     origin: Origin = Origin()
 

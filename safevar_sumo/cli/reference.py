@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import click
+import msgspec
 import numpy as np
 from rich.console import Console
 
@@ -20,8 +21,8 @@ from safevar_sumo.reference import (
     agreement,
     calibrate,
     calibration_comment,
-    data_lines,
     evaluations_of,
+    fitted_as,
     original_metrics,
     plot_agreement,
     read_reference,
@@ -65,13 +66,17 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
 @commands.command(name="calibrate")
 @click.argument("study")
 @click.argument("references", type=click.Path(path_type=Path), nargs=-1, metavar="[REFERENCE.csv]...")
-@click.option("--trials", type=click.IntRange(min=1), default=400, show_default=True, help="How many sets of parameters are tried.")
-@click.option("--seed", type=click.IntRange(min=0, max=2**32 - 2), default=1, show_default=True, help="Seed of the search.")
+@click.option("--trials", type=click.IntRange(min=1), help="How many sets of parameters are tried.  [default: the study's]")
+@click.option("--seed", type=click.IntRange(min=0, max=2**31), help="Seed of the search.  [default: the study's]")
+@click.option("--from-scratch", is_flag=True, help="Start from random places alone, as if the study's values were not known.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE.toml", help="Study file to write.  [default: STUDY-calibrated.toml]")
-def calibrate_command(study: str, references: tuple[Path, ...], trials: int, seed: int, jobs: int | None, out: Path | None) -> None:
-    """Fit what STUDY declares under [calibration] to the published values and to half of the rows of reference files."""
-    chosen = load_study(study)
+def calibrate_command(study: str, references: tuple[Path, ...], trials: int | None, seed: int | None, from_scratch: bool,
+                      jobs: int | None, out: Path | None) -> None:
+    """Fit what STUDY declares under [calibration] to the published values and to rows of reference files, as [fit] says."""
+    given = load_study(study)
+    asked = {name: value for name, value in (("trials", trials), ("seed", seed)) if value is not None}
+    chosen = msgspec.structs.replace(given, fit=msgspec.structs.replace(given.fit, **asked))
     system = assemble(chosen, study)
     target = out or Path(f"{chosen.name}-calibrated.toml")
     for taken in (Path(study), *references):
@@ -81,24 +86,24 @@ def calibrate_command(study: str, references: tuple[Path, ...], trials: int, see
     if len({path.name for path in references}) < len(references):
         raise InputError("REFERENCE.csv", "two files have one name", "files of different names")
     data = {path.name: _read(path, system.characteristics) for path in references}
-    used = data_lines(data, {path.name: path.read_bytes() for path in references})
     tried, lowest, best = 0, np.inf, chosen
     try:
         with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
-              counted_trials(Console(stderr=True), trials) as done):
+              counted_trials(Console(stderr=True), chosen.fit.trials) as done):
             def one_done(cost: float, so_far: Study) -> None:
                 nonlocal tried, lowest, best
                 tried, lowest, best = tried + 1, cost, so_far
                 done(cost)
 
-            found = calibrate(chosen, data, pool, trials, seed, one_done)
+            found = calibrate(chosen, data, pool, one_done, from_scratch=from_scratch)
     except KeyboardInterrupt:
         if tried:
-            write_study(target, best, f"Best of {tried} of {trials} trials, then interrupted (seed {seed}). Cost {lowest:.4f}.")
+            account = f"Best of {tried} of {chosen.fit.trials} trials, then interrupted (seed {chosen.fit.seed}). Cost {lowest:.4f}."
+            write_study(target, fitted_as(chosen, best), account)
             click.echo(f"interrupted: the best of {tried} trials is in {target}", err=True)
         raise
     print_calibration(Console(), chosen, found)
-    write_study(target, found.study, calibration_comment(found, chosen, used, trials, seed))
+    write_study(target, fitted_as(chosen, found.study), calibration_comment(found, chosen, data, from_scratch=from_scratch))
     Console().print(f"Study file: {target}", soft_wrap=True)
 
 
@@ -140,5 +145,4 @@ def _simulated(path: Path, data: ReferenceData, here: Evaluations) -> tuple[Refe
         raise SimulationError(f"{path}: not one of its {len(valid)} rows could be simulated")
     if not valid.all():
         click.echo(f"warning: {path}: {np.count_nonzero(~valid)} rows could not be simulated and are left out", err=True)
-    metrics = {name: values[valid] for name, values in data.metrics.items()}
-    return data._replace(settings=data.settings[valid], metrics=metrics), here.take(valid)
+    return data.take(valid), here.take(valid)

@@ -12,7 +12,7 @@ import msgspec
 from safevar_sumo.computing.identity import Inputs, changed, inputs_of
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.simulation import System, assemble, evaluate, network_files
+from safevar_sumo.simulation import System, assemble, network_files, score, simulate, simulate_alone
 from safevar_sumo.study import Study
 
 SHARED = ("network", "sources", "code")
@@ -39,13 +39,14 @@ class Pool(Protocol):
 
 
 class _Work(msgspec.Struct, frozen=True):
-    """A study as it travels to a worker, and the digests of the files that it is to be computed with."""
+    """A study as it travels to a worker, the digests of the files that it is to be computed with, and how."""
 
     study: Study
     inputs: Inputs
+    alone: bool
 
 
-def packed(study: Study, inputs: Mapping[str, Any] | None = None) -> bytes:
+def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, alone: bool = False) -> bytes:
     """A study as it travels to a worker.
 
     Parameters
@@ -53,10 +54,12 @@ def packed(study: Study, inputs: Mapping[str, Any] | None = None) -> bytes:
     inputs
         Layers of the study's identity by name; workers that have other files compute nothing. By default the files as
         they are now.
+    alone
+        To be simulated beside one copy of the network for all settings (`simulate_alone`).
     """
     if inputs is None:
         inputs = inputs_of(study, assemble(study))
-    return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED if layer in inputs}))
+    return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED if layer in inputs}, alone))
 
 
 def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
@@ -67,20 +70,20 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
     InputError
         If the study's files are not those that the campaign began with.
     """
-    system, network = _system(work)
+    system, network, alone = _system(work)
     _refuse_changes(network, {"network": network_files(system.scenario.network)})
-    evaluations = evaluate(system, settings)
+    evaluations = score(system, settings, (simulate_alone if alone else simulate)(system, settings))
     _refuse_changes(network, {"network": network_files(system.scenario.network)})
     return evaluations
 
 
 @lru_cache(maxsize=4)
-def _system(packed_work: bytes) -> tuple[System, Inputs]:
+def _system(packed_work: bytes) -> tuple[System, Inputs, bool]:
     """The system that a study names and what its network is to be; code that is loaded stays, whatever becomes of its files."""
     work = msgspec.msgpack.decode(packed_work, type=_Work)
     system = assemble(work.study)
     _refuse_changes(work.inputs, inputs_of(work.study, system))
-    return system, {layer: files for layer, files in work.inputs.items() if layer == "network"}
+    return system, {layer: files for layer, files in work.inputs.items() if layer == "network"}, work.alone
 
 
 def _refuse_changes(expected: Inputs, here: Inputs) -> None:

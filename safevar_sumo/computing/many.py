@@ -16,12 +16,13 @@ BATCH = 100
 """Settings per SUMO simulation."""
 
 
-def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[[int], None] = lambda number: None) -> Evaluations:
-    """Evaluate many filtered settings, shape (M, n), row by row; equal rows are simulated once.
+def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[[int], None] = lambda number: None, *,
+                 alone: bool = False) -> Evaluations:
+    """Evaluate many filtered settings, shape (M, n), row by row; equal rows are simulated once, `alone` as in `packed`.
 
     `done` is called with the number of settings of every batch that is finished.
     """
-    persistent, work = PersistentPool(pool, study), packed(study)
+    persistent, work = PersistentPool(pool, study), packed(study, alone=alone)
     unique, row_of = np.unique(settings, axis=0, return_inverse=True)
     starts = range(0, len(unique), BATCH)
     futures = {persistent.submit(work, unique[start:start + BATCH]): start for start in starts}

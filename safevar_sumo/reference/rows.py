@@ -7,6 +7,8 @@ in most files, `Dece`. There is no run column.
 from __future__ import annotations
 
 import csv
+import io
+from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,15 +38,22 @@ class ReferenceData(NamedTuple):
         Name -> values, shape (M,); NaN where undefined: TET and TIT of a collision, a column that is missing.
     skipped
         How many rows had a value outside its domain and were left out.
+    fingerprint
+        SHA-256 of the file's bytes.
     """
 
     settings: FloatArray
     metrics: dict[str, FloatArray]
     skipped: int
+    fingerprint: str = ""
 
     @property
     def collided(self) -> BoolArray:
         return np.asarray(self.metrics["safety_degree"] <= 0)
+
+    def take(self, rows: BoolArray) -> ReferenceData:
+        """The data of some rows."""
+        return self._replace(settings=self.settings[rows], metrics={name: values[rows] for name, values in self.metrics.items()})
 
 
 def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceData:
@@ -55,7 +64,8 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     InputError
         If it cannot be read, lacks a column or a row, or holds a cell that is no number; names file, row and column.
     """
-    table = _table(path)
+    content = _content(path)
+    table = _table(path, content)
     columns = _characteristic_columns(path, table, characteristics)
     wanted = [*columns, *(column for name, column in COLUMNS.items() if name != OPTIONAL or column in table)]
     missing = [column for column in wanted if column not in table]
@@ -71,7 +81,8 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     collided = metrics["safety_degree"] <= 0
     metrics["ave_dece"] = np.abs(metrics["ave_dece"])
     metrics["tet"], metrics["tit"] = (np.where(collided, np.nan, metrics[name]) for name in ("tet", "tit"))
-    return ReferenceData(package_filter(characteristics, settings[inside]), metrics, int(np.count_nonzero(~inside)))
+    return ReferenceData(package_filter(characteristics, settings[inside]), metrics, int(np.count_nonzero(~inside)),
+                         sha256(content).hexdigest())
 
 
 def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> FloatArray:
@@ -81,19 +92,27 @@ def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> 
     return np.where(share >= characteristics.threshold / width - 1e-12, settings, characteristics.original)
 
 
-def _table(path: Path) -> pd.DataFrame:
+def _content(path: Path) -> bytes:
+    """A file's bytes, read once: what comes through a pipe cannot be read again."""
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            header = [name.strip() for name in next(csv.reader(file), [])]
-            file.seek(0)
-            table = pd.read_csv(file, dtype=str, skipinitialspace=True, index_col=False)
+        return path.read_bytes()
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror or error}", "a CSV file") from None
+
+
+def _table(path: Path, content: bytes) -> pd.DataFrame:
+    """Its rows as they stand there, by their line less two; lines without anything are none."""
+    try:
+        text = content.decode("utf-8-sig")
+        header = [name.strip() for name in next(csv.reader(io.StringIO(text, newline="")), [])]
+        table = pd.read_csv(io.StringIO(text, newline=""), dtype=str, skipinitialspace=True, index_col=False, na_filter=False,
+                            skip_blank_lines=False).fillna("")
     except pd.errors.EmptyDataError:
         raise InputError(path, "is empty", "a CSV file with a header and rows") from None
     except (pd.errors.ParserError, csv.Error, UnicodeDecodeError) as error:
         raise InputError(path, f"is not CSV: {str(error).splitlines()[0]}", "a CSV file with a header and rows") from None
     table.columns = table.columns.str.strip()
+    table = table[(table != "").any(axis=1)]
     twice = [name for name in header if header.count(name) > 1]
     if twice:
         raise InputError(path, f"has the column {twice[0]!r} twice", "one column of a name")
@@ -126,5 +145,7 @@ def _numbers(path: Path, table: pd.DataFrame, column: str) -> FloatArray:
     values = pd.to_numeric(table[column], errors="coerce").to_numpy(dtype=float)
     wrong = np.flatnonzero(~np.isfinite(values))
     if wrong.size:
-        raise InputError(path, f"row {wrong[0] + 2}, column {column} = {table[column].iloc[wrong[0]]!r}", "a finite number")
+        cell = table[column].iloc[wrong[0]]
+        problem = f"row {table.index[wrong[0]] + 2}, column {column} " + (f"= {cell!r}" if cell.strip() else "is empty")
+        raise InputError(path, problem, "a finite number")
     return np.asarray(values)

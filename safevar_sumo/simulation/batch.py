@@ -49,12 +49,15 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSU
     InputError
         If a user's ADS fails.
     """
-    n = len(settings)
-    if system.step_length is not None:
-        options = ("--step-length", repr(system.step_length), *options)
+    options = (*step_options(system), *options)
     first, *others = [staged(point.scenario) for point in system.points]
-    with world_on(first, n, engine, options, others) as world:
+    with world_on(first, len(settings), engine, options, others) as world:
         return drive(system, settings, world, watch)
+
+
+def step_options(system: System) -> tuple[str, ...]:
+    """SUMO's options for the time step that the study asks for."""
+    return () if system.step_length is None else ("--step-length", repr(system.step_length))
 
 
 def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher | None = None) -> Drives:

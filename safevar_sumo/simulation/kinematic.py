@@ -15,16 +15,18 @@ import numpy as np
 
 from safevar_sumo.records import BoolArray, Drives, FloatArray
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.simulation.batch import drive
+from safevar_sumo.simulation.batch import drive, step_options
 from safevar_sumo.simulation.network import copied_id, copied_network
+from safevar_sumo.simulation.staging import staged
 from safevar_sumo.simulation.sumo import Engine, SumoWorld, open_world
 from safevar_sumo.simulation.system import System
 from safevar_sumo.vehicles import SumoType
 
 
 def simulate_alone(system: System, settings: FloatArray) -> Drives:
-    """`simulate`, with one copy of the network for all settings, shape (N, n)."""
-    with open_world(copied_network(system.scenario.network, 1), 1, Engine.LIBSUMO) as world:
+    """`simulate` in the study's one scenario, with one copy of the network for all settings, shape (N, n)."""
+    files = copied_network(staged(system.scenario), 1)
+    with open_world(files, 1, Engine.LIBSUMO, step_options(system)) as world:
         return drive(system, settings, KinematicWorld(world, len(settings)))
 
 

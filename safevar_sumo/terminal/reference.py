@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from safevar_sumo.reference import Agreement, Calibration
+from safevar_sumo.reference import Agreement, Calibration, on_a_bound
 from safevar_sumo.study import Study
 from safevar_sumo.terminal.heads import METRIC_HEADS
 
@@ -34,7 +34,8 @@ def print_calibration(console: Console, study: Study, found: Calibration) -> Non
         table.add_row(name, row.unit, *(f"{number:.5g}" for number in (value, row.lower, row.upper)))
     console.print(table)
     for name in found.used:
-        both = Table(f"{name}: used half / held back", title_justify="left")
+        both = Table(title=escape(f"{name}: rows used / held back"), title_justify="left")
+        both.add_column("")
         for head in ("Spearman's rho", "mean abs. error", "bias"):
             both.add_column(head, justify="right")
         halves = (found.used[name], found.held_back[name])
@@ -43,4 +44,8 @@ def print_calibration(console: Console, study: Study, found: Calibration) -> Non
                 " / ".join("-" if number is None else f"{number:.3f}" for number in (getattr(half, what)[metric] for half in halves))
                 for what in ("spearman", "mean_absolute_error", "bias")))
         console.print(both)
-    console.print(f"Cost {found.cost:.4f}")
+    for name in on_a_bound(found.values, study.calibration):
+        console.print(f"{name} stands on its bound: a wider one may fit better.", markup=False)
+    if not found.alone:
+        console.print("SUMO simulated every trial in copies of the network: beside one copy, vehicles do something else in this scenario.")
+    console.print(f"Cost {found.cost:.4f}; each search came to {', '.join(f'{cost:.4f}' for cost in found.reached)}")

@@ -102,6 +102,7 @@ def test_calibrate_without_data_fits_the_original_vehicle_alone(in_tmp: Path) ->
     ("vehicle.characteristics.mass.original", ("vehicle.characteristics.mass.original",)),
     ("ads.parameters.nothing", ("ads.parameters.nothing",)),
     ("weather.name", ("weather.name",)),
+    ("ads.parameters.throttle.00", ("ads.parameters.throttle.00",)),
 ])
 def test_calibrate_touches_nothing_but_parameters(key: str, told: tuple[str, ...], in_tmp: Path) -> None:
     Path("mine.toml").write_text(
@@ -121,6 +122,22 @@ def test_calibrate_refuses_bounds_that_the_models_do_not_take(key: str, lower: f
     refused("calibrate", "mine.toml", "--trials", "13", "--out", "x.toml", told=told)
 
 
+def test_calibrate_forgets_what_the_study_says_when_told_to(data: Path, in_tmp: Path) -> None:
+    """From random places alone, the value that the data was made with is found whatever the study starts from."""
+    truth = load_study("sun").ads.parameters["brake_gap"]
+    found = []
+    for own in (0.4 * truth, 1.5 * truth):
+        Path("mine.toml").write_text(
+            f'extends = "sun"\nname = "mine"\n[ads.parameters]\nbrake_gap = {own}\n[fit]\nstarts = 2\n'
+            "trials = 90\npopulation = 6\n[calibration]\n"
+            f'"ads.parameters.brake_gap" = {{ lower = {0.3 * truth}, upper = {1.6 * truth}, unit = "m", meaning = "gap" }}\n')
+        run("calibrate", "mine.toml", str(data), "--from-scratch", "--jobs", "1", "--out", "found.toml")
+        study = load_study("found.toml")
+        assert study.name == "mine-calibrated"
+        found.append(study.ads.parameters["brake_gap"])
+    assert found[0] == found[1] == pytest.approx(truth, rel=0.02)
+
+
 def test_calibrate_does_not_write_over_what_it_starts_from(data: Path, in_tmp: Path) -> None:
     refused("calibrate", "sun", str(data), "--trials", "1", "--out", str(data), told=("--out", data.name))
     assert data.read_text().startswith("max_rpm")
@@ -134,8 +151,7 @@ def test_settings_that_cannot_be_simulated_are_told(data: Path, in_tmp: Path) ->
 
 
 def test_an_interrupted_calibration_leaves_the_best_so_far(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(study: Study, references: object, pool: object, trials: int, seed: int,
-                    done: Callable[[float, Study], None]) -> None:
+    def interrupted(study: Study, references: object, pool: object, done: Callable[[float, Study], None], *, from_scratch: bool) -> None:
         done(2.0, study)
         done(1.0, with_values(study, {"ads.parameters.brake_gap": 5.5}))
         raise KeyboardInterrupt

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import threading
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -103,3 +106,21 @@ def test_a_file_without_any_usable_row_is_refused(tmp_path: Path) -> None:
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         read_reference(tmp_path / "nothing.csv", SUN)
+
+
+def test_a_cell_is_told_by_its_line_though_lines_are_blank_and_cells_empty(tmp_path: Path) -> None:
+    frame = table(SUN, SUN_COLUMNS).astype(object)
+    frame.loc[1, "mass"] = ""
+    lines = frame.to_csv(index=False).splitlines()
+    (tmp_path / "data.csv").write_text("\n".join([*lines[:2], "", "", *lines[2:]]) + "\n\n")
+    with pytest.raises(InputError, match="row 5, column mass is empty"):
+        read_reference(tmp_path / "data.csv", SUN)
+
+
+def test_a_file_that_can_be_read_only_once_has_the_fingerprint_of_its_bytes(tmp_path: Path) -> None:
+    """As `calibrate sun <(zcat data.csv.gz)` passes it."""
+    content = table(SUN, SUN_COLUMNS).to_csv(index=False).encode()
+    os.mkfifo(tmp_path / "pipe.csv")
+    threading.Thread(target=(tmp_path / "pipe.csv").write_bytes, args=(content,), daemon=True).start()
+    data = read_reference(tmp_path / "pipe.csv", SUN)
+    assert (len(data.settings), data.fingerprint) == (3, sha256(content).hexdigest())
