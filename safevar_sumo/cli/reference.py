@@ -54,9 +54,10 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     data, here = _simulated(reference, data, evaluations.take(np.arange(1, len(settings))))
     if not evaluations.valid[0]:
         raise SimulationError(f"study {study!r} cannot be simulated with the original vehicle")
-    result = agreement(data, here, chosen.published, evaluations.take([0]))
+    result = agreement(data, here, chosen, evaluations.take([0]))
     if plot is not None:
-        plot_agreement(plot, f"{chosen.title}\nagainst {reference.name}", system.characteristics, data, here)
+        plot_agreement(plot, f"{chosen.title}\nagainst {reference.name}", system.characteristics, data, here,
+                       chosen.repeatability.get("safety_degree"))
     if as_json:
         click.echo(json.dumps(result.to_dict(), indent=2, allow_nan=False))
     else:

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.reference.rows import ReferenceData
+from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 UNITS = {"safety_degree": "safety degree [m, -m/s]", "tet": "TET [s]", "tit": "TIT [s$^2$]", "ave_dece": "aveDece [m/s$^2$]"}
+_UNDATED: dict[str, dict[str, Any]] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+"""Metadata that leaves no date in a picture: the same data, the same bytes."""
 BINS = 8
 """Into so many equally full bins a characteristic's values are put in the picture."""
+
+
+FLIP = 2.0
+"""An outcome that lies within so many standard deviations of the repeats from the other one may be either."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +44,17 @@ class Agreement:
         How many the reference has, how many are here, how many both have.
     original
         By metric: the original vehicle's value there and here.
+    precision, recall
+        Share of the collisions here that are some there, and the other way round.
+    collision_speed
+        Mean over the collisions on both sides, there and here [m/s].
+    in_repeats
+        By metric: mean absolute error over the standard deviation of repeats of one setting there.
+    undecided
+        How many settings differ in whether they collide, and how many of these are within what repeats differ by: their
+        safety degree there or here is no more than two standard deviations from a collision.
+    by_predicted
+        Bins of equally many settings by their safety degree here: its ends, how many settings, and the mean error [m].
     """
 
     rows: int
@@ -45,25 +63,72 @@ class Agreement:
     bias: dict[str, float | None]
     collisions: dict[str, int]
     original: dict[str, dict[str, float | None]]
+    precision: float | None
+    recall: float | None
+    collision_speed: dict[str, float | None]
+    in_repeats: dict[str, float | None]
+    undecided: dict[str, int | None]
+    by_predicted: list[dict[str, float | None]]
 
     def to_dict(self) -> dict[str, Any]:
         """As plain values, under the attributes' names."""
         return asdict(self)
 
 
-def agreement(reference: ReferenceData, here: Evaluations, published: Mapping[str, float], original: Evaluations) -> Agreement:
-    """Compare row by row; `published` are the original vehicle's reference values, as far as there are any."""
+def agreement(reference: ReferenceData, here: Evaluations, study: Study, original: Evaluations) -> Agreement:
+    """Compare row by row; the study has the original vehicle's reference values and the repeatability, as far as they are known."""
     both = {name: _both(reference, here, name) for name in reference.metrics}
     differences = {name: here.metrics[name][rows] - reference.metrics[name][rows] for name, rows in both.items()}
+    errors = {name: _mean(np.abs(values)) for name, values in differences.items()}
+    collided = reference.collided & here.collided
+    counts = {"reference": int(np.count_nonzero(reference.collided)), "here": int(np.count_nonzero(here.collided)),
+              "both": int(np.count_nonzero(collided))}
     return Agreement(
         rows=len(here),
         spearman={name: rank_correlation(reference.metrics[name][rows], here.metrics[name][rows]) for name, rows in both.items()},
-        mean_absolute_error={name: _mean(np.abs(values)) for name, values in differences.items()},
+        mean_absolute_error=errors,
         bias={name: _mean(values) for name, values in differences.items()},
-        collisions={
-            "reference": int(np.count_nonzero(reference.collided)), "here": int(np.count_nonzero(here.collided)),
-            "both": int(np.count_nonzero(reference.collided & here.collided))},
-        original={name: {"reference": published.get(name), "here": _defined(values[0])} for name, values in original.metrics.items()})
+        collisions=counts,
+        original={name: {"reference": study.published.get(name), "here": _defined(values[0])} for name, values in original.metrics.items()},
+        precision=counts["both"] / counts["here"] if counts["here"] else None,
+        recall=counts["both"] / counts["reference"] if counts["reference"] else None,
+        collision_speed={"reference": _mean(-reference.metrics["safety_degree"][collided]), "here": _mean(here.collision_speed[collided])},
+        in_repeats={name: _in_repeats(error, study.repeatability.get(name)) for name, error in errors.items()},
+        undecided=_undecided(reference, here, study.repeatability.get("safety_degree")),
+        by_predicted=_by_predicted(here.f_safe, here.f_safe - reference.metrics["safety_degree"]))
+
+
+def may_be_either(reference: ReferenceData, here: Evaluations, repeatability: float) -> BoolArray:
+    """Which settings collide on one side alone, though repeats of them may do either."""
+    nearest = np.minimum(np.abs(reference.metrics["safety_degree"]), np.abs(here.f_safe))
+    return np.asarray((reference.collided != here.collided) & (nearest <= FLIP * repeatability))
+
+
+def _undecided(reference: ReferenceData, here: Evaluations, repeatability: float | None) -> dict[str, int | None]:
+    within = None if repeatability is None else int(np.count_nonzero(may_be_either(reference, here, repeatability)))
+    return {"differ": int(np.count_nonzero(reference.collided != here.collided)), "within_repeats": within}
+
+
+def _in_repeats(error: float | None, repeatability: float | None) -> float | None:
+    return None if error is None or repeatability is None else error / repeatability
+
+
+def _by_predicted(predicted: FloatArray, error: FloatArray) -> list[dict[str, float | None]]:
+    defined = ~np.isnan(predicted) & ~np.isnan(error)
+    return [{"lowest": float(predicted[rows].min()), "highest": float(predicted[rows].max()), "rows": len(rows),
+             "bias": float(error[rows].mean())}
+            for rows in _bins(np.where(defined, predicted, np.nan))]
+
+
+def _bins(values: FloatArray) -> list[npt.NDArray[np.intp]]:
+    """Rows of equally full bins of the values that are defined; equal values share a bin."""
+    defined = values[~np.isnan(values)]
+    if not defined.size:
+        return []
+    edges = np.unique(np.quantile(defined, np.linspace(0, 1, BINS + 1)))
+    bin_of = np.where(np.isnan(values), -1, np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0)))
+    filled = [np.flatnonzero(bin_of == i) for i in range(max(len(edges) - 1, 1))]
+    return [rows for rows in filled if rows.size]
 
 
 def rank_correlation(one: FloatArray, other: FloatArray) -> float | None:
@@ -88,8 +153,11 @@ def _defined(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
 
 
-def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, reference: ReferenceData, here: Evaluations) -> None:
-    """Draw here against reference for every metric, and the safety degree's mean error against each characteristic.
+def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, reference: ReferenceData, here: Evaluations,
+                   repeatability: float | None = None) -> None:
+    """Draw here against reference and error against what is predicted here, for every metric; the safety degree's by characteristic.
+
+    A ring is around a setting whose outcome differs by no more than repeats of it do.
 
     Raises
     ------
@@ -104,14 +172,18 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
 
     with sns.axes_style("whitegrid"), plt.rc_context({"font.size": 9}):
         columns = 4
-        rows = 1 + -(-len(characteristics) // columns)
+        rows = 2 + -(-len(characteristics) // columns)
         figure, axes = plt.subplots(rows, columns, figsize=(12, 2.4 * rows + 0.8), layout="constrained",
                                     gridspec_kw={"height_ratios": [1.5] + [1] * (rows - 1)})
-        for axis, metric in zip(axes[0], reference.metrics, strict=False):
-            _scatter(axis, metric, reference, here)
+        either = np.zeros(len(here), dtype=bool) if repeatability is None else may_be_either(reference, here, repeatability)
+        for axis, below, metric in zip(axes[0], axes[1], reference.metrics, strict=False):
+            _scatter(axis, metric, reference, here, either)
+            _error_by(below, here.metrics[metric], here.metrics[metric] - reference.metrics[metric])
+            below.set_xlabel(f"here: {UNITS[metric]}")
+            below.set_ylabel("mean error")
         error = here.metrics["safety_degree"] - reference.metrics["safety_degree"]
         lowest, highest = [], []
-        for i, axis in enumerate(axes[1:].flat):
+        for i, axis in enumerate(axes[2:].flat):
             if i >= len(characteristics):
                 axis.set_axis_off()
                 continue
@@ -121,26 +193,29 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
             member = characteristics.members[i]
             axis.set_xlabel(member.name + ("" if member.unit == "-" else f" [{member.unit}]"))
         margin = 0.1 * (max(highest) - min(lowest)) + 1e-6
-        for i, axis in enumerate(axes[1:].flat):
+        for i, axis in enumerate(axes[2:].flat):
             axis.set_ylim(min(lowest) - margin, max(highest) + margin)
             if i % columns == 0:
                 axis.set_ylabel("error of SD\n(here - reference)")
         figure.suptitle(title.replace("$", r"\$"))
         try:
-            figure.savefig(path, dpi=150)
+            figure.savefig(path, dpi=150, metadata=_UNDATED.get(path.suffix.lower()))
         except (OSError, ValueError) as error_written:
             raise InputError("--plot", f"cannot write {path}: {error_written}", "a file that ends in .png, .pdf or .svg") from None
         finally:
             plt.close(figure)
 
 
-def _scatter(axis: Axes, metric: str, reference: ReferenceData, here: Evaluations) -> None:
+def _scatter(axis: Axes, metric: str, reference: ReferenceData, here: Evaluations, either: BoolArray) -> None:
     rows = _both(reference, here, metric)
     collided = (reference.collided | here.collided)[rows]
     x, y = reference.metrics[metric][rows], here.metrics[metric][rows]
     axis.scatter(x[~collided], y[~collided], s=6, alpha=0.35, color="#0072b2", linewidths=0, label="no collision")
     if collided.any():
         axis.scatter(x[collided], y[collided], s=14, alpha=0.7, color="#d55e00", marker="x", linewidths=0.8, label="collision on a side")
+        if either[rows].any():
+            axis.scatter(x[either[rows]], y[either[rows]], s=40, facecolors="none", edgecolors="black", linewidths=0.6,
+                         label="either, in repeats")
         axis.legend(loc="upper left", fontsize=7, frameon=True)
     if x.size:
         ends = [min(x.min(), y.min()), max(x.max(), y.max())]
@@ -153,10 +228,9 @@ def _scatter(axis: Axes, metric: str, reference: ReferenceData, here: Evaluation
 
 def _error_by(axis: Axes, values: FloatArray, error: FloatArray) -> tuple[float, float]:
     """Mean error and its quartiles over bins of a characteristic; returns the lowest and highest value drawn."""
-    edges = np.unique(np.quantile(values, np.linspace(0, 1, BINS + 1)))
-    bin_of = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0))
-    filled = [np.flatnonzero(bin_of == i) for i in range(max(len(edges) - 1, 1))]
-    filled = [rows for rows in filled if rows.size]
+    filled = _bins(np.where(np.isnan(error), np.nan, values))
+    if not filled:
+        return 0.0, 0.0
     centres = np.array([values[rows].mean() for rows in filled])
     means = np.array([error[rows].mean() for rows in filled])
     quartiles = np.array([np.quantile(error[rows], [0.25, 0.75]) for rows in filled])

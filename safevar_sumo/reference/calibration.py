@@ -192,7 +192,7 @@ class _Trial:
         row = 1
         for data in self._references.values():
             here = evaluations.take(np.arange(row, row + len(data.settings)))
-            cost += reference_cost(agreement(data, here, {}, here), data, fit) / len(self._references)
+            cost += reference_cost(agreement(data, here, self.study, here), data, fit) / len(self._references)
             row += len(data.settings)
         return cost
 
@@ -203,7 +203,7 @@ def _told(study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> 
     for name, data in references.items():
         evaluations = evaluate_all(study, np.concatenate([characteristics.original[np.newaxis], data.settings]), pool)
         here = evaluations.take(np.arange(1, len(evaluations)))
-        told[name] = agreement(data, here, study.published, evaluations.take([0]))
+        told[name] = agreement(data, here, study, evaluations.take([0]))
     return told
 
 

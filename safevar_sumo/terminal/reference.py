@@ -14,14 +14,26 @@ from safevar_sumo.terminal.heads import METRIC_HEADS
 def print_agreement(console: Console, study: Study, told: Agreement) -> None:
     """Comparison with reference data, metric by metric."""
     table = Table("", title=escape(f"{study.title}: {told.rows} rows"), title_justify="left")
-    for head in ("Spearman's rho", "mean abs. error", "bias", "original there", "original here"):
+    for head in ("Spearman's rho", "mean abs. error", "in repeats", "bias", "original there", "original here"):
         table.add_column(head, justify="right")
     for name, head in METRIC_HEADS.items():
-        numbers = (told.spearman[name], told.mean_absolute_error[name], told.bias[name], *told.original[name].values())
+        numbers = (told.spearman[name], told.mean_absolute_error[name], told.in_repeats[name], told.bias[name],
+                   *told.original[name].values())
         table.add_row(head, *("-" if number is None else f"{number:.3f}" for number in numbers))
     console.print(table)
     collisions = told.collisions
-    console.print(f"Collisions: {collisions['reference']} in the reference, {collisions['here']} here, {collisions['both']} in both.")
+    console.print(f"Collisions: {collisions['reference']} in the reference, {collisions['here']} here, {collisions['both']} in both: "
+                  f"precision {_number(told.precision)}, recall {_number(told.recall)}; their mean speed is "
+                  f"{_number(told.collision_speed['reference'])} m/s there and {_number(told.collision_speed['here'])} m/s here.")
+    if told.undecided["within_repeats"] is not None:
+        console.print(f"Of {told.undecided['differ']} settings that collide on one side alone, {told.undecided['within_repeats']} "
+                      "may do either: repeats of them differ by as much.")
+    bins = ", ".join(f"{part['lowest']:.2f} to {part['highest']:.2f}: {part['bias']:+.2f}" for part in told.by_predicted)
+    console.print(f"Mean error by the safety degree here: {bins}.", markup=False)
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
 
 
 def print_calibration(console: Console, study: Study, found: Calibration) -> None:

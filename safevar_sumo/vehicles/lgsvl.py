@@ -33,7 +33,6 @@ PEAK_SLIP, SLIDING_SLIP, SLIDING_FRICTION = 0.4, 0.8, 0.5
 FRICTION = 1.0  # at the extremum
 SLIP_FLOOR = 4.0  # m/s, least speed that a slip is relative to (assumption, as PhysX has it)
 STANDSTILL = 0.05  # m/s, below which locked wheels hold the vehicle (assumption)
-DAMPING_SHARE = 0.1  # of wheelDamping that acts on a rolling wheel; the published data shows next to none
 WHEELBASE = 2.85  # m
 # The lane keeping has an error to correct: assumption, so that the steering angle has something to act on.
 LATERAL_ERROR, HEADING_ERROR = 0.10, 0.01  # m, rad
@@ -88,6 +87,8 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Time constant with which pedals follow their commands [s].
     wheel_mass_share
         Share of the four wheels' mass that the body carries beside its own [-].
+    wheel_damping_share
+        Share of wheelDamping that acts on a rolling wheel [-]; the published data shows little of it.
     steering_design_angle
         maxSteeringAngle of the vehicle that the lane keeping was made for [deg].
     """
@@ -100,6 +101,7 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     pedal_lag: Annotated[float, Meta(ge=0)]
     wheel_mass_share: Annotated[float, Meta(ge=0, le=1)]
+    wheel_damping_share: Annotated[float, Meta(ge=0, le=1)]
     steering_design_angle: Annotated[float, Meta(gt=0, lt=90)] = 39.4
 
     def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> _Prepared:
@@ -107,7 +109,7 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return _Prepared(
             step=step, substep=step / SUBSTEPS, mass=c["mass"], body=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"],
             radius=c["radius"], inertia=WHEELS * 0.5 * c["wheelMass"] * c["radius"] * c["radius"],
-            damping=WHEELS * DAMPING_SHARE * c["wheelDamping"], brake_torque=WHEELS * c["maxBrakeTorque"],
+            damping=WHEELS * self.wheel_damping_share * c["wheelDamping"], brake_torque=WHEELS * c["maxBrakeTorque"],
             motor_torque=c["maxMotorTorque"], least_rpm=c["minRpm"], largest_rpm=c["maxRpm"],
             steering=c["maxSteeringAngle"] * RADIANS, rolling_drag=c["tireDragCoeff"], shift_time=c["shiftTime"],
             slip_limit=c["tractionControlSlipLimit"], friction=FRICTION * road_friction)
