@@ -5,19 +5,52 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from safevar_sumo.analysis.quality import nondominated
+from safevar_sumo.answers import explain
+from safevar_sumo.answers.bench import Progress
 from safevar_sumo.report.material import Material
+from safevar_sumo.report.stored import stored
+from safevar_sumo.report.svg import Bar, rows
 from safevar_sumo.results import Handle, chosen_handle, unsafe_rows
 from safevar_sumo.showing.comparison import changes_in_words
 
 Found = list[dict[str, Any]]
 """What `explain --json` prints."""
+CAUSES = 6
+"""Minimal causes that a report shows, at the most."""
 REPLAYS = 10
 """Solutions that a report shows, at the most; explained ones come on top."""
+LIMIT = 20_000
+"""Simulations, about, that the minimal causes of a study may take."""
 FIRST = ("fewest", "smallest", "most_severe")
 """What is shown before anything else."""
 OBJECTIVES = ["f_safe", "f_diff", "f_num_diff"]
+
+
+def explanations(material: Material, jobs: int | None, progress: Progress) -> Found:
+    """The failures that matter, explained; computed once for these results."""
+    def compute() -> Found:
+        return explain(material.case, limit=LIMIT, jobs=jobs,
+                       progress=lambda what, done, total: progress(f"{material.case.name}: {what}", done, total)).records()
+
+    return list(stored(material, "explain", compute))
+
+
+def necessity(found: Found, material: Material) -> Markup | None:
+    """How often each characteristic is changed in a failure, and how often it is needed."""
+    shares: dict[str, dict[str, float]] = next((one["summary"] for one in found if "summary" in one), {})
+    names = [name for name in shares.get("necessary", {}) if shares["changed"].get(name)]
+    if not names:
+        return None
+    ordered = sorted(names, key=lambda name: (-shares["necessary"][name], -shares["changed"][name], name))
+    pieces = [[Bar(0, shares["changed"][name], "weak", f"{name}: changed in {shares['changed'][name]:.0%} of the failures"),
+               Bar(0, shares["necessary"][name], "hit", f"{name}: needed in {shares['necessary'][name]:.0%} of the failures")]
+              for name in ordered]
+    ends = [("", f"needed {shares['necessary'][name]:.0%}, changed {shares['changed'][name]:.0%}") for name in ordered]
+    told = f"{material.case.name}: how often a characteristic is needed for a failure, beside how often it is changed"
+    return rows(told, ordered, pieces, [None] * len(ordered), ends)
 
 
 def causes(found: Found, material: Material) -> list[dict[str, Any]]:
@@ -30,7 +63,7 @@ def causes(found: Found, material: Material) -> list[dict[str, Any]]:
                 distinct[key] = {"cause": cause, "because": failure["because"], "robustness": failure["robustness"],
                                  "handle": handle_of(failure)}
     ordered = sorted(distinct.values(), key=lambda one: _size(material, one["cause"]))
-    return [_told(material, place, one) for place, one in enumerate(ordered[:REPLAYS], 1)]
+    return [_told(material, place, one) for place, one in enumerate(ordered[:CAUSES], 1)]
 
 
 def smallest_cause(found: Found) -> dict[str, Any] | None:
@@ -53,20 +86,21 @@ def _told(material: Material, place: int, one: dict[str, Any]) -> dict[str, Any]
     cause = one["cause"]
     setting, boundary = material.setting_with(cause["changes"]), material.setting_with(cause["boundary"])
     members = {member.name: member for member in material.case.characteristics}
-    rows = [{"name": name, "unit": "" if members[name].unit == "-" else members[name].unit, "original": members[name].original,
+    table = [{"name": name, "unit": "" if members[name].unit == "-" else members[name].unit, "original": members[name].original,
              "boundary": cause["boundary"][name], "value": value} for name, value in cause["changes"].items()]
     comparison = material.compared(setting)
-    return {"title": f"Cause {place}: {', '.join(cause['changes'])}", "anchor": material.anchor("cause", place), "rows": rows,
+    return {"title": f"Cause {place}: {', '.join(cause['changes'])}", "anchor": material.anchor("cause", place), "rows": table,
             "end": comparison.verdict(comparison.rows[-1]), "because": one["because"], "robustness": one["robustness"],
-            "handle": one["handle"], "boundary": changes_in_words(material.case.characteristics, boundary),
+            "handle": one["handle"],
+            "whole": material.anchor("replay", one["handle"]), "boundary": changes_in_words(material.case.characteristics, boundary),
             "fraction": cause["fraction"], "replay": material.replay(setting)}
 
 
 def replays(material: Material, explained: Found | None) -> list[dict[str, Any]]:
     """The solutions worth a look: the chosen ones, the explained ones, and unsafe ones that no other beats in every objective."""
-    rows, told = material.solutions, []
+    told = []
     for place, handle in enumerate(_chosen(material, explained)):
-        row, setting = rows[handle], material.setting_of(Handle.parse(handle))
+        row, setting = material.solutions[handle], material.setting_of(Handle.parse(handle))
         one = {"handle": handle, "anchor": material.anchor("replay", handle), "f_safe": row["f_safe"], "f_diff": row["f_diff"],
                "f_num_diff": row["f_num_diff"], "outcome": row["outcome"], "open": place == 0 and not explained,
                "changes": changes_in_words(material.case.characteristics, setting)}

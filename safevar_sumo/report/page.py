@@ -8,8 +8,9 @@ from typing import Any
 
 from markupsafe import Markup
 
+from safevar_sumo.answers.bench import Progress, silent
 from safevar_sumo.errors import InputError
-from safevar_sumo.report.findings import causes, replays
+from safevar_sumo.report.findings import causes, explanations, necessity, replays
 from safevar_sumo.report.material import Material, gather
 from safevar_sumo.report.questions import figures, front, tables
 from safevar_sumo.report.tested import tested
@@ -27,10 +28,9 @@ SECTIONS = {
     "reproduce": "How to make every number again",
 }
 """The sections of a report by the names that `--only` takes, in their order."""
-Progress = Callable[[str, int, int], None]
 
 
-def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), progress: Progress = lambda what, done, total: None) -> str:
+def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), jobs: int | None = None, progress: Progress = silent) -> str:
     """One self-contained page about the results of one or several studies; the same results give the same page.
 
     Parameters
@@ -39,8 +39,10 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), pro
         Results directories.
     only
         Names of `SECTIONS`; all of them by default.
+    jobs
+        Worker processes for what is to be simulated, one for each core by default.
     progress
-        Is told what is being made, how many parts are done, and of how many.
+        Is told what is being made, how much of it is done, and of how much.
 
     Raises
     ------
@@ -52,37 +54,34 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), pro
         raise InputError("--only", f"there is no section {unknown[0]!r}", f"some of {','.join(SECTIONS)}")
     wanted = [name for name in SECTIONS if not only or name in only]
     materials = gather(directories)
-    total, done = len(materials) + 1, 0
-    studies = []
-    for material in materials:
-        progress(material.case.name, done, total)
-        studies.append(_study(material, wanted))
-        done += 1
-    progress("tables and figures", done, total)
+    studies = [_study(material, wanted, jobs, progress) for material in materials]
+    progress("tables and figures", 0, 1)
     cases = [material.case for material in materials]
     asked = "questions" in wanted
     page = environment(WEB).get_template("report.html.j2").render(
         title=f"Safety report: {', '.join(case.name for case in cases)}", sections={name: SECTIONS[name] for name in wanted},
         studies=studies,
         tables=tables(cases) if asked else [], figures=figures(cases) if asked else [],
-        commands=reproduce(materials, []) if "reproduce" in wanted else [],
+        commands=reproduce(materials, ["explain"] if "causes" in wanted else []) if "reproduce" in wanted else [],
         player=player_parts(), css=_part("report.css"), js=_part("report.js"))
-    progress("done", total, total)
+    progress("tables and figures", 1, 1)
     return page + "\n"
 
 
-def _study(material: Material, wanted: Sequence[str]) -> Mapping[str, Any]:
+def _study(material: Material, wanted: Sequence[str], jobs: int | None, progress: Progress) -> Mapping[str, Any]:
     """What one study gives to every section that is wanted."""
-    explained = None
+    explained = explanations(material, jobs, progress) if "causes" in wanted and material.system is not None else None
+    progress(f"{material.case.name}: replays", 0, 1)
     shown = replays(material, explained) if "causes" in wanted else []
     made: dict[str, Callable[[], Any]] = {
         "tested": lambda: tested(material),
         "verdict": lambda: verdict(material, explained),
         "causes": lambda: causes(explained or [], material),
+        "necessity": lambda: necessity(explained or [], material),
         "trust": lambda: trust(material, explained)}
     return {"name": material.case.name, "title": material.case.study.title, "anchor": material.anchor(), "replays": shown,
             "has_system": material.system is not None, "front": front(material, [one["handle"] for one in shown]) if shown else None,
-            **{name: make() for name, make in made.items() if name in wanted}}
+            **{name: make() for name, make in made.items() if name in wanted or (name == "necessity" and "causes" in wanted)}}
 
 
 def _part(name: str) -> Markup:
