@@ -28,13 +28,13 @@ class CampaignProgress:
     def __init__(self, console: Console, study: Study, keys: list[RunKey], quiet: bool) -> None:
         self._console, self._quiet = console, quiet
         shown = console.is_terminal and not quiet
-        self._room = console.width - max(map(len, study.search.algorithms)) - 1
+        self._room = console.width - max(map(len, study.search.labels)) - 1
         bar = [BarColumn(bar_width=BAR)] if self._room - BAR - 1 >= LEAST_ROOM else []
         self._room -= len(bar) * (BAR + 1)
         self._bar = Progress(TextColumn("{task.description}", markup=False), *bar, TextColumn("{task.fields[told]}", markup=False),
                              console=console, disable=not shown)
         self._lines = {}
-        for name in study.search.algorithms:
+        for name in study.search.labels:
             runs = sum(key.algorithm == name for key in keys)
             if runs:
                 task = self._bar.add_task(name, total=runs * study.search.evaluations, told="waiting")

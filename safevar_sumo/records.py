@@ -163,9 +163,13 @@ class Evaluations:
         """First objective: the safety degree (method section 3) [m, or -m/s on a collision]."""
         return self.metrics["safety_degree"]
 
+    def column(self, name: str) -> FloatArray:
+        """A metric, f_safe, f_diff or f_num_diff by name; shape (M,)."""
+        return np.asarray(getattr(self, name) if name in ("f_safe", "f_diff", "f_num_diff") else self.metrics[name])
+
     @property
     def objectives(self) -> FloatArray:
-        """The three objectives, all minimised, shape (M, 3)."""
+        """The published study's three objectives, all minimised, shape (M, 3)."""
         return np.stack([self.f_safe, self.f_diff, self.f_num_diff], axis=1)
 
     @property
@@ -197,12 +201,13 @@ class Evaluations:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Evaluations]) -> Evaluations:
-        """Several evaluations one after the other."""
+        """Several evaluations one after the other; a metric that is missing in one of them is undefined there."""
         def joined(name: str) -> np.ndarray:
             return np.concatenate([getattr(part, name) for part in parts])
 
         return cls(
             settings=joined("settings"), outcome=joined("outcome"), collision_speed=joined("collision_speed"),
-            metrics={name: np.concatenate([part.metrics[name] for part in parts]) for name in parts[0].metrics},
+            metrics={name: np.concatenate([part.metrics.get(name, np.full(len(part), np.nan)) for part in parts])
+                     for name in dict.fromkeys(name for part in parts for name in part.metrics)},
             f_diff=joined("f_diff"), f_num_diff=joined("f_num_diff"),
             reasons={setting: reason for part in parts for setting, reason in part.reasons.items()})

@@ -24,16 +24,19 @@ LARGEST = 1e12
 """Of what a characteristic may be, in its unit."""
 REPLACED = ("calibration",)
 """Tables that a study does not inherit in part from the one that it extends."""
+OBJECTIVES = ("safety_degree", "f_diff", "f_num_diff")
+"""What the published study minimises."""
 T = TypeVar("T")
 
 
 class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One row of the characteristics table; the quantities are in `unit`."""
+    """One row of the characteristics table; the quantities are in `unit`, a change counts `weight` times in f_diff."""
 
     unit: str
     original: float
     lower: float
     upper: float
+    weight: Positive = 1.0
 
 
 class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -69,16 +72,20 @@ class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     `ttc_threshold` is TTC* [s]; `sampling_interval` [s] is the time between two samples that
     TET, TIT and aveDece are computed from (a whole multiple of the simulation's step; by default the step).
+    `also` names further metrics as `package.module:Name`.
     """
 
     ttc_threshold: Positive
     sampling_interval: Positive | None = None
+    also: list[str] = []
 
 
 class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What is searched with: `runs` runs of every algorithm, each with `evaluations` simulations.
 
-    A batch of simulations that takes longer than `time_limit` [s] is taken for hung.
+    A batch of simulations that takes longer than `time_limit` [s] is taken for hung. `objectives` are minimised, a
+    metric in its unsafe direction. `parameters` are those of algorithms, by their labels; in a file they stand in tables
+    such as [search.nsga2].
     """
 
     algorithms: Annotated[list[str], Meta(min_length=1)]
@@ -87,6 +94,18 @@ class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     runs: PositiveInt
     seed: Seed
     time_limit: Annotated[float, Meta(gt=0, le=86400)] = 300.0
+    objectives: Annotated[list[str], Meta(min_length=2, max_length=6)] = msgspec.field(default_factory=lambda: list(OBJECTIVES))
+    parameters: dict[str, Parameters] = {}
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """What the algorithms are called in results, and how the study names them: of `package.module:Name` the Name."""
+        return {label_of(name): name for name in self.algorithms}
+
+
+def label_of(algorithm: str) -> str:
+    """What an algorithm is called in results: of `package.module:Name` the Name."""
+    return algorithm.rpartition(":")[2]
 
 
 class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -228,6 +247,7 @@ def _given(study: StudyLike) -> tuple[object, dict[str, Any], tuple[str, ...]]:
 def _checked(path: object, raw: dict[str, Any]) -> Study:
     if "origin" in raw:
         raise InputError(path, "origin: Object contains unknown field `origin`")
+    raw = _with_algorithms(raw)
     for key, row in _characteristic_rows(raw):
         _converted(path, row, CharacteristicTable, key)  # before the whole: msgspec does not tell which row of a table is wrong
     parsed = _converted(path, raw, Study)
@@ -241,6 +261,16 @@ def _checked(path: object, raw: dict[str, Any]) -> Study:
             raise InputError(path, f"published.{name} = 0", "a number other than 0")
     _check_finite(path, tables_of(parsed), "")
     return parsed
+
+
+def _with_algorithms(raw: dict[str, Any]) -> dict[str, Any]:
+    """The tables of algorithms, such as [search.nsga2], put where the schema has them."""
+    search = raw.get("search")
+    if not isinstance(search, dict):
+        return raw
+    own = {key: value for key, value in search.items() if isinstance(value, dict) and key not in SearchTable.__struct_fields__}
+    rest = {key: value for key, value in search.items() if key not in own}
+    return {**raw, "search": {**rest, "parameters": {**rest.get("parameters", {}), **own}}} if own else raw
 
 
 def _converted(source: object, raw: object, table: type[T], prefix: str = "") -> T:

@@ -6,14 +6,14 @@ import pandas as pd
 
 from safevar_sumo.analysis.case import ALGORITHM_TITLES, Case, Unanswerable
 from safevar_sumo.analysis.inference import ALPHA
-from safevar_sumo.analysis.layout import METRIC_TITLES
+from safevar_sumo.analysis.layout import titles_of
 from safevar_sumo.analysis.rq1 import rq1
 from safevar_sumo.analysis.rq2 import rq2
 
 
 def brief(case: Case) -> list[str]:
     """One line for each algorithm and baseline: effect sizes, and an asterisk where p says that they are no chance."""
-    lines = []
+    lines, titles = [], titles_of(case.scoring.metrics)
     asked = ((rq1, "algorithm", "RQ1: more unsafe than the original if below 0.5 (A12)"),
              (rq2, "baseline", "RQ2: NSGA-II better than the other if above 0.5 (A12)"))
     for ask, who, title in asked:
@@ -24,12 +24,12 @@ def brief(case: Case) -> list[str]:
             continue
         lines.append(f"{title}; * p < {ALPHA:g}")
         for name, of_it in frame.groupby(who, sort=False):
-            told = [_effect(*row) for row in zip(of_it["metric"], of_it["effect_size"], of_it["p_value"], strict=True)]
+            told = [_effect(titles[row[0]], *row[1:]) for row in zip(of_it["metric"], of_it["effect_size"], of_it["p_value"], strict=True)]
             lines.append(f"  {ALGORITHM_TITLES.get(str(name), name)}: {', '.join(told)}")
     return lines
 
 
-def _effect(metric: str, effect: float | None, p: float | None) -> str:
+def _effect(title: str, effect: float | None, p: float | None) -> str:
     if effect is None or p is None or pd.isna(p):
-        return f"{METRIC_TITLES[metric]} -"
-    return f"{METRIC_TITLES[metric]} {effect:.2f}{'*' if p < ALPHA else ''}"
+        return f"{title} -"
+    return f"{title} {effect:.2f}{'*' if p < ALPHA else ''}"

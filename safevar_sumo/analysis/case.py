@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.errors import InputError, told
-from safevar_sumo.metrics import METRICS
+from safevar_sumo.metrics import SAFEVAR, MetricFacts, Scoring
 from safevar_sumo.records import FloatArray, Outcome
 from safevar_sumo.results import Failure, failure_lines, load
 from safevar_sumo.scenarios import weather_of
@@ -23,10 +23,6 @@ from safevar_sumo.vehicles import CharacteristicSet
 NSGA2 = "nsga2"
 """The algorithm that RQ2 asks about and whose solutions RQ3 looks at."""
 ALGORITHM_TITLES = {"nsga2": "NSGA-II", "rs": "RS", "safe_fuzzer": "SafeFuzzer"}
-OVER_NON_COLLISIONS = ("tet", "tit")
-"""Metrics that are taken over solutions without collision (method section 4)."""
-MORE_IS_UNSAFE = {"safety_degree": False, "tet": True, "tit": True, "ave_dece": False}
-"""Whether a larger value of a metric is the more unsafe one."""
 
 
 class Unanswerable(InputError):
@@ -49,6 +45,8 @@ class Case:
         Frames as `safevar_sumo.results.load` gives them.
     finished
         Algorithm and number of every finished run.
+    scoring
+        Which metrics there are, and what was minimised.
     has_runs
         False for imported solutions, of which nobody knows the run.
     failures
@@ -63,6 +61,7 @@ class Case:
     finished: tuple[tuple[str, int], ...]
     has_runs: bool
     failures: tuple[Failure, ...] = ()
+    scoring: Scoring = SAFEVAR
 
     @property
     def characteristics(self) -> CharacteristicSet:
@@ -76,7 +75,7 @@ class Case:
     def algorithms(self) -> tuple[str, ...]:
         """Algorithms that have solutions or a finished run, in the study's order."""
         there = {*self.solutions["algorithm"], *(algorithm for algorithm, _ in self.finished)}
-        return tuple(name for name in dict.fromkeys([*self.study.search.algorithms, *sorted(there)]) if name in there)
+        return tuple(name for name in dict.fromkeys([*self.study.search.labels, *sorted(there)]) if name in there)
 
     def solutions_of(self, algorithm: str) -> pd.DataFrame:
         """Pooled solutions of all finished runs of an algorithm.
@@ -112,7 +111,7 @@ class Case:
         else:
             done = Counter(algorithm for algorithm, _ in self.finished)
             planned = self.study.search.runs
-            short = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.algorithms if done[name] < planned]
+            short = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.labels if done[name] < planned]
             if short:
                 told.append(f"{self.name}: unfinished, {', '.join(short)}; made of what is finished.")
         if self.failures:
@@ -121,10 +120,14 @@ class Case:
         return told
 
 
-def values(solutions: pd.DataFrame, metric: str) -> FloatArray:
-    """Where a metric counts, its values: TET and TIT of solutions without collision, else of all; undefined ones left out."""
-    counted = solutions[~collided(solutions)] if metric in OVER_NON_COLLISIONS else solutions
-    found = counted[metric].to_numpy(dtype=float)
+def counted(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
+    """The solutions over which a metric is taken: TET and TIT over those without collision (method section 4)."""
+    return solutions if metric.over_collisions else solutions[~collided(solutions)]
+
+
+def values(solutions: pd.DataFrame, metric: MetricFacts) -> FloatArray:
+    """Where a metric counts, its values; undefined ones left out."""
+    found = counted(solutions, metric)[metric.name].to_numpy(dtype=float)
     return np.asarray(found[~np.isnan(found)])
 
 
@@ -167,12 +170,20 @@ def load_case(directory: Path) -> Case:
     original = manifest.get("original")
     if not isinstance(original, dict):
         raise InputError(directory / "manifest.json", "tells nothing of the original vehicle", "what the command study has written")
-    return case_of(study, original, solutions, evaluations, finished, "imported" not in manifest, failures)
+    try:
+        scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else SAFEVAR
+    except msgspec.ValidationError as error:
+        raise invalid(directory / "manifest.json", manifest["scoring"], error, "scoring") from None
+    return case_of(study, original, solutions, evaluations, finished, "imported" not in manifest, failures, scoring)
 
 
 def case_of(study: Study, original: Mapping[str, Any], solutions: pd.DataFrame, evaluations: pd.DataFrame,
-               finished: Sequence[tuple[str, int]], has_runs: bool = True, failures: Sequence[Failure] = ()) -> Case:
+            finished: Sequence[tuple[str, int]], has_runs: bool = True, failures: Sequence[Failure] = (),
+            scoring: Scoring = SAFEVAR) -> Case:
     """Put a case together; in `original` an undefined metric is None or missing."""
-    metrics = {name: np.nan if original.get(name) is None else float(original[name]) for name in METRICS}
+    names = [metric.name for metric in scoring.metrics]
+    columns = [*names, *(objective.name for objective in scoring.objectives)]
+    metrics = {name: np.nan if original.get(name) is None else float(original[name]) for name in names}
+    solutions, evaluations = (frame.assign(**{name: np.nan for name in columns if name not in frame}) for frame in (solutions, evaluations))
     return Case(name=study.name, study=study, original=metrics, solutions=solutions, evaluations=evaluations,
-                   finished=tuple(finished), has_runs=has_runs, failures=tuple(failures))
+                finished=tuple(finished), has_runs=has_runs, failures=tuple(failures), scoring=scoring)

@@ -12,9 +12,10 @@ import numpy as np
 
 from safevar_sumo.analysis.case import ALGORITHM_TITLES, Case, Unanswerable
 from safevar_sumo.analysis.discussion import effects
-from safevar_sumo.analysis.quality import WORST, convergence, nondominated
+from safevar_sumo.analysis.quality import WORST, convergence, nondominated, objectives
 from safevar_sumo.analysis.rq3 import ANY, critical, rq31, rq32
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -122,7 +123,7 @@ def sizes_of_changes(case: Case) -> Figure:
 
 
 def pareto_fronts(case: Case) -> Figure:
-    """The non-dominated solutions of each algorithm, all its runs together, in the three pairs of objectives.
+    """The non-dominated solutions of each algorithm, all its runs together, in every pair of objectives.
 
     Beside them the original vehicle, and the line at and left of which a solution is a collision.
 
@@ -131,28 +132,44 @@ def pareto_fronts(case: Case) -> Figure:
     Unanswerable
         If there is no solution.
     """
-    names = list(OBJECTIVE_TITLES)
+    goals = case.scoring.objectives
+    scales = [one.sign * (100 if one.name == F_DIFF.name else 1) for one in goals]
     fronts = {}
     for algorithm in case.algorithms:
-        points = case.solutions_of(algorithm)[names].dropna().to_numpy(dtype=float)
+        points = objectives(case, case.solutions_of(algorithm))
         if len(points):
-            fronts[algorithm] = nondominated(points) * [1, 100, 1]
+            fronts[algorithm] = nondominated(points) * scales
     if not fronts:
         raise Unanswerable(case.name, "has no solution", "results with at least one finished run")
-    figure, (axes,) = _figure(f"{case.name}: non-dominated solutions of each algorithm, all runs together", 1, 3, (9.6, 3.7))
-    original = (case.original["safety_degree"], 0.0, 0.0)
-    for axis, (first, second) in zip(axes, combinations(range(3), 2), strict=True):
+    pairs = list(combinations(range(len(goals)), 2))
+    rows = next(rows for rows in (5, 2, 1) if len(pairs) % (3 * rows) == 0 or rows == 1)
+    columns = len(pairs) // rows
+    figure, axes = _figure(f"{case.name}: non-dominated solutions of each algorithm, all runs together", rows, columns,
+                           (max(3.2 * columns, 5), 3.7 * rows))
+    original = [_of_original(case, one) for one in goals]
+    for axis, (first, second) in zip(axes.flat, pairs, strict=True):
         for i, (algorithm, points) in enumerate(fronts.items()):
             axis.plot(points[:, first], points[:, second], linestyle="", marker=MARKERS[i % len(MARKERS)], markersize=4, alpha=0.6,
                       markeredgewidth=0, color=COLOURS[i % len(COLOURS)], label=f"{_title(algorithm)} ({len(points)})")
-        if not np.isnan(original[first]):
+        if not np.isnan([original[first], original[second]]).any():
             axis.plot(original[first], original[second], linestyle="", marker="*", markersize=9, color="black", label="original vehicle")
-        if names[first] == "f_safe":
+        if goals[first] == F_SAFE:
             axis.axvline(0, color="black", linewidth=0.8, linestyle="--", label="collision: 0 and left of it")
-        axis.set_xlabel(OBJECTIVE_TITLES[names[first]])
-        axis.set_ylabel(OBJECTIVE_TITLES[names[second]])
-    _legend_below(figure, axes[0])
+        axis.set_xlabel(_objective_title(goals[first]))
+        axis.set_ylabel(_objective_title(goals[second]))
+    _legend_below(figure, axes.flat[0])
     return figure
+
+
+def _objective_title(objective: Objective) -> str:
+    return OBJECTIVE_TITLES.get(objective.name) or f"{_plain(objective.title)} [{_unit(objective.unit)}]"
+
+
+def _of_original(case: Case, objective: Objective) -> float:
+    """The original vehicle's value; NaN where nobody knows it."""
+    if objective.name in (F_DIFF.name, F_NUM_DIFF.name):
+        return 0.0
+    return case.original.get("safety_degree" if objective == F_SAFE else objective.name, np.nan)
 
 
 def hypervolume_growth(case: Case) -> Figure:

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.case import ALGORITHM_TITLES, MORE_IS_UNSAFE
+from safevar_sumo.analysis.case import ALGORITHM_TITLES
 from safevar_sumo.analysis.inference import ALPHA, ASYMPTOTIC, EXACT, NOTABLE
 from safevar_sumo.analysis.questions import SAFETY, Answer
 from safevar_sumo.analysis.rq3 import ANY
+from safevar_sumo.metrics import MetricFacts
 
 UNDEFINED = "-"
-METRIC_TITLES = {"igd": "IGD", "igd_plus": "IGD+", "hypervolume": "HV", "safety_degree": "SD", "tet": "TET", "tit": "TIT",
-                 "ave_dece": "aveDece"}
+INDICATOR_TITLES = {"igd": "IGD", "igd_plus": "IGD+", "hypervolume": "HV"}
 SAFETY_UNITS = {"avgSD_mD": "avgSD_mD [m]", "avgSD_cS": "avgSD_cS [m/s]", "TET": "TET [s]", "TIT": "TIT [s^2]",
                 "aveDece": "aveDece [m/s^2]"}
 PAPER_NUMBERS = ("2", "3", "4", "5", "6")
 """The numbers of changed characteristics that the paper's table of RQ3.3 has."""
 BOLD_NOTE = f"Bold (or *): p < {ALPHA:g}; an effect size of medium or large magnitude."
-UNITS_NOTE = "SD in m, or minus the collision's speed in m/s; TET in s, TIT in s^2, aveDece in m/s^2."
-NON_COLLISION_NOTE = "TET and TIT over solutions without collision, SD and aveDece over all."
 
 
 class Bold(str):
@@ -40,24 +38,46 @@ class Table(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-Layouts = Mapping[str, Callable[[pd.DataFrame], list[Table]]]
-"""What turns an answer's frame into tables, by the answer's name."""
+Layout = Callable[[Answer], list[Table]]
+"""What turns an answer into tables."""
+Layouts = Mapping[str, Layout]
+"""Layouts by the answers' names."""
 
 
 def lay_out(answer: Answer, layouts: Layouts | None = None) -> list[Table]:
     """The tables of an answer; without any case that has it, one that says why."""
     if answer.frame.empty:
         return [Table(TITLES[answer.name], (), [], 0, (), answer.notes)]
-    tables = (layouts or LAYOUTS)[answer.name](answer.frame)
+    tables = (layouts or LAYOUTS)[answer.name](answer)
     return [*tables[:-1], tables[-1]._replace(notes=(*tables[-1].notes, *answer.notes))]
 
 
-def _tests(frame: pd.DataFrame, who: str, name: str, notes: tuple[str, ...]) -> Table:
+def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
+    """What metrics and quality indicators are called in tables, by name."""
+    return {**INDICATOR_TITLES, **{metric.name: metric.title for metric in metrics}}
+
+
+def units_note(metrics: Iterable[MetricFacts]) -> str:
+    """The units of metrics."""
+    return "; ".join(f"{metric.title} in {metric.unit}" for metric in metrics if metric.unit != "-") + "."
+
+
+def non_collision_note(metrics: Iterable[MetricFacts]) -> str:
+    """Which metrics are taken over which solutions."""
+    titles: dict[bool, list[str]] = {False: [], True: []}
+    for metric in metrics:
+        titles[metric.over_collisions].append(metric.title)
+    without, over_all = (" and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names) for names in titles.values())
+    return f"{without} over solutions without collision, {over_all} over all." if without else f"{over_all} over all solutions."
+
+
+def _tests(answer: Answer, who: str, notes: tuple[str, ...]) -> Table:
     """p-values and effect sizes, cases side by side."""
+    frame, name, titles = answer.frame, answer.name, titles_of(answer.metrics)
     cases = list(dict.fromkeys(frame["setting"]))
     cells = {(row[who], row["metric"], row["setting"]): row for row in frame.to_dict("records")}
     parts = ("p", "A12", "magnitude", "n1", "n2") if len(cases) == 1 else ("p", "A12", "magnitude")
-    rows = [(algorithm_title(algorithm), METRIC_TITLES[metric],
+    rows = [(algorithm_title(algorithm), titles[metric],
              *(cell for case in cases for cell in _test(cells.get((algorithm, metric, case)), len(parts))))
             for algorithm, metric in dict.fromkeys(zip(frame[who], frame["metric"], strict=True))]
     methods = [f"p{' with e' if method == EXACT else ''}: {method}." for method in (ASYMPTOTIC, EXACT) if method in set(frame["method"])]
@@ -73,24 +93,26 @@ def _test(row: Mapping[Any, Any] | None, width: int) -> tuple[str, ...]:
     return (p, effect, row["magnitude"], str(row["n1"]), str(row["n2"]))[:width]
 
 
-def _rq1(frame: pd.DataFrame) -> list[Table]:
-    test = _tests(frame, "algorithm", "rq1", (
+def _rq1(answer: Answer) -> list[Table]:
+    frame, metrics = answer.frame, answer.metrics
+    test = _tests(answer, "algorithm", (
         "A12 below 0.5: the algorithm's solutions are more unsafe than the original vehicle,",
-        "whose value is repeated to the sample's size.", NON_COLLISION_NOTE))
+        "whose value is repeated to the sample's size.", non_collision_note(metrics)))
     cases = list(dict.fromkeys(frame["setting"]))
     means = {(row["setting"], row["algorithm"], row["metric"]): row["mean"] for row in frame.to_dict("records")}
     means |= {(row["setting"], "original", row["metric"]): row["original"] for row in frame.to_dict("records")}
-    rows = [(algorithm_title(name), *(_number(means.get((case, name, metric)), ".2f") for case in cases for metric in MORE_IS_UNSAFE))
+    rows = [(algorithm_title(name), *(_number(means.get((case, name, metric.name)), ".2f") for case in cases for metric in metrics))
             for name in ("original", *dict.fromkeys(frame["algorithm"]))]
-    heads = tuple(METRIC_TITLES[metric] for metric in MORE_IS_UNSAFE)
+    heads = tuple(metric.title for metric in metrics)
     spans = tuple((case, len(heads)) for case in cases)
-    return [test, Table("RQ1: mean metrics", ("vehicle", *heads * len(cases)), rows, 1, spans, (UNITS_NOTE, NON_COLLISION_NOTE))]
+    return [test, Table("RQ1: mean metrics", ("vehicle", *heads * len(cases)), rows, 1, spans,
+                        (units_note(metrics), non_collision_note(metrics)))]
 
 
-def _rq2(frame: pd.DataFrame) -> list[Table]:
-    return [_tests(frame, "baseline", "rq2", (
+def _rq2(answer: Answer) -> list[Table]:
+    return [_tests(answer, "baseline", (
         "A12 above 0.5: NSGA-II is better; IGD, IGD+, HV: run against run, the others: pooled solutions.",
-        NON_COLLISION_NOTE, "IGD on the objectives as they are, IGD+ and hypervolume (HV) on normalised ones."))]
+        non_collision_note(answer.metrics), "IGD on the objectives as they are, IGD+ and hypervolume (HV) on normalised ones."))]
 
 
 def _rq31(frame: pd.DataFrame) -> list[Table]:
@@ -227,6 +249,15 @@ TITLES = {
     "combinations": "The most frequent combinations of four changes",
     "weather": "One weather against another",
 }
+
+
+def of_frame(layout: Callable[[pd.DataFrame], list[Table]]) -> Layout:
+    """A layout that needs an answer's frame alone."""
+    return lambda answer: layout(answer.frame)
+
+
 LAYOUTS: Layouts = {
-    "rq1": _rq1, "rq2": _rq2, "rq3.1": _rq31, "rq3.2": _rq32, "rq3.3": _rq33, SAFETY: _safety, "collisions": _collisions,
-    "combinations": _combinations, "weather": _weather}
+    "rq1": _rq1, "rq2": _rq2,
+    **{name: of_frame(layout) for name, layout in {
+        "rq3.1": _rq31, "rq3.2": _rq32, "rq3.3": _rq33, SAFETY: _safety, "collisions": _collisions, "combinations": _combinations,
+        "weather": _weather}.items()}}

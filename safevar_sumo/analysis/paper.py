@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import pandas as pd
 
 from safevar_sumo.analysis.inference import ALPHA, NOTABLE
-from safevar_sumo.analysis.layout import LAYOUTS, METRIC_TITLES, TITLES, UNDEFINED, Bold, Table, algorithm_title, p_value
+from safevar_sumo.analysis.layout import LAYOUTS, TITLES, UNDEFINED, Bold, Layouts, Table, algorithm_title, of_frame, p_value, titles_of
+from safevar_sumo.analysis.questions import Answer
 
 MARK = "x"
 CELL_NOTE = f"Cells: p / A12; bold (or *) where p < {ALPHA:g} and A12 is of medium or large magnitude."
@@ -16,13 +17,14 @@ SMALLER = "A12 below 0.5: the algorithm's solutions are more unsafe than the ori
 GREATER = "A12 above 0.5: NSGA-II is better."
 
 
-def _tests(frame: pd.DataFrame, who: str, name: str, note: str) -> list[Table]:
+def _tests(answer: Answer, who: str, note: str) -> list[Table]:
     """A row for each case and algorithm, a column for each metric."""
+    frame, name, titles = answer.frame, answer.name, titles_of(answer.metrics)
     cells = {(row["setting"], row[who], row["metric"]): _cell(row) for row in frame.to_dict("records")}
     metrics = list(dict.fromkeys(frame["metric"]))
     rows = [(case, algorithm_title(algorithm), *(cells.get((case, algorithm, metric), UNDEFINED) for metric in metrics))
             for case, algorithm in dict.fromkeys(zip(frame["setting"], frame[who], strict=True))]
-    return [Table(TITLES[name], ("case", who, *(METRIC_TITLES.get(metric, metric) for metric in metrics)), rows, 2,
+    return [Table(TITLES[name], ("case", who, *(titles.get(metric, metric) for metric in metrics)), rows, 2,
                   notes=(CELL_NOTE, note))]
 
 
@@ -45,6 +47,6 @@ def _combinations(frame: pd.DataFrame) -> list[Table]:
                   ("Percent of the critical solutions with exactly four characteristics changed; #: rank.",))]
 
 
-PAPER: Mapping[str, Callable[[pd.DataFrame], list[Table]]] = {
-    **LAYOUTS, "rq1": lambda frame: _tests(frame, "algorithm", "rq1", SMALLER),
-    "rq2": lambda frame: _tests(frame, "baseline", "rq2", GREATER), "combinations": _combinations}
+PAPER: Layouts = {
+    **LAYOUTS, "rq1": lambda answer: _tests(answer, "algorithm", SMALLER), "rq2": lambda answer: _tests(answer, "baseline", GREATER),
+    "combinations": of_frame(_combinations)}

@@ -12,7 +12,6 @@ from safevar_sumo.analysis.case import Case, Unanswerable
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 
-OBJECTIVES = ["f_safe", "f_diff", "f_num_diff"]
 MORE_IS_BETTER = {"igd": False, "igd_plus": False, "hypervolume": True}
 WORST = 1.1
 """Each coordinate of hypervolume's reference point, on objectives normalised to 0..1: the nadir, a tenth further away."""
@@ -55,10 +54,15 @@ class Scale(NamedTuple):
         return np.asarray((points - self.ideal) / self.width)
 
 
-def objectives(frame: pd.DataFrame) -> FloatArray:
-    """The objectives of the rows that have all three, shape (M, 3)."""
-    points = frame[OBJECTIVES].to_numpy(dtype=float)
+def objectives(case: Case, frame: pd.DataFrame) -> FloatArray:
+    """The objectives of the rows that have all of them, each to be minimised, shape (M, objectives)."""
+    points = _values(case, frame)
     return np.asarray(points[np.isfinite(points).all(axis=1)])
+
+
+def _values(case: Case, frame: pd.DataFrame) -> FloatArray:
+    signs = [objective.sign for objective in case.scoring.objectives]
+    return np.asarray(frame[[objective.name for objective in case.scoring.objectives]].to_numpy(dtype=float) * signs)
 
 
 def reference_front(case: Case) -> FloatArray:
@@ -69,7 +73,7 @@ def reference_front(case: Case) -> FloatArray:
     Unanswerable
         If there is no solution.
     """
-    points = objectives(case.solutions)
+    points = objectives(case, case.solutions)
     if not len(points):
         raise Unanswerable(case.name, "has no solution", "results with at least one finished run")
     return nondominated(points)
@@ -91,7 +95,7 @@ def indicators(case: Case) -> pd.DataFrame:
         normal = scale.normalised(reference)
     by_run = dict(list(case.solutions.groupby(["algorithm", "run"])))
     for algorithm, run in runs:
-        front = objectives(by_run[algorithm, run]) if (algorithm, run) in by_run else np.zeros((0, 3))
+        front = objectives(case, by_run[algorithm, run]) if (algorithm, run) in by_run else np.zeros((0, 0))
         if len(front):
             found = scale.normalised(front)
             rows.append((algorithm, run, igd(front, reference), igd_plus(found, normal), hypervolume(found)))
@@ -113,16 +117,16 @@ def convergence(case: Case, points: int = 50) -> pd.DataFrame:
     budget = case.study.search.evaluations
     grid = np.unique(np.linspace(min(case.study.search.population, budget), budget, points).astype(int))
     by_run = dict(list(case.evaluations.groupby(["algorithm", "run"])))
-    parts = [pd.DataFrame({"algorithm": key[0], "run": key[1], "evaluations": grid, "hypervolume": _growth(by_run[key], scale, grid)})
+    parts = [pd.DataFrame({"algorithm": key[0], "run": key[1], "evaluations": grid, "hypervolume": _growth(case, by_run[key], scale, grid)})
              for key in keys if key in by_run]
     if not parts:
         raise Unanswerable(case.name, "has no evaluations", "results with the journals of their runs")
     return pd.concat(parts, ignore_index=True)
 
 
-def _growth(evaluations: pd.DataFrame, scale: Scale, grid: np.ndarray) -> list[float]:
+def _growth(case: Case, evaluations: pd.DataFrame, scale: Scale, grid: np.ndarray) -> list[float]:
     """Hypervolume of the first k evaluations for every k of the grid."""
-    found = scale.normalised(evaluations[OBJECTIVES].to_numpy(dtype=float))
+    found = scale.normalised(_values(case, evaluations))
     defined = np.isfinite(found).all(axis=1)
     found, places = found[defined], evaluations["evaluation"].to_numpy()[defined]
     ends = np.searchsorted(places, grid, side="left")

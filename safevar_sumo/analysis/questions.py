@@ -8,12 +8,13 @@ from typing import NamedTuple
 import pandas as pd
 
 from safevar_sumo.analysis import discussion
-from safevar_sumo.analysis.case import MORE_IS_UNSAFE, NSGA2, OVER_NON_COLLISIONS, Case, Unanswerable, collided
+from safevar_sumo.analysis.case import NSGA2, Case, Unanswerable, counted
 from safevar_sumo.analysis.discussion import combinations
 from safevar_sumo.analysis.rq1 import rq1
 from safevar_sumo.analysis.rq2 import rq2
 from safevar_sumo.analysis.rq3 import critical, rq31, rq32, rq33, rq33_safety
 from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.metrics import SAFEVAR, MetricFacts
 
 Frames = dict[str, pd.DataFrame]
 SAFETY = "rq3.3-safety"
@@ -33,11 +34,12 @@ QUESTIONS = (*OF_A_CASE, WEATHER)
 
 
 class Answer(NamedTuple):
-    """The answer to a question: a tidy frame over all cases (empty if none can be asked), and what to know about it."""
+    """The answer to a question: a tidy frame over all cases (empty if none can be asked), what to know about it, and its metrics."""
 
     name: str
     frame: pd.DataFrame
     notes: tuple[str, ...]
+    metrics: tuple[MetricFacts, ...] = SAFEVAR.metrics
 
 
 def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
@@ -51,6 +53,7 @@ def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
     if question is not None and question not in QUESTIONS:
         raise InputError("--rq", f"there is no question {question!r}", one_of(QUESTIONS))
     answers, refusals, names = [], [], [case.name for case in cases]
+    metrics = tuple({metric.name: metric for case in cases for metric in case.scoring.metrics}.values())
     for name in QUESTIONS if question is None else (question,):
         frames, refused = _asked(name, cases)
         refusals += refused
@@ -61,7 +64,7 @@ def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
             frame = pd.concat(found, ignore_index=True)
             inside = {*frame["setting"], *frame["other"]} if name == WEATHER else set(names) - {error.source for error in refused}
             about = [note for case in cases if case.name in inside for note in _notes(name, case)]
-            answers.append(Answer(part, frame, tuple(dict.fromkeys([*notes, *about]))))
+            answers.append(Answer(part, frame, tuple(dict.fromkeys([*notes, *about])), metrics))
     if refusals and all(one.frame.empty for one in answers):
         raise refusals[0]
     return answers
@@ -114,9 +117,9 @@ def _notes(question: str, case: Case) -> list[str]:
 def _undefined(case: Case) -> list[str]:
     """Which values are missing where they should be there."""
     told = []
-    for metric in MORE_IS_UNSAFE:
-        rows = case.solutions[~collided(case.solutions)] if metric in OVER_NON_COLLISIONS else case.solutions
-        number = int(rows[metric].isna().sum())
+    for metric in case.scoring.metrics:
+        rows = counted(case.solutions, metric)
+        number = int(rows[metric.name].isna().sum())
         if number:
-            told.append(f"{case.name}: {metric} is undefined in {number} of {len(rows)} solutions, which are left out of it.")
+            told.append(f"{case.name}: {metric.name} is undefined in {number} of {len(rows)} solutions, which are left out of it.")
     return told

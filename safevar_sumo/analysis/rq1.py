@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.case import MORE_IS_UNSAFE, Case, Unanswerable, values
+from safevar_sumo.analysis.case import Case, Unanswerable, values
 from safevar_sumo.analysis.inference import Comparison, compare, magnitude
 
 COLUMNS = ["setting", "algorithm", "metric", "p_value", "effect_size", "magnitude", "n1", "n2", "method", "mean", "original"]
@@ -27,10 +27,10 @@ def rq1(case: Case) -> pd.DataFrame:
     rows = []
     for algorithm in case.algorithms:
         solutions = case.solutions_of(algorithm)
-        for metric, original in case.original.items():
-            sample = values(solutions, metric)
-            told = against(sample, original, MORE_IS_UNSAFE[metric])
-            rows.append((case.name, algorithm, metric, *told, float(np.mean(sample)) if sample.size else None,
+        for metric in case.scoring.metrics:
+            sample, original = values(solutions, metric), case.original[metric.name]
+            told = against(sample, original, metric.more_is_unsafe)
+            rows.append((case.name, algorithm, metric.name, *told, float(np.mean(sample)) if sample.size else None,
                          None if np.isnan(original) else original))
     return pd.DataFrame(rows, columns=COLUMNS, dtype=object)
 

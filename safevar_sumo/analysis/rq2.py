@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pandas as pd
 
-from safevar_sumo.analysis.case import MORE_IS_UNSAFE, NSGA2, Case, Unanswerable, values
+from safevar_sumo.analysis.case import NSGA2, Case, Unanswerable, values
 from safevar_sumo.analysis.inference import Comparison, compare
 from safevar_sumo.analysis.quality import MORE_IS_BETTER, indicators
 from safevar_sumo.analysis.rq1 import turned
@@ -37,7 +37,7 @@ def rq2(case: Case) -> pd.DataFrame:
             if quality is not None:
                 told = compare(*(quality.loc[quality["algorithm"] == name, indicator] for name in (NSGA2, baseline)))
             rows.append((case.name, baseline, indicator, *(told if more_is_better else turned(told))))
-        for metric, more_is_unsafe in MORE_IS_UNSAFE.items():
+        for metric in case.scoring.metrics:
             told = compare(values(own, metric), values(case.solutions_of(baseline), metric))
-            rows.append((case.name, baseline, metric, *(told if more_is_unsafe else turned(told))))
+            rows.append((case.name, baseline, metric.name, *(told if metric.more_is_unsafe else turned(told))))
     return pd.DataFrame(rows, columns=COLUMNS, dtype=object)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from safevar_sumo.api.witness import Witness, trace_frame
+from safevar_sumo.metrics import Scoring
 from safevar_sumo.records import Drives, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import record
 from safevar_sumo.simulation import Engine, System, assemble, score
@@ -41,6 +42,8 @@ class Simulation:
         Its outcome, metrics and objectives as arrays of one row.
     drives
         The simulation as it went, of one vehicle.
+    scoring
+        What was measured, and what a search would minimise.
     original
         The original vehicle in the same study; of the original vehicle, itself.
     """
@@ -50,6 +53,7 @@ class Simulation:
     put_back: Mapping[str, float]
     evaluation: Evaluations
     drives: Drives
+    scoring: Scoring
     _seen: Witness
     _original: Simulation | None = None
 
@@ -77,6 +81,13 @@ class Simulation:
         """f_safe [m, or -m/s on a collision], f_diff [fraction], f_num_diff [characteristics]; all are minimised."""
         told = self.record()
         return {name: float(told[name]) if told[name] is not None else np.nan for name in told if name.startswith("f_")}
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The unit of every number of `record`, by its name."""
+        measured = {metric.name: metric.unit for metric in self.scoring.metrics}
+        measured |= {one.name: one.unit for one in self.scoring.objectives if one.name in self.metrics}
+        return {"collision_speed": "m/s", **measured, "f_safe": "m, or -m/s", "f_diff": "fraction", "f_num_diff": "characteristics"}
 
     @cached_property
     def trace(self) -> pd.DataFrame:
@@ -151,7 +162,8 @@ def _simulated(study: Study, system: System, asked: FloatArray, setting: FloatAr
     drives = drive(replace(system, ads=seen), rows, engine)
     return Simulation(
         study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
-        put_back=_put_back(system, asked, setting), evaluation=score(system, rows, drives), drives=drives, _seen=seen)
+        put_back=_put_back(system, asked, setting), evaluation=score(system, rows, drives), drives=drives,
+        scoring=system.measuring.scoring, _seen=seen)
 
 
 def _put_back(system: System, asked: FloatArray, setting: FloatArray) -> dict[str, float]:

@@ -72,7 +72,7 @@ def prepared(study: StudyLike, source: str = "") -> tuple[Study, System]:
         If one of its names or parameters cannot be used.
     """
     chosen, system = assembled(study, source)
-    for name in chosen.search.algorithms:
+    for name in chosen.search.labels:
         algorithm_of(name, chosen)
     return chosen, system
 
@@ -86,7 +86,7 @@ def carried_out(study: Study, system: System, keys: list[RunKey], directory: Pat
     SafevarError
         If another process works on one of the runs, or as `carry_out`.
     """
-    results = ResultsDirectory(directory, study, identity_of(study, system))
+    results = ResultsDirectory(directory, study, identity_of(study, system), system.measuring.scoring)
     campaign = carry_out(study, keys, results, pool, observer, batch, retry_failed=retry_failed, source=source)
     if campaign.busy:
         raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: the same again later finishes the study")

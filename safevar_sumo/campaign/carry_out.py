@@ -13,6 +13,7 @@ from safevar_sumo.campaign.interrupts import interrupts_between_waits
 from safevar_sumo.campaign.keys import RunKey, algorithm_of, run_generator
 from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.computing import PersistentPool, Pool, packed
+from safevar_sumo.metrics import SAFEVAR, Scoring
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ORIGINAL, Failure, JournalBusy, ResultsDirectory
 from safevar_sumo.search import Problem
@@ -23,13 +24,15 @@ from safevar_sumo.vehicles import CharacteristicSet
 class Campaign(NamedTuple):
     """What runs of a study found: the original vehicle's evaluation and the solutions of every finished run.
 
-    `failures` are settings that could not be simulated; `busy` runs are in the hands of another process.
+    `failures` are settings that could not be simulated; `busy` runs are in the hands of another process; `scoring` is what
+    was measured and minimised.
     """
 
     original: Evaluations
     solutions: dict[RunKey, Evaluations]
     failures: list[Failure]
     busy: list[RunKey]
+    scoring: Scoring = SAFEVAR
 
 
 def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, pool: Pool, observer: Observer,
@@ -60,8 +63,9 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
     persistent, work = PersistentPool(pool, study, source), packed(study, results.manifest)
     original = _original(work, characteristics, results, persistent, observer)
     results.begin(original)
-    problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations)
-    campaign = Campaign(original, {}, [], [])
+    problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,
+                      population=study.search.population, scoring=results.scoring)
+    campaign = Campaign(original, {}, [], [], results.scoring)
     waiting, runs = deque(keys), set[Run]()
     gathering = Gathering(persistent, work, batch or BATCH)
 

@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, one_of
-from safevar_sumo.search import ALGORITHMS, Algorithm
-from safevar_sumo.study import Study
+from safevar_sumo.plugins import Lookup, Member, made
+from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm
+from safevar_sumo.study import SearchTable, Study
 
 
 class RunKey(NamedTuple):
@@ -24,14 +25,34 @@ class RunKey(NamedTuple):
 
 def all_runs(study: Study) -> list[RunKey]:
     """Every run of a study."""
-    return [RunKey(name, run) for name in dict.fromkeys(study.search.algorithms) for run in range(study.search.runs)]
+    return [RunKey(label, run) for label in study.search.labels for run in range(study.search.runs)]
 
 
-def algorithm_of(name: str, study: Study) -> Algorithm:
-    """An algorithm by name, set as the study says."""
-    if name not in ALGORITHMS:
-        raise InputError(f"study {study.name!r}", f"search.algorithms: there is no algorithm {name!r}", one_of(ALGORITHMS))
-    return ALGORITHMS[name].of(study.search)
+def algorithm_of(label: str, study: Study) -> Algorithm:
+    """An algorithm by its label in results, set as the study says.
+
+    Raises
+    ------
+    InputError
+        If there is no such algorithm, it does not meet its contract, or does not take its parameters.
+    """
+    source, search = f"study {study.name!r}", study.search
+    name, key = search.labels.get(label, label), f"search.{label}"
+    if len(search.labels) < len(set(search.algorithms)):
+        raise InputError(source, f"search.algorithms = {search.algorithms}: two have one name", "algorithms of different names")
+    for stray in search.parameters:
+        if stray not in ALGORITHMS and stray not in search.labels:
+            legal = f"{one_of([*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels])}"
+            raise InputError(source, f"search.{stray}: there is no such key and no such algorithm", legal)
+    member = algorithm_member(name, study)
+    algorithm = made(member, search.parameters.get(label, {}), f"search.algorithms: {name!r}", key, source)
+    return algorithm if member.guard is None else GuardedAlgorithm(algorithm, member.guard)
+
+
+def algorithm_member(name: str, study: Study) -> Member:
+    """How an algorithm is found."""
+    lookup = Lookup(f"study {study.name!r}", study.origin.places)
+    return lookup.class_of(ALGORITHMS, name, "search.algorithms", ALGORITHM_CONTRACT)
 
 
 def run_generator(study: Study, key: RunKey) -> np.random.Generator:

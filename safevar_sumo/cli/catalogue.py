@@ -45,7 +45,7 @@ def _catalogue(studies: list[Study]) -> dict[str, Any]:
         "scenarios": [_described(name, cls) for name, cls in SCENARIOS.items()],
         "weathers": [msgspec.to_builtins(weather) for weather in WEATHERS.values()],
         "algorithms": [_described(name, cls) for name, cls in ALGORITHMS.items()],
-        "metrics": [_described(name, metric) for name, metric in METRICS.items()],
+        "metrics": [{"name": name, "description": metric.description} for name, metric in METRICS.items()],
     }
 
 

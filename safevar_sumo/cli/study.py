@@ -60,7 +60,8 @@ def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -
     """The study with a command's options in place of its own search table."""
     changes: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
     if algorithms is not None:
-        changes["algorithms"] = list(dict.fromkeys(name.strip() for name in algorithms.split(",")))
+        names = [name.strip() for name in algorithms.split(",")]
+        changes["algorithms"] = list(dict.fromkeys(study.search.labels.get(name, name) for name in names))
     return msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, **changes))
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from safevar_sumo.computing.sources import DIGITS, foreign_code, package_code
+from safevar_sumo.plugins import make_reachable
 from safevar_sumo.results import fixed
 from safevar_sumo.simulation import System, network_files
 from safevar_sumo.study import Study
@@ -39,9 +40,12 @@ def identity_of(study: Study, system: System) -> dict[str, Any]:
 def inputs_of(study: Study, system: System) -> Inputs:
     """Digests of the files that every worker must have alike."""
     tables = (study.vehicle, study.ads, study.scenario)
+    make_reachable(study.origin.places)
     return {
         "network": network_files(system.scenario.network),
-        "sources": foreign_code([table.model for table in tables], [table.parameters for table in tables]),
+        "sources": foreign_code(
+            [*(table.model for table in tables), *study.metrics.also, *study.search.objectives, *study.search.algorithms],
+            [*(table.parameters for table in tables), study.search.parameters]),
         "code": dict(package_code())}
 
 

@@ -1,14 +1,19 @@
-"""Safety metrics of method section 4; each module computes one from a trace and its encounter."""
+"""Safety metrics of method section 4: one record each, of a function of drives and what tables need to know of it."""
 
-from safevar_sumo.metrics.deceleration import average_deceleration
-from safevar_sumo.metrics.safety_degree import safety_degree
-from safevar_sumo.metrics.time_to_collision import time_exposed, time_integrated, time_to_collision
+from safevar_sumo.metrics.base import Metric, MetricFacts, foreign_metric
+from safevar_sumo.metrics.deceleration import AVE_DECE
+from safevar_sumo.metrics.safety_degree import SAFETY_DEGREE
+from safevar_sumo.metrics.scoring import F_DIFF, F_NUM_DIFF, F_SAFE, Objective, Scoring
+from safevar_sumo.metrics.time_to_collision import TET, TIT, time_to_collision
 
-METRICS = {
-    "safety_degree": safety_degree,
-    "tet": time_exposed,
-    "tit": time_integrated,
-    "ave_dece": average_deceleration,
-}
+METRICS = {metric.name: metric for metric in (
+    SAFETY_DEGREE,
+    TET,
+    TIT,
+    AVE_DECE,
+)}
+SAFEVAR = Scoring(metrics=tuple(metric.facts for metric in METRICS.values()), objectives=(F_SAFE, F_DIFF, F_NUM_DIFF))
+"""What the published study measures and minimises (method sections 3 and 4)."""
 
-__all__ = ["METRICS", "average_deceleration", "safety_degree", "time_exposed", "time_integrated", "time_to_collision"]
+__all__ = ["F_DIFF", "F_NUM_DIFF", "F_SAFE", "METRICS", "SAFEVAR", "Metric", "MetricFacts", "Objective", "Scoring", "foreign_metric",
+           "time_to_collision"]

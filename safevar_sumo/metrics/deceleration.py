@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from safevar_sumo.metrics.base import Metric
 from safevar_sumo.metrics.sampling import every, total
 from safevar_sumo.records import STANDSTILL, Drives, FloatArray
 from safevar_sumo.study import MetricsTable
@@ -23,3 +24,8 @@ def average_deceleration(drives: Drives, thresholds: MetricsTable) -> FloatArray
     number = np.count_nonzero(counts, axis=0)
     summed = total(np.where(counts, lost, 0.0))
     return np.asarray(np.divide(summed, number, out=np.full_like(summed, np.nan), where=number > 0))
+
+
+AVE_DECE = Metric(
+    name="ave_dece", title="aveDece", unit="m/s^2", more_is_unsafe=False, function=average_deceleration,
+    description="Mean loss of speed per time over the samples in which the brake is commanded and the vehicle moves.")

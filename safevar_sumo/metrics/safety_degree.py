@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from safevar_sumo.metrics.base import Metric
 from safevar_sumo.records import Drives, FloatArray
 from safevar_sumo.study import MetricsTable
 
@@ -17,3 +18,8 @@ def safety_degree(drives: Drives, thresholds: MetricsTable) -> FloatArray:
     least = np.min(np.where(counts, drives.encounter.separation, np.inf), axis=0)
     least = np.where(np.isfinite(least), least, np.nan)
     return np.where(np.isnan(drives.collision_speed), least, -drives.collision_speed)
+
+
+SAFETY_DEGREE = Metric(
+    name="safety_degree", title="SD", unit="m, or -m/s", head="SD", more_is_unsafe=False, function=safety_degree,
+    description="Least separation during the encounter [m, > 0], or minus the speed of the collision [m/s, <= 0].")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from safevar_sumo.metrics.base import Metric
 from safevar_sumo.metrics.sampling import every, total
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Drives, FloatArray
 from safevar_sumo.study import MetricsTable
@@ -40,3 +41,11 @@ def _critical(drives: Drives, thresholds: MetricsTable) -> tuple[FloatArray, flo
     stride = every(drives.trace.step, thresholds.sampling_interval)
     ttc = time_to_collision(drives)[::stride]
     return np.where(ttc <= thresholds.ttc_threshold, ttc, np.inf), stride * drives.trace.step
+
+
+TET = Metric(
+    name="tet", title="TET", unit="s", more_is_unsafe=True, over_collisions=False, function=time_exposed,
+    description="TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s].")
+TIT = Metric(
+    name="tit", title="TIT", unit="s^2", more_is_unsafe=True, over_collisions=False, function=time_integrated,
+    description="TIT* = sum of (TTC* - TTC(t)) dt over the same samples [s^2].")

@@ -3,6 +3,7 @@
 from safevar_sumo.plugins.contract import Contract
 from safevar_sumo.plugins.guard import Guard
 from safevar_sumo.plugins.lending import lent
-from safevar_sumo.plugins.lookup import Lookup, Member, sources
+from safevar_sumo.plugins.lookup import Lookup, Member, make_reachable
+from safevar_sumo.plugins.making import made
 
-__all__ = ["Contract", "Guard", "Lookup", "Member", "lent", "sources"]
+__all__ = ["Contract", "Guard", "Lookup", "Member", "lent", "made", "make_reachable"]

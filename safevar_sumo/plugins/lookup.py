@@ -114,7 +114,7 @@ class Lookup(NamedTuple):
             raise InputError(self.source, f"{guard.name}: other processes cannot import from __main__", "a module in a file of its own")
         place = _place_of(top, places)
         _forget_all_but(places)
-        _make_reachable(places)
+        make_reachable(places)
         if place:
             self._refuse_taken(top, place, guard)
         before = set(sys.modules)
@@ -142,21 +142,6 @@ class Lookup(NamedTuple):
             del sys.modules[top]
 
 
-def sources(members: Iterable[Member]) -> dict[str, Path]:
-    """The source files of members from outside the package, and of what they have imported from beside them, by module."""
-    found: dict[str, Path] = {}
-    for member in members:
-        if member.guard is None:
-            continue
-        top = member.module.partition(".")[0]
-        beside = {name for name, one in _loaded.items() if one.folder == member.folder}
-        for name, module in list(sys.modules.items()):
-            file = getattr(module, "__file__", None)
-            if file and (name == top or name.startswith(f"{top}.") or name in beside):
-                found[name] = Path(file)
-    return dict(sorted(found.items()))
-
-
 def _place_of(top: str, places: Iterable[str]) -> str:
     """The first folder that holds a module or package of that name; "" if only an installed one can be meant."""
     specs = {place: PathFinder.find_spec(top, [place]) for place in places}
@@ -177,10 +162,10 @@ def _folder_of(module: ModuleType) -> str:
     return str(Path(paths[0] if paths else module.__file__ or "").resolve().parent)
 
 
-def _make_reachable(places: Iterable[str]) -> None:
-    """Let modules import what lies beside them: behind everything that is installed, so that nothing of that is hidden."""
+def make_reachable(places: Iterable[str]) -> None:
+    """Let modules import what lies beside them, or in the working directory, but nothing there hides what is installed."""
     sys.path[:] = [place for place in sys.path if place not in _reachable]
-    _reachable[:] = [place for place in dict.fromkeys(places) if place not in sys.path]
+    _reachable[:] = [place for place in dict.fromkeys((*places, os.getcwd())) if place not in sys.path]
     here = [i for i, place in enumerate(sys.path) if place in ("", os.getcwd())]
     start = here[0] if here else len(sys.path)
     sys.path[start:start] = _reachable

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.study import Study
@@ -18,7 +19,6 @@ from safevar_sumo.vehicles import CharacteristicSet
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-UNITS = {"safety_degree": "safety degree [m, -m/s]", "tet": "TET [s]", "tit": "TIT [s$^2$]", "ave_dece": "aveDece [m/s$^2$]"}
 _UNDATED: dict[str, dict[str, Any]] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
 """Metadata that leaves no date in a picture: the same data, the same bytes."""
 BINS = 8
@@ -179,7 +179,7 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
         for axis, below, metric in zip(axes[0], axes[1], reference.metrics, strict=False):
             _scatter(axis, metric, reference, here, either)
             _error_by(below, here.metrics[metric], here.metrics[metric] - reference.metrics[metric])
-            below.set_xlabel(f"here: {UNITS[metric]}")
+            below.set_xlabel(f"here: {_label(metric)}")
             below.set_ylabel("mean error")
         error = here.metrics["safety_degree"] - reference.metrics["safety_degree"]
         lowest, highest = [], []
@@ -206,6 +206,10 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
             plt.close(figure)
 
 
+def _label(metric: str) -> str:
+    return f"{METRICS[metric].title} [{METRICS[metric].unit.replace('^2', '$^2$')}]"
+
+
 def _scatter(axis: Axes, metric: str, reference: ReferenceData, here: Evaluations, either: BoolArray) -> None:
     rows = _both(reference, here, metric)
     collided = (reference.collided | here.collided)[rows]
@@ -222,8 +226,9 @@ def _scatter(axis: Axes, metric: str, reference: ReferenceData, here: Evaluation
         axis.plot(ends, ends, color="black", linewidth=0.8, linestyle="--")
     rho = rank_correlation(x, y)
     axis.set_title(f"rho = {'-' if rho is None else f'{rho:.3f}'}, {x.size} rows")
-    axis.set_xlabel(f"reference: {UNITS[metric]}")
-    axis.set_ylabel(f"here: {UNITS[metric]}")
+    label = _label(metric)
+    axis.set_xlabel(f"reference: {label}")
+    axis.set_ylabel(f"here: {label}")
 
 
 def _error_by(axis: Axes, values: FloatArray, error: FloatArray) -> tuple[float, float]:

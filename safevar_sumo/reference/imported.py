@@ -13,7 +13,7 @@ from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.vehicles import CharacteristicSet
 
-SHORT = {"sd": "safety_degree", "tet": "tet", "tit": "tit", "ave_dece": "ave_dece"}
+SHORT = {short: metric.name for metric in METRICS.values() for short in (metric.name, metric.title.lower())}
 """What a command calls the metrics."""
 ORIGINAL_FORM = "sd=NUMBER,tet=NUMBER,tit=NUMBER,ave_dece=NUMBER"
 

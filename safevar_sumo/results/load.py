@@ -12,6 +12,7 @@ from safevar_sumo.results.imported import read_imported
 from safevar_sumo.results.journal import read_journal
 from safevar_sumo.results.manifest import MANIFEST, owner, read_manifest
 from safevar_sumo.results.store import RUNS, evaluations_frame, solutions_frame
+from safevar_sumo.study import label_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -75,7 +76,7 @@ def load(directory: str | Path) -> Results:
     try:
         characteristics = tuple(manifest["study"]["vehicle"]["characteristics"])
         search = manifest["study"]["search"]
-        wanted = [(name, run) for name in dict.fromkeys(search["algorithms"]) for run in range(search["runs"])]
+        wanted = [(name, run) for name in dict.fromkeys(map(label_of, search["algorithms"])) for run in range(search["runs"])]
         budget = int(search["evaluations"])
     except (KeyError, TypeError, ValueError):
         raise InputError(place / MANIFEST, "tells of no characteristics or of no search", "what the command study has written") from None

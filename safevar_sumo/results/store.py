@@ -9,10 +9,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.metrics import METRICS
+from safevar_sumo.metrics import METRICS, SAFEVAR, Scoring
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results.files import make_directory, sync_directory, write_whole
 from safevar_sumo.results.journal import Journal, JournalBusy, owner_of
@@ -40,6 +41,8 @@ class ResultsDirectory:
         The study as it is run, options applied.
     identity
         What its results depend on beside its file: see `safevar_sumo.computing.identity_of`.
+    scoring
+        What is measured and minimised.
 
     Raises
     ------
@@ -47,9 +50,11 @@ class ResultsDirectory:
         If the directory cannot be written, holds other things, or belongs to another study or version.
     """
 
-    def __init__(self, path: Path, study: Study, identity: Mapping[str, Any] = MappingProxyType({})) -> None:
-        self.path, self._study = path, study
+    def __init__(self, path: Path, study: Study, identity: Mapping[str, Any] = MappingProxyType({}), scoring: Scoring = SAFEVAR) -> None:
+        self.path, self._study, self.scoring = path, study, scoring
         self.manifest = manifest_of(study, identity)
+        if scoring != SAFEVAR:
+            self.manifest["scoring"] = msgspec.to_builtins(scoring)
         make_directory(path)
         self._refuse_another_study()
 
@@ -114,12 +119,14 @@ def evaluations_frame(characteristics: tuple[str, ...], runs: Iterable[tuple[tup
     """One row per evaluation.
 
     Columns: algorithm, run, the characteristics' filtered values in their table units, f_safe, f_diff [fraction],
-    f_num_diff, safety_degree [m or -m/s], tet [s], tit [s^2], ave_dece [m/s^2], outcome.
+    f_num_diff, safety_degree [m or -m/s], tet [s], tit [s^2], ave_dece [m/s^2], further metrics, outcome.
     """
     import pandas as pd
 
-    frames = [_frame("", 0, characteristics, Evaluations.none(len(characteristics), METRICS))]
-    frames += [_frame(algorithm, run, characteristics, found) for (algorithm, run), found in runs]
+    found = list(runs)
+    metrics = dict.fromkeys([*METRICS, *(name for _, one in found for name in one.metrics)])
+    frames = [_frame("", 0, characteristics, Evaluations.none(len(characteristics), metrics))]
+    frames += [_frame(algorithm, run, characteristics, one) for (algorithm, run), one in found]
     return pd.concat(frames, ignore_index=True)
 
 

@@ -5,20 +5,27 @@ from __future__ import annotations
 import random
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Self
+from functools import cache
+from typing import Annotated, Any
 
 import numpy as np
 from deap import base, tools
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from safevar_sumo.records import Evaluations
 from safevar_sumo.search.base import Problem, Search
-from safevar_sumo.study import SearchTable
 from safevar_sumo.vehicles import CharacteristicSet
 
+Probability = Annotated[float, Meta(ge=0, le=1)]
+Index = Annotated[float, Meta(ge=0, le=1000)]
+OBJECTIVES = 3
+"""Of the published study."""
 
-class _Fitness(base.Fitness):  # type: ignore[misc]
-    weights = (-1.0, -1.0, -1.0)
+
+@cache
+def _fitness(objectives: int) -> type[Any]:
+    """The class of fitnesses of so many objectives, all minimised."""
+    return type("Fitness", (base.Fitness,), {"weights": (-1.0,) * objectives})
 
 
 class _Individual(list[float]):
@@ -29,41 +36,39 @@ class _Individual(list[float]):
 
     def __init__(self, values: list[float]) -> None:
         super().__init__(values)
-        self.fitness = _Fitness()
+        self.fitness = _fitness(OBJECTIVES)()
 
 
 class Nsga2(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Elitist search by rank and crowding distance; population = offspring, SBX, polynomial mutation.
 
     The variables are the characteristics' unfiltered values; what is simulated and reported is filtered.
-    Mutation has probability 1/n per variable. The result is the non-dominated part of the last population.
+    Mutation has by default the probability 1/n per variable. The result is the non-dominated part of the last population.
     A setting whose simulation failed does not survive.
     """
 
-    population: int
-    crossover_probability: float = 0.9
-    crossover_index: float = 20.0
-    mutation_index: float = 20.0
-
-    @classmethod
-    def of(cls, table: SearchTable) -> Self:
-        return cls(population=table.population)
+    crossover_probability: Probability = 0.9
+    crossover_index: Index = 20.0
+    mutation_probability: Probability | None = None
+    mutation_index: Index = 20.0
+    tournament_size: Annotated[int, Meta(ge=2, le=1000)] = 2
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         characteristics = problem.characteristics
         variation = _Variation(self, characteristics, random.Random(int(rng.integers(2**63))))
-        initial = problem.uniform(min(self.population, problem.evaluations), rng)
+        initial = problem.uniform(min(problem.population, problem.evaluations), rng)
         brood = [_Individual(values) for values in initial.tolist()]
         population: list[_Individual] = []
         asked = 0
         while brood:
             evaluated = yield characteristics.filter(np.array(brood))
-            for i, (individual, objectives) in enumerate(zip(brood, evaluated.objectives.tolist(), strict=True)):
-                individual.evaluation = evaluated.take([i])
+            for i, (individual, objectives) in enumerate(zip(brood, problem.scoring.values(evaluated).tolist(), strict=True)):
+                individual.evaluation, individual.fitness = evaluated.take([i]), _fitness(len(objectives))()
                 individual.fitness.values = tuple(objectives)
             asked += len(brood)
-            population = _survivors(population + [one for one in brood if one.evaluation.valid[0]], self.population)
-            brood = variation.offspring(population, min(self.population, problem.evaluations - asked))
+            good = [one for one, valid in zip(brood, problem.scoring.valid(evaluated), strict=True) if valid]
+            population = _survivors(population + good, problem.population)
+            brood = variation.offspring(population, min(problem.population, problem.evaluations - asked))
         front = [one.evaluation for one in population if one.rank == 0]
         return Evaluations.concatenate(front) if front else evaluated.take([])
 
@@ -73,6 +78,8 @@ class _Variation:
 
     def __init__(self, settings: Nsga2, characteristics: CharacteristicSet, generator: random.Random) -> None:
         self._settings, self._state = settings, generator.getstate()
+        given = settings.mutation_probability
+        self._mutation = 1 / len(characteristics) if given is None else given
         self._lower, self._upper = characteristics.lower.tolist(), characteristics.upper.tolist()
 
     @contextmanager
@@ -91,11 +98,11 @@ class _Variation:
         children: list[_Individual] = []
         with self.randomness():
             while population and len(children) < number:
-                first, second = (_Individual(list(_tournament(population))) for _ in range(2))
+                first, second = (_Individual(list(_tournament(population, self._settings.tournament_size))) for _ in range(2))
                 if random.random() <= self._settings.crossover_probability:
                     tools.cxSimulatedBinaryBounded(first, second, self._settings.crossover_index, self._lower, self._upper)
                 for child in (first, second):
-                    tools.mutPolynomialBounded(child, self._settings.mutation_index, self._lower, self._upper, 1 / len(child))
+                    tools.mutPolynomialBounded(child, self._settings.mutation_index, self._lower, self._upper, self._mutation)
                     children.append(child)
         return children[:number]
 
@@ -111,12 +118,13 @@ def _survivors(individuals: list[_Individual], number: int) -> list[_Individual]
     return survivors[:number]
 
 
-def _tournament(population: list[_Individual]) -> _Individual:
-    """The better of two that are drawn without replacement: by rank, then by crowding distance, then by chance."""
+def _tournament(population: list[_Individual], size: int = 2) -> _Individual:
+    """The best of some that are drawn without replacement: by rank, then by crowding distance, then by chance."""
     if len(population) == 1:
         return population[0]
-    first, second = random.sample(population, 2)
-    keys = [(one.rank, -one.fitness.crowding_dist) for one in (first, second)]
-    if keys[0] == keys[1]:
-        return first if random.random() < 0.5 else second
-    return first if keys[0] < keys[1] else second
+    best, *others = random.sample(population, min(size, len(population)))
+    for other in others:
+        mine, its = ((one.rank, -one.fitness.crowding_dist) for one in (best, other))
+        if its < mine or (its == mine and random.random() >= 0.5):
+            best = other
+    return best

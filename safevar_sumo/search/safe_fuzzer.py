@@ -2,60 +2,72 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Annotated
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Meta, Struct
 
+from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, SAFEVAR, Scoring
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search.base import Problem, Search
-from safevar_sumo.study import SearchTable
 
-GENERATION = 50
 KEPT = 50
-"""How many of the best scores are the result."""
-WARM_UP = 500
-"""Evaluations before ranges are narrowed or a generation must improve."""
-GENERATIONS_BETWEEN_UPDATES = 5
-GENERATIONS_WITHOUT_IMPROVEMENT = 5
 SAFETY_WEIGHT = 6.0
-"""Weight of the safety degree in the score, in which change and number changed weigh 1 each."""
+Number = Annotated[int, Meta(ge=1, le=1_000_000)]
 
 
 class SafeFuzzer(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Changes a few characteristics of the original vehicle, in ranges that narrow towards what was less safe."""
+    """Changes a few characteristics of the original vehicle, in ranges that narrow towards what was less safe.
 
-    @classmethod
-    def of(cls, table: SearchTable) -> Self:
-        return cls()
+    Parameters
+    ----------
+    generation
+        Settings of a generation.
+    kept
+        How many of the best scores are the result.
+    warm_up
+        Evaluations before ranges are narrowed or a generation must improve.
+    generations_between_updates, generations_without_improvement
+        After how many generations ranges are narrowed, and the search ends.
+    safety_weight
+        Weight of the first objective in the score, in which each of the others weighs 1.
+    """
+
+    generation: Number = 50
+    kept: Number = KEPT
+    warm_up: Annotated[int, Meta(ge=0)] = 500
+    generations_between_updates: Number = 5
+    generations_without_improvement: Number = 5
+    safety_weight: Annotated[float, Meta(ge=0, le=1e6)] = SAFETY_WEIGHT
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         ranges = _Ranges(problem)
         done: list[Evaluations] = []
         window: list[Evaluations] = []
         asked = generation = lean = 0
-        while asked < problem.evaluations and lean < GENERATIONS_WITHOUT_IMPROVEMENT:
-            settings = ranges.draw(min(GENERATION, problem.evaluations - asked), rng)
+        while asked < problem.evaluations and lean < self.generations_without_improvement:
+            settings = ranges.draw(min(self.generation, problem.evaluations - asked), rng)
             earlier = Evaluations.concatenate(done) if done else None
             evaluated = yield settings
             asked, generation = asked + len(settings), generation + 1
             done.append(evaluated)
             window.append(evaluated)
-            if earlier is not None and len(earlier) >= WARM_UP:
-                lean = 0 if _improves(evaluated, earlier) else lean + 1
-            if asked >= WARM_UP and generation % GENERATIONS_BETWEEN_UPDATES == 0:
+            if earlier is not None and len(earlier) >= self.warm_up:
+                lean = 0 if _improves(evaluated, earlier, problem.scoring, self.safety_weight, self.kept) else lean + 1
+            if asked >= self.warm_up and generation % self.generations_between_updates == 0:
                 ranges.narrow(Evaluations.concatenate(window))
                 window = []
         everything = Evaluations.concatenate(done)
-        valid = everything.take(everything.valid)
-        return valid.take(np.argsort(_scores(valid), kind="stable")[:KEPT])
+        valid = everything.take(problem.scoring.valid(everything))
+        return valid.take(np.argsort(_scores(valid, problem.scoring, self.safety_weight), kind="stable")[:self.kept])
 
 
 class _Ranges:
     """Where values are drawn, and how many characteristics change at the most."""
 
     def __init__(self, problem: Problem) -> None:
-        self._characteristics, self._original = problem.characteristics, problem.original
+        self._characteristics, self._scoring = problem.characteristics, problem.scoring
+        self._original = problem.scoring.values(problem.original)[0, 0]
         self.lower, self.upper = problem.characteristics.lower.copy(), problem.characteristics.upper.copy()
         self.most_changed = len(problem.characteristics)
 
@@ -80,7 +92,7 @@ class _Ranges:
 
     def narrow(self, window: Evaluations) -> None:
         """Towards the mean change, up and down, of what was less safe than the original since the last time."""
-        unsafe = window.take(window.valid & (window.f_safe < self._original.f_safe[0]))
+        unsafe = window.take(self._scoring.valid(window) & (self._scoring.values(window)[:, 0] < self._original))
         if not len(unsafe):
             return
         for i, original in enumerate(self._characteristics.original):
@@ -92,21 +104,36 @@ class _Ranges:
         self.most_changed = max(1, int(np.floor(np.mean(unsafe.f_num_diff) + 0.5)))
 
 
-def _improves(generation: Evaluations, earlier: Evaluations) -> bool:
+def _improves(generation: Evaluations, earlier: Evaluations, scoring: Scoring = SAFEVAR, safety_weight: float = SAFETY_WEIGHT,
+              kept: int = KEPT) -> bool:
     """Whether a generation's best score is lower than the worst of the best of all earlier ones."""
-    scores = _scores(Evaluations.concatenate([earlier, generation]))
+    scores = _scores(Evaluations.concatenate([earlier, generation]), scoring, safety_weight)
     before, now = scores[:len(earlier)], scores[len(earlier):]
-    best = np.sort(before[~np.isnan(before)])[:KEPT]
+    best = np.sort(before[~np.isnan(before)])[:kept]
     now = now[~np.isnan(now)]
     return bool(now.size and (not best.size or now.min() < best[-1]))
 
 
-def _scores(evaluations: Evaluations) -> FloatArray:
-    """(6 SD_norm + f_diff + num_norm) / 8, lower is better; SD by min-max over `evaluations`; NaN where it failed."""
-    safety = np.where(evaluations.valid, evaluations.f_safe, np.nan)
-    if np.all(np.isnan(safety)):
-        return safety
-    least, spread = np.nanmin(safety), np.nanmax(safety) - np.nanmin(safety)
-    normalised = (safety - least) / spread if spread > 0 else safety - least
-    number = (evaluations.f_num_diff - 1) / max(evaluations.settings.shape[1] - 1, 1)
-    return np.asarray((SAFETY_WEIGHT * normalised + evaluations.f_diff + number) / (SAFETY_WEIGHT + 2))
+def _scores(evaluations: Evaluations, scoring: Scoring = SAFEVAR, safety_weight: float = SAFETY_WEIGHT) -> FloatArray:
+    """(6 SD_norm + f_diff + num_norm) / 8, lower is better; SD by min-max over `evaluations`; NaN where it failed.
+
+    Of other objectives the first one stands for SD, and the others count by min-max as well.
+    """
+    values = np.where(scoring.valid(evaluations)[:, np.newaxis], scoring.values(evaluations), np.nan)
+    score = safety_weight * _normalised(values[:, 0])
+    for objective, column in zip(scoring.objectives[1:], values[:, 1:].T, strict=True):
+        if objective.name == F_DIFF.name:
+            score = score + column
+        elif objective.name == F_NUM_DIFF.name:
+            score = score + (column - 1) / max(evaluations.settings.shape[1] - 1, 1)
+        else:
+            score = score + _normalised(column)
+    return np.asarray(score / (safety_weight + len(scoring.objectives) - 1))
+
+
+def _normalised(values: FloatArray) -> FloatArray:
+    """Between 0 and 1 by the least and the greatest of them; those that are undefined stay so."""
+    if np.all(np.isnan(values)):
+        return values
+    least, spread = np.nanmin(values), np.nanmax(values) - np.nanmin(values)
+    return np.asarray((values - least) / spread if spread > 0 else values - least)

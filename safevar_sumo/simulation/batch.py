@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Drives, Evaluations, FloatArray, Outcome, Trace
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.simulation.parts import Parts
@@ -33,7 +32,8 @@ def score(system: System, settings: FloatArray, run: Drives) -> Evaluations:
         settings=settings,
         outcome=run.outcome,
         collision_speed=run.collision_speed,
-        metrics={name: metric(run, system.metrics) for name, metric in METRICS.items()},
+        metrics={**{name: metric(run, system.metrics) for name, metric in system.measuring.metrics.items()},
+                 **{name: change.function(settings, system.characteristics) for name, change in system.measuring.changes.items()}},
         f_diff=system.characteristics.largest_change(settings),
         f_num_diff=system.characteristics.number_changed(settings))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -13,13 +12,13 @@ import msgspec
 
 from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.errors import InputError, one_of
-from safevar_sumo.metrics import METRICS
-from safevar_sumo.plugins import Guard, Lookup, Member
+from safevar_sumo.plugins import Guard, Lookup, Member, made
 from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, weather_of
 from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.simulation.measuring import TAKEN, Measuring, measuring_of
 from safevar_sumo.simulation.network import is_folder
-from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather, invalid
+from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather
 from safevar_sumo.vehicles import VEHICLE_CONTRACT, VEHICLES, CharacteristicSet, GuardedVehicle, Vehicle, calibration_drive
 
 
@@ -37,7 +36,8 @@ class Models(NamedTuple):
 class System:
     """What a simulation is made of.
 
-    `step_length` [s] is None where the network's own counts; `members` are how its models were found.
+    `step_length` [s] is None where the network's own counts; `metrics` are thresholds, `measuring` is what is computed
+    with them; `members` are how everything was found.
     """
 
     characteristics: CharacteristicSet
@@ -48,6 +48,7 @@ class System:
     metrics: MetricsTable
     nominal: Nominal
     members: tuple[Member, ...]
+    measuring: Measuring
     step_length: float | None = None
     matrix: tuple[Point, ...] = ()
 
@@ -68,14 +69,15 @@ def assemble(study: Study, source: str = "") -> System:
     source = source or f"study {study.name!r}"
     models = models_of(study, source)
     _check_units(study, models.vehicle, models.members[0].guard is None, source)
+    measuring = measuring_of(study, Lookup(source, study.origin.places))
     for name in study.published:
-        if name not in METRICS:
-            raise InputError(source, f"published.{name} is no metric", one_of(METRICS))
+        if name not in measuring.metrics:
+            raise InputError(source, f"published.{name} is no metric", one_of(measuring.metrics))
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     return System(
         characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
         metrics=study.metrics, nominal=calibration_drive(models.vehicle, characteristics),  # type: ignore[arg-type]
-        members=models.members, step_length=study.step_length)
+        members=(*models.members, *measuring.members), measuring=measuring, step_length=study.step_length)
 
 
 def models_of(study: Study, source: str) -> Models:
@@ -100,6 +102,8 @@ def _with_network(scenario: Any, places: Sequence[str]) -> Any:
 def _check_units(study: Study, vehicle: Vehicle, ours: bool, source: str) -> None:
     given, known = study.vehicle.characteristics, vehicle.UNITS
     for name in given:
+        if name in TAKEN:
+            raise InputError(source, f"vehicle.characteristics.{name}: the name is a column of results", f"none of {', '.join(TAKEN)}")
         if name not in known:
             raise InputError(source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", one_of(known))
         if given[name].unit != known[name]:
@@ -113,36 +117,22 @@ def _check_units(study: Study, vehicle: Vehicle, ours: bool, source: str) -> Non
 
 def _vehicle(choice: VehicleTable, lookup: Lookup) -> tuple[Vehicle, Member]:
     member = lookup.class_of(VEHICLES, choice.model, "vehicle.model", VEHICLE_CONTRACT)
-    vehicle = _made(member, choice, "vehicle", lookup.source)
+    vehicle = made(member, choice.parameters, f"vehicle.model = {choice.model!r}", "vehicle.parameters", lookup.source)
     return (vehicle if member.guard is None else GuardedVehicle(vehicle, member.guard)), member
 
 
 def _scenario(choice: ModelTable, lookup: Lookup) -> tuple[Scenario, Member]:
     member = lookup.class_of(SCENARIOS, choice.model, "scenario.model", SCENARIO_CONTRACT)
-    scenario = _made(member, choice, "scenario", lookup.source)
+    scenario = made(member, choice.parameters, f"scenario.model = {choice.model!r}", "scenario.parameters", lookup.source)
     return _with_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.places), member
 
 
 def _ads(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
     member = lookup.class_of(ADS, choice.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT)
-    driver = _made(member, choice, "ads", lookup.source)
+    name = f"ads.model = {choice.model!r}"
+    make = partial(made, member, choice.parameters, name, "ads.parameters", lookup.source)
+    driver = make()
     if issubclass(member.what, ScalarAds):
-        guard = member.guard or Guard(lookup.source, f"ads.model = {choice.model!r}")
-        return PerVehicle(partial(_made, member, choice, "ads", lookup.source), guard), member
+        guard = member.guard or Guard(lookup.source, name)
+        return PerVehicle(make, guard), member
     return (driver if member.guard is None else GuardedAds(driver, member.guard)), member
-
-
-def _made(member: Member, choice: ModelTable | VehicleTable, key: str, source: str) -> Any:
-    """An instance with its parameters."""
-    cls = member.what
-    if issubclass(cls, msgspec.Struct):
-        try:
-            return msgspec.convert(choice.parameters, cls)
-        except msgspec.ValidationError as error:
-            raise invalid(source, choice.parameters, error, f"{key}.parameters") from None
-    try:
-        inspect.signature(cls).bind(**choice.parameters)
-    except TypeError as error:
-        raise InputError(source, f"{key}.model = {choice.model!r} does not take {key}.parameters = {choice.parameters}: {error}") from None
-    guard = member.guard or Guard(source, f"{key}.model = {choice.model!r}")
-    return guard.call("__init__", partial(cls, **choice.parameters))

@@ -14,7 +14,6 @@ from safevar_sumo.campaign import Campaign, Forecast
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import failure_lines, record, solutions_frame
 from safevar_sumo.study import Study
-from safevar_sumo.terminal.heads import METRIC_HEADS
 from safevar_sumo.vehicles import CharacteristicSet
 
 SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\nTET, TIT: over solutions without collision."
@@ -24,7 +23,7 @@ def print_forecast(console: Console, study: Study, runs: int, told: Forecast) ->
     """What a campaign would take."""
     console.print(study.title, soft_wrap=True, highlight=False, markup=False)
     table = Table(show_header=False)
-    table.add_row("algorithms", ", ".join(study.search.algorithms))
+    table.add_row("algorithms", ", ".join(study.search.labels))
     table.add_row("runs", str(runs))
     table.add_row("evaluations, at the most", str(told.evaluations))
     table.add_row("evaluations/s, measured by a short probe", f"{told.rate:.0f}")
@@ -38,7 +37,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     from safevar_sumo.analysis import brief, case_of  # takes longer to load than all the rest
 
     found = {"original vehicle": campaign.original}
-    for algorithm in study.search.algorithms:
+    for algorithm in study.search.labels:
         of_it = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]
         if of_it:
             found[algorithm] = Evaluations.concatenate(of_it)
@@ -47,8 +46,8 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
         table.add_column(head, justify="right")
     table.add_row("solutions", "-", *(str(len(one)) for one in list(found.values())[1:]))
     table.add_row("collisions", *(str(int(np.count_nonzero(one.collided))) for one in found.values()))
-    for name, head in METRIC_HEADS.items():
-        table.add_row(f"mean {head}", *(_mean(one.metrics[name]) for one in found.values()))
+    for metric in campaign.scoring.metrics:
+        table.add_row(escape(f"mean {metric.heading}"), *(_mean(one.metrics[metric.name]) for one in found.values()))
     console.print(table)
     console.print(SAFETY_NOTE)
     if campaign.failures:
@@ -58,7 +57,9 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     _print_most_critical(console, study, campaign)
     names = tuple(study.vehicle.characteristics)
     solutions = solutions_frame(names, campaign.solutions.items())
-    for line in brief(case_of(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions))):
+    case = case_of(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
+                   scoring=campaign.scoring)
+    for line in brief(case):
         console.print(line, soft_wrap=True, markup=False, highlight=False)
     console.print(f"All tables: python -m safevar_sumo tables {shlex.quote(str(directory))}", soft_wrap=True, markup=False, highlight=False)
 

@@ -6,9 +6,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from safevar_sumo.metrics import METRICS
 from safevar_sumo.reference import Agreement, Calibration, on_a_bound
 from safevar_sumo.study import Study
-from safevar_sumo.terminal.heads import METRIC_HEADS
 
 
 def print_agreement(console: Console, study: Study, told: Agreement) -> None:
@@ -16,7 +16,8 @@ def print_agreement(console: Console, study: Study, told: Agreement) -> None:
     table = Table("", title=escape(f"{study.title}: {told.rows} rows"), title_justify="left")
     for head in ("Spearman's rho", "mean abs. error", "in repeats", "bias", "original there", "original here"):
         table.add_column(head, justify="right")
-    for name, head in METRIC_HEADS.items():
+    for name in told.spearman:
+        head = METRICS[name].heading
         numbers = (told.spearman[name], told.mean_absolute_error[name], told.in_repeats[name], told.bias[name],
                    *told.original[name].values())
         table.add_row(head, *("-" if number is None else f"{number:.3f}" for number in numbers))
@@ -51,7 +52,8 @@ def print_calibration(console: Console, study: Study, found: Calibration) -> Non
         for head in ("Spearman's rho", "mean abs. error", "bias"):
             both.add_column(head, justify="right")
         halves = (found.used[name], found.held_back[name])
-        for metric, head in METRIC_HEADS.items():
+        for metric in halves[0].spearman:
+            head = METRICS[metric].heading
             both.add_row(head, *(
                 " / ".join("-" if number is None else f"{number:.3f}" for number in (getattr(half, what)[metric] for half in halves))
                 for what in ("spearman", "mean_absolute_error", "bias")))

@@ -9,14 +9,11 @@ from rich.console import Console
 from rich.table import Table
 
 from safevar_sumo.api import Simulation
+from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study
-from safevar_sumo.terminal.heads import METRIC_HEADS
 from safevar_sumo.terminal.plain import plain
 from safevar_sumo.vehicles import CharacteristicSet
-
-UNITS = {"collision_speed": "m/s", "safety_degree": "m, or -m/s", "tet": "s", "tit": "s^2", "ave_dece": "m/s^2",
-         "f_safe": "m, or -m/s", "f_diff": "fraction", "f_num_diff": "characteristics"}
 
 
 def print_simulation(console: Console, found: Simulation) -> None:
@@ -29,7 +26,7 @@ def print_simulation(console: Console, found: Simulation) -> None:
     for head in ("original", "simulated"):
         table.add_column(head, justify="right")
     table.add_row("outcome", "", *(record["outcome"] for record in records))
-    for name, unit in UNITS.items():
+    for name, unit in found.units.items():
         table.add_row(name, unit, *("undefined" if record[name] is None else f"{record[name]:.4g}" for record in records))
     console.print(table)
     _say(console, f"The original vehicle {found.original.verdict}.")
@@ -68,11 +65,11 @@ def print_sweep(console: Console, study: Study, names: Sequence[str], original: 
     for column in columns:
         unit = characteristics.members[column].unit
         table.add_column(plain(f"{names[columns.index(column)]}{'' if unit == '-' else f', {unit}'}"), justify="right")
-    for head in ("outcome", *METRIC_HEADS.values()):
+    for head in ("outcome", *(METRICS[name].heading if name in METRICS else name for name in found.metrics)):
         table.add_column(head, justify="left" if head == "outcome" else "right")
     for which in (original, found):
         for row in range(len(which)):
-            metrics = [which.metrics[name][row] for name in METRIC_HEADS]
+            metrics = [which.metrics[name][row] for name in found.metrics]
             table.add_row(*(f"{which.settings[row, column]:g}" for column in columns), str(which.outcome[row]),
                           *("-" if np.isnan(value) else f"{value:.3f}" for value in metrics), end_section=which is original)
     console.print(table)

@@ -6,6 +6,7 @@ from typing import Any
 from safevar_sumo.vehicles.base import SumoType, Vehicle, VehicleState, at_start
 from safevar_sumo.vehicles.calibration_drive import calibration_drive
 from safevar_sumo.vehicles.carla import Carla
+from safevar_sumo.vehicles.changes import CHANGES, Change, foreign_change
 from safevar_sumo.vehicles.characteristics import Characteristic, CharacteristicSet
 from safevar_sumo.vehicles.guarded import VEHICLE_CONTRACT, GuardedVehicle
 from safevar_sumo.vehicles.lgsvl import Lgsvl
@@ -18,5 +19,5 @@ VEHICLES: Mapping[str, type[Any]] = {
 }
 
 __all__ = [
-    "VEHICLES", "VEHICLE_CONTRACT", "Carla", "Characteristic", "CharacteristicSet", "GuardedVehicle", "SumoType", "Vehicle", "VehicleState",
-    "at_start", "calibration_drive"]
+    "CHANGES", "VEHICLES", "VEHICLE_CONTRACT", "Carla", "Change", "Characteristic", "CharacteristicSet", "GuardedVehicle", "SumoType",
+    "Vehicle", "VehicleState", "at_start", "calibration_drive", "foreign_change"]

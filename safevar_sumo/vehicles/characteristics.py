@@ -19,13 +19,14 @@ FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
 
 @dataclass(frozen=True, kw_only=True)
 class Characteristic:
-    """One characteristic of the vehicle under test; all quantities in `unit`."""
+    """One characteristic of the vehicle under test; all quantities in `unit`. A change counts `weight` times in f_diff."""
 
     name: str
     unit: str
     original: float
     lower: float
     upper: float
+    weight: float = 1.0
 
     @property
     def threshold(self) -> float:
@@ -56,7 +57,7 @@ class CharacteristicSet:
     def of(cls, table: Mapping[str, CharacteristicTable]) -> CharacteristicSet:
         """Take the characteristics of a study's table, in its order."""
         return cls(tuple(
-            Characteristic(name=name, unit=row.unit, original=row.original, lower=row.lower, upper=row.upper)
+            Characteristic(name=name, unit=row.unit, original=row.original, lower=row.lower, upper=row.upper, weight=row.weight)
             for name, row in table.items()))
 
     def __len__(self) -> int:
@@ -85,6 +86,10 @@ class CharacteristicSet:
     def threshold(self) -> FloatArray:
         return np.array([member.threshold for member in self.members])
 
+    @cached_property
+    def weight(self) -> FloatArray:
+        return np.array([member.weight for member in self.members])
+
     def filter(self, settings: FloatArray) -> FloatArray:
         """Put back to the original what changes by no more than its threshold (method section 2)."""
         return np.where(np.abs(self.original - settings) > self.threshold, settings, self.original)
@@ -94,8 +99,8 @@ class CharacteristicSet:
         return np.asarray(filtered != self.original)
 
     def largest_change(self, filtered: FloatArray) -> FloatArray:
-        """f_diff = max_i |v_i - v''_i| / v_i, a fraction, shape (N,) (method section 3)."""
-        return np.asarray(np.max(np.abs(self.original - filtered) / np.abs(self.original), axis=1))
+        """f_diff = max_i w_i |v_i - v''_i| / v_i, a fraction, shape (N,) (method section 3, where every weight w is 1)."""
+        return np.asarray(np.max(self.weight * (np.abs(self.original - filtered) / np.abs(self.original)), axis=1))
 
     def number_changed(self, filtered: FloatArray) -> FloatArray:
         """f_numDiff, the number of characteristics changed, shape (N,) (method section 3)."""

@@ -104,7 +104,7 @@ def test_imported_solutions_have_no_indicators() -> None:
 
 def test_a_solution_without_safety_degree_is_on_no_front() -> None:
     case = made_up(row(sd=math.nan), row(sd=1.5))
-    assert objectives(case.solutions).tolist() == [[1.5, 0, 0]]
+    assert objectives(case, case.solutions).tolist() == [[1.5, 0, 0]]
 
 
 def test_convergence_grows_to_the_hypervolume_of_all() -> None:
@@ -117,7 +117,7 @@ def test_convergence_grows_to_the_hypervolume_of_all() -> None:
     for run, of_it in grown.groupby("run"):
         assert (np.diff(of_it["hypervolume"]) >= 0).all()
         seen = case.evaluations[case.evaluations["run"] == run]
-        normal = Scale.of(reference_front(case)).normalised(objectives(seen))
+        normal = Scale.of(reference_front(case)).normalised(objectives(case, seen))
         assert of_it["hypervolume"].iloc[-1] == pytest.approx(moocore.hypervolume(normal, ref=[1.1] * 3))
     early = grown[grown["run"] == 0]
     assert early.loc[early["evaluations"] >= 40, "hypervolume"].nunique() == 1, "a run that ended early keeps what it had"

@@ -17,7 +17,7 @@ import pytest
 from latex_syntax import mistakes
 from made_up import made_up, made_up_study, row
 
-from safevar_sumo.analysis import Case, answer
+from safevar_sumo.analysis import Answer, Case, answer
 from safevar_sumo.analysis.layout import LAYOUTS, Layouts
 from safevar_sumo.analysis.paper import PAPER
 from safevar_sumo.analysis.tables import FORMATS, as_json, csv, escaped, latex, markdown, text
@@ -184,7 +184,7 @@ def test_the_papers_layout_has_cases_by_metrics_and_cells_of_p_and_a12() -> None
 def test_the_papers_layout_marks_what_is_part_of_a_combination() -> None:
     frame = pd.DataFrame({"setting": ["sun", "sun", "rain"], "rank": [1, 2, 1], "characteristics": [["a", "b"], ["b", "c"], ["c", "a"]],
                           "percent": [50.0, 25.0, 100.0]})
-    (table,) = PAPER["combinations"](frame)
+    (table,) = PAPER["combinations"](Answer("combinations", frame, ()))
     assert table.heads == ("characteristic", "#1", "#2", "#1")
     assert table.spans == (("sun", 2), ("rain", 1))
     assert table.rows == [("a", "x", "", "x"), ("b", "x", "x", ""), ("c", "", "x", "x"), ("% of solutions", "50.0", "25.0", "100.0")]

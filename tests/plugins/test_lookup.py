@@ -9,7 +9,6 @@ import pytest
 from beside import ADS, SCALAR, Mine
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import sources
 from safevar_sumo.simulation import assemble, evaluate
 from safevar_sumo.study import load_study
 
@@ -54,14 +53,6 @@ def test_a_module_that_was_edited_is_read_anew_and_so_is_what_it_imports(mine: M
     assert throttle(folder / "mine.toml") == 0.2
     (folder / "sibling.py").write_text("VALUE = 0.6\n")  # as long as before, within the same second
     assert throttle(folder / "mine.toml") == 0.6
-
-
-def test_the_sources_of_a_plug_in_are_its_file_and_what_it_imports_from_beside_it(mine: Mine, folder: Path) -> None:
-    (folder / "sibling.py").write_text("VALUE = 0.2\n")
-    (folder / "stranger.py").write_text("")
-    system = mine("import json\nfrom sibling import VALUE\n" + CONSTANT.format("VALUE"))
-    assert sources(system.members) == {"mine": folder / "mine.py", "sibling": folder / "sibling.py"}
-    assert sources(assemble(load_study("smoke")).members) == {}
 
 
 def test_a_file_with_the_name_of_an_installed_module_is_refused_where_it_is_meant_and_ignored_where_not(mine: Mine, folder: Path) -> None:

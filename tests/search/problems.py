@@ -8,7 +8,7 @@ import numpy as np
 
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.search import ALGORITHMS, Problem, Search
-from safevar_sumo.study import SearchTable, load_study
+from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
 
 SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
@@ -31,10 +31,9 @@ def sphere(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluati
 
 
 def begun(name: str, seed: int, evaluations: int, characteristics: CharacteristicSet = SUN) -> Search:
-    table = SearchTable(algorithms=[name], population=POPULATION, evaluations=evaluations, runs=1, seed=seed)
     original = sphere(characteristics, characteristics.original[np.newaxis])
-    problem = Problem(characteristics=characteristics, original=original, evaluations=evaluations)
-    return ALGORITHMS[name].of(table).search(problem, np.random.default_rng(seed))
+    problem = Problem(characteristics=characteristics, original=original, evaluations=evaluations, population=POPULATION)
+    return ALGORITHMS[name]().search(problem, np.random.default_rng(seed))
 
 
 def searched(name: str, seed: int, evaluations: int, characteristics: CharacteristicSet = SUN,

@@ -60,6 +60,9 @@ class _Dtlz2(Evaluations):
         return np.stack([g * np.cos(angles[:, 0]) * np.cos(angles[:, 1]), g * np.cos(angles[:, 0]) * np.sin(angles[:, 1]),
                          g * np.sin(angles[:, 0])], axis=1)
 
+    def column(self, name: str) -> np.ndarray:
+        return self.objectives[:, ["f_safe", "f_diff", "f_num_diff"].index(name)]
+
     def take(self, rows) -> Evaluations:  # type: ignore[no-untyped-def]
         return _Dtlz2(**vars(super().take(rows)))
 

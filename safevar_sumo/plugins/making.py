@@ -1,0 +1,43 @@
+"""An instance of a class that a study names, with the parameters that it gives."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import msgspec
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.plugins.guard import Guard
+from safevar_sumo.plugins.lookup import Member
+from safevar_sumo.study import invalid
+
+
+def made(member: Member, parameters: Mapping[str, Any], name: str, key: str, source: str) -> Any:
+    """An instance.
+
+    Parameters
+    ----------
+    name
+        The member as the study names it, such as `ads.model = 'my_ads:Careful'`.
+    key
+        Where its parameters stand in the study, such as `ads.parameters`.
+
+    Raises
+    ------
+    InputError
+        If the class does not take the parameters.
+    """
+    cls = member.what
+    if issubclass(cls, msgspec.Struct):
+        try:
+            return msgspec.convert(parameters, cls)
+        except msgspec.ValidationError as error:
+            raise invalid(source, parameters, error, key) from None
+    try:
+        inspect.signature(cls).bind(**parameters)
+    except TypeError as error:
+        raise InputError(source, f"{name} does not take {key} = {dict(parameters)}: {error}") from None
+    return (member.guard or Guard(source, name)).call("__init__", partial(cls, **parameters))

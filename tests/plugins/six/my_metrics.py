@@ -1,0 +1,15 @@
+import numpy as np
+
+from safevar_sumo.metrics import Metric
+
+
+def largest_jerk(drives, thresholds):
+    """The largest change of the acceleration per time [m/s^3]."""
+    trace = drives.trace
+    acceleration = np.diff(trace.speed, axis=0) / trace.step
+    jerk = np.abs(np.diff(acceleration, axis=0)) / trace.step
+    return np.max(np.where(trace.active[2:], jerk, 0.0), axis=0)
+
+
+JERK = Metric(name="jerk", title="jerk", unit="m/s^3", more_is_unsafe=True, function=largest_jerk,
+              description="Largest change of acceleration.")

@@ -1,0 +1,12 @@
+import numpy as np
+
+from safevar_sumo.vehicles import Change
+
+
+def mean_change(settings, characteristics):
+    """The mean relative change over all characteristics."""
+    share = np.abs(settings - characteristics.original) / characteristics.original
+    return np.add.accumulate(share, axis=1)[:, -1] / len(characteristics)
+
+
+MEAN = Change(name="mean_change", title="mean change", unit="fraction", function=mean_change)
