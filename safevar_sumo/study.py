@@ -14,6 +14,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.shipped import STUDIES
+from safevar_sumo.variation import Correlation, Distribution
 
 Positive = Annotated[float, Meta(gt=0, le=1e6)]
 PositiveInt = Annotated[int, Meta(ge=1)]
@@ -155,7 +156,8 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `step_length` is the simulation's time step [s], by default the one of the network's options;
     `published` are the original vehicle's metrics in the published study, by name, as far as there are any;
     `repeatability` are standard deviations of repeats of one setting there;
-    `calibration` tells which parameters are free, by their keys in the file, such as `ads.parameters.corridor`, `fit` how they are found.
+    `calibration` tells which parameters are free, by their keys in the file, such as `ads.parameters.corridor`, `fit` how they are found;
+    `variation` and `correlations` tell how characteristics vary in the world, by name: uniformly where nothing is said.
     """
 
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z")]
@@ -171,6 +173,8 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     repeatability: dict[str, Annotated[float, Meta(gt=0, le=1e6)]] = {}
     fit: FitTable = msgspec.field(default_factory=FitTable)
     calibration: dict[str, FreeParameter] = {}
+    variation: dict[str, Distribution] = {}
+    correlations: list[Correlation] = []
     origin: Origin = Origin()
 
 
@@ -370,7 +374,7 @@ def _without_nothing(raw: Any) -> Any:
 
 
 def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Override `base` by `over`; a table with another `model`, and what may be calibrated, replace the whole table."""
+    """Override `base` by `over`; another `model` or `distribution`, and what may be calibrated, replace the whole table."""
     result = dict(base)
     for key, value in over.items():
         result[key] = _merged(base[key], value) if _refines(key, base.get(key), value) else value
@@ -381,7 +385,7 @@ def _refines(key: str, old: object, new: object) -> bool:
     """Whether a new table changes single keys of the old one."""
     if key in REPLACED or not (isinstance(old, dict) and isinstance(new, dict)):
         return False
-    return bool(new.get("model", old.get("model")) == old.get("model"))
+    return all(new.get(kind, old.get(kind)) == old.get(kind) for kind in ("model", "distribution"))
 
 
 def _check_finite(path: object, value: object, key: str) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from safevar_sumo.answers.alone import Alone
 from safevar_sumo.answers.findings import Explained
 from safevar_sumo.answers.pairs import Pair
+from safevar_sumo.answers.risk import Risk
 from safevar_sumo.answers.tolerance import Tolerance
 from safevar_sumo.errors import InputError
 
@@ -53,8 +54,8 @@ def profiles_figure(told: Tolerance) -> Figure:
         _profile(axis, one)
     for axis in list(axes.flat)[len(told.alone):]:
         axis.set_axis_off()
-    figure.supylabel(DEGREE, fontsize=FONT, ha="center")
-    figure.supxlabel("dot: the original vehicle; hatched: unsafe; below the dashed line: collisions", fontsize=FONT)
+    figure.supylabel(DEGREE, fontsize=FONT)
+    figure.supxlabel("dot: the original vehicle; hatched: unsafe;\nbelow the dashed line: collisions", fontsize=FONT)
     return figure
 
 
@@ -96,7 +97,7 @@ def pairs_figure(told: Tolerance, most: int = 6) -> Figure:
     bar = figure.colorbar(colours, ax=axes, shrink=0.9)
     bar.set_label(DEGREE, fontsize=FONT)
     bar.ax.tick_params(labelsize=FONT)
-    figure.supxlabel("dot: the original vehicle; hatched: unsafe; cross: the unsafe setting that is nearest to the original", fontsize=FONT)
+    figure.supxlabel("dot: the original vehicle; hatched: unsafe;\ncross: the unsafe setting nearest to the original", fontsize=FONT)
     return figure
 
 
@@ -116,6 +117,36 @@ def _plane(axis: Axes, pair: Pair, limits: tuple[float, float]) -> QuadMesh:
     axis.set_ylim(second.lower, second.upper)
     axis.grid(visible=False)
     return colours
+
+
+def sensitivity_figure(told: Risk) -> Figure:
+    """First-order and total Sobol indices of every characteristic with their intervals, of the safety degree and of being unsafe.
+
+    Raises
+    ------
+    InputError
+        If there are none, because characteristics are correlated.
+    """
+    if told.sensitivity is None or told.sensitivity_of_unsafe is None:
+        raise InputError("correlations", "there are no sensitivity indices of correlated characteristics", "a study without correlations")
+    names = told.sensitivity.sort_values("total", kind="stable")["characteristic"].to_list()
+    title = f"{told.study.name}: what decides ({told.confidence:.0%} intervals)"
+    figure, (axes,) = new_figure(title, 1, 2, (7.2, 1.5 + 0.28 * max(len(names), 4)))
+    of_what = {"safety degree": told.sensitivity, f"unsafe ({told.unsafe})": told.sensitivity_of_unsafe}
+    for axis, (what, frame) in zip(axes, of_what.items(), strict=True):
+        rows = frame.set_index("characteristic").loc[names]
+        for column, label, colour, shift in (("total", "total: with all others", CHANGED, 0.2), ("first_order", "alone", NECESSARY, -0.2)):
+            width = (rows[f"{column}_upper"] - rows[column]).clip(lower=0)
+            axis.barh(np.arange(len(names)) + shift, rows[column], height=0.36, color=colour, xerr=width, label=label,
+                      error_kw={"elinewidth": 0.8, "ecolor": "black"})
+        axis.set_yticks(np.arange(len(names)), [plain(name) for name in names])
+        axis.set_title(plain(what), fontsize=FONT)
+        axis.set_xlabel("share of the variance [-]")
+        axis.set_xlim(left=0)
+        axis.grid(visible=False, axis="y")
+    axes[1].set_yticklabels([])
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=FONT)
+    return figure
 
 
 def new_figure(title: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping
 from shlex import quote
 
 from safevar_sumo.answers.because import REMAINDER, Because, Course
+from safevar_sumo.answers.rules import Rule
+from safevar_sumo.answers.unsafe import Unsafe
 from safevar_sumo.records import Outcome
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
@@ -94,3 +96,19 @@ def _numbers(told: Because, part: str) -> str:
 def number_of(count: int, what: str) -> str:
     """`1 change`, `2 changes`."""
     return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def rule_in_words(rule: Rule, characteristics: CharacteristicSet, unsafe: Unsafe) -> str:
+    """A rule with what it is worth: `tireFric below 1.35 and gearSwitchTime above 0.55 s: collides in 92% (..), covers 61% (..)`."""
+    told = [_condition(member, *rule.limits[member.name]) for member in characteristics if member.name in rule.limits]
+    what = "collides" if unsafe.below is None else f"SD is below {unsafe.below:g}"
+    shares = [f"{word} {share:.0%} ({interval[0]:.0%} to {interval[1]:.0%})" if share is not None and interval is not None else f"{word} -"
+              for word, share, interval in ((f"{what} in", rule.density, rule.density_interval),
+                                            ("covers", rule.coverage, rule.coverage_interval))]
+    return f"{joined(told) if told else 'everywhere'}: {', '.join(shares)}"
+
+
+def _condition(member: Characteristic, low: float | None, high: float | None) -> str:
+    if low is not None and high is not None:
+        return f"{member.name} from {low:g} to {high:g}{unit(member)}"
+    return f"{member.name} {f'below {high:g}' if low is None else f'above {low:g}'}{unit(member)}"

@@ -19,6 +19,8 @@ COMMANDS = {
     "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms and metrics."),
     "explain": ("explain", "Explain failures: which changes did it, how little is enough, and why."),
     "tolerance": ("tolerance", "Find how far each characteristic may go: alone, in pairs, and all together."),
+    "risk": ("risk", "Estimate how likely an unsafe outcome is, and what decides."),
+    "rules": ("rules", "Find rules that tell where it is unsafe, in physical units."),
     "tables": ("answers", "Answer the research questions as tables."),
     "figures": ("answers", "Draw the figures of results."),
     "report": ("report", "Write one page about results: verdict, causes, replays, tables, figures."),

@@ -1,0 +1,48 @@
+"""The command that estimates how likely an unsafe outcome is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+from rich.console import Console
+
+from safevar_sumo.cli.outputs import PICTURES, check_output
+from safevar_sumo.cli.program import commands
+from safevar_sumo.cli.simulating import jobs_option, json_option, study_of, unsafe_option
+
+
+@commands.command()
+@click.argument("place", metavar="STUDY|DIR")
+@click.option("--samples", type=click.IntRange(1, 100_000_000), default=10_000, show_default=True, metavar="N",
+              help="How many vehicles are drawn at the most.")
+@click.option("--confidence", type=click.FloatRange(0, 1, min_open=True, max_open=True), default=0.95, show_default=True,
+              help="Confidence of the intervals.")
+@click.option("--width", type=click.FloatRange(0, 1, min_open=True), help="Stop as soon as the interval of the probability is no wider.")
+@unsafe_option
+@jobs_option
+@json_option
+@click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help="Draw what decides here: png, pdf or svg.")
+def risk(place: str, samples: int, confidence: float, width: float | None, unsafe: str | None, jobs: int | None, as_json: bool,
+         plot: Path | None) -> None:
+    """Estimate how likely an unsafe outcome is when vehicles vary as STUDY says under [variation], and what decides."""
+    from safevar_sumo import answers
+    from safevar_sumo.terminal.risk import print_risk
+    from safevar_sumo.terminal.stages import stages
+
+    chosen = study_of(place)
+    if plot is not None:
+        check_output(plot, "--plot", PICTURES)
+    with stages(Console(stderr=True)) as progress:
+        told = answers.risk(chosen, samples=samples, confidence=confidence, width=width, unsafe=unsafe, jobs=jobs, progress=progress)
+    if told.sensitivity is None:
+        click.echo("note: characteristics are correlated, for which sensitivity indices are not defined: there are none", err=True)
+    if told.errors:
+        click.echo(f"warning: {told.errors} vehicles could not be simulated and are left out", err=True)
+    if as_json:
+        click.echo(json.dumps(told.record(), indent=2, allow_nan=False))
+    else:
+        print_risk(Console(), told)
+    if plot is not None:
+        answers.save(answers.sensitivity_figure(told), plot, "--plot")

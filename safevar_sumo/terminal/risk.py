@@ -1,0 +1,44 @@
+"""How likely an unsafe outcome is, for a reader."""
+
+from __future__ import annotations
+
+import math
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from safevar_sumo.answers import Risk
+from safevar_sumo.variation import Uniform
+
+
+def print_risk(console: Console, told: Risk) -> None:
+    """The probability with its interval, how vehicles vary, and what decides."""
+    low, high = told.interval
+    _say(console, told.study.title)
+    _say(console, f"Unsafe: {told.unsafe}. {told.failures} of {told.samples} vehicles.")
+    _say(console, f"Probability {told.probability:.4g}, with {told.confidence:.0%} confidence from {low:.4g} to {high:.4g}.")
+    laws = {name: law.__struct_config__.tag for name, law in told.study.variation.items() if not isinstance(law, Uniform)}
+    varied = "; ".join(f"{name} {law}" for name, law in laws.items())
+    _say(console, f"They vary as the study says: {varied}; the others uniformly." if laws else "They vary uniformly over the whole domain.")
+    if told.sensitivity is None or told.sensitivity_of_unsafe is None:
+        return
+    table = Table("characteristic", title="What decides: share of the variance", title_justify="left")
+    for what in ("SD", "unsafe"):
+        table.add_column(f"{what}: alone", justify="right")
+        table.add_column("in all", justify="right")
+    second = told.sensitivity_of_unsafe.set_index("characteristic")
+    for row in told.sensitivity.sort_values("total", ascending=False, kind="stable").to_dict("records"):
+        other = second.loc[row["characteristic"]]
+        table.add_row(escape(row["characteristic"]), *(_index(one, name) for one in (row, other) for name in ("first_order", "total")))
+    console.print(table)
+    console.print(f"Sobol indices, first order and total, with half of their {told.confidence:.0%} intervals.", highlight=False)
+
+
+def _index(row: object, name: str) -> str:
+    value, low, high = (float(row[f"{name}{end}"]) for end in ("", "_lower", "_upper"))  # type: ignore[index]
+    return "-" if math.isnan(value) else f"{value:.2f} ±{(high - low) / 2:.2f}"
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, soft_wrap=True, markup=False, highlight=False)
