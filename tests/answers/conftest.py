@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from safevar_sumo.computing import many
+from safevar_sumo.study import Study
 
 
 @pytest.fixture(autouse=True)
 def _made_up_studies_travel_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     pack = many.packed
-    monkeypatch.setattr(many, "packed", lambda study: study.name.encode() if study.name == "made-up" else pack(study))
+
+    def packed(study: Study, **options: Any) -> bytes:
+        return study.name.encode() if study.name == "made-up" else pack(study, **options)
+
+    monkeypatch.setattr(many, "packed", packed)
