@@ -10,7 +10,22 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from safevar_sumo.api import Figures, Results, Simulation, Tables, evaluate, figures, load, run, simulate, tables
+    from safevar_sumo.api import (
+        Figures,
+        Results,
+        Simulation,
+        Tables,
+        evaluate,
+        explain,
+        figures,
+        load,
+        risk,
+        rules,
+        run,
+        simulate,
+        tables,
+        tolerance,
+    )
     from safevar_sumo.errors import InputError, SafevarError, SimulationError
     from safevar_sumo.study import Study, Weather, load_study, study_names
 
@@ -23,13 +38,14 @@ _ROOM_OF = {
     "run": "api", "load": "api", "Results": "api",
     "tables": "api", "Tables": "api",
     "figures": "api", "Figures": "api",
+    "explain": "api", "tolerance": "api", "risk": "api", "rules": "api",
     "SafevarError": "errors", "InputError": "errors", "SimulationError": "errors",
 }
 """Every public name and the room that it comes from."""
 
 __all__ = [
     "Figures", "InputError", "Results", "SafevarError", "Simulation", "SimulationError", "Study", "Tables", "Weather", "__version__",
-    "evaluate", "figures", "load", "load_study", "run", "simulate", "study_names", "tables",
+    "evaluate", "explain", "figures", "load", "load_study", "risk", "rules", "run", "simulate", "study_names", "tables", "tolerance",
 ]
 
 if not TYPE_CHECKING:  # a type checker is to know the names above, and no others

@@ -4,6 +4,7 @@ from safevar_sumo.answers.because import Because, Braking, Course
 from safevar_sumo.answers.explanation import explain
 from safevar_sumo.answers.figures import necessity_figure, pairs_figure, profiles_figure, save, sensitivity_figure
 from safevar_sumo.answers.findings import Cause, Explained, Explanation
+from safevar_sumo.answers.lead import lead
 from safevar_sumo.answers.risk import Risk, risk
 from safevar_sumo.answers.robustness import Robustness
 from safevar_sumo.answers.rules import Rule, Rules, rules
@@ -12,5 +13,5 @@ from safevar_sumo.answers.unsafe import Unsafe
 from safevar_sumo.answers.words import changes, command, number_of, rule_in_words, sentence
 
 __all__ = ["Because", "Braking", "Cause", "Course", "Explained", "Explanation", "Risk", "Robustness", "Rule", "Rules", "Tolerance",
-           "Unsafe", "changes", "command", "explain", "necessity_figure", "number_of", "pairs_figure", "profiles_figure", "risk",
+           "Unsafe", "changes", "command", "explain", "lead", "necessity_figure", "number_of", "pairs_figure", "profiles_figure", "risk",
            "rule_in_words", "rules", "save", "sensitivity_figure", "sentence", "tolerance"]

@@ -68,10 +68,14 @@ class Unsafe:
         """
         if evaluations.collided.any() or original.collided.any():
             return cls()
-        half = HALF * float(original.f_safe[0])
-        if not half > 0:
+        if not original.f_safe[0] > 0:
             raise InputError("--unsafe", "nothing collides, and the original vehicle has no safety degree to halve", LEGAL)
-        return cls(float(f"{half:.6g}"))
+        return cls.half_of(float(original.f_safe[0]))
+
+    @classmethod
+    def half_of(cls, degree: float) -> Unsafe:
+        """Below half of a safety degree [m], as exactly as one tells it."""
+        return cls(float(f"{HALF * degree:.6g}"))
 
 
 def usual_in(bench: Bench, original: Evaluations) -> Unsafe:

@@ -2,8 +2,10 @@
 
 from safevar_sumo.api.answers import Figures, Tables, figures, tables
 from safevar_sumo.api.once import Simulation, simulate
+from safevar_sumo.api.questions import explain, risk, rules, tolerance
 from safevar_sumo.api.results import Results, load
 from safevar_sumo.api.running import run
 from safevar_sumo.api.settings import evaluate
 
-__all__ = ["Figures", "Results", "Simulation", "Tables", "evaluate", "figures", "load", "run", "simulate", "tables"]
+__all__ = ["Figures", "Results", "Simulation", "Tables", "evaluate", "explain", "figures", "load", "risk", "rules", "run",
+           "simulate", "tables", "tolerance"]

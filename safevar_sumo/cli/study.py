@@ -51,8 +51,9 @@ def study(study: str, batch: int | None, out: Path | None, jobs: int | None, clu
         except KeyboardInterrupt:
             click.echo(f"what is computed is kept in {directory}: the same command goes on from there", err=True)
             raise
+        if not quiet:
+            print_summary(Console(), chosen, campaign, directory, pool)
     if not quiet:
-        print_summary(Console(), chosen, campaign, directory)
         Console().print(f"Results: {directory}", soft_wrap=True, markup=False, highlight=False)
 
 

@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from safevar_sumo.campaign import Campaign, Forecast
+from safevar_sumo.computing import Pool
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import failure_lines, record, solutions_frame
 from safevar_sumo.study import Study
@@ -32,10 +33,18 @@ def print_forecast(console: Console, study: Study, runs: int, told: Forecast) ->
     console.print(table)
 
 
-def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path) -> None:
-    """Per algorithm what was found, beside the original vehicle; the most critical setting; what RQ1 and RQ2 say of it."""
+def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path, pool: Pool) -> None:
+    """The answer; per algorithm what was found, beside the original vehicle; the most critical setting; what RQ1 and RQ2 say of it."""
     from safevar_sumo.analysis import brief, case_of  # takes longer to load than all the rest
+    from safevar_sumo.answers import lead
 
+    names = tuple(study.vehicle.characteristics)
+    solutions = solutions_frame(names, campaign.solutions.items())
+    if len(solutions):
+        for line in lead(study, solutions, campaign.original, pool):
+            console.print(line, soft_wrap=True, markup=False, highlight=False)
+        more = f"Why, and how far: python -m safevar_sumo explain {shlex.quote(str(directory))}"
+        console.print(more, soft_wrap=True, markup=False, highlight=False)
     found = {"original vehicle": campaign.original}
     for algorithm in study.search.labels:
         of_it = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]
@@ -55,8 +64,6 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
         for line in failure_lines(campaign.failures):
             console.print(f"  {line}", soft_wrap=True, markup=False, highlight=False)
     _print_most_critical(console, study, campaign)
-    names = tuple(study.vehicle.characteristics)
-    solutions = solutions_frame(names, campaign.solutions.items())
     case = case_of(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
                    scoring=campaign.scoring)
     for line in brief(case):

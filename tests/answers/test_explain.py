@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from slippery import Here
 
 from safevar_sumo.analysis import Case, load_cases
-from safevar_sumo.answers import Explained, explain
+from safevar_sumo.answers import Explained, explain, lead
 from safevar_sumo.answers.bench import Bench
 from safevar_sumo.answers.boundary import RESOLUTION
 from safevar_sumo.cli.program import commands
@@ -111,3 +111,14 @@ def test_what_cannot_be_read_is_refused(slippery: Path, arguments: list[str], sa
     done = CliRunner().invoke(commands, ["explain", str(slippery), "--jobs", "1", *arguments])
     assert isinstance(done.exception, InputError)
     assert says in str(done.exception)
+
+
+def test_the_summary_of_a_study_leads_with_the_answer(case: Case) -> None:
+    original = Bench(case.study, Here()).original()
+    first, *others = lead(case.study, case.solutions, original, Here())
+    crashes = int((case.solutions["outcome"] == "collision").sum())
+    assert first == f"Unsafe (collision): {crashes} of {len(case.solutions)} solutions."
+    assert [line.partition(":")[0] for line in others] == ["Fewest changes", "Smallest changes", "Most severe"]
+    assert all(" It takes " in line for line in others)
+    safe = case.solutions[case.solutions["f_safe"] > 2]
+    assert lead(case.study, safe, original, Here())[0].startswith(f"Nothing unsafe found in {len(safe)} solutions")

@@ -1,0 +1,73 @@
+"""An engineer's questions: which changes did it, how far may each go, how likely is it, in which region."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from safevar_sumo.api.results import Results
+from safevar_sumo.study import Study, StudyLike, load_study
+
+if TYPE_CHECKING:
+    from safevar_sumo.answers import Explained, Risk, Rules, Tolerance
+    from safevar_sumo.computing import Pool
+
+
+def explain(source: StudyLike | Results, *, solutions: Sequence[str] = (), unsafe: str | None = None, top: int = 8,
+            pool: Pool | None = None, jobs: int | None = None) -> Explained:
+    """Explain failures: minimal causes, their boundaries, why, and whether they hang on a hair.
+
+    Parameters
+    ----------
+    source
+        Results, whose solutions are explained; or a study, of which failures all over the domain are.
+    solutions
+        Handles of solutions, such as "nsga2:3:0"; by default the failures that matter.
+    unsafe
+        "collision" or "below=X"; by default a collision if there is one, else half of the original's safety degree.
+    top
+        How many failures are explained in full at the most.
+    pool, jobs
+        Where to simulate: a pool, or that many worker processes, by default one for each core.
+
+    Raises
+    ------
+    InputError
+        If something that is asked for is not there or cannot be used.
+    """
+    from safevar_sumo import answers
+
+    asked = source.case if isinstance(source, Results) else load_study(source)
+    return answers.explain(asked, solutions=solutions, unsafe=unsafe, top=top, pool=pool, jobs=jobs)
+
+
+def tolerance(study: StudyLike | Results, *, unsafe: str | None = None, characteristics: Sequence[str] | None = None, pairs: bool = False,
+              pool: Pool | None = None, jobs: int | None = None) -> Tolerance:
+    """How far characteristics may go: each alone, with `pairs` two together, and all together. Otherwise as `explain`."""
+    from safevar_sumo import answers
+
+    return answers.tolerance(_study(study), unsafe=unsafe, characteristics=characteristics, pairs=pairs, pool=pool, jobs=jobs)
+
+
+def risk(study: StudyLike | Results, *, samples: int = 10_000, confidence: float = 0.95, width: float | None = None,
+         unsafe: str | None = None, pool: Pool | None = None, jobs: int | None = None) -> Risk:
+    """How likely an unsafe outcome is when vehicles vary as the study says, and what decides.
+
+    At most `samples` vehicles are drawn, fewer if the interval of the probability is no wider than `width` before.
+    Otherwise as `explain`.
+    """
+    from safevar_sumo import answers
+
+    return answers.risk(_study(study), samples=samples, confidence=confidence, width=width, unsafe=unsafe, pool=pool, jobs=jobs)
+
+
+def rules(study: StudyLike | Results, *, samples: int = 16_384, unsafe: str | None = None, pool: Pool | None = None,
+          jobs: int | None = None) -> Rules:
+    """Rules that tell where it is unsafe, from `samples` settings spread over the whole domain. Otherwise as `explain`."""
+    from safevar_sumo import answers
+
+    return answers.rules(_study(study), samples=samples, unsafe=unsafe, pool=pool, jobs=jobs)
+
+
+def _study(source: StudyLike | Results) -> Study:
+    return source.study if isinstance(source, Results) else load_study(source)
