@@ -10,6 +10,7 @@ import numpy as np
 
 from safevar_sumo.campaign.gathering import BATCH, Gathering
 from safevar_sumo.campaign.interrupts import interrupts_between_waits
+from safevar_sumo.campaign.isolation import check_isolation
 from safevar_sumo.campaign.keys import RunKey, algorithm_of, run_generator
 from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.computing import PersistentPool, Pool, packed
@@ -61,7 +62,7 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
     """
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     persistent, work = PersistentPool(pool, study, source), packed(study, results.manifest)
-    original = _original(work, characteristics, results, persistent, observer)
+    original = _original(study, work, characteristics, results, persistent, observer)
     results.begin(original)
     problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,
                       population=study.search.population, scoring=results.scoring)
@@ -104,9 +105,9 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
                              failures=sorted(campaign.failures))
 
 
-def _original(work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: PersistentPool,
+def _original(study: Study, work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: PersistentPool,
               observer: Observer) -> Evaluations:
-    """The original vehicle's evaluation, simulated once; where it fails, the study is at fault."""
+    """The original vehicle's evaluation, simulated once; where it fails, or models mix settings up, the study is at fault."""
     def simulated() -> Evaluations:
         return pool.submit(work, characteristics.original[np.newaxis], must_succeed=True).result()
 
@@ -120,6 +121,7 @@ def _original(work: bytes, characteristics: CharacteristicSet, results: ResultsD
         if journal.content.evaluations is not None:
             return journal.content.evaluations
         evaluations = simulated()
+        check_isolation(study, characteristics, lambda settings: pool.submit(work, settings))
         journal.append([0], evaluations)
         return evaluations
     finally:

@@ -17,7 +17,8 @@ from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, weather_of
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.simulation.measuring import TAKEN, Measuring, measuring_of
-from safevar_sumo.simulation.network import is_folder
+from safevar_sumo.simulation.network import OPTIONS, folder_of, is_folder
+from safevar_sumo.simulation.options import check_options
 from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather
 from safevar_sumo.vehicles import VEHICLE_CONTRACT, VEHICLES, CharacteristicSet, GuardedVehicle, Vehicle, calibration_drive
 
@@ -73,6 +74,7 @@ def assemble(study: Study, source: str = "") -> System:
     for name in study.published:
         if name not in measuring.metrics:
             raise InputError(source, f"published.{name} is no metric", one_of(measuring.metrics))
+    check_options(folder_of(models.scenario.network) / OPTIONS)
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     return System(
         characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,

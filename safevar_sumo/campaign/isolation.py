@@ -1,0 +1,77 @@
+"""Whether other people's models keep settings apart: the same settings alone, together, again and in another order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Future
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from safevar_sumo.errors import ForeignError
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
+
+LEGAL = ("what happens to vehicle i depends on vehicle i alone: nothing kept in a class, a module or the model itself from one call or "
+         "setting to another, no mean or sum over the batch, nothing random")
+
+
+class Submit(Protocol):
+    """Has a batch of settings computed."""
+
+    def __call__(self, settings: FloatArray) -> Future[Evaluations]: ...
+
+
+def foreign_names(study: Study) -> list[str]:
+    """What of a study is computed by code from outside, as the study names it."""
+    named = {"vehicle.model": [study.vehicle.model], "ads.model": [study.ads.model], "scenario.model": [study.scenario.model],
+             "metrics.also": study.metrics.also, "search.objectives": study.search.objectives}
+    return [f"{key} = {name!r}" for key, names in named.items() for name in names if ":" in name]
+
+
+def check_isolation(study: Study, characteristics: CharacteristicSet, submit: Submit) -> None:
+    """Refuse models that let one setting change another's result.
+
+    Raises
+    ------
+    ForeignError
+        Naming the models, the first result that differs, and what to do.
+    """
+    foreign = foreign_names(study)
+    if not foreign:
+        return
+    settings = _far_apart(characteristics)
+    order = np.arange(len(settings))
+    ways: dict[str, Sequence[npt.NDArray[np.intp]]] = {
+        "together": [order], "together again": [order], "in another order": [order[::-1]], "alone": list(order[:, np.newaxis])}
+    running = {way: [(rows, submit(settings[rows])) for rows in batches] for way, batches in ways.items()}
+    found = {way: {int(row): future.result().take([i]) for rows, future in batches for i, row in enumerate(rows)}
+             for way, batches in running.items()}
+    for way, results in found.items():
+        for row, result in results.items():
+            told = _difference(found["together"][row], result)
+            if told:
+                problem = f"with {' and '.join(foreign)} a result depends on what else is simulated: {told[0]} is {told[1]} together and "
+                raise ForeignError(f"study {study.name!r}", f"{problem}{told[2]} {way}", LEGAL)
+
+
+def _far_apart(characteristics: CharacteristicSet) -> FloatArray:
+    """The original setting and corners of the domains, filtered; shape (5, n)."""
+    lower, upper, number = characteristics.lower, characteristics.upper, np.arange(len(characteristics))
+    corners = [characteristics.original, lower, upper, np.where(number % 2, lower, upper), np.where(number % 2, upper, lower)]
+    return characteristics.filter(np.array(corners))
+
+
+def _difference(one: Evaluations, other: Evaluations) -> tuple[str, object, object] | None:
+    """The first number in which two evaluations of a setting differ, and both values; failures tell nothing."""
+    if not (one.valid[0] and other.valid[0]):
+        return None
+    if one.outcome[0] != other.outcome[0]:
+        return "outcome", str(one.outcome[0]), str(other.outcome[0])
+    for name in ("collision_speed", *one.metrics):
+        here, there = (of.metrics.get(name, of.collision_speed) for of in (one, other))
+        if not np.array_equal(here, there, equal_nan=True):
+            return name, float(here[0]), float(there[0])
+    return None
