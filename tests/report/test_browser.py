@@ -1,0 +1,158 @@
+"""The pages in a real browser, opened as files: nothing fetched, nothing wrong on the console, everything works."""
+
+from __future__ import annotations
+
+import base64
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from browser import axe_core, chromium, resized, violations
+from selenium.webdriver import Chrome
+from selenium.webdriver.common.by import By
+
+from safevar_sumo.analysis import load_cases
+from safevar_sumo.report import make_report
+from safevar_sumo.showing import animate, compare
+from safevar_sumo.simulation import assemble
+
+ORDER = "return [...arguments[0].tBodies[0].rows].map((row) => parseFloat(row.cells[2].textContent))"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
+    found = chromium(tmp_path_factory.mktemp("profile"))
+    yield found
+    found.quit()
+
+
+@pytest.fixture(scope="module")
+def report(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("page") / "report.html"
+    file.write_text(make_report([slippery]), encoding="utf-8")
+    return file
+
+
+def opened(browser: Chrome, page: Path, anchor: str = "") -> None:
+    browser.get("about:blank")
+    browser.get_log("browser")
+    browser.get_log("performance")
+    browser.get(page.as_uri() + anchor)
+
+
+def requests_of(browser: Chrome) -> list[str]:
+    messages = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
+    return [one["params"]["request"]["url"] for one in messages if one["method"] == "Network.requestWillBeSent"]
+
+
+def shown_time(player: object) -> float:
+    return float(player.find_element(By.CSS_SELECTOR, ".time").text.split()[0])  # type: ignore[attr-defined]
+
+
+def try_player(browser: Chrome, player: object) -> None:
+    """Play it, pause it, scrub it, jump to a moment."""
+    find = player.find_element  # type: ignore[attr-defined]
+    button, slider = find(By.CSS_SELECTOR, ".play"), find(By.CSS_SELECTOR, ".when")
+    browser.execute_script("arguments[0].value = 0; arguments[0].dispatchEvent(new Event('input'))", slider)
+    assert shown_time(player) == 0
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
+    start = find(By.CSS_SELECTOR, "[data-body]:has(.changed)").get_attribute("transform")
+    button.click()
+    assert button.text == "Pause"
+    time.sleep(0.6)
+    button.click()
+    assert button.text == "Play"
+    assert 0.1 < shown_time(player) < 5
+    browser.execute_script("arguments[0].value = arguments[0].max; arguments[0].dispatchEvent(new Event('input'))", slider)
+    assert find(By.CSS_SELECTOR, "[data-body]:has(.changed)").get_attribute("transform") != start
+    assert "hits at" in player.text  # type: ignore[attr-defined]
+    find(By.CSS_SELECTOR, "[data-sample]").click()
+    assert "brakes" in player.text  # type: ignore[attr-defined]
+
+
+def test_an_animation_plays_and_scrubs_as_a_file(browser: Chrome, slippery: Path, tmp_path: Path) -> None:
+    (case,) = load_cases([slippery])
+    animate(compare(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0]), tmp_path / "it.html")
+    opened(browser, tmp_path / "it.html")
+    try_player(browser, browser.find_element(By.CSS_SELECTOR, ".player"))
+    assert [entry["message"] for entry in browser.get_log("browser")] == []
+    assert requests_of(browser) == [(tmp_path / "it.html").as_uri()]
+
+
+@pytest.mark.slow
+def test_nothing_leaves_the_page_and_nothing_is_wrong_with_it(browser: Chrome, report: Path) -> None:
+    opened(browser, report)
+    browser.execute_script("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    time.sleep(0.5)
+    assert [entry["message"] for entry in browser.get_log("browser")] == []
+    assert {url.partition(":")[0] for url in requests_of(browser)} <= {"file", "data"}
+    assert [url for url in requests_of(browser) if url.startswith("file:")] in ([], [report.as_uri()])
+    broken = "return [...document.images].filter((one) => one.complete && !one.naturalWidth).length"
+    assert browser.execute_script(broken) == 0
+
+
+@pytest.mark.slow
+def test_tables_sort_and_a_row_opens_its_replay(browser: Chrome, report: Path) -> None:
+    opened(browser, report)
+    row = browser.find_element(By.CSS_SELECTOR, "tr[data-opens]")
+    table = row.find_element(By.XPATH, "ancestor::table")
+    button = table.find_element(By.XPATH, ".//thead//th[3]/button")
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
+    for _ in range(2):
+        button.click()
+        numbers = browser.execute_script(ORDER, table)
+        up = table.find_element(By.XPATH, ".//thead//th[3]").get_attribute("aria-sort") == "ascending"
+        assert numbers == sorted(numbers, reverse=not up)
+    row = table.find_elements(By.CSS_SELECTOR, "tr[data-opens]")[-1]
+    replay = browser.find_element(By.ID, row.get_attribute("data-opens"))
+    browser.execute_script("arguments[0].open = false", replay)
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", row)
+    row.find_elements(By.TAG_NAME, "td")[1].click()
+    time.sleep(0.6)
+    assert replay.get_attribute("open") is not None
+    assert browser.execute_script("const box = arguments[0].getBoundingClientRect(); return box.top >= -1 && box.top < innerHeight", replay)
+    try_player(browser, replay.find_element(By.CSS_SELECTOR, ".player"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [390, 1400])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_it_fits_the_screen_and_everybody_can_read_it(width: int, scheme: str, browser: Chrome, report: Path, axe: str) -> None:
+    resized(browser, width, scheme)
+    try:
+        opened(browser, report)
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+        browser.execute_script("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+        assert violations(browser, axe) == []
+    finally:
+        resized(browser, 1400)
+
+
+@pytest.fixture(scope="module")
+def axe(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return axe_core(tmp_path_factory.mktemp("axe"))
+
+
+@pytest.mark.slow
+def test_it_prints(browser: Chrome, report: Path) -> None:
+    opened(browser, report)
+    printed = base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", {"printBackground": True})["data"])
+    assert printed.startswith(b"%PDF")
+    assert printed.count(b"/Type /Page\n") >= 3
+
+
+@pytest.mark.slow
+def test_without_javascript_it_stands_still_and_tells_the_same(browser: Chrome, report: Path) -> None:
+    browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
+    try:
+        opened(browser, report)
+        assert "The smallest change that makes it collide" in browser.find_element(By.TAG_NAME, "main").text
+        player = browser.find_element(By.CSS_SELECTOR, ".player")
+        assert "hits at" in player.text
+        assert not player.find_element(By.CSS_SELECTOR, ".controls").is_displayed()
+        assert player.find_element(By.CSS_SELECTOR, ".changed").is_displayed()
+    finally:
+        browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
