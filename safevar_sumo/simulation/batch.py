@@ -67,6 +67,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
     prepared = vehicle.prepare(characteristics, system.weather.road_friction, step)
     world.set_types(vehicle.sumo_type(prepared))
     world.depart()
+    length = world.vehicle_length(VUT)
 
     state = at_start(vehicle, prepared, world.speeds())
     driver = system.ads.start(n, system.nominal, step)
@@ -87,9 +88,11 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
                   obstacle_speed=scene.obstacle_speed)
         if not verdict.open.any():
             break
+        if watch is None:
+            world.leave(verdict.ended)
         state = vehicle.advance(prepared, state, command)
         world.advance(np.where(verdict.open, state.speed, 0.0))
-    trace = log.trace(sample + 1, step, world.vehicle_length(VUT))
+    trace = log.trace(sample + 1, step, length)
     return Drives(trace=trace, encounter=parts.encounter(trace), outcome=verdict.outcome(), collision_speed=verdict.collision_speed)
 
 
@@ -112,10 +115,11 @@ class _Log:
 
 
 class _Verdict:
-    """How N simulations end; `open` where the outcome can still change. Method section 4."""
+    """How N simulations end; `open` where the outcome can still change, `ended` those that ended last. Method section 4."""
 
     def __init__(self, n: int) -> None:
         self.open = np.ones(n, dtype=bool)
+        self.ended: list[int] = []
         self.collision_speed = np.full(n, np.nan)
         self._moved = np.zeros(n, dtype=bool)
         self._stood = np.zeros(n, dtype=bool)
@@ -123,7 +127,7 @@ class _Verdict:
 
     def judge(self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: BoolArray | bool) -> BoolArray:
         """Take in one sample; returns for which vehicles it still belongs to the run."""
-        active = self.open & ~over
+        before, active = self.open.copy(), self.open & ~over
         for copy, collision_speed in collisions.items():
             if self.open[copy]:
                 self.collision_speed[copy] = collision_speed
@@ -133,6 +137,7 @@ class _Verdict:
         self._moved |= self.open & ~standing
         self._over |= self.open & over
         self.open &= ~over & ~np.asarray(last)
+        self.ended = (before & ~self.open).nonzero()[0].tolist()
         return active
 
     def outcome(self) -> npt.NDArray[np.str_]:

@@ -8,7 +8,7 @@ is straight and nobody reacts to the vehicle under test; whoever uses it holds i
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -50,6 +50,9 @@ class KinematicWorld(SumoWorld):
         self._along = _direction(vehicle.getAngle(vut))
         self._body = vehicle.getLength(vut), vehicle.getWidth(vut)
         self._speeds += vehicle.getSpeed(vut)
+
+    def leave(self, copies: Iterable[int]) -> None:
+        """There is but one on the road, and the others need it there."""
 
     def advance(self, speeds: FloatArray) -> None:
         """Ballistic: the way of a step is that of the mean speed."""

@@ -9,10 +9,11 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from enum import StrEnum
 from io import StringIO
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,8 @@ class SumoWorld:
     def __init__(self, api: Any, n: int, *, first: int = 0, watched: bool = False, standing: StandingSumo | None = None) -> None:
         self._api, self.n, self._first, self._standing = api, n, first, standing
         self._parts: list[SumoWorld] = []
+        self._left: dict[str, tuple[float, tuple[float, float]]] = {}
+        """Speed and position of vehicles under test that have left the road."""
         self._ids: dict[str, list[str]] = {}
         self._positions: dict[str, FloatArray] = {}
         self._copy_of = {name: copy for copy, name in enumerate(self.ids(VUT))}
@@ -93,9 +96,10 @@ class SumoWorld:
 
     def advance(self, speeds: FloatArray) -> None:
         """One simulation step in which the vehicles under test reach `speeds` [m/s]."""
-        set_speed = self._api.vehicle.setSpeed
+        set_speed = _direct(self._api, "vehicle", "setSpeed")
         for name, speed in zip(self.ids(VUT), speeds.tolist(), strict=True):
-            set_speed(name, speed)
+            if name not in self._left:
+                set_speed(name, speed)
         self._api.simulationStep()
         for world in (self, *self._parts):
             world._positions.clear()
@@ -108,20 +112,29 @@ class SumoWorld:
             self._copy_of[collision.collider]: collision.colliderSpeed
             for collision in self._api.simulation.getCollisions() if collision.collider in self._copy_of}
 
+    def leave(self, copies: Iterable[int]) -> None:
+        """Take vehicles under test off the road whose runs are over: they are told to be as they were, and cost nothing."""
+        vehicle, names = self._api.vehicle, self.ids(VUT)
+        for name in (names[copy] for copy in copies):
+            self._left[name] = vehicle.getSpeed(name), vehicle.getPosition(name)
+            vehicle.remove(name)
+
     def speeds(self) -> FloatArray:
         """Speeds of the vehicles under test as SUMO has them [m/s]."""
-        return np.array([self._api.vehicle.getSpeed(name) for name in self.ids(VUT)])
+        speed = _direct(self._api, "vehicle", "getSpeed")
+        return np.array([self._left[name][0] if name in self._left else speed(name) for name in self.ids(VUT)])
 
     def vehicle_positions(self, actor: str) -> FloatArray:
-        return self._looked_up(actor, self._api.vehicle.getPosition)
+        return self._looked_up(actor, _direct(self._api, "vehicle", "getPosition"))
 
     def person_positions(self, actor: str) -> FloatArray:
-        return self._looked_up(actor, self._api.person.getPosition)
+        return self._looked_up(actor, _direct(self._api, "person", "getPosition"))
 
     def _looked_up(self, actor: str, position: Callable[[str], tuple[float, float]]) -> FloatArray:
         """Positions in this step; whoever asks again gets the same array."""
         if actor not in self._positions:
-            self._positions[actor] = np.array([position(name) for name in self.ids(actor)])
+            found = (self._left[name][1] if name in self._left else position(name) for name in self.ids(actor))
+            self._positions[actor] = np.fromiter(chain.from_iterable(found), float, 2 * self.n).reshape(self.n, 2)
         return self._positions[actor]
 
     def whereabouts(self) -> dict[str, tuple[float, float, float]]:
@@ -164,6 +177,7 @@ class SumoWorld:
     def part(self, first: int, n: int) -> SumoWorld:
         """The world of `n` copies alone, from the `first`."""
         part = SumoWorld(self._api, n, first=first)
+        part._left = self._left
         self._parts.append(part)
         return part
 
@@ -237,6 +251,12 @@ def _standing_world(folder: str, traffic: Sequence[Traffic], options: Sequence[s
 
 def _failure(error: Exception) -> SimulationError:
     return SimulationError(f"SUMO failed: {str(error).strip() or 'it closed the connection'}")
+
+
+def _direct(api: Any, domain: str, name: str) -> Callable[..., Any]:
+    """A function of SUMO's without libsumo's Python wrapper, which costs as much as the call; traci has none."""
+    compiled = getattr(api, "_libsumo", None)
+    return getattr(getattr(api, domain), name) if compiled is None else getattr(compiled, f"{domain}_{name}")  # type: ignore[no-any-return]
 
 
 def _api(engine: Engine) -> Any:
