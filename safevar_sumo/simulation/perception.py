@@ -6,11 +6,13 @@ from collections import deque
 
 import numpy as np
 
-from safevar_sumo.records import FloatArray, Observation
+from safevar_sumo.records import EVERYWHERE, FloatArray, Observation
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather
 
 STEP_DECIMALS = 6  # of a delay in steps: a whole number of steps is whole
+HIDDEN = np.array([[np.inf], [np.inf], [0.0], [0.0]])
+"""Gap and lateral place [m], lateral speed and speed [m/s] of somebody who is not seen."""
 
 
 class Perception:
@@ -23,10 +25,11 @@ class Perception:
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
         """What is seen at this step; every step is to be shown. Who is hidden is infinitely far away and still."""
-        there = (scene.gap, scene.lateral, scene.lateral_speed, np.broadcast_to(scene.obstacle_speed, speed.shape))
-        hidden = (np.inf, np.inf, 0.0, 0.0)
-        seen = [np.where(scene.visible, one, other) for one, other in zip(there, hidden, strict=True)]
-        gap, lateral, lateral_speed, obstacle_speed, own = self._late(np.stack([*seen, speed]))
+        now = np.empty((len(HIDDEN) + 1, len(speed)))
+        now[0], now[1], now[2], now[3], now[4] = scene.gap, scene.lateral, scene.lateral_speed, scene.obstacle_speed, speed
+        if scene.visible is not EVERYWHERE:
+            now[:-1] = np.where(scene.visible, now[:-1], HIDDEN)
+        gap, lateral, lateral_speed, obstacle_speed, own = self._late(now)
         return Observation(time, speed, gap, own - obstacle_speed, lateral, lateral_speed, self._visibility, obstacle_speed)
 
     def _late(self, now: FloatArray) -> FloatArray:

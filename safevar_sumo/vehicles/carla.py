@@ -17,36 +17,50 @@ from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
+# Numbers that meet arrays in every step are arrays themselves: numpy would convert a float each time, which takes as long again.
+ONE, NEUTRAL, FIRST = map(np.array, (1.0, 0.0, 1.0))
 GRAVITY = 9.81  # m/s^2
 RPM = 2 * math.pi / 60  # rad/s per r/min
 ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default
 # Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) r/min, N m, stretched over max_rpm.
-TORQUE_IDLE, TORQUE_PEAK, TORQUE_END = 400.0, 500.0, 400.0  # N m
-PEAK_AT, END_AT = 1890 / 5800, 5730 / 5800  # of the maximum speed; the falling line goes on to it
+TORQUE_IDLE, TORQUE_PEAK, TORQUE_END = map(np.array, (400.0, 500.0, 400.0))  # N m
+PEAK_AT, END_AT = map(np.array, (1890 / 5800, 5730 / 5800))  # of the maximum speed; the falling line goes on to it
+TORQUE_RISE = np.array((TORQUE_PEAK - TORQUE_IDLE) / PEAK_AT)
+TORQUE_FALL = np.array((TORQUE_PEAK - TORQUE_END) / (END_AT - PEAK_AT))
 GEAR_RATIOS = np.array([0.0, 2.85, 2.02, 1.35, 1.0])  # neutral first; blueprint of the LincolnMkz2017
 FINAL_RATIO = 4.0
 OVERALL_RATIOS = GEAR_RATIOS * FINAL_RATIO
-SHIFT_UP, SHIFT_DOWN = 0.65, 0.5  # of max_rpm
-AUTOBOX_LATENCY = 2.0  # s, least time between two switches of the automatic gearbox; PxVehicleAutoBoxData
+TOP = np.array(len(GEAR_RATIOS) - 1.0)
+SHIFT_UP, SHIFT_DOWN = map(np.array, (0.65, 0.5))  # of max_rpm
+AUTOBOX_LATENCY = np.array(2.0)  # s, least time between two switches of the automatic gearbox; PxVehicleAutoBoxData
 WHEELS = 4
 WHEEL_MASS = 20.0  # kg each; PxVehicleWheelData.mMass
 AIR_DENSITY = 1.2  # kg/m^3
 FRONTAL_AREA = 2.2  # m^2, of the LincolnMkz2017
 TIME_ROUNDING = 1e-9  # s; below it two sums of steps are the same time
-STANDSTILL = 0.03  # m/s, below which a braked vehicle is held by its tyres (PxVehicle sticky tires)
+STANDSTILL = np.array(0.03)  # m/s, below which a braked vehicle is held by its tyres (PxVehicle sticky tires)
 SUBSTEP = 1 / 60  # s at most; CARLA 0.9.10 (MaxSubstepDeltaTime)
 NEWTON_STEPS = 8  # from 1 to a cube root near 1: the last ones change nothing
 TYRE_STEPS = 3  # in a substep; what PhysX takes below 5 m/s (setSubStepCount), here at any speed
 
 
 class _Prepared(NamedTuple):
-    """Constants of a run, SI; arrays of shape (N,)."""
+    """Constants of a run, SI; arrays of shape (N,).
+
+    `throttle_rates` and `brake_rates` are the most that a pedal falls and rises in a substep; with `per_step`, divided by
+    the tyres' step; `speed_by_force` and `speed_by_air` are what a force, and the square of a speed, make of a speed in it.
+    """
 
     substeps: int
     step: float
+    throttle_rates: tuple[FloatArray, FloatArray]
+    brake_rates: tuple[FloatArray, FloatArray]
     mass: FloatArray
     radius: FloatArray
+    engine_inertia_per_step: FloatArray
     wheel_inertia: FloatArray
+    wheel_inertia_per_step: FloatArray
+    wheel_coasts: FloatArray
     wheel_damping: FloatArray
     brake_torque: FloatArray
     grip: FloatArray
@@ -57,7 +71,10 @@ class _Prepared(NamedTuple):
     damping_engaged: FloatArray
     damping_neutral: FloatArray
     shift_time: FloatArray
+    shift_ends: FloatArray
     air_drag: FloatArray
+    speed_by_force: FloatArray
+    speed_by_air: FloatArray
     assumed_height: FloatArray
     slip_offset: FloatArray
     nothing: FloatArray
@@ -118,14 +135,23 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         radius = c["radius"] / 100
         grip = c["tireFric"] * (self.tyre_friction * road_friction) * c["mass"] * GRAVITY
         substeps = math.ceil(step / SUBSTEP - TIME_ROUNDING)
+        substep = step / substeps
+        tyre_step = substep / TYRE_STEPS
+        wheel_inertia, wheel_damping = WHEELS * 0.5 * WHEEL_MASS * radius * radius, WHEELS * c["dampRate"]
+        air_drag, speed_by_force = 0.5 * AIR_DENSITY * FRONTAL_AREA * c["dragCoeff"], tyre_step / c["mass"]
         return _Prepared(
-            substeps=substeps, step=step / substeps, mass=c["mass"], radius=radius,
-            wheel_inertia=WHEELS * 0.5 * WHEEL_MASS * radius * radius,
-            wheel_damping=WHEELS * c["dampRate"], brake_torque=WHEELS * c["maxBrakeTorque"],
+            substeps=substeps, step=substep, mass=c["mass"], radius=radius,
+            throttle_rates=(np.array(-self.throttle_fall * substep), np.array(self.throttle_rise * substep)),
+            brake_rates=(np.array(-self.brake_fall * substep), np.array(self.brake_rise * substep)),
+            engine_inertia_per_step=np.array(ENGINE_INERTIA / tyre_step), wheel_inertia=wheel_inertia,
+            wheel_inertia_per_step=wheel_inertia / tyre_step,
+            wheel_coasts=wheel_inertia / tyre_step + wheel_damping,
+            wheel_damping=wheel_damping, brake_torque=WHEELS * c["maxBrakeTorque"],
             grip=grip, slip_stiffness=WHEELS * GRAVITY * self.longitudinal_stiffness / (3 * grip),
             clutch=c["clutchStrength"], engine_limit=c["max_rpm"] * RPM, damping_full=c["dampRateFullT"],
             damping_engaged=c["dampRateZeroT_CE"], damping_neutral=c["dampRateZeroT_CD"], shift_time=c["gearSwitchTime"],
-            air_drag=0.5 * AIR_DENSITY * FRONTAL_AREA * c["dragCoeff"],
+            shift_ends=c["gearSwitchTime"] - TIME_ROUNDING,
+            air_drag=air_drag, speed_by_force=speed_by_force, speed_by_air=speed_by_force * air_drag,
             assumed_height=self.camera_height / (self.camera_height + (radius - self.camera_design_radius)),
             slip_offset=np.full_like(radius, self.slip_offset), nothing=np.zeros_like(radius))
 
@@ -180,15 +206,15 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             state = self._pedals(prepared, state, command)
             state = _shift(prepared, state)
             state = self._roll(prepared, state)
-        moves = (state.brake <= 0) | (state.speed >= STANDSTILL)
-        return state._replace(speed=np.where(moves, state.speed, 0.0), wheel_speed=np.where(moves, state.wheel_speed, 0.0))
+        moves, nothing = (state.brake <= prepared.nothing) | (state.speed >= STANDSTILL), prepared.nothing
+        return state._replace(speed=np.where(moves, state.speed, nothing), wheel_speed=np.where(moves, state.wheel_speed, nothing))
 
     def _pedals(self, p: _Prepared, s: CarlaState, command: Command) -> CarlaState:
         """Pedals follow their commands at finite rates."""
-        throttle, brake, h = command.throttle - s.throttle, command.brake - s.brake, p.step
+        (throttle_falls, throttle_rises), (brake_falls, brake_rises) = p.throttle_rates, p.brake_rates
         return s._replace(
-            throttle=s.throttle + np.minimum(np.maximum(throttle, -self.throttle_fall * h), self.throttle_rise * h),
-            brake=s.brake + np.minimum(np.maximum(brake, -self.brake_fall * h), self.brake_rise * h))
+            throttle=s.throttle + np.minimum(np.maximum(command.throttle - s.throttle, throttle_falls), throttle_rises),
+            brake=s.brake + np.minimum(np.maximum(command.brake - s.brake, brake_falls), brake_rises))
 
     def _roll(self, p: _Prepared, s: CarlaState) -> CarlaState:
         """Engine, clutch, wheels, tyres and body over one substep.
@@ -199,22 +225,21 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
         The force F is explicit. It ends the slip within a step at most, and never reverses it: so it cannot ring.
         """
-        step = p.step / TYRE_STEPS
         gear = s.gear.astype(np.intp)
-        in_gear = gear > 0
+        in_gear = s.gear > NEUTRAL
         ratio = OVERALL_RATIOS[gear]
         clutch = p.clutch * in_gear
         through_clutch = ratio * clutch
         closed = np.where(in_gear, p.damping_engaged, p.damping_neutral)
-        engine = ENGINE_INERTIA / step + closed + (p.damping_full - closed) * s.throttle + clutch
-        wheel = p.wheel_inertia / step + p.wheel_damping + through_clutch * ratio * (1 - clutch / engine)
+        engine = p.engine_inertia_per_step + closed + (p.damping_full - closed) * s.throttle + clutch
+        wheel = p.wheel_coasts + through_clutch * ratio * (ONE - clutch / engine)
         # What a step makes of each speed (that of a wheel at its rim), of torques and of the tyres' force:
-        engine_keeps, engine_gains = ENGINE_INERTIA / step / engine, s.throttle * self._torque(p, s) / engine
+        engine_keeps, engine_gains = p.engine_inertia_per_step / engine, s.throttle * self._torque(p, s) / engine
         rim_by_torque = p.radius / wheel
-        rim_keeps, rim_by_engine = p.wheel_inertia / step / wheel, through_clutch * rim_by_torque
+        rim_keeps, rim_by_engine = p.wheel_inertia_per_step / wheel, through_clutch * rim_by_torque
         rim_loses = s.brake * p.brake_torque * rim_by_torque
-        rim_by_force, speed_by_force = p.radius * rim_by_torque, step / p.mass
-        speed_loses = speed_by_force * p.air_drag * s.speed * s.speed
+        rim_by_force, speed_by_force = p.radius * rim_by_torque, p.speed_by_force
+        speed_loses = p.speed_by_air * s.speed * s.speed
         slip_by_force = rim_by_force + speed_by_force
         engine_by_rim = through_clutch / (engine * p.radius)
 
@@ -243,9 +268,9 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def _torque(self, p: _Prepared, s: CarlaState) -> FloatArray:
         """Engine torque at full throttle [N m]: linear between the points of the curve, zero above its end."""
         x = s.engine_speed / p.engine_limit
-        rising = TORQUE_IDLE + (TORQUE_PEAK - TORQUE_IDLE) / PEAK_AT * x
-        falling = TORQUE_PEAK - (TORQUE_PEAK - TORQUE_END) / (END_AT - PEAK_AT) * (x - PEAK_AT)
-        return self.engine_torque * np.where(x <= 1, np.minimum(rising, falling), 0.0)
+        rising = TORQUE_IDLE + TORQUE_RISE * x
+        falling = TORQUE_PEAK - TORQUE_FALL * (x - PEAK_AT)
+        return self.engine_torque * np.where(x <= ONE, np.minimum(rising, falling), p.nothing)
 
 
 def _shift(p: _Prepared, s: CarlaState) -> CarlaState:
@@ -253,9 +278,9 @@ def _shift(p: _Prepared, s: CarlaState) -> CarlaState:
     settled = s.gear == s.target_gear
     automatic = settled & (s.since_shift >= AUTOBOX_LATENCY)
     relative = s.engine_speed / p.engine_limit
-    up = np.where(s.gear > 0, automatic & (relative > SHIFT_UP) & (s.gear < len(GEAR_RATIOS) - 1), settled & (s.throttle > 0))
-    down = automatic & (relative < SHIFT_DOWN) & (s.gear > 1)
+    up = np.where(s.gear > NEUTRAL, automatic & (relative > SHIFT_UP) & (s.gear < TOP), settled & (s.throttle > p.nothing))
+    down = automatic & (relative < SHIFT_DOWN) & (s.gear > FIRST)
     target = s.target_gear + up - down
-    since_shift = np.where(target == s.target_gear, s.since_shift + p.step, 0.0)
-    gear = np.where((target == s.gear) | (since_shift >= p.shift_time - TIME_ROUNDING), target, 0.0)
+    since_shift = np.where(target == s.target_gear, s.since_shift + p.step, p.nothing)
+    gear = np.where((target == s.gear) | (since_shift >= p.shift_ends), target, NEUTRAL)
     return s._replace(gear=gear, target_gear=target, since_shift=since_shift)
