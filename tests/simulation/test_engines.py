@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.errors import SimulationError
+from safevar_sumo.errors import EnvironmentFault, SimulationError
 from safevar_sumo.metrics import time_to_collision
 from safevar_sumo.records import Trace
 from safevar_sumo.simulation import Engine, assemble, simulate
@@ -52,7 +52,7 @@ def test_broken_traffic_is_an_error_in_sumos_words(tmp_path: Path) -> None:
     files = copied_network("lead_vehicle_stopped", 1)
     broken = tmp_path / "traffic.rou.xml"
     broken.write_text(files.traffic.read_text().replace("0.road", "nowhere"))
-    with pytest.raises(SimulationError, match="nowhere"), open_world(CopiedNetwork(files.network, broken, files.options), 1) as world:
+    with pytest.raises(EnvironmentFault, match="nowhere"), open_world(CopiedNetwork(files.network, broken, files.options), 1) as world:
         world.depart()
     with open_world(files, 1) as world:  # and the process is as good as before
         world.depart()
