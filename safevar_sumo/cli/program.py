@@ -26,6 +26,7 @@ COMMANDS = {
     "report": ("report", "Write one page about results: verdict, causes, replays, tables, figures."),
     "import": ("reference", "Make results of solutions in the published package's CSV format."),
     "validate": ("reference", "Compare a study with reference data, row by row."),
+    "replicate": ("replicate", "Hold whole studies against published ones: tables, conclusions, and whether they hold."),
     "calibrate": ("reference", "Fit a study's free parameters to reference data."),
 }
 """Every command, in the order of the help: the module of this folder that it lives in, and what the help says of it."""

@@ -1,0 +1,174 @@
+"""What both sides say, in words: the published conclusion, whether it holds here, by which rule, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.analysis.case import ALGORITHM_TITLES
+from safevar_sumo.analysis.inference import ALPHA
+from safevar_sumo.reference.agreement import rank_correlation
+from safevar_sumo.reference.beside import HERE, THERE, Beside
+
+HOLDS, DIRECTION, DIFFERS, OPEN = "holds", "holds in direction", "differs", "cannot be told"
+CLOSE, ALIKE = 0.7, 0.4
+"""Rank correlations from which an order holds, and from which it holds in direction."""
+FACTOR = 1.5
+"""Shares and means that differ by no more than this factor are the same."""
+MOSTLY, PARTLY = 0.8, 0.6
+"""Shares of the characteristics that are changed the same way, from which that holds, and holds in direction."""
+LEANING = 0.2
+"""A characteristic is mostly increased or decreased if that is by so much of its changes more frequent than the other."""
+RULES = (
+    f"Tests (RQ1, RQ2): *{HOLDS}* if both sides are significant (p < {ALPHA:g}) to the same side, or neither is significant; "
+    f"*{DIRECTION}* if one alone is significant and both effect sizes lie on the same side of 0.5; else *{DIFFERS}*.",
+    f"Numbers of changes (RQ3.1): *{HOLDS}* if the most frequent number is the same, *{DIRECTION}* if the means differ by at most 1.",
+    f"Orders (RQ3.2, weather): *{HOLDS}* from a rank correlation of {CLOSE:g}, *{DIRECTION}* from {ALIKE:g}.",
+    f"Directions of changes (RQ3.3): *{HOLDS}* if at least {100 * MOSTLY:.0f} % of the characteristics that lean to one side there "
+    f"(by {100 * LEANING:.0f} % of their changes) lean to it here, *{DIRECTION}* from {100 * PARTLY:.0f} %.",
+    f"Shares and means (collisions, safety): *{HOLDS}* within a factor of {FACTOR:g}, *{DIRECTION}* if both are above zero.",
+    f"Combinations: *{HOLDS}* if the most frequent one is the same, *{DIRECTION}* if it is among those shown on the other side or "
+    "shares three of its four characteristics with the most frequent one there.")
+
+
+class Conclusion(NamedTuple):
+    """A published conclusion in words, whether it holds here, and the numbers that say so."""
+
+    question: str
+    setting: str
+    words: str
+    verdict: str
+    why: str
+
+
+def conclusions(tables: Sequence[Beside]) -> list[Conclusion]:
+    """All of them, in the order of the questions."""
+    return [one for table in tables if not table.frame.empty for one in READERS[table.name](table.frame)]
+
+
+def _tests(question: str, who: str, better: str) -> Any:
+    def read(frame: pd.DataFrame) -> Iterator[Conclusion]:
+        for row in frame.to_dict("records"):
+            (a, p), (b, q) = ((_number(row[f"effect_size {side}"]), _number(row[f"p_value {side}"])) for side in (HERE, THERE))
+            subject = f"{ALGORITHM_TITLES.get(row[who], row[who])}, {row['metric']}"
+            if a is None or b is None or p is None or q is None:
+                yield Conclusion(question, row["setting"], subject, OPEN, "there is no test " + (HERE if a is None else THERE))
+                continue
+            told = _difference(b, q, better)
+            verdict = HOLDS if (p < ALPHA) == (q < ALPHA) and (q >= ALPHA or _same_side(a, b)) else (
+                DIRECTION if (p < ALPHA) != (q < ALPHA) and _same_side(a, b) else DIFFERS)
+            yield Conclusion(question, row["setting"], f"{subject}: {told}", verdict,
+                             f"effect size {a:.2f} here ({row[f'magnitude {HERE}']}, p {p:.2g}), {b:.2f} published "
+                             f"({row[f'magnitude {THERE}']}, p {q:.2g})")
+    return read
+
+
+def _same_side(one: float, other: float) -> bool:
+    return (one - 0.5) * (other - 0.5) > 0
+
+
+def _difference(effect: float, p: float, better: str) -> str:
+    if p >= ALPHA:
+        return "no difference"
+    high, low = better.split("/")
+    return high if effect > 0.5 else low
+
+
+def _numbers(frame: pd.DataFrame) -> Iterator[Conclusion]:
+    for setting, rows in frame.groupby("setting", sort=False):
+        sides = [rows[f"percent {side}"].fillna(0).to_numpy(dtype=float) for side in (HERE, THERE)]
+        if not all(side.sum() for side in sides):
+            continue
+        number = rows["j"].astype(int).to_numpy()
+        modes, means = [number[side.argmax()] for side in sides], [float(number @ side / side.sum()) for side in sides]
+        verdict = HOLDS if modes[0] == modes[1] else DIRECTION if abs(means[0] - means[1]) <= 1 else DIFFERS
+        yield Conclusion("RQ3.1", str(setting), f"most critical solutions change {modes[1]} characteristics", verdict,
+                         f"most frequent {modes[0]} here, {modes[1]} published; mean {means[0]:.1f} and {means[1]:.1f}")
+
+
+def _orders(frame: pd.DataFrame) -> Iterator[Conclusion]:
+    for setting, rows in frame[frame["j"] == "any"].groupby("setting", sort=False):
+        told = rows.dropna(subset=[f"percent {HERE}", f"percent {THERE}"])
+        if told.empty:
+            continue
+        first = told.sort_values(f"percent {THERE}", ascending=False, kind="stable")["characteristic"].head(3)
+        mine = told.sort_values(f"percent {HERE}", ascending=False, kind="stable")["characteristic"].head(3)
+        yield _by_rank("RQ3.2", str(setting), f"changed most often: {', '.join(first)}", told, "percent", f"; here {', '.join(mine)}")
+
+
+def _weather(frame: pd.DataFrame) -> Iterator[Conclusion]:
+    for (setting, other), rows in frame.groupby(["setting", "other"], sort=False):
+        told = rows.dropna(subset=[f"difference {HERE}", f"difference {THERE}"])
+        yield _by_rank("weather", f"{setting}, {other}", "how much more often each characteristic is changed in the worse weather",
+                       told, "difference", "")
+
+
+def _by_rank(question: str, setting: str, words: str, told: pd.DataFrame, column: str, more: str) -> Conclusion:
+    rho = rank_correlation(*(told[f"{column} {side}"].to_numpy(dtype=float) for side in (HERE, THERE)))
+    verdict = OPEN if rho is None else HOLDS if rho >= CLOSE else DIRECTION if rho >= ALIKE else DIFFERS
+    return Conclusion(question, setting, words, verdict, ("no rank correlation" if rho is None else f"rank correlation {rho:.2f}") + more)
+
+
+def _directions(frame: pd.DataFrame) -> Iterator[Conclusion]:
+    for setting, rows in frame[frame["j"] == "any"].groupby("setting", sort=False):
+        leaning = {}
+        for side in (HERE, THERE):
+            counts = rows.pivot_table(index="characteristic", columns="direction", values=f"n {side}", aggfunc="sum", sort=False)
+            both = (counts["increase"] + counts["decrease"]).replace(0, np.nan)
+            leaning[side] = ((counts["increase"] - counts["decrease"]) / both).astype(float)
+        clear = leaning[THERE].abs() >= LEANING
+        same = np.sign(leaning[HERE][clear]) == np.sign(leaning[THERE][clear])
+        if not len(same):
+            continue
+        share = float(same.mean())
+        verdict = HOLDS if share >= MOSTLY else DIRECTION if share >= PARTLY else DIFFERS
+        other = ", ".join(map(str, same.index[~same]))
+        yield Conclusion("RQ3.3", str(setting), f"{int(clear.sum())} characteristics are changed mostly one way", verdict,
+                         f"{int(same.sum())} of them the same way here" + (f", but not {other}" if other else ""))
+
+
+def _ratios(question: str, who: str, value: str, words: str) -> Any:
+    def read(frame: pd.DataFrame) -> Iterator[Conclusion]:
+        rows = frame[frame["j"] == "any"] if "j" in frame else frame
+        for row in rows.to_dict("records"):
+            here, there = (_number(row[f"{value} {side}"]) for side in (HERE, THERE))
+            subject = f"{ALGORITHM_TITLES.get(row[who], row[who])}: {words}"
+            if here is None or there is None:
+                missing = " and ".join(side for side, number in ((HERE, here), (THERE, there)) if number is None)
+                yield Conclusion(question, row["setting"], subject, OPEN, f"there is none {missing}")
+                continue
+            yield Conclusion(question, row["setting"], subject, _ratio(here, there), f"{here:.3g} here, {there:.3g} published")
+    return read
+
+
+def _ratio(here: float, there: float) -> str:
+    if here == there or (here * there > 0 and 1 / FACTOR <= here / there <= FACTOR):
+        return HOLDS
+    return DIRECTION if here * there > 0 else DIFFERS
+
+
+def _combinations(frame: pd.DataFrame) -> Iterator[Conclusion]:
+    for setting, rows in frame.groupby("setting", sort=False):
+        here, there = (rows.sort_values("place")[f"characteristics {side}"].dropna().tolist() for side in (HERE, THERE))
+        if not here or not there:
+            continue
+        shared = len(set(here[0].split(", ")) & set(there[0].split(", ")))
+        verdict = HOLDS if here[0] == there[0] else DIRECTION if there[0] in here or here[0] in there or shared >= 3 else DIFFERS
+        yield Conclusion("combinations", str(setting), f"four changed most often together: {there[0]}", verdict,
+                         f"here {here[0]}; {shared} of four the same")
+
+
+def _number(value: object) -> float | None:
+    return None if value is None or pd.isna(value) else float(value)  # type: ignore[arg-type, call-overload]
+
+
+READERS: Mapping[str, Any] = {
+    "rq1": _tests("RQ1", "algorithm", "safer than the original vehicle/more unsafe than the original vehicle"),
+    "rq2": _tests("RQ2", "baseline", "NSGA-II does better/NSGA-II does worse"),
+    "rq3.1": _numbers, "rq3.2": _orders, "rq3.3": _directions,
+    "rq3.3-safety": _ratios("RQ3.3", "quantity", "value", "mean change of safety in critical solutions"),
+    "collisions": _ratios("collisions", "algorithm", "share", "share of the solutions that collide"),
+    "combinations": _combinations, "weather": _weather}
