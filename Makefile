@@ -2,7 +2,7 @@
 PYTHON ?= python3
 RUN := .venv/bin/python
 
-.PHONY: study test test-all lint benchmark clean
+.PHONY: study test test-all lint docs benchmark clean
 
 study: .venv/installed
 	$(RUN) -m safevar_sumo study rain
@@ -18,13 +18,16 @@ lint: .venv/installed
 	$(RUN) -m mypy
 	.venv/bin/lint-imports --no-logo
 
+docs: .venv/installed
+	$(RUN) -m mkdocs build --quiet --strict
+
 benchmark: .venv/installed
 	$(RUN) benchmarks/evaluation.py
 	$(RUN) benchmarks/campaign.py
 
 .venv/installed: setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(RUN) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[test]"
+	$(RUN) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[test,docs]"
 	touch $@
 
 clean:
