@@ -30,7 +30,8 @@ def blocks(page: str) -> list[Block]:
     return [Block(*one) for one in found]
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)])
+@pytest.mark.parametrize("page", [
+    pytest.param(page, marks=[] if page == "README.md" else [pytest.mark.slow]) for page in PAGES if blocks(page)])
 def test_every_block_of_a_page_does_what_it_says(page: str, in_tmp: Path) -> None:
     names: dict[str, Any] = {}
     for block in blocks(page):
