@@ -9,11 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.campaign.gathering import BATCH, Gathering
-from safevar_sumo.campaign.interrupts import interrupts_between_waits
 from safevar_sumo.campaign.isolation import check_isolation
 from safevar_sumo.campaign.keys import RunKey, algorithm_of, run_generator
 from safevar_sumo.campaign.run import Observer, Run
-from safevar_sumo.computing import PersistentPool, Pool, packed
+from safevar_sumo.computing import PersistentPool, Pool, first_of, packed, result_of
 from safevar_sumo.metrics import SAFEVAR, Scoring
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ORIGINAL, Failure, JournalBusy, ResultsDirectory
@@ -81,23 +80,22 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
             gathering.ask(run, run.missing)
 
     try:
-        with interrupts_between_waits() as first_of:
-            while waiting or runs:
-                while waiting and len(runs) < gathering.runs_wanted(study.search.population):
-                    key = waiting.popleft()
-                    try:
-                        journal = results.journal(str(key))
-                    except JournalBusy:
-                        campaign.busy.append(key)
-                        continue
-                    search = algorithm_of(key.algorithm, study).search(problem, run_generator(study, key))
-                    runs.add(run := Run(key, search, journal, observer, study.search.evaluations, retry=retry_failed))
-                    go_on(run)
-                gathering.send()
-                for future in first_of(gathering.under_way):
-                    for run, evaluations in gathering.take(future):
-                        if run.take(evaluations):
-                            go_on(run)
+        while waiting or runs:
+            while waiting and len(runs) < gathering.runs_wanted(study.search.population):
+                key = waiting.popleft()
+                try:
+                    journal = results.journal(str(key))
+                except JournalBusy:
+                    campaign.busy.append(key)
+                    continue
+                search = algorithm_of(key.algorithm, study).search(problem, run_generator(study, key))
+                runs.add(run := Run(key, search, journal, observer, study.search.evaluations, retry=retry_failed))
+                go_on(run)
+            gathering.send()
+            for future in first_of(gathering.under_way):
+                for run, evaluations in gathering.take(future):
+                    if run.take(evaluations):
+                        go_on(run)
     finally:
         for run in runs:
             run.close()
@@ -109,7 +107,7 @@ def _original(study: Study, work: bytes, characteristics: CharacteristicSet, res
               observer: Observer) -> Evaluations:
     """The original vehicle's evaluation, simulated once; where it fails, or models mix settings up, the study is at fault."""
     def simulated() -> Evaluations:
-        return pool.submit(work, characteristics.original[np.newaxis], must_succeed=True).result()
+        return result_of(pool.submit(work, characteristics.original[np.newaxis], must_succeed=True))
 
     try:
         journal = results.journal(ORIGINAL)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.campaign.gathering import BATCH
-from safevar_sumo.computing import PersistentPool, Pool, packed
+from safevar_sumo.computing import PersistentPool, Pool, packed, result_of
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -39,10 +39,10 @@ def forecast(study: Study, runs: int, pool: Pool, batch: int | None = None) -> F
         drawn = [characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (size, len(characteristics))))
                  for _ in range(number * pool.workers)]
         for future in [persistent.submit(work, settings) for settings in drawn]:
-            future.result()
+            result_of(future)
         return time.perf_counter() - start
 
-    persistent.submit(work, characteristics.original[np.newaxis], must_succeed=True).result()
+    result_of(persistent.submit(work, characteristics.original[np.newaxis], must_succeed=True))
     probe(1)  # starts the workers and builds the network
     rate = PROBE_BATCHES * pool.workers * size / probe(PROBE_BATCHES)
     evaluations = runs * study.search.evaluations

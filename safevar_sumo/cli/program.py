@@ -59,6 +59,7 @@ def commands() -> None:
 
 def main() -> None:
     """Run the program; its exit code is 0, 1 (failed), 2 (bad input) or 130 (interrupted)."""
+    _have_standard_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -81,6 +82,15 @@ def main() -> None:
         _drop_output()
         _fail(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}", 1)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _have_standard_streams() -> None:
+    """Who starts us with a standard stream closed is not told what goes there; no file of ours may get its number."""
+    while (handle := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(handle, True)
+    os.close(handle)
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
 
 
 def _drop_output() -> None:

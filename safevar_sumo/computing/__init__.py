@@ -3,9 +3,10 @@
 from safevar_sumo.computing.base import Pool, PoolLostError, WorkerLostError, evaluate_batch, packed
 from safevar_sumo.computing.cluster import cluster_pool
 from safevar_sumo.computing.identity import identity_of
+from safevar_sumo.computing.interrupts import first_of, result_of
 from safevar_sumo.computing.local import available_cores, local_pool
 from safevar_sumo.computing.many import evaluate_all
 from safevar_sumo.computing.persistent import PersistentPool
 
 __all__ = ["PersistentPool", "Pool", "PoolLostError", "WorkerLostError", "available_cores", "cluster_pool", "evaluate_all",
-           "evaluate_batch", "identity_of", "local_pool", "packed"]
+           "evaluate_batch", "first_of", "identity_of", "local_pool", "packed", "result_of"]

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.computing.base import PoolLostError, WorkerLostError, evaluate_batch
+from safevar_sumo.computing.interrupts import interrupts_noted
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray
 
@@ -59,10 +60,11 @@ def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise InputError("--cluster", f"nobody answers at {address!r}: {error}", legal) from None
-    try:
-        yield ClusterPool(client, time_limit)
-    finally:
-        client.close()
+    with interrupts_noted():
+        try:
+            yield ClusterPool(client, time_limit)
+        finally:
+            client.close()
 
 
 class ClusterPool:

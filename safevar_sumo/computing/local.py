@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from safevar_sumo.computing.base import PoolLostError, WorkerLostError, evaluate_batch
+from safevar_sumo.computing.interrupts import interrupts_noted
 from safevar_sumo.errors import EnvironmentFault, SafevarError, told
 from safevar_sumo.records import Evaluations, FloatArray
 
@@ -42,11 +43,12 @@ def local_pool(jobs: int, time_limit: float) -> Iterator[LocalPool]:
     time_limit
         A batch that takes longer is stopped [s].
     """
-    pool = LocalPool(jobs, time_limit)
-    try:
-        yield pool
-    finally:
-        pool.close()
+    with interrupts_noted():
+        pool = LocalPool(jobs, time_limit)
+        try:
+            yield pool
+        finally:
+            pool.close()
 
 
 class LocalPool:
@@ -90,6 +92,8 @@ class LocalPool:
 
     def _started(self) -> _Worker:
         for _ in range(STARTS):
+            if self._closed:
+                raise PoolLostError("the worker processes are closed down")
             worker = _Worker()
             self._living.add(worker)
             if self._closed:

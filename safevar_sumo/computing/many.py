@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import as_completed
 
 import numpy as np
 
 from safevar_sumo.computing.base import Pool, packed
+from safevar_sumo.computing.interrupts import first_of
 from safevar_sumo.computing.persistent import PersistentPool
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
@@ -27,7 +27,8 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     starts = range(0, len(unique), BATCH)
     futures = {persistent.submit(work, unique[start:start + BATCH]): start for start in starts}
     parts: dict[int, Evaluations] = {}
-    for future in as_completed(futures):
-        parts[futures[future]] = future.result()
-        done(len(parts[futures[future]]))
+    while len(parts) < len(futures):
+        for future in first_of([future for future, start in futures.items() if start not in parts]):
+            parts[futures[future]] = future.result()
+            done(len(parts[futures[future]]))
     return Evaluations.concatenate([parts[start] for start in starts]).take(row_of.ravel())

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.computing import PersistentPool, Pool, evaluate_all, packed
+from safevar_sumo.computing import PersistentPool, Pool, evaluate_all, packed, result_of
 from safevar_sumo.computing.identity import inputs_of
 from safevar_sumo.computing.many import BATCH
 from safevar_sumo.errors import InputError, SimulationError
@@ -178,7 +178,7 @@ class _Trial:
 
     def costs(self, studies: Sequence[Study]) -> list[float]:
         submitted = [self._submit(study) for study in studies]
-        return [self._cost(Evaluations.concatenate([part.result() for part in parts])) for parts in submitted]
+        return [self._cost(Evaluations.concatenate([result_of(part) for part in parts])) for parts in submitted]
 
     def _submit(self, study: Study) -> list[Future[Evaluations]]:
         work, size = packed(study, self._inputs, alone=self.alone), len(self._settings) if self.alone else BATCH

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import pkgutil
 import subprocess
 import sys
@@ -53,3 +54,11 @@ def test_one_simulation_loads_sumo_and_no_statistics() -> None:
     code = "from click.testing import CliRunner\nfrom safevar_sumo.cli.program import commands\n"
     assert loaded(code + "print(CliRunner().invoke(commands, ['list']).exit_code)") == set()
     assert loaded(code + "print(CliRunner().invoke(commands, ['simulate', 'sun', '--json']).exit_code)") <= {"libsumo", "traci"}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a shell that closes streams")
+@pytest.mark.parametrize(("streams", "code"), [(">&-", 0), (">&- 2>&- <&-", 0), ("> /dev/full", 1)])
+def test_closed_and_full_streams_are_no_traceback(streams: str, code: int) -> None:
+    done = subprocess.run(f"{sys.executable} -m safevar_sumo list {streams}", shell=True, capture_output=True, text=True, check=False)
+    assert done.returncode == code
+    assert done.stderr in ("", "safevar-sumo: No space left on device\n")

@@ -13,12 +13,15 @@ import psutil
 
 SAFEVAR = [sys.executable, "-m", "safevar_sumo"]
 WAIT = 60.0
+running: list[subprocess.Popen[str]] = []
+"""What a test has started."""
 
 
 def started(*arguments: str, **options: object) -> subprocess.Popen[str]:
     """A command in a process group of its own, as a shell starts it."""
-    return subprocess.Popen([*SAFEVAR, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,  # type: ignore[call-overload,no-any-return]
-                            start_new_session=True, **options)
+    running.append(subprocess.Popen([*SAFEVAR, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,  # type: ignore[call-overload]
+                                    start_new_session=True, **options))
+    return running[-1]
 
 
 def until(condition: Callable[[], bool], process: subprocess.Popen[str] | None = None) -> None:
