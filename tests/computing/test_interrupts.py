@@ -20,7 +20,7 @@ def press() -> None:
 
 def test_ctrl_c_is_raised_where_a_result_is_waited_for_and_nowhere_else() -> None:
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), interrupts_noted():
+    with pytest.raises(KeyboardInterrupt), interrupts_noted():  # noqa: PT012
         press()
         press()
         with pytest.raises(KeyboardInterrupt):
@@ -41,7 +41,7 @@ def test_ctrl_c_during_a_wait_is_noticed_soon() -> None:
 
 def test_what_nobody_has_waited_for_is_raised_at_the_end() -> None:
     done = []
-    with pytest.raises(KeyboardInterrupt), interrupts_noted():
+    with pytest.raises(KeyboardInterrupt), interrupts_noted():  # noqa: PT012
         press()
         done.append(True)
     assert done
