@@ -13,6 +13,10 @@ from slippery import make_results
 from safevar_sumo.simulation import System, assemble
 from safevar_sumo.study import load_study, study_names
 
+collect_ignore = [] if os.name == "posix" else [
+    "computing/test_local_pool.py", "end_to_end/test_cluster.py", "end_to_end/test_faults.py", "end_to_end/test_identity.py"]
+"""Tests that kill, stop and interrupt processes as POSIX has it."""
+
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("default")
 

@@ -19,10 +19,11 @@ import numpy as np
 
 from safevar_sumo.computing.base import PoolLostError, WorkerLostError, evaluate_batch
 from safevar_sumo.computing.interrupts import interrupts_noted
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, told
 from safevar_sumo.records import Evaluations, FloatArray
 
 ADDRESS = re.compile(r"[a-z]+://[^\s/]+:\d+/?")
+CERTIFICATES = "for tls:// certificates in Dask's configuration: distributed.comm.tls.ca-file and .client.cert, .client.key"
 CONNECT_TIMEOUT = 10.0
 """How long an address may take to answer [s]."""
 SECONDS_BETWEEN_COUNTS = 5.0
@@ -60,6 +61,8 @@ def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise InputError("--cluster", f"nobody answers at {address!r}: {error}", legal) from None
+    except (TypeError, RuntimeError) as error:
+        raise InputError("--cluster", f"{address!r}: {told(error)}", CERTIFICATES) from None
     with interrupts_noted():
         try:
             yield ClusterPool(client, time_limit)

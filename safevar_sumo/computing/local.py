@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from multiprocessing import connection, resource_tracker
+from multiprocessing import connection
 from types import ModuleType
 from typing import Any
 
@@ -204,6 +204,9 @@ def _end_with_the_caller() -> None:
 
 def _leave_interrupts_to_the_caller() -> None:
     """Ctrl-C reaches all processes of a terminal: block it in this thread, whose processes then never see it, however young."""
+    if sys.platform == "win32":  # there are no signal masks: a process ignores interrupts once it serves
+        return
+    from multiprocessing import resource_tracker
+
     resource_tracker.ensure_running()  # its start would unblock interrupts
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -38,7 +38,7 @@ def cached(folder: str, name: str, build: Callable[[Path], None]) -> Path:
                 build(Path(made))
                 built = Path(made) / name
                 checksum = built.with_name(name + CHECKSUM)
-                checksum.write_text(_sha256(built))
+                checksum.write_text(_sha256(built), encoding="ascii")
                 for file in (built, checksum):
                     _sync(file)
                     os.replace(file, target.with_name(file.name))
@@ -49,7 +49,7 @@ def cached(folder: str, name: str, build: Callable[[Path], None]) -> Path:
 
 def _intact(target: Path) -> bool:
     try:
-        return target.with_name(target.name + CHECKSUM).read_text() == _sha256(target)
+        return target.with_name(target.name + CHECKSUM).read_text(encoding="ascii") == _sha256(target)
     except (OSError, UnicodeDecodeError):
         return False
 

@@ -15,6 +15,9 @@ def _nothing_left_running() -> Iterator[None]:
     yield
     for process in processes.running:
         if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
+            if os.name == "posix":
+                os.killpg(process.pid, signal.SIGKILL)
+            else:
+                process.kill()
             process.communicate()
     processes.running.clear()

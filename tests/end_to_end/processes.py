@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -47,10 +48,10 @@ def workers_of(process: subprocess.Popen[str]) -> list[psutil.Process]:
 
 def left_of_group(process: subprocess.Popen[str]) -> list[str]:
     """What still lives of a command's process group."""
-    left = []
-    for one in psutil.process_iter():
+    left: list[str] = []
+    for one in psutil.process_iter() if os.name == "posix" else ():
         try:
-            if psutil.os.getpgid(one.pid) == process.pid and one.status() != psutil.STATUS_ZOMBIE:
+            if os.getpgid(one.pid) == process.pid and one.status() != psutil.STATUS_ZOMBIE:
                 left.append(" ".join(one.cmdline()))
         except (psutil.Error, ProcessLookupError):
             continue

@@ -16,6 +16,7 @@ import pytest
 from processes import ended, killed, started, until, written
 
 from safevar_sumo.computing import cluster
+from safevar_sumo.errors import InputError
 from safevar_sumo.results import load
 
 STUDY = 'extends = "smoke"\nname = "small"\n[search]\nalgorithms = ["nsga2", "rs", "safe_fuzzer"]\nevaluations = 150\n'
@@ -108,6 +109,11 @@ def test_an_address_that_nobody_answers_is_told_in_time(in_tmp: Path) -> None:
     assert "--cluster: nobody answers at 'tcp://127.0.0.1:9'" in errors
     assert len(errors.strip().splitlines()) == 2
     assert not Path("out").exists()
+
+
+def test_an_encrypted_scheduler_needs_certificates_from_the_configuration() -> None:
+    with pytest.raises(InputError, match=r"certificates in Dask's configuration"), cluster.cluster_pool("tls://127.0.0.1:9", 9.0):
+        pass
 
 
 def test_a_worker_with_other_versions_computes_nothing() -> None:

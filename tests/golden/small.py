@@ -1,0 +1,72 @@
+"""The originals of the shipped studies and small searches of them, computed in this process; run as a program, renews golden.json."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from concurrent.futures import Future
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from safevar_sumo.campaign import all_runs, carry_out
+from safevar_sumo.computing import evaluate_batch, identity_of
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import ResultsDirectory, load
+from safevar_sumo.simulation import assemble
+from safevar_sumo.study import Study, load_study
+
+STUDIES = ("sun", "rain", "lgsvl", "native")
+FILE = Path(__file__).with_name("golden.json")
+
+
+class Here:
+    """A pool that computes in this process, at once."""
+
+    workers = 1
+
+    def submit(self, work: bytes, settings: FloatArray) -> Future[Evaluations]:
+        future: Future[Evaluations] = Future()
+        future.set_result(evaluate_batch(work, settings))
+        return future
+
+
+class Silent:
+    """An observer that nobody hears."""
+
+    def evaluated(self, *_: object) -> None: ...
+    def finished(self, *_: object) -> None: ...
+    def warned(self, message: str) -> None: ...
+
+
+def small(name: str) -> Study:
+    """A shipped study with a search of a second."""
+    study = load_study(name)
+    search = msgspec.structs.replace(study.search, algorithms=["nsga2", "rs", "safe_fuzzer"], population=10, evaluations=40, runs=1)
+    return msgspec.structs.replace(study, search=search)
+
+
+def computed(name: str) -> dict[str, Any]:
+    """The original vehicle's evaluation, and a digest of the solutions of every algorithm."""
+    study = small(name)
+    with tempfile.TemporaryDirectory() as folder:
+        results = ResultsDirectory(Path(folder), study, identity_of(study, assemble(study)))
+        results.finish(carry_out(study, all_runs(study), results, Here(), Silent()).solutions)
+        found = load(folder)
+    digests = {algorithm: sha256(rows.to_csv(index=False, lineterminator="\n").encode()).hexdigest()
+               for algorithm, rows in found.solutions.groupby("algorithm")}
+    return {"original": found.manifest["original"], "solutions": digests}
+
+
+def platform_here() -> dict[str, str]:
+    """The platform as manifests tell it."""
+    study = small("native")
+    told: dict[str, str] = identity_of(study, assemble(study))["platform"]
+    return told
+
+
+if __name__ == "__main__":
+    golden = {"platform": platform_here(), "studies": {name: computed(name) for name in STUDIES}}
+    FILE.write_text(json.dumps(golden, indent=2) + "\n", encoding="utf-8", newline="\n")
