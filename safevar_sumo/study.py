@@ -121,9 +121,11 @@ class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where a study comes from; no part of what it is.
 
-    `places` are the folders of its file and of those that it extends, in which its plug-ins are looked up first.
+    `called` is the path that names it on the command line, if its name does not; `places` are the folders of its file and of those that it extends, in
+    which its plug-ins are looked up first.
     """
 
+    called: str = ""
     places: tuple[str, ...] = ()
 
 
@@ -235,7 +237,8 @@ def load_study(study: StudyLike, **changes: Any) -> Study:
         Naming file, key, value and what is legal.
     """
     source, raw, places = _given(study)
-    return msgspec.structs.replace(_checked(source, _merged(raw, changes)), origin=Origin(places=places))
+    called = study.origin.called if isinstance(study, Study) else str(source) if places else ""
+    return msgspec.structs.replace(_checked(source, _merged(raw, changes)), origin=Origin(called=called, places=places))
 
 
 def _given(study: StudyLike) -> tuple[object, dict[str, Any], tuple[str, ...]]:

@@ -58,8 +58,7 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     bars: Any = CampaignProgress(Console(stderr=True), chosen, keys, quiet=False)
     showing = bars if progress is True else nullcontext(progress or Unheard())
     with a_pool(chosen, jobs, cluster) as pool, showing as observer:
-        carried_out(chosen, system, keys, directory, pool, observer, batch, retry_failed=retry_failed,
-                    source=str(study) if isinstance(study, str | Path) else "")
+        carried_out(chosen, system, keys, directory, pool, observer, batch, retry_failed=retry_failed)
     return load(directory)
 
 
@@ -78,7 +77,7 @@ def prepared(study: StudyLike, source: str = "") -> tuple[Study, System]:
 
 
 def carried_out(study: Study, system: System, keys: list[RunKey], directory: Path, pool: Pool, observer: Observer,
-                batch: int | None, *, retry_failed: bool = False, source: str = "") -> Campaign:
+                batch: int | None, *, retry_failed: bool = False) -> Campaign:
     """Carry out runs of a study in a directory; with all of them finished, its solutions are written. See `carry_out`.
 
     Raises
@@ -87,7 +86,7 @@ def carried_out(study: Study, system: System, keys: list[RunKey], directory: Pat
         If another process works on one of the runs, or as `carry_out`.
     """
     results = ResultsDirectory(directory, study, identity_of(study, system), system.measuring.scoring)
-    campaign = carry_out(study, keys, results, pool, observer, batch, retry_failed=retry_failed, source=source)
+    campaign = carry_out(study, keys, results, pool, observer, batch, retry_failed=retry_failed)
     if campaign.busy:
         raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: the same again later finishes the study")
     if keys == all_runs(study):

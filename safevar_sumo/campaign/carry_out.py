@@ -36,7 +36,7 @@ class Campaign(NamedTuple):
 
 
 def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, pool: Pool, observer: Observer,
-              batch: int | None = None, *, retry_failed: bool = False, source: str = "") -> Campaign:
+              batch: int | None = None, *, retry_failed: bool = False) -> Campaign:
     """Carry out runs of a study, or finish what of them is unfinished.
 
     Parameters
@@ -51,8 +51,6 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
         Settings per SUMO simulation at the most, gathered from several runs.
     retry_failed
         Whether settings that could not be simulated before are tried again.
-    source
-        How the user calls the study, its name by default.
 
     Raises
     ------
@@ -60,7 +58,7 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
         If a journal cannot be written or the study itself is at fault.
     """
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    persistent, work = PersistentPool(pool, study, source), packed(study, results.manifest)
+    persistent, work = PersistentPool(pool, study), packed(study, results.manifest)
     original = _original(study, work, characteristics, results, persistent, observer)
     results.begin(original)
     problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,

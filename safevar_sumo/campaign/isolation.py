@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from safevar_sumo.computing import result_of
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
@@ -47,7 +48,7 @@ def check_isolation(study: Study, characteristics: CharacteristicSet, submit: Su
     ways: dict[str, Sequence[npt.NDArray[np.intp]]] = {
         "together": [order], "together again": [order], "in another order": [order[::-1]], "alone": list(order[:, np.newaxis])}
     running = {way: [(rows, submit(settings[rows])) for rows in batches] for way, batches in ways.items()}
-    found = {way: {int(row): future.result().take([i]) for rows, future in batches for i, row in enumerate(rows)}
+    found = {way: {int(row): result_of(future).take([i]) for rows, future in batches for i, row in enumerate(rows)}
              for way, batches in running.items()}
     for way, results in found.items():
         for row, result in results.items():

@@ -46,8 +46,7 @@ def study(study: str, batch: int | None, out: Path | None, jobs: int | None, clu
             return
         try:
             with CampaignProgress(Console(stderr=True), chosen, keys, quiet) as progress:
-                campaign = carried_out(chosen, system, keys, directory, pool, progress, batch, retry_failed=retry_failed,
-                                       source=study)
+                campaign = carried_out(chosen, system, keys, directory, pool, progress, batch, retry_failed=retry_failed)
         except KeyboardInterrupt:
             click.echo(f"what is computed is kept in {directory}: the same command goes on from there", err=True)
             raise

@@ -40,11 +40,11 @@ class PersistentPool:
     pool
         Computes batches.
     study
-        What is computed; who names it otherwise, such as by a path, gives that as `source`.
+        What is computed.
     """
 
-    def __init__(self, pool: Pool, study: Study, source: str = "") -> None:
-        self._pool, self._source, self._in_a_row = pool, source or study.name, 0
+    def __init__(self, pool: Pool, study: Study) -> None:
+        self._pool, self._source, self._in_a_row = pool, study.origin.called or study.name, 0
         self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
         self._foreign = [table.model for table in (study.vehicle, study.ads, study.scenario) if ":" in table.model]
 

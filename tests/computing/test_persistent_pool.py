@@ -14,12 +14,12 @@ from safevar_sumo.computing.persistent import ATTEMPTS
 from safevar_sumo.errors import EnvironmentFault, ForeignError, InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, Outcome
-from safevar_sumo.study import ModelTable, load_study
+from safevar_sumo.study import ModelTable, Origin, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 
 STUDY = load_study("sun")
 SUN = CharacteristicSet.of(STUDY.vehicle.characteristics)
-FOREIGN = msgspec.structs.replace(STUDY, ads=ModelTable(model="my_ads:Mine"))
+FOREIGN = msgspec.structs.replace(STUDY, ads=ModelTable(model="my_ads:Mine"), origin=Origin(called="my study.toml"))
 
 
 def settings(number: int) -> np.ndarray:
@@ -122,7 +122,7 @@ def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> No
 
     pool = ToldPool(fault)
     with pytest.raises(ForeignError) as told:
-        PersistentPool(pool, FOREIGN, "my study.toml").submit(b"", settings(50)).result(timeout=5)
+        PersistentPool(pool, FOREIGN).submit(b"", settings(50)).result(timeout=5)
     assert "ZeroDivisionError; again by: python -m safevar_sumo simulate 'my study.toml' --set " in str(told.value)
     assert f"--set {SUN.names[0]}=4313.0" in str(told.value)
     assert str(told.value).count("--set") == 1, "what is not changed need not be set"

@@ -84,7 +84,7 @@ def test_killed_ten_times_at_random_moments_and_resumed(whole: Path) -> None:
 
 def test_workers_killed_at_random_moments(whole: Path) -> None:
     moments, out, kills = random.Random(5), Path("out"), 0
-    process = started("study", "small.toml", "--out", "out", "--jobs", "2", "--batch", "2")
+    process = started("study", "small.toml", "--out", "out", "--jobs", "2", "--batch", "5")
     until(lambda: written(out) > 0, process)
     while process.poll() is None and kills < 6:
         time.sleep(moments.uniform(0.2, 0.6))
