@@ -121,8 +121,8 @@ class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where a study comes from; no part of what it is.
 
-    `called` is the path that names it on the command line, if its name does not; `places` are the folders of its file and of those that it extends, in
-    which its plug-ins are looked up first.
+    `called` is the path that names it on the command line, if its name does not; `places` are the folders of its file and
+    of those that it extends, in which its plug-ins are looked up first.
     """
 
     called: str = ""

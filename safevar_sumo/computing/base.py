@@ -9,10 +9,10 @@ from typing import Any, Protocol
 
 import msgspec
 
-from safevar_sumo.computing.identity import Inputs, changed, inputs_of
+from safevar_sumo.computing.identity import Inputs, changed, inputs_of, networks_of
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.simulation import System, assemble, network_files, score, simulate, simulate_alone
+from safevar_sumo.simulation import System, assemble, score, simulate, simulate_alone
 from safevar_sumo.study import Study
 
 SHARED = ("network", "sources", "code")
@@ -71,9 +71,9 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
         If the study's files are not those that the campaign began with.
     """
     system, network, alone = _system(work)
-    _refuse_changes(network, {"network": network_files(system.scenario.network)})
+    _refuse_changes(network, {"network": networks_of(system)})
     evaluations = score(system, settings, (simulate_alone if alone else simulate)(system, settings))
-    _refuse_changes(network, {"network": network_files(system.scenario.network)})
+    _refuse_changes(network, {"network": networks_of(system)})
     return evaluations
 
 

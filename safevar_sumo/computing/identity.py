@@ -5,12 +5,12 @@ from __future__ import annotations
 import platform
 from functools import cache
 from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from safevar_sumo.computing.sources import DIGITS, foreign_code, package_code
-from safevar_sumo.plugins import make_reachable
 from safevar_sumo.results import fixed
 from safevar_sumo.simulation import System, network_files
 from safevar_sumo.study import Study
@@ -34,19 +34,25 @@ def identity_of(study: Study, system: System) -> dict[str, Any]:
             names = {key: value for key, value in resolved[table]["parameters"].items() if isinstance(value, str)}
             resolved[table] = {**resolved[table], "parameters": {**msgspec.to_builtins(model), **names}}
     resolved["weather"] = msgspec.to_builtins(system.weather)
+    if system.matrix:
+        resolved["weathers"] = [msgspec.to_builtins(point.weather) for point in system.matrix]
     return {"resolved": resolved, **inputs_of(study, system), "platform": _platform()}
 
 
 def inputs_of(study: Study, system: System) -> Inputs:
     """Digests of the files that every worker must have alike."""
-    tables = (study.vehicle, study.ads, study.scenario)
-    make_reachable(study.origin.places)
-    return {
-        "network": network_files(system.scenario.network),
-        "sources": foreign_code(
-            [*(table.model for table in tables), *study.metrics.also, *study.search.objectives, *study.search.algorithms],
-            [*(table.parameters for table in tables), study.search.parameters]),
-        "code": dict(package_code())}
+    modules = [member.module for member in system.members if member.guard is not None]
+    modules += [name.partition(":")[0] for name in study.search.algorithms if ":" in name]
+    parameters = [study.vehicle.parameters, study.ads.parameters, study.scenario.parameters, study.search.parameters]
+    return {"network": networks_of(system), "sources": foreign_code(modules, parameters), "code": dict(package_code())}
+
+
+def networks_of(system: System) -> dict[str, str]:
+    """Digests of the files of all networks that settings are simulated on."""
+    folders = list(dict.fromkeys(point.scenario.network for point in system.points))
+    if len(folders) == 1:
+        return network_files(folders[0])
+    return {f"{Path(folder).name}/{name}": digest for folder in folders for name, digest in network_files(folder).items()}
 
 
 def changed(there: Inputs, here: Inputs) -> list[str]:

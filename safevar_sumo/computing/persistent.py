@@ -46,7 +46,8 @@ class PersistentPool:
     def __init__(self, pool: Pool, study: Study) -> None:
         self._pool, self._source, self._in_a_row = pool, study.origin.called or study.name, 0
         self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-        self._foreign = [table.model for table in (study.vehicle, study.ads, study.scenario) if ":" in table.model]
+        names = [study.vehicle.model, study.ads.model, study.scenario.model, *study.metrics.also, *study.search.objectives]
+        self._foreign = [name for name in dict.fromkeys(names) if ":" in name]
 
     @property
     def workers(self) -> int:

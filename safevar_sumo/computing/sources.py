@@ -6,7 +6,7 @@ import ast
 import importlib.util
 import sys
 import sysconfig
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -35,22 +35,19 @@ def package_code() -> dict[str, str]:
     return {path.relative_to(PACKAGE).as_posix(): digest_of(path) for path in files}
 
 
-def foreign_code(models: list[str], parameters: list[Any]) -> dict[str, str]:
-    """Digests of the files behind a study's models, by their names beside the model's.
+def foreign_code(modules: Iterable[str], parameters: Iterable[Any]) -> dict[str, str]:
+    """Digests of the files behind a study's plug-ins, by their names beside the plug-in's.
 
     Parameters
     ----------
-    models
-        As a study names them; those of the form `package.module:Name` come from outside.
+    modules
+        Of the plug-ins.
     parameters
         Of the models; a text among them that is the path of a file counts with its content.
     """
     found: dict[str, Path] = {}
-    for model in models:
-        module, colon, _ = model.partition(":")
-        if colon:
-            own = module.partition(".")[0]
-            _follow(module, own, found)
+    for module in modules:
+        _follow(module, module.partition(".")[0], found)
     files = {name: digest_of(path) for name, path in found.items()}
     return dict(sorted({**files, **{text: digest_of(Path(text)) for one in parameters for text in _files_in(one)}}.items()))
 

@@ -16,7 +16,7 @@ from safevar_sumo.study import Study, tables_of
 MANIFEST = "manifest.json"
 FORMAT = 2
 VERSIONED = ("safevar_sumo", "libsumo", "eclipse-sumo", "deap", "numpy")
-FREE = ("title", "published", "repeatability", "fit", "calibration")
+FREE = ("title", "published", "repeatability", "fit", "calibration", "variation", "correlations")
 """Keys of a study that change no result of a campaign."""
 FREE_OF_SEARCH = ("runs", "algorithms", "evaluations", "time_limit")
 """Keys of its search table that change no evaluation: which runs there are, how far they go, how long one may take."""
