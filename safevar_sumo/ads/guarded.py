@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -47,15 +48,22 @@ class PerVehicle:
         return drivers
 
     def drive(self, seen: Observation, memory: list[ScalarAds]) -> tuple[Command, list[ScalarAds]]:
-        pedals = np.empty((2, len(memory)))
-        for i, driver in enumerate(memory):
-            given = self._guard.call("drive", driver.drive, _one(seen, i))
-            pair = self._guard.parts("drive", given, "(throttle, brake), each in [0, 1]")
-            for place, name, value in zip(pedals, ("throttle", "brake"), pair, strict=True):
-                place[i] = value if type(value) is float and 0 <= value <= 1 else self._guard.numbers("drive", name, value, (), 0.0, 1.0)
-        return Command(*pedals), memory
+        pedals = [self._pedals(self._guard.call("drive", driver.drive, one)) for driver, one in zip(memory, _each(seen), strict=True)]
+        return Command(*np.array(pedals, dtype=float).reshape(len(memory), 2).T.copy()), memory
+
+    def _pedals(self, given: Any) -> tuple[float, float]:
+        if type(given) is tuple and len(given) == 2:
+            throttle, brake = given
+            if type(throttle) is type(brake) is float and 0 <= throttle <= 1 and 0 <= brake <= 1:
+                return throttle, brake  # nearly always: this is called for every vehicle in every step
+        throttle, brake = self._guard.parts("drive", given, "(throttle, brake), each in [0, 1]")
+        return self._pedal("throttle", throttle), self._pedal("brake", brake)
+
+    def _pedal(self, name: str, value: Any) -> float:
+        return float(self._guard.numbers("drive", name, value, (), 0.0, 1.0))
 
 
-def _one(seen: Observation, i: int) -> Observation:
-    """What vehicle `i` sees, as plain numbers."""
-    return Observation(*(float(value[i] if isinstance(value, np.ndarray) and value.ndim else value) for value in seen))  # type: ignore[arg-type]
+def _each(seen: Observation) -> Iterator[Observation]:
+    """What each vehicle sees, as plain numbers."""
+    columns = [value.tolist() if isinstance(value, np.ndarray) and value.ndim else repeat(float(value)) for value in seen]
+    return map(Observation._make, zip(*columns, strict=False))
