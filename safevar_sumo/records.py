@@ -136,6 +136,19 @@ class Drives:
     outcome: npt.NDArray[np.str_]
     collision_speed: FloatArray
 
+    def of(self, vehicles: slice) -> Drives:
+        """The drives of some of the vehicles."""
+        return Drives(
+            trace=self.trace.of(vehicles), encounter=Encounter._make(values[:, vehicles] for values in self.encounter),
+            outcome=self.outcome[vehicles], collision_speed=self.collision_speed[vehicles])
+
+    @property
+    def relative_speed(self) -> FloatArray:
+        """Speed of a collision relative to the obstacle along the vehicle's way [m/s], shape (N,); NaN without one."""
+        last = len(self.trace.time) - 1 - np.argmax(self.trace.active[::-1], axis=0)
+        theirs = np.broadcast_to(self.trace.obstacle_speed, self.trace.speed.shape)[last, np.arange(len(last))]
+        return np.asarray(self.collision_speed - theirs)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluations:

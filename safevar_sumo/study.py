@@ -6,7 +6,7 @@ import math
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import tomli_w
@@ -109,6 +109,29 @@ def label_of(algorithm: str) -> str:
     return algorithm.rpartition(":")[2]
 
 
+class TestTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A test of a matrix: its scenario at every combination of the values in `over`, in every one of the weathers.
+
+    `parameters` are added to those of the study's scenario; with another `model` they stand alone.
+    """
+
+    name: Annotated[str, Meta(min_length=1)]
+    model: str = ""
+    parameters: Parameters = {}
+    over: dict[str, Annotated[list[Any], Meta(min_length=1)]] = {}
+    weathers: list[str] = []
+
+
+class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Several scenario points in which every setting is simulated.
+
+    `aggregate` is what becomes of their safety degrees: that of the point in which the setting comes off worst, or the mean.
+    """
+
+    tests: Annotated[list[TestTable], Meta(min_length=1)]
+    aggregate: Literal["worst", "mean"] = "worst"
+
+
 class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A parameter that may be calibrated: its bounds in `unit`, and what it means."""
 
@@ -155,6 +178,7 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole study as its TOML file gives it; `load_study` reads one.
 
+    `matrix` are the scenario points that it is simulated in, if there is more than the one scenario;
     `step_length` is the simulation's time step [s], by default the one of the network's options;
     `published` are the original vehicle's metrics in the published study, by name, as far as there are any;
     `repeatability` are standard deviations of repeats of one setting there;
@@ -170,6 +194,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     ads: ModelTable
     metrics: MetricsTable
     search: SearchTable
+    matrix: MatrixTable | None = None
     step_length: Annotated[float, Meta(ge=0.001, le=1)] | None = None
     published: dict[str, float] = {}
     repeatability: dict[str, Annotated[float, Meta(gt=0, le=1e6)]] = {}

@@ -3,7 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
+from safevar_sumo.scenarios.along import Along
 from safevar_sumo.scenarios.base import VUT, Lane, Point, Scenario, Scene, World
+from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.guarded import SCENARIO_CONTRACT, GuardedScenario
 from safevar_sumo.scenarios.lead_vehicle_stopped import LeadVehicleStopped
@@ -12,6 +14,8 @@ from safevar_sumo.scenarios.weather import WEATHERS, weather_of
 
 SCENARIOS: Mapping[str, type[Any]] = {
     "pedestrian_crossing": PedestrianCrossing,
+    "along": Along,
+    "car_to_car": CarToCar,
     "crossing": Crossing,
     "lead_vehicle_stopped": LeadVehicleStopped,
 }

@@ -39,6 +39,9 @@ class World(Protocol):
     def person_positions(self, actor: str) -> FloatArray:
         """Positions of a person in its N copies; shape (N, 2) [m]."""
 
+    def speeds(self) -> FloatArray:
+        """Speeds of the vehicles under test; shape (N,) [m/s]."""
+
     def vehicle_length(self, actor: str) -> float:
         """Length of a vehicle [m]."""
 

@@ -22,6 +22,8 @@ PARKED_GAP = 1.0
 PARKED_LENGTH = {"parked_small": 4.25, "parked_large": 4.5}
 """The middle of what the protocol allows, 4.1 to 4.4 and 4.3 to 4.7 m."""
 PARKED_WIDTH = 1.8
+WALKS_ON = 5.0
+"""How far past the middle of the lane it walks before it stands [m]."""
 Metres = Annotated[float, Meta(ge=0, le=100)]
 
 
@@ -131,7 +133,8 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             "vType[@id='vut']": {"length": repr(self.vut_length), "width": repr(self.vut_width)},
             "vehicle[@id='vut']": {"departPos": repr(front), "departSpeed": repr(self.speed * KMH)},
             "person[@id='pedestrian']": {"type": self._of("target"), "departPos": repr(abs(stands - begins))},
-            "person[@id='pedestrian']/walk": {"edges": " ".join(walks_on), "speed": repr(self._of("target_speed") * KMH)},
+            "person[@id='pedestrian']/walk": {
+                "edges": " ".join(walks_on), "speed": repr(self._of("target_speed") * KMH), "arrivalPos": "-1" if self._sign > 0 else "1"},
         }
         return {**changes, **self._parked(frame, path, roads)}
 
@@ -157,7 +160,8 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
         front = memory.frame.along(world.vehicle_positions(VUT))
         lateral = self._lateral(memory.frame, world)
-        now, then = memory.walk.travelled(memory.sample * step), memory.walk.travelled((memory.sample + 1) * step)
+        across = self._of("lateral_start") + WALKS_ON
+        now, then = (min(memory.walk.travelled(sample * step), across) for sample in (memory.sample, memory.sample + 1))
         pace = (then - now) / step
         if pace != memory.given:
             world.walk(PEDESTRIAN, pace)

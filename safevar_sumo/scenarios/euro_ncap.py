@@ -71,6 +71,13 @@ class Walk(NamedTuple):
             return self.speed * since - self.run_up
         return self.speed * self.speed / (4 * self.run_up) * since * since
 
+    def pace(self, time: float) -> float:
+        """Speed [m/s] at a time [s]."""
+        since = max(time - self.begin, 0.0)
+        if not self.run_up or since >= 2 * self.run_up / self.speed:
+            return self.speed
+        return self.speed * self.speed / (2 * self.run_up) * since
+
 
 def lateral_of(location: float, width: float) -> float:
     """Offset from the middle of a vehicle's front of an impact location, 0 to 100 % of its width [m]."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Drives, Evaluations, FloatArray, Outcome, Trace
-from safevar_sumo.scenarios import VUT
+from safevar_sumo.scenarios import VUT, Point
 from safevar_sumo.simulation.parts import Parts
 from safevar_sumo.simulation.staging import staged
 from safevar_sumo.simulation.sumo import Engine, SumoWorld, world_on
@@ -16,14 +17,6 @@ from safevar_sumo.simulation.system import System
 from safevar_sumo.vehicles import at_start
 
 Watcher = Callable[[SumoWorld], None]
-
-
-def evaluate(system: System, settings: FloatArray) -> Evaluations:
-    """Simulate filtered settings, shape (N, n), in one batch and score them.
-
-    A pure function: row i of the result depends on row i of `settings` alone, to the bit.
-    """
-    return score(system, settings, simulate(system, settings))
 
 
 def score(system: System, settings: FloatArray, run: Drives) -> Evaluations:
@@ -38,9 +31,11 @@ def score(system: System, settings: FloatArray, run: Drives) -> Evaluations:
         f_num_diff=system.characteristics.number_changed(settings))
 
 
-def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = (),
+def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = (),
              watch: Watcher | None = None) -> Drives:
-    """Run the scenario once for every setting; shape (N, n). `watch` is shown the world at every sample.
+    """Drive every setting, shape (N, n), at every one of the points, which share a network; `watch` is shown the world at every sample.
+
+    The drives at the first point come first, then those at the second, and so on.
 
     Raises
     ------
@@ -52,7 +47,7 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSU
     options = (*step_options(system), *options)
     first, *others = [staged(point.scenario) for point in system.points]
     with world_on(first, len(settings), engine, options, others) as world:
-        return drive(system, settings, world, watch)
+        return drive(system, np.tile(settings, (len(system.points), 1)), world, watch)
 
 
 def step_options(system: System) -> tuple[str, ...]:
@@ -61,10 +56,13 @@ def step_options(system: System) -> tuple[str, ...]:
 
 
 def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher | None = None) -> Drives:
-    """Drive the vehicles of an open world that nobody has stepped yet; see `simulate`."""
+    """Drive the vehicles of an open world that nobody has stepped yet; see `drive_all`.
+
+    With several points the k-th part of the settings is in the k-th of them.
+    """
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    prepared = vehicle.prepare(characteristics, system.weather.road_friction, step)
+    prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step)
     world.set_types(vehicle.sumo_type(prepared))
     world.depart()
     length = world.vehicle_length(VUT)
@@ -94,6 +92,12 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
         world.advance(np.where(verdict.open, state.speed, 0.0))
     trace = log.trace(sample + 1, step, length)
     return Drives(trace=trace, encounter=parts.encounter(trace), outcome=verdict.outcome(), collision_speed=verdict.collision_speed)
+
+
+def _road_friction(points: Sequence[Point], n: int) -> Any:
+    """Factor on the tyres' friction: a number, or shape (n,) where the points differ."""
+    factors = [point.weather.road_friction for point in points]
+    return factors[0] if len(set(factors)) == 1 else np.repeat(factors, n // len(points))
 
 
 class _Log:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.records import Drives, FloatArray
-from safevar_sumo.simulation.batch import simulate
+from safevar_sumo.simulation.matrix import simulate
 from safevar_sumo.simulation.network import copied_network, copy_and_name
 from safevar_sumo.simulation.sumo import SumoWorld
 from safevar_sumo.simulation.system import System

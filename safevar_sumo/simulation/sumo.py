@@ -46,9 +46,10 @@ class Engine(StrEnum):
 class SumoWorld:
     """N copies of a network under simulation; made by `open_world`. Shapes: (N,) or (N, 2)."""
 
-    def __init__(self, api: Any, n: int, *, first: int = 0, watched: bool = False, standing: StandingSumo | None = None) -> None:
+    def __init__(self, api: Any, n: int, *, first: int = 0, watched: bool = False, standing: StandingSumo | None = None,
+                 whole: SumoWorld | None = None) -> None:
         self._api, self.n, self._first, self._standing = api, n, first, standing
-        self._parts: list[SumoWorld] = []
+        self._parts, self._whole = list[SumoWorld](), whole
         self._left: dict[str, tuple[float, tuple[float, float]]] = {}
         """Speed and position of vehicles under test that have left the road."""
         self._ids: dict[str, list[str]] = {}
@@ -132,6 +133,8 @@ class SumoWorld:
 
     def _looked_up(self, actor: str, position: Callable[[str], tuple[float, float]]) -> FloatArray:
         """Positions in this step; whoever asks again gets the same array."""
+        if self._whole is not None and actor == VUT:
+            return self._whole.vehicle_positions(VUT)[self._first:self._first + self.n]
         if actor not in self._positions:
             found = (self._left[name][1] if name in self._left else position(name) for name in self.ids(actor))
             self._positions[actor] = np.fromiter(chain.from_iterable(found), float, 2 * self.n).reshape(self.n, 2)
@@ -176,7 +179,7 @@ class SumoWorld:
 
     def part(self, first: int, n: int) -> SumoWorld:
         """The world of `n` copies alone, from the `first`."""
-        part = SumoWorld(self._api, n, first=first)
+        part = SumoWorld(self._api, n, first=first, whole=self)
         part._left = self._left
         self._parts.append(part)
         return part

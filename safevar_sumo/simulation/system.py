@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +21,7 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.simulation.measuring import TAKEN, Measuring, measuring_of
 from safevar_sumo.simulation.network import OPTIONS, folder_of, is_folder
 from safevar_sumo.simulation.options import check_options
-from safevar_sumo.study import MetricsTable, ModelTable, Study, VehicleTable, Weather
+from safevar_sumo.study import MetricsTable, ModelTable, Study, TestTable, VehicleTable, Weather
 from safevar_sumo.vehicles import VEHICLE_CONTRACT, VEHICLES, CharacteristicSet, GuardedVehicle, Vehicle, calibration_drive
 
 
@@ -52,11 +54,16 @@ class System:
     measuring: Measuring
     step_length: float | None = None
     matrix: tuple[Point, ...] = ()
+    aggregate: str = "worst"
 
     @property
     def points(self) -> tuple[Point, ...]:
         """Where a setting is simulated: the matrix, or the study's one scenario."""
         return self.matrix or (Point(self.scenario, self.weather),)
+
+    def at(self, point: Point) -> System:
+        """The same at one point alone."""
+        return replace(self, scenario=point.scenario, weather=point.weather, matrix=())
 
 
 def assemble(study: Study, source: str = "") -> System:
@@ -79,7 +86,8 @@ def assemble(study: Study, source: str = "") -> System:
     return System(
         characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
         metrics=study.metrics, nominal=calibration_drive(models.vehicle, characteristics),  # type: ignore[arg-type]
-        members=(*models.members, *measuring.members), measuring=measuring, step_length=study.step_length)
+        members=(*models.members, *measuring.members), measuring=measuring, step_length=study.step_length, matrix=_matrix(study, source),
+        aggregate="worst" if study.matrix is None else study.matrix.aggregate)
 
 
 def models_of(study: Study, source: str) -> Models:
@@ -87,6 +95,31 @@ def models_of(study: Study, source: str) -> Models:
     lookup = Lookup(source, study.origin.places)
     vehicle, ads, scenario = _vehicle(study.vehicle, lookup), _ads(study.ads, lookup), _scenario(study.scenario, lookup)
     return Models(vehicle[0], ads[0], scenario[0], weather_of(study.weather, source), (vehicle[1], ads[1], scenario[1]))
+
+
+def _matrix(study: Study, source: str) -> tuple[Point, ...]:
+    """The points of a study's matrix, each by a name of its own."""
+    points = [] if study.matrix is None else [point for test in study.matrix.tests for point in _points_of(test, study, source)]
+    named = Counter(point.name for point in points)
+    for name, number in named.items():
+        if number > 1:
+            raise InputError(source, f"matrix.tests: {number} points are {name!r}", "a name of its own for each test, and values once")
+    return tuple(points)
+
+
+def _points_of(test: TestTable, study: Study, source: str) -> Iterator[Point]:
+    same = test.model in ("", study.scenario.model)
+    base = {**(study.scenario.parameters if same else {}), **test.parameters}
+    lookup = Lookup(f"{source}: test {test.name!r}", study.origin.places)
+    weathers: list[str | Weather] = list(test.weathers) or [study.weather]
+    for values in product(*test.over.values()):
+        over = dict(zip(test.over, values, strict=True))
+        scenario, _ = _scenario(ModelTable(model=test.model or study.scenario.model, parameters={**base, **over}), lookup)
+        for choice in weathers:
+            weather = weather_of(choice, lookup.source)
+            place = {"test": test.name, **over, "weather": weather.name}
+            name = ", ".join([test.name, *(f"{key} {value}" for key, value in over.items()), weather.name])
+            yield Point(scenario, weather, name, tuple(place.items()))
 
 
 def _with_network(scenario: Any, places: Sequence[str]) -> Any:

@@ -1,0 +1,70 @@
+"""Euro NCAP's pedestrian who walks along the lane, CPLA."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from safevar_sumo.records import Encounter, Trace
+from safevar_sumo.scenarios.ahead import Ahead, Memory, encounter, right_of
+from safevar_sumo.scenarios.base import Actors, Roads, Scene, World
+from safevar_sumo.scenarios.euro_ncap import BODIES, KMH, VUT_LENGTH, VUT_WIDTH, Body, Range, Walk
+
+PROTOCOL = Range(10, 60, (50, 10, 25, 75, 90))
+
+
+class Along(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A pedestrian walks ahead in the vehicle's lane, away from it, and does not look round.
+
+    Parameters
+    ----------
+    speed
+        The vehicle's at the start [km/h].
+    impact_location
+        Where on the vehicle's front the pedestrian would be hit, from its left corner [% of the width].
+    target, target_speed, acceleration_distance
+        `adult` or `child`; its speed, and the way within which it reaches that from the start on [km/h, m].
+    time_to_impact, time_after
+        Time from the start to the impact if nobody brakes, and on from there to the end of the run [s].
+    vut_length, vut_width
+        The vehicle under test [m].
+    """
+
+    speed: Annotated[float, Meta(gt=0, le=250)] = 40.0
+    impact_location: Annotated[float, Meta(ge=0, le=100)] = 50.0
+    target: Literal["adult", "child"] = "adult"
+    target_speed: Annotated[float, Meta(gt=0, le=18)] = 5.0
+    acceleration_distance: Annotated[float, Meta(ge=0, le=100)] = 1.0
+    time_to_impact: Annotated[float, Meta(gt=0, le=60)] = 6.0
+    time_after: Annotated[float, Meta(gt=0, le=60)] = 4.0
+    vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
+    vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
+    network: str = "along"
+
+    @property
+    def duration(self) -> float:
+        """Length of a run [s]."""
+        return self.time_to_impact + self.time_after
+
+    def remarks(self) -> list[str]:
+        """What is outside the protocol."""
+        return PROTOCOL.remarks("CPLA", self.speed, self.impact_location)
+
+    def actors(self, roads: Roads) -> Actors:
+        return self._ahead.actors(self.target, Body(self.vut_length, self.vut_width), self.speed * KMH)
+
+    def begin(self, world: World) -> Memory:
+        return self._ahead.begin(world)
+
+    def observe(self, world: World, step: float, memory: Memory) -> tuple[Scene, Memory]:
+        return self._ahead.observe(world, step, memory, world.speeds())
+
+    def encounter(self, trace: Trace) -> Encounter:
+        return encounter(trace)
+
+    @property
+    def _ahead(self) -> Ahead:
+        walk = Walk(0.0, self.target_speed * KMH, self.acceleration_distance)
+        gap = self.speed * KMH * self.time_to_impact - walk.travelled(self.time_to_impact)
+        return Ahead(BODIES[self.target], gap, right_of(self.impact_location, self.vut_width), walk.pace)

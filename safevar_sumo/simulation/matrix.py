@@ -1,0 +1,144 @@
+"""Settings at the points of a study: at its one scenario, or at all of a matrix, where the worst point counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import Drives, Encounter, Evaluations, FloatArray, Trace
+from safevar_sumo.scenarios import Point
+from safevar_sumo.simulation.batch import Watcher, drive_all, score
+from safevar_sumo.simulation.network import empty_fingerprint
+from safevar_sumo.simulation.staging import staged
+from safevar_sumo.simulation.sumo import Engine
+from safevar_sumo.simulation.system import System
+
+LARGEST_WORLD = 600
+"""Copies of a network in one simulation; more are not faster."""
+
+
+class AtPoint(NamedTuple):
+    """N settings at one point of a study."""
+
+    point: Point
+    evaluations: Evaluations
+    drives: Drives
+
+
+def evaluate(system: System, settings: FloatArray) -> Evaluations:
+    """Simulate filtered settings, shape (N, n), in one batch and score them.
+
+    A pure function: row i of the result depends on row i of `settings` alone, to the bit. In a matrix a setting's row is that
+    of the point in which it comes off worst; with the aggregate `mean` its safety degree is the mean over the points.
+    """
+    if not system.matrix:
+        return score(system, settings, simulate(system, settings))
+    found = at_every_point(system, settings)
+    row_of, columns = _worst(found), np.arange(len(settings))
+    every = Evaluations.concatenate([one.evaluations for one in found])
+    result = every.take(row_of * len(settings) + columns)
+    if system.aggregate == "mean":
+        degrees = np.stack([one.evaluations.f_safe for one in found])
+        total = np.add.accumulate(np.where(np.isnan(degrees), 0.0, degrees), axis=0)[-1]
+        number = np.count_nonzero(~np.isnan(degrees), axis=0)
+        mean = np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
+        result = replace(result, metrics={**result.metrics, "safety_degree": mean})
+    return result
+
+
+def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = (),
+             watch: Watcher | None = None) -> Drives:
+    """Run the scenario once for every setting; shape (N, n). `watch` is shown the world at every sample.
+
+    In a matrix a setting's drive is that of the point in which it comes off worst; who watches sees all settings at the
+    point in which the last of them does.
+
+    Raises
+    ------
+    SimulationError
+        If SUMO fails.
+    InputError
+        If a user's ADS fails.
+    """
+    if not system.matrix:
+        return drive_all(system, settings, engine, options, watch)
+    if watch is not None or engine is Engine.GUI:
+        return drive_all(at_worst(system, settings), settings, engine, options, watch)
+    found = at_every_point(system, settings, engine, options)
+    return _picked([one.drives for one in found], _worst(found))
+
+
+def at_every_point(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = ()) -> list[AtPoint]:
+    """Settings, shape (N, n), at every point, in the points' order; raises as `simulate`."""
+    n, found = len(settings), dict[str, AtPoint]()
+    for points in _together(system.points, max(LARGEST_WORLD // max(n, 1), 1)):
+        drives = drive_all(replace(system, matrix=points), settings, engine, options)
+        evaluations = score(system, np.tile(settings, (len(points), 1)), drives)
+        for k, point in enumerate(points):
+            rows = slice(k * n, (k + 1) * n)
+            found[point.name] = AtPoint(point, evaluations.take(np.arange(rows.start, rows.stop)), drives.of(rows))
+    return [found[point.name] for point in system.points]
+
+
+def at_worst(system: System, settings: FloatArray) -> System:
+    """The system at the one point in which the last of the settings comes off worst."""
+    if not system.matrix:
+        return system
+    return system.at(system.points[_worst(at_every_point(system, settings[-1:]))[0]])
+
+
+def named_point(system: System, name: str, source: object) -> System:
+    """The system at the point of a matrix that is named.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name.
+    """
+    for point in system.matrix:
+        if point.name == name:
+            return system.at(point)
+    raise InputError(source, repr(name), "; ".join(point.name for point in system.matrix) or "a study with a matrix")
+
+
+def _together(points: Sequence[Point], most: int) -> Iterator[tuple[Point, ...]]:
+    """Points that share a network, as many as one simulation may have."""
+    groups: dict[str, list[Point]] = {}
+    for point in points:
+        groups.setdefault(empty_fingerprint(staged(point.scenario)), []).append(point)
+    for group in groups.values():
+        for start in range(0, len(group), most):
+            yield tuple(group[start:start + most])
+
+
+def _worst(found: Sequence[AtPoint]) -> npt.NDArray[np.intp]:
+    """For every setting the number of the point with the least safety degree; among equals the first by name."""
+    order = sorted(range(len(found)), key=lambda k: found[k].point.name)
+    degrees = np.stack([found[k].evaluations.f_safe for k in order])
+    return np.asarray(np.array(order)[np.argmin(np.where(np.isnan(degrees), np.inf, degrees), axis=0)])
+
+
+def _picked(drives: Sequence[Drives], number: npt.NDArray[np.intp]) -> Drives:
+    """For every vehicle its drive among several; shorter ones stay at their last sample, where nothing counts any more."""
+    length, columns = max(len(one.trace.time) for one in drives), np.arange(len(number))
+
+    def picked(values: list[np.ndarray]) -> np.ndarray:
+        whole = [np.concatenate([one, np.repeat(one[-1:], length - len(one), axis=0)]) for one in values]
+        return np.stack(whole)[number, :, columns].T
+
+    longest = max((one.trace for one in drives), key=lambda trace: len(trace.time))
+    names = [one.name for one in fields(Trace) if np.ndim(getattr(longest, one.name)) == 2]
+    columns_of: dict[str, Any] = {name: picked([getattr(one.trace, name) for one in drives]) for name in names}
+    trace = replace(longest, **columns_of)
+    ended = np.array([len(one.trace.time) for one in drives])[number]
+    active = trace.active & (np.arange(length)[:, np.newaxis] < ended)
+    encounters = zip(*(one.encounter for one in drives), strict=True)
+    return Drives(
+        trace=replace(trace, active=active), encounter=Encounter._make(picked(list(values)) for values in encounters),
+        outcome=np.stack([one.outcome for one in drives])[number, columns],
+        collision_speed=np.stack([one.collision_speed for one in drives])[number, columns])
