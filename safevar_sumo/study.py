@@ -23,7 +23,7 @@ Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
 LARGEST = 1e12
 """Of what a characteristic may be, in its unit."""
-REPLACED = ("calibration",)
+REPLACED = ("calibration", "published")
 """Tables that a study does not inherit in part from the one that it extends."""
 OBJECTIVES = ("safety_degree", "f_diff", "f_num_diff")
 """What the published study minimises."""
@@ -109,7 +109,7 @@ def label_of(algorithm: str) -> str:
     return algorithm.rpartition(":")[2]
 
 
-class TestTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class MatrixTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A test of a matrix: its scenario at every combination of the values in `over`, in every one of the weathers.
 
     `parameters` are added to those of the study's scenario; with another `model` they stand alone.
@@ -128,7 +128,7 @@ class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     `aggregate` is what becomes of their safety degrees: that of the point in which the setting comes off worst, or the mean.
     """
 
-    tests: Annotated[list[TestTable], Meta(min_length=1)]
+    tests: Annotated[list[MatrixTest], Meta(min_length=1)]
     aggregate: Literal["worst", "mean"] = "worst"
 
 

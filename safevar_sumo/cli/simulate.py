@@ -20,8 +20,9 @@ from safevar_sumo.cli.target import Target, replay_options, target_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import record
-from safevar_sumo.simulation import System, assemble
+from safevar_sumo.simulation import System, assemble, at_every_point, named_point, point_record, remarks_of
 from safevar_sumo.study import check_writable
+from safevar_sumo.terminal.matrix import print_matrix
 from safevar_sumo.terminal.simulation import print_simulation, print_sweep
 
 
@@ -34,13 +35,16 @@ from safevar_sumo.terminal.simulation import print_simulation, print_sweep
 @click.option("--beyond", is_flag=True, help="Take values beyond the domains too.")
 @click.option("--trace", type=click.Path(path_type=Path), metavar="FILE.csv", help="Write the simulation step by step.")
 @showing_options
+@click.option("--point", metavar="NAME", help="Of a study with a matrix: this point alone.")
 @click.option("--gui", is_flag=True, help="Show it in sumo-gui.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def simulate_command(study: str, solution: str | None, choice: str | None, changes: tuple[str, ...], no_filter: bool, beyond: bool,
-                     trace: Path | None, gui: bool, as_json: bool, **shown: Path | None) -> None:
+                     trace: Path | None, point: str | None, gui: bool, as_json: bool, **shown: Path | None) -> None:
     """Simulate STUDY once, or a solution of the results directory DIR with the study as recorded there."""
     target, showing = target_of(study, solution, choice), Shown(**shown)
     system = assemble(target.study, target.source)
+    if point is not None:
+        system = named_point(system, point, "--point")
     swept = read_changes(changes, system.characteristics, beyond)
     base = system.characteristics.original if target.setting is None else target.setting
     asked = settings_of(swept, base, system.characteristics)
@@ -57,7 +61,7 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
         _write_trace(trace, found)
     if showing.asked:
         showing.show(target.study, system, found.evaluation.settings[0])
-    _tell(target, found, as_json)
+    _tell(target, system, found, as_json)
 
 
 def _check_outputs(study: str, trace: Path | None, showing: Shown) -> None:
@@ -86,12 +90,17 @@ def _sweep(target: Target, system: System, asked: FloatArray, names: tuple[str, 
                    err=True)
 
 
-def _tell(target: Target, found: Simulation, as_json: bool) -> None:
+def _tell(target: Target, system: System, found: Simulation, as_json: bool) -> None:
+    points = at_every_point(system, found.evaluation.settings) if system.matrix else []
     if as_json:
         replayed = {} if target.handle is None else {"solution": str(target.handle)}
-        click.echo(json.dumps({**found.record(), **replayed}, indent=2, allow_nan=False))
+        matrix = {"points": [point_record(one) for one in points]} if points else {}
+        click.echo(json.dumps({**found.record(), **replayed, **matrix}, indent=2, allow_nan=False))
     else:
         print_simulation(Console(), found)
+        print_matrix(Console(), points)
+    for remark in dict.fromkeys(remark for one in system.points for remark in remarks_of(one.scenario)):
+        click.echo(f"note: {remark}", err=True)
     for name, value in found.put_back.items():
         click.echo(f"note: {name} = {value:g} is so near the original that the filter put {found.setting[name]:g} back; "
                    "--no-filter keeps it", err=True)

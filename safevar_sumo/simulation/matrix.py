@@ -30,6 +30,21 @@ class AtPoint(NamedTuple):
     drives: Drives
 
 
+def point_record(found: AtPoint, row: int = 0) -> dict[str, Any]:
+    """One setting at one point as plain values: where that is, how it ended, speeds of the impact [m/s]; undefined is None."""
+    evaluations, relative = found.evaluations, found.drives.relative_speed
+    numbers = {"impact_speed": evaluations.collision_speed[row], "relative_impact_speed": relative[row],
+               "safety_degree": evaluations.f_safe[row]}
+    return {"point": found.point.name, **dict(found.point.place), "outcome": str(evaluations.outcome[row]),
+            **{name: None if np.isnan(value) else float(value) for name, value in numbers.items()}}
+
+
+def remarks_of(scenario: Any) -> list[str]:
+    """What a user should know of a scenario's parameters."""
+    remarks = getattr(scenario, "remarks", None)
+    return [] if remarks is None else remarks()
+
+
 def evaluate(system: System, settings: FloatArray) -> Evaluations:
     """Simulate filtered settings, shape (N, n), in one batch and score them.
 

@@ -21,7 +21,7 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.simulation.measuring import TAKEN, Measuring, measuring_of
 from safevar_sumo.simulation.network import OPTIONS, folder_of, is_folder
 from safevar_sumo.simulation.options import check_options
-from safevar_sumo.study import MetricsTable, ModelTable, Study, TestTable, VehicleTable, Weather
+from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather
 from safevar_sumo.vehicles import VEHICLE_CONTRACT, VEHICLES, CharacteristicSet, GuardedVehicle, Vehicle, calibration_drive
 
 
@@ -107,7 +107,7 @@ def _matrix(study: Study, source: str) -> tuple[Point, ...]:
     return tuple(points)
 
 
-def _points_of(test: TestTable, study: Study, source: str) -> Iterator[Point]:
+def _points_of(test: MatrixTest, study: Study, source: str) -> Iterator[Point]:
     same = test.model in ("", study.scenario.model)
     base = {**(study.scenario.parameters if same else {}), **test.parameters}
     lookup = Lookup(f"{source}: test {test.name!r}", study.origin.places)
