@@ -12,7 +12,7 @@ import msgspec
 from safevar_sumo.computing.identity import Inputs, changed, inputs_of, networks_of
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.simulation import System, assemble, score, simulate, simulate_alone
+from safevar_sumo.simulation import System, assemble, evaluate, score, simulate_alone
 from safevar_sumo.study import Study
 
 SHARED = ("network", "sources", "code")
@@ -72,7 +72,8 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
     """
     system, network, alone = _system(work)
     _refuse_changes(network, {"network": networks_of(system)})
-    evaluations = score(system, settings, (simulate_alone if alone else simulate)(system, settings))
+    beside = alone and not system.matrix
+    evaluations = score(system, settings, simulate_alone(system, settings)) if beside else evaluate(system, settings)
     _refuse_changes(network, {"network": networks_of(system)})
     return evaluations
 
