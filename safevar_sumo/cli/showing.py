@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import click
 
 from safevar_sumo.cli.outputs import PICTURES, check_output, refuse_inputs
+from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.simulation import System
 from safevar_sumo.study import Study
@@ -22,10 +23,12 @@ class Shown(NamedTuple):
 
     plot: Path | None
     animate: Path | None
+    gui: bool = False
+    slower: float = 1.0
 
     @property
     def asked(self) -> bool:
-        return any(self)
+        return self.plot is not None or self.animate is not None or self.gui
 
     @property
     def files(self) -> list[Path]:
@@ -36,6 +39,8 @@ class Shown(NamedTuple):
         """Refuse what cannot be written or is read from `study`, before anything is simulated; raises InputError."""
         from safevar_sumo.showing import ANIMATIONS, check_animation
 
+        if self.slower != 1 and not self.gui:
+            raise InputError("--slower", f"{self.slower:g} without --gui", "together with --gui")
         if self.plot is not None:
             refuse_inputs(self.plot, "--plot", study)
             check_output(self.plot, "--plot", PICTURES)
@@ -46,18 +51,23 @@ class Shown(NamedTuple):
 
     def show(self, study: Study, system: System, setting: FloatArray) -> None:
         """Simulate a filtered setting, shape (n,), beside the original vehicle, and show both."""
-        from safevar_sumo.showing import animate, compare, draw_comparison, write_figure
+        from safevar_sumo.showing import animate, compare, draw_comparison, show_in_gui, write_figure
 
         comparison = compare(study, system, setting)
         if self.plot is not None:
             write_figure(draw_comparison(comparison), self.plot)
         if self.animate is not None:
             animate(comparison, self.animate)
+        if self.gui:
+            show_in_gui(comparison, system.scenario.network, slower=self.slower)
 
 
 def showing_options(command: Command) -> Command:
     """The options that `Shown` is made of."""
     for option in (
+            click.option("--slower", type=click.FloatRange(0.01, 1000), default=1.0, show_default=True, metavar="TIMES",
+                         help="How many times slower than real time --gui plays."),
+            click.option("--gui", is_flag=True, help="Show both in sumo-gui, each on its road."),
             click.option("--animate", type=FILE, metavar="FILE", help="Show both from above, moving: gif, mp4 or html."),
             click.option("--plot", type=FILE, metavar="FILE", help="Draw it beside the original vehicle: png, pdf or svg.")):
         command = option(command)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -36,10 +37,9 @@ from safevar_sumo.terminal.simulation import print_simulation, print_sweep
 @click.option("--trace", type=click.Path(path_type=Path), metavar="FILE.csv", help="Write the simulation step by step.")
 @showing_options
 @click.option("--point", metavar="NAME", help="Of a study with a matrix: this point alone.")
-@click.option("--gui", is_flag=True, help="Show it in sumo-gui.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def simulate_command(study: str, solution: str | None, choice: str | None, changes: tuple[str, ...], no_filter: bool, beyond: bool,
-                     trace: Path | None, point: str | None, gui: bool, as_json: bool, **shown: Path | None) -> None:
+                     trace: Path | None, point: str | None, as_json: bool, **shown: Any) -> None:
     """Simulate STUDY once, or a solution of the results directory DIR with the study as recorded there."""
     target, showing = target_of(study, solution, choice), Shown(**shown)
     system = assemble(target.study, target.source)
@@ -50,11 +50,11 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
     asked = settings_of(swept, base, system.characteristics)
     _check_outputs(study, trace, showing)
     if any(len(values) > 1 for values in swept.values()):
-        if trace is not None or showing.asked or gui:
+        if trace is not None or showing.asked:
             raise InputError("--set", f"{' '.join(changes)} is a sweep", "one value for each with --trace, --plot, --animate or --gui")
         _sweep(target, system, asked, tuple(swept), not no_filter, as_json)
         return
-    found = beside_the_original(target.study, system, asked[0], filtered=not no_filter, gui=gui)
+    found = beside_the_original(target.study, system, asked[0], filtered=not no_filter)
     if target.recorded is not None and not changes:
         _warn_of_differences(target, found)
     if trace is not None:

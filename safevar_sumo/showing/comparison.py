@@ -12,7 +12,7 @@ import numpy as np
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.showing.moments import moments
-from safevar_sumo.simulation import System, score
+from safevar_sumo.simulation import System, at_worst, score
 from safevar_sumo.simulation.film import Film, film
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -80,7 +80,7 @@ def spaced(unit: str) -> str:
 
 
 def compare(study: Study, system: System, setting: FloatArray) -> Comparison:
-    """Simulate a filtered setting, shape (n,), beside the original vehicle.
+    """Simulate a filtered setting, shape (n,), beside the original vehicle; in a matrix, where the setting comes off worst.
 
     Raises
     ------
@@ -89,9 +89,11 @@ def compare(study: Study, system: System, setting: FloatArray) -> Comparison:
     """
     original = system.characteristics.original
     settings = np.stack([original]) if np.array_equal(original, setting) else np.stack([original, setting])
-    taken = film(system, settings)
-    return Comparison(title=study.title, characteristics=system.characteristics, ttc_threshold=system.metrics.ttc_threshold,
-                      evaluations=score(system, settings, taken.drives), film=taken)
+    there = at_worst(system, settings)
+    where = [f" ({point.name})" for point in system.matrix if (point.scenario, point.weather) == (there.scenario, there.weather)]
+    taken = film(there, settings)
+    return Comparison(title=study.title + "".join(where[:1]), characteristics=system.characteristics, ttc_threshold=system.metrics.ttc_threshold,
+                      evaluations=score(there, settings, taken.drives), film=taken)
 
 
 def differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:

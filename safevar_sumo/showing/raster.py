@@ -89,7 +89,7 @@ class _Canvas:
             draw.polygon(self._pixels(lane.line, sample), fill=PATH)
             return
         if lane.kind == "crossing":
-            for stripe in _stripes(lane):
+            for stripe in stripes(lane):
                 draw.polygon(self._pixels(stripe, sample), fill=WHITE)
             return
         self._strip(draw, lane.line, lane.width, SEAM if lane.kind == "road" else PATH, sample)
@@ -98,7 +98,7 @@ class _Canvas:
 
     def _strip(self, draw: ImageDraw, line: FloatArray, width: float, colour: str, sample: int) -> None:
         for start, end in pairwise(line):
-            draw.polygon(self._pixels(_quad(start, end, width), sample), fill=colour)
+            draw.polygon(self._pixels(quad(start, end, width), sample), fill=colour)
 
     def _body(self, draw: ImageDraw, body: Body, sample: int) -> None:
         if body.is_person:
@@ -147,15 +147,15 @@ class _Canvas:
         draw.text((FINER * place[0], FINER * place[1]), text, fill=colour, font=ImageFont.load_default(FINER * size))
 
 
-def _quad(start: FloatArray, end: FloatArray, width: float) -> FloatArray:
+def quad(start: FloatArray, end: FloatArray, width: float) -> FloatArray:
     """A straight strip from start to end, shape (4, 2)."""
     along = end - start
     side = np.array([-along[1], along[0]]) / (np.hypot(*along) or 1.0) * width / 2
     return np.array([start + side, end + side, end - side, start - side])
 
 
-def _stripes(lane: Lane) -> Iterator[FloatArray]:
+def stripes(lane: Lane) -> Iterator[FloatArray]:
     for start, end in pairwise(lane.line):
         along = (end - start) / (np.hypot(*(end - start)) or 1.0)
         for place in np.arange(STRIPE / 2, np.hypot(*(end - start)) - STRIPE, 2 * STRIPE):
-            yield _quad(start + along * place, start + along * (place + STRIPE), lane.width)
+            yield quad(start + along * place, start + along * (place + STRIPE), lane.width)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.records import Drives, FloatArray
-from safevar_sumo.simulation.matrix import simulate
+from safevar_sumo.simulation.matrix import at_worst, simulate
 from safevar_sumo.simulation.network import copied_network, copy_and_name
 from safevar_sumo.simulation.sumo import SumoWorld
 from safevar_sumo.simulation.system import System
@@ -62,12 +62,14 @@ class Film:
 def film(system: System, settings: FloatArray) -> Film:
     """Simulate settings, shape (N, n), as `simulate` does, and keep where everybody was.
 
+    In a matrix all of them are at the one point in which the last of them comes off worst.
+
     Raises
     ------
     SimulationError, InputError
         As `simulate`.
     """
-    camera = _Camera(len(settings))
+    camera, system = _Camera(len(settings)), at_worst(system, settings)
     drives = simulate(system, settings, watch=camera.take)
     return Film(drives=drives, tracks=camera.tracks(), road=road_of(system.scenario.network))
 

@@ -272,6 +272,19 @@ def _api(engine: Engine) -> Any:
     return traci
 
 
+engine_of = _api
+
+
+def start_engine(api: Any, engine: Engine, arguments: Sequence[str]) -> None:
+    """Start an engine's program with these arguments."""
+    _start(api, engine, [_binary(engine), *arguments])
+
+
+def stop_engine(api: Any) -> None:
+    """Release what `start_engine` has started; see `_close`."""
+    _close(api)
+
+
 def sumo_command(engine: Engine, files: CopiedNetwork) -> list[str]:
     """The command line that starts SUMO on copies of a network."""
     window = ["--start", "true", "--quit-on-end", "true", "--window-size", "1200,700"] if engine is Engine.GUI else []
