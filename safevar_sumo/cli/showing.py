@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
+import numpy as np
 
 from safevar_sumo.cli.outputs import PICTURES, check_output, refuse_inputs
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
-from safevar_sumo.simulation import System
+from safevar_sumo.simulation import System, at_worst
 from safevar_sumo.study import Study
 
 Command = Callable[..., Any]
@@ -59,7 +60,7 @@ class Shown(NamedTuple):
         if self.animate is not None:
             animate(comparison, self.animate)
         if self.gui:
-            show_in_gui(comparison, system.scenario.network, slower=self.slower)
+            show_in_gui(comparison, at_worst(system, setting[np.newaxis]).scenario.network, slower=self.slower)
 
 
 def showing_options(command: Command) -> Command:

@@ -92,8 +92,9 @@ def compare(study: Study, system: System, setting: FloatArray) -> Comparison:
     there = at_worst(system, settings)
     where = [f" ({point.name})" for point in system.matrix if (point.scenario, point.weather) == (there.scenario, there.weather)]
     taken = film(there, settings)
-    return Comparison(title=study.title + "".join(where[:1]), characteristics=system.characteristics, ttc_threshold=system.metrics.ttc_threshold,
-                      evaluations=score(there, settings, taken.drives), film=taken)
+    return Comparison(title=study.title + "".join(where[:1]), characteristics=system.characteristics,
+                      ttc_threshold=system.metrics.ttc_threshold, evaluations=score(there, settings, taken.drives),
+                      film=taken)
 
 
 def differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:
