@@ -15,6 +15,7 @@ from safevar_sumo.errors import SafevarError
 INTERRUPTED = 130
 COMMANDS = {
     "study": ("study", "Search a study; the same command again goes on where it was stopped."),
+    "status": ("status", "Tell how far a study is that runs elsewhere: runs, front so far, collisions, time left."),
     "simulate": ("simulate", "Simulate a study once: how it ends, its safety metrics and objectives."),
     "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms and metrics."),
     "explain": ("explain", "Explain failures: which changes did it, how little is enough, and why."),
