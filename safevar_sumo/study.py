@@ -375,10 +375,10 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise InputError("--out", f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
+        raise InputError("out", f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
 
 
-def check_writable(path: Path, flag: str = "--out") -> None:
+def check_writable(path: Path, source: str = "out") -> None:
     """Refuse a file that cannot be written before the work whose result it is to take.
 
     Raises
@@ -393,7 +393,7 @@ def check_writable(path: Path, flag: str = "--out") -> None:
         if is_new:
             path.unlink()
     except OSError as error:
-        raise InputError(flag, f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
+        raise InputError(source, f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
 
 
 def _without_nothing(raw: Any) -> Any:

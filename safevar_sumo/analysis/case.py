@@ -147,7 +147,7 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
     places = [Path(directory) for directory in directories]
     twice = [place for place, number in Counter(place.resolve() for place in places).items() if number > 1]
     if twice:
-        raise InputError("DIR", f"{twice[0]} is given twice", "each results directory once")
+        raise InputError("directories", f"{twice[0]} is given twice", "each results directory once")
     found = [_loaded(place) for place in places]
     names = Counter(one.name for one in found)
     return [replace(one, name=f"{one.name} ({place})") if names[one.name] > 1 else one for one, place in zip(found, places, strict=True)]

@@ -51,7 +51,7 @@ def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
         If there is no such question, or no case holds what the one question, or any, asks for.
     """
     if question is not None and question not in QUESTIONS:
-        raise InputError("--rq", f"there is no question {question!r}", one_of(QUESTIONS))
+        raise InputError("question", f"there is no question {question!r}", one_of(QUESTIONS))
     answers, refusals, names = [], [], [case.name for case in cases]
     metrics = tuple({metric.name: metric for case in cases for metric in case.scoring.metrics}.values())
     for name in QUESTIONS if question is None else (question,):

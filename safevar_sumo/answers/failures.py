@@ -58,7 +58,7 @@ def failures_of(source: Study | Case, bench: Bench, original: Evaluations, named
     """
     if isinstance(source, Study):
         if named:
-            raise InputError("--solution", f"{source.name!r} is a study and has no solutions", "a results directory")
+            raise InputError("solution", f"{source.name!r} is a study and has no solutions", "a results directory")
         settings = bench.characteristics.filter(spread(bench.characteristics, LOOKED_AT, source.search.seed))
         called: list[Handle | None] = [None] * len(settings)
         recorded = None

@@ -83,7 +83,7 @@ def pairs_figure(told: Tolerance, most: int = 6) -> Figure:
         If pairs were not looked at.
     """
     if not told.pairs:
-        raise InputError("--pairs", "there is no pair to draw", "at least two characteristics, looked at in pairs")
+        raise InputError("pairs", "there is no pair to draw", "at least two characteristics, looked at in pairs")
     worst = sorted(told.pairs, key=lambda pair: (-pair.unsafe_share, np.nanmin(pair.safety_degree)))[:most]
     degrees = np.concatenate([pair.safety_degree.ravel() for pair in worst])
     columns = min(3, len(worst))
@@ -162,7 +162,7 @@ def new_figure(title: str, rows: int, columns: int, size: tuple[float, float]) -
     return figure, axes
 
 
-def save(figure: Figure, path: Path, flag: str = "--out") -> None:
+def save(figure: Figure, path: Path, source: str = "out") -> None:
     """Write a figure to a file: png, pdf or svg.
 
     Raises
@@ -173,7 +173,7 @@ def save(figure: Figure, path: Path, flag: str = "--out") -> None:
     try:
         figure.savefig(path, dpi=DPI)
     except OSError as error:
-        raise InputError(flag, f"cannot write {path}: {error.strerror or error}", "a directory that can be written") from None
+        raise InputError(source, f"cannot write {path}: {error.strerror or error}", "a directory that can be written") from None
 
 
 def plain(name: str) -> str:

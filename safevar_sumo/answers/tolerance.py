@@ -102,7 +102,7 @@ def _columns(study: Study, characteristics: Sequence[str] | None) -> list[int]:
     names = list(study.vehicle.characteristics)
     for name in characteristics or ():
         if name not in names:
-            raise InputError("--characteristics", f"there is no characteristic {name!r}", one_of(names))
+            raise InputError("characteristics", f"there is no characteristic {name!r}", one_of(names))
     return [column for column, name in enumerate(names) if characteristics is None or name in characteristics]
 
 

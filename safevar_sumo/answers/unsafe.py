@@ -49,7 +49,7 @@ class Unsafe:
         except ValueError:
             below = math.nan
         if not math.isfinite(below):
-            raise InputError("--unsafe", repr(text), LEGAL)
+            raise InputError("unsafe", repr(text), LEGAL)
         return cls(below)
 
     @classmethod
@@ -69,7 +69,7 @@ class Unsafe:
         if evaluations.collided.any() or original.collided.any():
             return cls()
         if not original.f_safe[0] > 0:
-            raise InputError("--unsafe", "nothing collides, and the original vehicle has no safety degree to halve", LEGAL)
+            raise InputError("unsafe", "nothing collides, and the original vehicle has no safety degree to halve", LEGAL)
         return cls.half_of(float(original.f_safe[0]))
 
     @classmethod

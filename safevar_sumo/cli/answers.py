@@ -20,17 +20,17 @@ WITHOUT_NOTES = ("csv", "json")
 
 @commands.command()
 @click.argument("directories", nargs=-1, required=True, metavar="DIR...")
-@click.option("--rq", type=click.Choice(QUESTIONS), help="This question alone.")
+@click.option("--rq", "question", type=click.Choice(QUESTIONS), help="This question alone.")
 @click.option("--format", "kind", type=click.Choice(list(FORMATS)), default="text", show_default=True, help="How they are written.")
 @click.option("--layout", type=click.Choice(list(LAYOUTS_BY_NAME)), default="full", show_default=True,
               help="Everything, or RQ1, RQ2 and the combinations as the paper has them.")
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write each table to a file of this directory.")
-def tables(directories: tuple[str, ...], rq: str | None, kind: str, layout: str, out: Path | None) -> None:
+def tables(directories: tuple[str, ...], question: str | None, kind: str, layout: str, out: Path | None) -> None:
     """Answer the research questions as tables, from the results directories DIR..., one for each case."""
     if layout != "full" and kind not in LAID_OUT:
         raise InputError("--layout", f"{layout!r}, but --format {kind} has no layout", f"--format {', '.join(LAID_OUT)}")
     write = partial(LAID_OUT[kind], layouts=LAYOUTS_BY_NAME[layout]) if kind in LAID_OUT else FORMATS[kind]
-    answers = answer(load_cases(directories), rq)
+    answers = answer(load_cases(directories), question)
     if kind in WITHOUT_NOTES:
         _warn(list(dict.fromkeys(note for one in answers for note in one.notes)))
     if out is not None:
@@ -40,7 +40,7 @@ def tables(directories: tuple[str, ...], rq: str | None, kind: str, layout: str,
                 write_whole(out / f"{one.name}.{ENDINGS[kind]}", write([one]))
         click.echo(f"Tables: {out}")
         return
-    shown = [one for one in answers if one.name == rq] if rq is not None and kind in WITHOUT_NOTES else answers
+    shown = [one for one in answers if one.name == question] if question is not None and kind in WITHOUT_NOTES else answers
     click.echo(write(shown), nl=False)
 
 

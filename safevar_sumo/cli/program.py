@@ -7,10 +7,11 @@ import io
 import os
 import signal
 import sys
+from typing import Any
 
 import click
 
-from safevar_sumo.errors import SafevarError
+from safevar_sumo.errors import InputError, SafevarError
 
 INTERRUPTED = 130
 COMMANDS = {
@@ -43,6 +44,16 @@ class OnDemand(click.Group):
         if name in COMMANDS:
             importlib.import_module(f"safevar_sumo.cli.{COMMANDS[name][0]}")
         return super().get_command(ctx, name)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Call a command; what the library says of one of its parameters is said of the flag that gives it."""
+        try:
+            return super().invoke(ctx)
+        except InputError as error:
+            command = super().get_command(ctx, str(ctx.invoked_subcommand))
+            flags = {one.name: one.opts[-1] for one in command.params if isinstance(one, click.Option)} if command else {}
+            error.source = flags.get(str(error.source), error.source)
+            raise
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):

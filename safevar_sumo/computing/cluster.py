@@ -51,18 +51,18 @@ def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
     try:
         from distributed import Client
     except ImportError:
-        raise InputError("--cluster", "Dask is not installed", "pip install 'safevar_sumo[cluster]'") from None
+        raise InputError("cluster", "Dask is not installed", "pip install 'safevar_sumo[cluster]'") from None
     legal = "the address of a Dask scheduler, such as tcp://host:8786"
     if not ADDRESS.fullmatch(address):
-        raise InputError("--cluster", repr(address), legal)
+        raise InputError("cluster", repr(address), legal)
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is told by us
     try:
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
-        raise InputError("--cluster", f"nobody answers at {address!r}: {error}", legal) from None
+        raise InputError("cluster", f"nobody answers at {address!r}: {error}", legal) from None
     except (TypeError, RuntimeError) as error:
-        raise InputError("--cluster", f"{address!r}: {told(error)}", CERTIFICATES) from None
+        raise InputError("cluster", f"{address!r}: {told(error)}", CERTIFICATES) from None
     with interrupts_noted():
         try:
             yield ClusterPool(client, time_limit)

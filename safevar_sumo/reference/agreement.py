@@ -201,7 +201,7 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
         try:
             figure.savefig(path, dpi=150, metadata=_UNDATED.get(path.suffix.lower()))
         except (OSError, ValueError) as error_written:
-            raise InputError("--plot", f"cannot write {path}: {error_written}", "a file that ends in .png, .pdf or .svg") from None
+            raise InputError("plot", f"cannot write {path}: {error_written}", "a file that ends in .png, .pdf or .svg") from None
         finally:
             plt.close(figure)
 

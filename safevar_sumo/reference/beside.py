@@ -49,15 +49,15 @@ def paired(here: Sequence[Case], there: Sequence[Case]) -> Pairs:
     InputError
         If a side has two results of one study, or no study is on both.
     """
-    sides = [_by_study(here, "DIR"), _by_study(there, "--published")]
+    sides = [_by_study(here, "directories"), _by_study(there, "published")]
     common = [name for name in sides[0] if name in sides[1]]
     if not common:
-        raise InputError("--published", f"has {', '.join(sides[1])} and none of {', '.join(sides[0])}",
+        raise InputError("published", f"has {', '.join(sides[1])} and none of {', '.join(sides[0])}",
                          "imported results of a study that DIR has results of (command import)")
     for name in common:
         one, other = (side[name].characteristics for side in sides)
         if one.names != other.names or not np.array_equal(one.original, other.original):
-            raise InputError("--published", f"{name} is of another vehicle there", "results of one and the same study")
+            raise InputError("published", f"{name} is of another vehicle there", "results of one and the same study")
     cases = [[side[name] for name in common] for side in sides]
     alone = [[name for name in side if name not in common] for side in sides]
     return Pairs(cases[0], cases[1], alone[0], alone[1])

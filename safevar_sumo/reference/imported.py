@@ -42,8 +42,8 @@ def original_metrics(given: str | None, published: Mapping[str, float]) -> dict[
         except ValueError:
             value = np.nan
         if name not in SHORT or not np.isfinite(value):
-            raise InputError("--original", f"{part!r} in {given!r}", ORIGINAL_FORM)
+            raise InputError("original", f"{part!r} in {given!r}", ORIGINAL_FORM)
         original[SHORT[name]] = value
     if original["safety_degree"] is None:
-        raise InputError("--original", "the study has no published values of the original vehicle", ORIGINAL_FORM)
+        raise InputError("original", "the study has no published values of the original vehicle", ORIGINAL_FORM)
     return original

@@ -51,7 +51,7 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     """
     unknown = [name for name in only if name not in SECTIONS]
     if unknown:
-        raise InputError("--only", f"there is no section {unknown[0]!r}", f"some of {','.join(SECTIONS)}")
+        raise InputError("only", f"there is no section {unknown[0]!r}", f"some of {','.join(SECTIONS)}")
     wanted = [name for name in SECTIONS if not only or name in only]
     materials = gather(directories)
     studies = [_study(material, wanted, jobs, progress) for material in materials]

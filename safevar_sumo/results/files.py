@@ -24,7 +24,7 @@ def make_directory(path: Path) -> None:
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
-        raise InputError("--out", f"cannot write to {path}: {error.strerror}", "a directory that can be written") from None
+        raise InputError("out", f"cannot write to {path}: {error.strerror}", "a directory that can be written") from None
 
 
 def make_durable(path: Path) -> None:

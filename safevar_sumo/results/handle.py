@@ -29,7 +29,7 @@ class Handle(NamedTuple):
         return f"{self.algorithm}:{self.run}:{self.row}"
 
     @classmethod
-    def parse(cls, text: str, source: object = "--solution") -> Handle:
+    def parse(cls, text: str, source: object = "solution") -> Handle:
         """Read a handle.
 
         Raises
@@ -54,7 +54,7 @@ def handles(solutions: pd.DataFrame) -> list[Handle]:
             for algorithm, number, place in zip(solutions["algorithm"], run, row, strict=True)]
 
 
-def position_of(solutions: pd.DataFrame, handle: Handle, source: object = "--solution") -> int:
+def position_of(solutions: pd.DataFrame, handle: Handle, source: object = "solution") -> int:
     """The place of a handle's solution among the rows of the frame.
 
     Raises
@@ -110,5 +110,5 @@ def chosen_handle(solutions: pd.DataFrame, original: float, choice: str, source:
     if candidates.empty:
         if named.empty:
             raise InputError(source, "these results hold no solution", "results with a solution")
-        raise InputError(source, "these results hold no unsafe solution", "--most-severe, or --solution")
+        raise InputError(source, "these results hold no unsafe solution", "the most severe one, or a solution by its handle")
     return Handle.parse(candidates.sort_values(CHOICES[choice], kind="stable")["handle"].iloc[0], source)

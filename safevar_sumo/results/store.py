@@ -84,7 +84,7 @@ class ResultsDirectory:
         if not (self.path / MANIFEST).exists():
             foreign = sorted(one.name for one in self.path.iterdir() if one.name not in (RUNS, SOLUTIONS) and not one.name.startswith("."))
             if foreign:
-                raise InputError("--out", f"{self.path} holds other things: {foreign[0]}", "an empty directory, or one of this study")
+                raise InputError("out", f"{self.path} holds other things: {foreign[0]}", "an empty directory, or one of this study")
             return
         stored = read_manifest(self.path)
         told, way_back = ("they are imported", "") if "imported" in stored else difference(stored, self.manifest)

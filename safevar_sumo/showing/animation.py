@@ -32,11 +32,11 @@ def animate(comparison: Comparison, path: Path) -> None:
     """
     ending = path.suffix.lower()
     if ending not in ANIMATIONS:
-        raise InputError("--animate", str(path), f"a file that ends in {', '.join(ANIMATIONS)}")
+        raise InputError("animate", str(path), f"a file that ends in {', '.join(ANIMATIONS)}")
     try:
         ANIMATIONS[ending](scene_of(comparison), path)
     except OSError as error:
-        raise InputError("--animate", f"cannot write {path}: {error.strerror or error}", "a file in a directory that exists") from None
+        raise InputError("animate", f"cannot write {path}: {error.strerror or error}", "a file in a directory that exists") from None
 
 
 def check_animation(path: Path) -> None:
@@ -87,7 +87,7 @@ def _ffmpeg() -> str:
 
         return str(imageio_ffmpeg.get_ffmpeg_exe())
     except (ImportError, RuntimeError):
-        raise InputError("--animate", "there is no ffmpeg to encode an mp4 with",
+        raise InputError("animate", "there is no ffmpeg to encode an mp4 with",
                          "ffmpeg on the PATH, or pip install 'safevar_sumo[film]'; a .gif or .html needs neither") from None
 
 

@@ -81,7 +81,7 @@ def write_figure(figure: Figure, path: Path) -> None:
         with matplotlib.rc_context({"svg.hashsalt": "safevar_sumo"}):
             figure.savefig(path, dpi=DPI, metadata=undated.get(path.suffix.lower().lstrip("."), {}))
     except OSError as error:
-        raise InputError("--plot", f"cannot write {path}: {error.strerror or error}", "a file in a directory that exists") from None
+        raise InputError("plot", f"cannot write {path}: {error.strerror or error}", "a file in a directory that exists") from None
 
 
 def _legend(figure: Figure, comparison: Comparison) -> None:

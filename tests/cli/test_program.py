@@ -5,15 +5,19 @@ from __future__ import annotations
 import importlib
 import os
 import pkgutil
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import click
 import pytest
 from click.testing import CliRunner
 
+import safevar_sumo
 from safevar_sumo import cli
 from safevar_sumo.cli.program import COMMANDS, commands
+from safevar_sumo.errors import InputError
 
 HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
 
@@ -62,3 +66,19 @@ def test_closed_and_full_streams_are_no_traceback(streams: str, code: int) -> No
     done = subprocess.run(f"{sys.executable} -m safevar_sumo list {streams}", shell=True, capture_output=True, text=True, check=False)
     assert done.returncode == code
     assert done.stderr in ("", "safevar-sumo: No space left on device\n")
+
+
+def test_what_the_library_says_of_a_parameter_is_said_of_its_flag(in_tmp: Path) -> None:
+    Path("file").write_text("")
+    for arguments in (["import", "native", "--rs", "x.csv", "--out", "o", "--original", "sd"], ["study", "smoke", "--cluster", "nowhere"],
+                      ["study", "smoke", "--out", "file"]):
+        told = CliRunner().invoke(commands, arguments).exception
+        assert isinstance(told, InputError)
+        assert told.source == arguments[-2]
+
+
+def test_no_module_below_the_commands_names_a_flag() -> None:
+    package = Path(safevar_sumo.__file__).parent
+    for path in package.rglob("*.py"):
+        if "cli" not in path.parts:
+            assert not re.search(r'InputError\(\s*f?"-', path.read_text()), path

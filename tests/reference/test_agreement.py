@@ -92,5 +92,5 @@ def test_the_picture_is_drawn_whatever_the_data(tmp_path: Path) -> None:
 
 def test_a_picture_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     for path in (tmp_path / "no" / "x.png", tmp_path / "x.nonsense"):
-        with pytest.raises(InputError, match="--plot"):
+        with pytest.raises(InputError, match="plot"):
             plot_agreement(path, "title", ONE, reference([1.0, 2.0], [1, 1]), here([1.0, 2.0], [1, 1]))
