@@ -43,8 +43,6 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     brake_place, brake_gap_before, brake_gap_past
         For every metre that he is short of that lateral place, or past it, the gap shrinks by as much [m, -, -]: whoever
         is about to enter the way, or to leave it, is braked for later. The visibility is a factor on what is left.
-    brake_keeps
-        Once it brakes, it goes on up to gaps that are as much larger than the one at which it begins [m].
     throttle
         Throttle at the policy's speed levels 0, 2.7 and 5.3 m/s.
     """
@@ -57,7 +55,6 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     brake_place: float
     brake_gap_before: NotNegative
     brake_gap_past: NotNegative
-    brake_keeps: Annotated[float, Meta(ge=0, le=1e3)] = 1e3
     throttle: Annotated[tuple[Throttle, Throttle, Throttle], Meta()]
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
@@ -78,7 +75,7 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         near = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - aside)
         watched = np.abs(seen.lateral) <= self.corridor
         begins = watched & (seen.gap <= near) & (seen.gap > PASSED)
-        goes_on = watched & braked & (seen.gap <= near + self.brake_keeps) & (seen.gap > 2 * PASSED)
+        goes_on = watched & braked & (seen.gap > 2 * PASSED)
         return np.asarray(begins | goes_on)
 
     def _throttle(self, speed: FloatArray) -> FloatArray:

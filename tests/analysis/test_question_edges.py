@@ -54,7 +54,7 @@ def test_the_same_weather_twice_is_no_pair() -> None:
 def test_the_clearer_weather_comes_first(clear: str, wet: str) -> None:
     friction_first = [made_up(row(values=HEAVY), study=made_up_study(name=name, weather=name)) for name in (wet, clear)]
     pair, = weather_pairs(friction_first)
-    expected = sorted((clear, wet), key=lambda name: {"clear": (1, 1), "fog": (0.9, 0.6), "wet": (0.85, 1), "night": (1, 0.75)}[name])
+    expected = sorted((clear, wet), key=lambda name: {"clear": (1, 1), "fog": (0.9, 0.6), "wet": (0.71, 1), "night": (1, 0.75)}[name])
     assert [one.name for one in pair] == expected[::-1]
 
 
