@@ -1,0 +1,68 @@
+"""Adaptive cruise control (Milanes and Shladover 2014; Xiao, Wang, van Arem 2017), as SUMO's `MSCFModel_ACC` computes it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.ads.idm import Memory
+from safevar_sumo.ads.pedals import pedals, trim
+from safevar_sumo.ads.way import FARTHEST, in_the_way
+from safevar_sumo.records import Command, FloatArray, Nominal, Observation
+
+Positive = Annotated[float, Meta(gt=0, le=1e3)]
+# Gains of the modes [1/s for speeds, 1/s^2 for gaps] and thresholds: defaults of MSCFModel_ACC.
+SPEED_GAIN = -0.4
+CLOSING = 0.8, 0.04
+KEEPING = 0.07, 0.23
+AVOIDING = 0.23, 0.8
+FOLLOWS_BELOW = 100.0  # m
+KEEPS_GAP, KEEPS_SPEED = 0.2, 0.1  # m, m/s: errors below which the gap is kept
+
+
+class Acc(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Holds a speed, or a time headway to the one ahead.
+
+    Parameters
+    ----------
+    cruise_speed
+        Speed that it holds [m/s].
+    headway, standing_gap
+        Desired time headway [s], and the gap on top of it [m].
+    corridor
+        Half the width of its way [m].
+    """
+
+    cruise_speed: Positive = 13.89
+    headway: Positive = 1.0
+    standing_gap: Annotated[float, Meta(ge=0, le=100)] = 2.5
+    corridor: Positive = 1.4
+
+    def start(self, n: int, nominal: Nominal, step: float) -> Memory:
+        return Memory(nominal, step, None)
+
+    def drive(self, seen: Observation, memory: Memory) -> tuple[Command, Memory]:
+        trimmed = trim(memory.nominal, seen) if memory.trimmed is None else memory.trimmed
+        gap = np.where(in_the_way(seen, self.corridor), seen.gap, FARTHEST)
+        wanted = self.acceleration_at(gap, seen.speed, seen.obstacle_speed)
+        return pedals(memory.nominal, seen.speed, wanted, trimmed), memory._replace(trimmed=trimmed)
+
+    def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
+        """Acceleration asked for [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""
+        too_fast, slower = speed - self.cruise_speed, leader_speed - speed
+        error = gap - self.standing_gap - _standing_distance(speed) - self.headway * speed
+        keeps = (np.abs(error) < KEEPS_GAP) & (np.abs(too_fast) < KEEPS_SPEED)
+        following = np.where(keeps, _law(KEEPING, slower, error),
+                             np.where(error < 0, _law(AVOIDING, slower, error), _law(CLOSING, slower, error)))
+        return np.where(gap - self.standing_gap > FOLLOWS_BELOW, SPEED_GAIN * too_fast, following)
+
+
+def _standing_distance(speed: FloatArray) -> FloatArray:
+    """Distance kept beside the headway [m] (Xiao et al. 2017): 2 m below 10.8 m/s, 75 / v - 5 up to 15 m/s, none above."""
+    return np.minimum(np.maximum(75 / np.maximum(speed, 1.0) - 5, 0.0), 2.0)
+
+
+def _law(gains: tuple[float, float], speed_error: FloatArray, gap_error: FloatArray) -> FloatArray:
+    return gains[0] * speed_error + gains[1] * gap_error

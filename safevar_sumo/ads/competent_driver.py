@@ -1,0 +1,71 @@
+"""The competent and careful human driver of UN Regulation No. 157, annex 4, appendix 3 (longitudinal part)."""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.ads.reacting import HARDEST, JERK, TIME_ROUNDING, Reaction, react, unaware
+from safevar_sumo.ads.way import in_the_way, time_to_reach
+from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
+
+Positive = Annotated[float, Meta(gt=0, le=1e3)]
+NotNegative = Annotated[float, Meta(ge=0, le=1e3)]
+
+
+class _Memory(NamedTuple):
+    """Reaction; where the obstacle was first seen, infinite before [m]; whether it was in the way then; for how long it has strayed [s]."""
+
+    reaction: Reaction
+    first: FloatArray
+    ahead: BoolArray
+    strayed: FloatArray
+
+
+class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Holds its speed; perceives who strays into its way, reacts to a TTC below 2 s, and brakes with up to 0.774 g.
+
+    Parameters
+    ----------
+    cruise_speed
+        Speed that it holds [m/s], by default the one that it starts with.
+    critical_ttc, reaction_time
+        Time to collision that is a danger, and time from there to the brake [s].
+    stray, perception_time
+        Who enters the way is perceived once he has strayed so far from where he was first seen, and so long after [m, s].
+    lets_go
+        Deceleration with the accelerator released, while it reacts [m/s^2].
+    corridor
+        Half the width of its way [m].
+    """
+
+    cruise_speed: Positive | None = None
+    critical_ttc: Positive = 2.0
+    reaction_time: NotNegative = 0.75
+    stray: NotNegative = 0.375
+    perception_time: NotNegative = 0.4
+    lets_go: NotNegative = 0.4
+    corridor: Positive = 1.4
+
+    def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
+        return _Memory(unaware(n, nominal, step), np.full(n, np.inf), np.zeros(n, dtype=bool), np.full(n, -1.0))
+
+    def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
+        perceived, memory = self._perceived(seen, memory)
+        danger = perceived & in_the_way(seen, self.corridor) & (time_to_reach(seen) < self.critical_ttc)
+        command, reaction = react(seen, memory.reaction, danger, np.full_like(seen.speed, HARDEST), reaction_time=self.reaction_time,
+                                  jerk=JERK, lets_go=self.lets_go, cruise_speed=self.cruise_speed)
+        return command, memory._replace(reaction=reaction)
+
+    def _perceived(self, seen: Observation, memory: _Memory) -> tuple[BoolArray, _Memory]:
+        sighted = np.isfinite(seen.gap) & np.isfinite(seen.lateral)
+        lateral = np.where(sighted, seen.lateral, 0.0)
+        begins = sighted & ~np.isfinite(memory.first)
+        first = np.where(begins, lateral, memory.first)
+        ahead = memory.ahead | (begins & (np.abs(lateral) <= self.corridor))
+        away = np.abs(lateral - np.where(np.isfinite(first), first, 0.0))
+        strays = sighted & (away >= self.stray)
+        strayed = np.where(memory.strayed >= 0, memory.strayed + memory.reaction.step, np.where(strays, 0.0, -1.0))
+        return ahead | (strayed >= self.perception_time - TIME_ROUNDING), memory._replace(first=first, ahead=ahead, strayed=strayed)

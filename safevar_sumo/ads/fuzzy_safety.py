@@ -1,0 +1,87 @@
+"""The fuzzy safety model (Mattas et al. 2020, "Fuzzy Surrogate Safety Metrics"), the performance model of UN R157 as amended."""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.ads.reacting import HARDEST, Reaction, react, unaware
+from safevar_sumo.ads.way import in_the_way
+from safevar_sumo.records import Command, FloatArray, Nominal, Observation
+
+Positive = Annotated[float, Meta(gt=0, le=1e3)]
+NotNegative = Annotated[float, Meta(ge=0, le=1e3)]
+LEAST = 1e-9
+"""Accelerations and widths below this are 0 [m/s^2, m]."""
+
+
+class _Memory(NamedTuple):
+    """Reaction, and the own speed a call ago [m/s], None at first."""
+
+    reaction: Reaction
+    speed: FloatArray | None
+
+
+class FuzzySafety(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Holds its speed; brakes as hard as its fuzzy metrics say: PFS, whether a stop is still safe, and CFS, whether a crash is ahead.
+
+    Parameters
+    ----------
+    cruise_speed
+        Speed that it holds [m/s], by default the one that it starts with.
+    reaction_time
+        rt [s].
+    comfortable, hardest, leader_deceleration
+        b_min, b_max, b_u [m/s^2].
+    margin
+        To the safe distance, and to the gap itself [m].
+    corridor
+        Half the width of its way [m].
+    """
+
+    cruise_speed: Positive | None = None
+    reaction_time: NotNegative = 0.75
+    comfortable: Positive = 4.0
+    hardest: Positive = 6.0
+    leader_deceleration: Positive = 7.0
+    margin: NotNegative = 2.0
+    corridor: Positive = 1.4
+
+    def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
+        return _Memory(unaware(n, nominal, step), None)
+
+    def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
+        before = seen.speed if memory.speed is None else memory.speed
+        acceleration = (seen.speed - before) / memory.reaction.step
+        gap = np.where(in_the_way(seen, self.corridor), seen.gap, np.inf)
+        proactive = self.proactive(gap, seen.speed, seen.obstacle_speed)
+        critical = self.critical(gap, seen.speed, seen.obstacle_speed, acceleration)
+        wanted = np.where(critical > 0, critical * (self.hardest - self.comfortable) + self.comfortable, proactive * self.comfortable)
+        command, reaction = react(seen, memory.reaction, (proactive > 0) | (critical > 0), np.minimum(wanted, HARDEST),
+                                  reaction_time=self.reaction_time, cruise_speed=self.cruise_speed)
+        return command, _Memory(reaction, seen.speed)
+
+    def proactive(self, gap: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:
+        """PFS in [0, 1] at a gap [m] and speeds [m/s], shape (N,): 0 above the safe distance, 1 below the unsafe one."""
+        theirs = u * u / (2 * self.leader_deceleration)
+        safe = v * self.reaction_time + v * v / (2 * self.comfortable) - theirs + self.margin
+        unsafe = v * self.reaction_time + v * v / (2 * self.hardest) - theirs
+        return _share(gap - self.margin, unsafe, safe)
+
+    def critical(self, gap: FloatArray, v: FloatArray, u: FloatArray, a: FloatArray) -> FloatArray:
+        """CFS in [0, 1], with the own acceleration a [m/s^2] too."""
+        held = np.maximum(a, -self.comfortable)
+        then = v + self.reaction_time * held
+        closing = (v + held * self.reaction_time / 2 - u) * self.reaction_time
+        left = (then - u) * (then - u)
+        fuzzy = _share(gap, closing + left / (2 * self.hardest), closing + left / (2 * self.comfortable))
+        slowing = np.where(gap < (v - u) * (v - u) / (2 * np.maximum(np.abs(held), LEAST)), 1.0, 0.0)
+        return np.where(v <= u, 0.0, np.where(then < u, slowing, fuzzy))
+
+
+def _share(value: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """1 below `low`, 0 above `high`, linear between."""
+    width = np.maximum(high - low, LEAST)
+    return np.minimum(np.maximum((high - np.minimum(value, high + width)) / width, 0.0), 1.0)

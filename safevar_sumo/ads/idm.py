@@ -1,0 +1,64 @@
+"""The intelligent driver model (Treiber, Hennecke, Helbing 2000), as SUMO's `MSCFModel_IDM` computes it."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.ads.pedals import pedals, trim
+from safevar_sumo.ads.way import FARTHEST, in_the_way
+from safevar_sumo.records import Command, FloatArray, Nominal, Observation
+
+Positive = Annotated[float, Meta(gt=0, le=1e3)]
+LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
+
+
+class Memory(NamedTuple):
+    """The original vehicle; time between calls [s]; trim of the accelerator, of the first look."""
+
+    nominal: Nominal
+    step: float
+    trimmed: FloatArray | None
+
+
+class Idm(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """dv/dt = a (1 - (v / v0)^4 - (s* / s)^2), s* = s0 + max(0, v T + v (v - u) / (2 sqrt(a b))).
+
+    Parameters
+    ----------
+    cruise_speed
+        v0 [m/s].
+    headway, standing_gap
+        T [s], s0 [m].
+    acceleration, deceleration
+        a, b [m/s^2].
+    corridor
+        Half the width of its way [m].
+    """
+
+    cruise_speed: Positive = 13.89
+    headway: Positive = 1.0
+    standing_gap: Annotated[float, Meta(ge=0, le=100)] = 2.5
+    acceleration: Positive = 2.6
+    deceleration: Positive = 4.5
+    corridor: Positive = 1.4
+
+    def start(self, n: int, nominal: Nominal, step: float) -> Memory:
+        return Memory(nominal, step, None)
+
+    def drive(self, seen: Observation, memory: Memory) -> tuple[Command, Memory]:
+        trimmed = trim(memory.nominal, seen) if memory.trimmed is None else memory.trimmed
+        gap = np.where(in_the_way(seen, self.corridor), seen.gap, FARTHEST)
+        wanted = self.acceleration_at(gap, seen.speed, seen.obstacle_speed)
+        return pedals(memory.nominal, seen.speed, wanted, trimmed), memory._replace(trimmed=trimmed)
+
+    def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
+        """dv/dt [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""
+        share = speed / self.cruise_speed
+        closing = speed * (speed - leader_speed) / (2 * math.sqrt(self.acceleration * self.deceleration))
+        desired = self.standing_gap + np.maximum(speed * self.headway + closing, 0.0)
+        there = np.maximum(gap, LEAST_GAP)
+        return np.asarray(self.acceleration * (1 - share * share * share * share - desired * desired / (there * there)))

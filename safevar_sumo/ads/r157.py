@@ -1,0 +1,43 @@
+"""The braking that UN Regulation No. 157 asks of an automated lane keeping system, 5.2.5.2."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.ads.reacting import Reaction, react, unaware
+from safevar_sumo.ads.way import in_the_way, time_to_reach
+from safevar_sumo.records import Command, Nominal, Observation
+
+Positive = Annotated[float, Meta(gt=0, le=1e3)]
+
+
+class R157(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Holds its speed; reacts to a TTC below (v - u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s, and brakes with 6 m/s^2 at once.
+
+    Parameters
+    ----------
+    cruise_speed
+        Speed that it holds [m/s], by default the one that it starts with.
+    deceleration, reaction_time, margin
+        6 m/s^2, 0.35 s and 0.1 s in the regulation.
+    corridor
+        Half the width of its way [m].
+    """
+
+    cruise_speed: Positive | None = None
+    deceleration: Positive = 6.0
+    reaction_time: Annotated[float, Meta(ge=0, le=60)] = 0.35
+    margin: Annotated[float, Meta(ge=0, le=60)] = 0.1
+    corridor: Positive = 1.4
+
+    def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
+        return unaware(n, nominal, step)
+
+    def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+        critical = seen.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
+        danger = in_the_way(seen, self.corridor) & (time_to_reach(seen) < critical)
+        return react(seen, memory, danger, np.full_like(seen.speed, self.deceleration), reaction_time=self.reaction_time,
+                     jerk=self.deceleration / memory.step, cruise_speed=self.cruise_speed)

@@ -1,0 +1,73 @@
+"""What drivers do who see a danger, react after a while, and brake: the common part of the reference drivers.
+
+Each of them has a danger and a deceleration of its own. Until it reacts it holds the speed that it started with.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.ads.pedals import pedals, trim
+from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
+
+GRAVITY = 9.81  # m/s^2
+HARDEST = 0.774 * GRAVITY
+"""Deceleration of the competent and careful driver [m/s^2] (UN R157, annex 4, appendix 3)."""
+JERK = 12.65
+"""By how much it rises a second [m/s^3] (ibid.)."""
+CRUISE_GAIN = 1.0
+"""Acceleration per error of the speed that is held [1/s]."""
+TIME_ROUNDING = 1e-9
+"""Times that differ by less are the same [s]."""
+
+
+class Reaction(NamedTuple):
+    """The original vehicle; time between calls [s]; speed to hold [m/s] and the pedal's trim, of the first look.
+
+    `waited` is the time since the danger was first seen, negative before [s]; `asked` the deceleration [m/s^2], both (N,).
+    """
+
+    nominal: Nominal
+    step: float
+    held: tuple[FloatArray, FloatArray] | None
+    waited: FloatArray
+    asked: FloatArray
+
+
+def unaware(n: int, nominal: Nominal, step: float) -> Reaction:
+    """Nobody has seen a danger yet."""
+    return Reaction(nominal, step, None, np.full(n, -1.0), np.zeros(n))
+
+
+def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration: FloatArray, *, reaction_time: float, jerk: float = JERK,
+          lets_go: float = 0.0, cruise_speed: float | None = None) -> tuple[Command, Reaction]:
+    """Pedals of drivers in a danger, which passes when the obstacle is out of sight, behind or no longer nearing.
+
+    Parameters
+    ----------
+    danger
+        Whether it is seen now; shape (N,).
+    deceleration
+        What is braked with once they react, shape (N,) [m/s^2]; it rises at `jerk` [m/s^3].
+    reaction_time
+        From the first sight of the danger to the brake [s].
+    lets_go
+        Deceleration while they react [m/s^2].
+    cruise_speed
+        Speed that they hold [m/s], by default the one that they started with.
+    """
+    held = reaction.held
+    if held is None:
+        speed = seen.speed if cruise_speed is None else np.full_like(seen.speed, cruise_speed)
+        held = speed, trim(reaction.nominal, seen)
+    nears = np.isfinite(seen.gap) & (seen.gap > 0) & (seen.closing_speed > 0)
+    aware = reaction.waited >= 0
+    waited = np.where(aware, np.where(nears, reaction.waited + reaction.step, -1.0), np.where(danger, 0.0, -1.0))
+    brakes = waited >= reaction_time - TIME_ROUNDING
+    asked = np.where(brakes, np.minimum(reaction.asked + jerk * reaction.step, deceleration), 0.0)
+    holding = CRUISE_GAIN * (held[0] - seen.speed)
+    acceleration = np.where(brakes, -asked, np.where((waited >= 0) & (lets_go > 0), -lets_go, holding))
+    command = pedals(reaction.nominal, seen.speed, acceleration, held[1])
+    return command, reaction._replace(held=held, waited=waited, asked=asked)

@@ -1,0 +1,54 @@
+"""Responsibility-sensitive safety (Shalev-Shwartz, Shammah, Shashua 2017), longitudinal part, as a reference driver."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.ads.reacting import HARDEST, Reaction, react, unaware
+from safevar_sumo.ads.way import in_the_way
+from safevar_sumo.records import Command, FloatArray, Nominal, Observation
+
+Positive = Annotated[float, Meta(gt=0, le=1e3)]
+NotNegative = Annotated[float, Meta(ge=0, le=1e3)]
+
+
+class Rss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Holds its speed; a gap below the safe distance is a danger, to which it reacts and brakes with up to 0.774 g.
+
+    safe distance = v rt + a rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u).
+
+    Parameters
+    ----------
+    cruise_speed
+        Speed that it holds [m/s], by default the one that it starts with.
+    reaction_time
+        rt [s].
+    acceleration, deceleration, leader_deceleration
+        a while it reacts, b of its own braking, b_u of the one ahead [m/s^2].
+    corridor
+        Half the width of its way [m].
+    """
+
+    cruise_speed: Positive | None = None
+    reaction_time: NotNegative = 0.75
+    acceleration: NotNegative = 0.0
+    deceleration: Positive = HARDEST
+    leader_deceleration: Positive = HARDEST
+    corridor: Positive = 1.4
+
+    def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
+        return unaware(n, nominal, step)
+
+    def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+        danger = in_the_way(seen, self.corridor) & (seen.gap < self.safe_distance(seen.speed, seen.obstacle_speed))
+        return react(seen, memory, danger, np.full_like(seen.speed, self.deceleration), reaction_time=self.reaction_time,
+                     cruise_speed=self.cruise_speed)
+
+    def safe_distance(self, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
+        """The least gap that is safe [m], at speeds [m/s] of shape (N,)."""
+        rt, faster = self.reaction_time, speed + self.reaction_time * self.acceleration
+        own = speed * rt + self.acceleration * rt * rt / 2 + faster * faster / (2 * self.deceleration)
+        return np.asarray(np.maximum(own - leader_speed * leader_speed / (2 * self.leader_deceleration), 0.0))

@@ -1,0 +1,137 @@
+"""The reference drivers against SUMO's own models, their formulas worked out by hand, and the numbers of the regulations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from safevar_sumo.ads.acc import Acc
+from safevar_sumo.ads.competent_driver import CompetentDriver
+from safevar_sumo.ads.fuzzy_safety import FuzzySafety
+from safevar_sumo.ads.idm import Idm
+from safevar_sumo.ads.krauss import Krauss
+from safevar_sumo.ads.r157 import R157
+from safevar_sumo.ads.rss import Rss
+from safevar_sumo.records import Nominal, Observation
+from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.simulation.network import CopiedNetwork
+from safevar_sumo.simulation.sumo import open_world
+
+STEP = 0.05
+TABLE = np.arange(0.0, 20.5, 0.5)
+KNOWN = Nominal(mass=1500.0, accel=3.0, decel=10.0, max_speed=50.0, tau=0.1, speeds=TABLE, full_throttle=np.full(len(TABLE), 3.0),
+                coasting=np.zeros(len(TABLE)), braking=10.0)
+"""Its brake pedal is the deceleration over 10 m/s^2."""
+GAPS, SPEEDS, LEADERS = (values.ravel() for values in np.meshgrid([1.0, 4.0, 12.0, 30.0, 80.0, 150.0], [2.0, 8.0, 13.0], [0.0, 5.0, 12.5]))
+
+
+@pytest.fixture(scope="module")
+def sumo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """libsumo with a vehicle of every model, all with SUMO's default parameters of a passenger car, cruising at 13.89 m/s."""
+    folder = NETWORKS / "car_to_car"
+    traffic = tmp_path_factory.mktemp("models") / "traffic.rou.xml"
+    kinds = [f'<vType id="{name}" carFollowModel="{name}" minGap="2.5" tau="1" accel="2.6" decel="4.5" maxSpeed="13.89" speedDev="0"'
+             f' sigma="0"/><vehicle id="{name}" type="{name}" route="r" depart="0" departPos="{100 + 300 * i}"/>'
+             for i, name in enumerate(("IDM", "ACC", "Krauss"))]
+    traffic.write_text('<routes><route id="r" edges="road"/>' + "".join(kinds) + "</routes>")
+    with open_world(CopiedNetwork(folder / "network.net.xml", traffic, folder / "scenario.sumocfg"), 0):
+        import libsumo
+
+        libsumo.simulationStep()
+        yield libsumo
+
+
+def theirs(sumo: Any, model: str, net_of: float) -> np.ndarray:
+    """Acceleration that SUMO's model makes of every state [m/s^2]."""
+    speeds = [sumo.vehicle.getFollowSpeed(model, v, gap - net_of, u, 4.5) for gap, v, u in zip(GAPS, SPEEDS, LEADERS, strict=True)]
+    return (np.array(speeds) - SPEEDS) / STEP
+
+
+def test_idm_is_sumos(sumo: Any) -> None:
+    expected, ours = theirs(sumo, "IDM", 2.5), Idm().acceleration_at(GAPS, SPEEDS, LEADERS)
+    stops = SPEEDS + ours * STEP <= 0  # nobody drives backwards
+    assert ours[~stops] == pytest.approx(expected[~stops], abs=1e-6)
+    assert expected[stops] == pytest.approx(-SPEEDS[stops] / STEP, abs=1e-6)
+    assert np.count_nonzero(~stops) > 30
+
+
+def test_acc_is_sumos(sumo: Any) -> None:
+    expected, ours = theirs(sumo, "ACC", 2.5), Acc().acceleration_at(GAPS, SPEEDS, LEADERS)
+    compared = (SPEEDS + ours * STEP > 0) & (np.abs(expected - ours) < 1e-6)
+    braked = expected < ours - 1e-6  # in danger SUMO's brakes harder than its control law: its emergency override
+    assert np.all(compared | braked | (SPEEDS + ours * STEP <= 0))
+    assert np.count_nonzero(compared) > 35
+
+
+def test_krauss_means_to_keep_just_the_speed_that_sumos_keeps_behind_somebody_who_stands(sumo: Any) -> None:
+    """v_safe = -b tau + sqrt((b tau)^2 + 2 b gap) is where SUMO's ballistic update comes to rest, too."""
+    gaps = np.array([6.0, 12.0, 20.0, 30.0])
+    safe = -4.5 + np.sqrt(4.5**2 + 2 * 4.5 * gaps)
+    driver, nothing = Krauss(cruise_speed=50.0, standing_gap=0.0, braking_share=0.45, reaction_time=1.0), np.zeros(4)
+    command, _ = driver.drive(Observation(0.0, safe, gaps, safe, nothing, nothing, 1.0), driver.start(4, KNOWN, STEP))
+    assert np.stack(command) == pytest.approx(np.zeros((2, 4)), abs=1e-9)
+    kept = [sumo.vehicle.getFollowSpeed("Krauss", v, gap, 0.0, 4.5) for v, gap in zip(safe, gaps, strict=True)]
+    assert kept == pytest.approx(safe, abs=1e-4)
+
+
+def braking(driver: Any, speed: float, gap: float, leader: float = 0.0, lateral: float = 0.0,
+            lateral_speed: float = 0.0) -> tuple[float, np.ndarray]:
+    """Gap at which a driver first brakes, driven on at constant speed towards somebody, and its decelerations from then on."""
+    one, memory, first, asked = np.ones(1), driver.start(1, KNOWN, STEP), np.nan, []
+    for k in range(400):
+        now = gap - (speed - leader) * k * STEP
+        if now <= 0:
+            break
+        seen = Observation(k * STEP, speed * one, now * one, (speed - leader) * one, (lateral + lateral_speed * k * STEP) * one,
+                           lateral_speed * one, 1.0, leader * one, 0 * one)
+        command, memory = driver.drive(seen, memory)
+        if command.brake[0] > 0.05 and np.isnan(first):  # more than the accelerator let go
+            first = now
+        if not np.isnan(first):
+            asked.append(float(command.brake[0]) * 10)
+    return first, np.array(asked)
+
+
+def test_the_competent_driver_brakes_three_quarters_of_a_second_after_two_seconds_to_collision() -> None:
+    begun, asked = braking(CompetentDriver(), 15.0, 60.0)
+    assert begun == pytest.approx(15.0 * (2.0 - 0.75), abs=2 * 15 * STEP)
+    rise = np.minimum(12.65 * STEP * np.arange(1, len(asked) + 1), 0.774 * 9.81)
+    assert asked == pytest.approx(rise, abs=12.65 * STEP + 1e-9)
+    assert asked[-1] == pytest.approx(0.774 * 9.81)
+
+
+def test_the_competent_driver_perceives_a_crossing_pedestrian_after_a_stray_of_three_eighths_of_a_metre() -> None:
+    """Starts 2 m aside at 1 m/s, seen at once: strays at 0.375 s, perceived at 0.775 s, then TTC is below 2 s, 0.75 s to the brake."""
+    begun, _ = braking(CompetentDriver(), 10.0, 20.0, lateral=-2.0, lateral_speed=1.0)
+    assert begun == pytest.approx(20.0 - 10 * (0.375 + 0.4 + 0.75), abs=10 * 2.1 * STEP)
+
+
+def test_r157_brakes_with_6_at_once_when_the_regulation_says() -> None:
+    begun, asked = braking(R157(), 12.0, 60.0)
+    assert begun == pytest.approx(12.0 * (12.0 / 12 + 0.45 - 0.35), abs=2 * 12 * STEP)
+    assert asked == pytest.approx(np.full(len(asked), 6.0))
+
+
+def test_rss_brakes_a_reaction_time_after_its_safe_distance() -> None:
+    b = 0.774 * 9.81
+    safe = 12 * 0.75 + (12**2 - 5**2) / (2 * b)
+    assert Rss().safe_distance(np.array([12.0]), np.array([5.0]))[0] == pytest.approx(safe)
+    begun, _ = braking(Rss(), 12.0, 60.0, leader=5.0)
+    assert begun == pytest.approx(safe - 7 * 0.75, abs=2 * 7 * STEP)
+
+
+def test_fuzzy_metrics_are_those_worked_out_by_hand() -> None:
+    """v = 20, u = 10: d_safe = 15 + 50 - 50/7 + 2 = 59.857, d_unsafe = 15 + 33.333 - 7.143 = 41.190, at gap - 2."""
+    model, one = FuzzySafety(), np.ones(1)
+    for gap, pfs in ((62.0, 0.0), (43.1, 1.0), (52.523809, 0.5)):
+        assert model.proactive(gap * one, 20 * one, 10 * one)[0] == pytest.approx(pfs, abs=1e-3)
+    # a = 0: v' = 20; closing = 7.5, d_safe = 7.5 + 12.5 = 20, d_unsafe = 7.5 + 8.333 = 15.833
+    for gap, cfs in ((20.1, 0.0), (15.8, 1.0), (17.91667, 0.5)):
+        assert model.critical(gap * one, 20 * one, 10 * one, 0 * one)[0] == pytest.approx(cfs, abs=1e-4)
+    # a = -8, at most -4: v' = 12 - 3 = 9 < u = 10: a crash is ahead where the gap is below (12 - 10)^2 / (2 * 4) = 0.5
+    assert model.critical(0.4 * one, 12 * one, 10 * one, -8 * one)[0] == 1
+    assert model.critical(0.6 * one, 12 * one, 10 * one, -8 * one)[0] == 0
+    assert model.critical(1.0 * one, 10 * one, 10 * one, 0 * one)[0] == 0
