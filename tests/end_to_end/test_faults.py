@@ -67,19 +67,49 @@ def test_two_workers_leave_the_same_bytes(whole: Path) -> None:
     assert Path("out/manifest.json").read_bytes() == (whole / "manifest.json").read_bytes()
 
 
-def test_killed_ten_times_at_random_moments_and_resumed(whole: Path) -> None:
+def killed_and_resumed(times: int) -> None:
+    """Kill the study so often, a moment after it has got further, and finish it."""
     moments, out = random.Random(4), Path("out")
-    for _ in range(10):
+    for _ in range(times):
         before = written(out)
         process = started("study", "small.toml", "--out", "out", "--jobs", "1", "--batch", "1")
         until(lambda: written(out) > before, process)  # noqa: B023
         time.sleep(moments.uniform(0, 0.1))
-        assert process.poll() is None, "the study is too short to be killed ten times"
+        assert process.poll() is None, "the study is too short to be killed so often"
         killed(process)
         until(lambda: not left_of_group(process))  # noqa: B023
     assert not (out / "solutions.csv").exists()
     study("--out", "out", "--jobs", "2")
-    assert solutions(out) == solutions(whole)
+
+
+def test_killed_at_random_moments_and_resumed(whole: Path) -> None:
+    killed_and_resumed(5)
+    assert solutions("out") == solutions(whole)
+
+
+@pytest.mark.slow
+def test_killed_a_hundred_times_at_random_moments_and_resumed() -> None:
+    Path("small.toml").write_text(STUDY.replace("evaluations = 150", "evaluations = 400"))
+    study("--out", "whole", "--jobs", "2")
+    killed_and_resumed(100)
+    assert solutions("out") == solutions("whole")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_workers_that_are_stopped_lose_nothing(goes_on: bool, whole: Path) -> None:
+    Path("small.toml").write_text(STUDY + "time_limit = 6\n")
+    process, moments = started("study", "small.toml", "--out", "out", "--jobs", "2", "--batch", "5"), random.Random(6)
+    until(lambda: written(Path("out")) > 0, process)
+    for _ in range(3):
+        for worker in workers_of(process)[:1]:
+            worker.suspend()
+            time.sleep(moments.uniform(0.5, 1.5))
+            if goes_on:
+                worker.resume()
+    ended(process, 0)
+    assert solutions("out") == solutions(whole)
+    assert not load("out").failures
 
 
 def test_workers_killed_at_random_moments(whole: Path) -> None:
@@ -299,7 +329,8 @@ libsumo.vehicletype.setMass = deadly
     pytest.param("kill", 1, "the worker process died (exit code -9)", marks=pytest.mark.slow)])
 def test_settings_that_sumo_dies_of_are_recorded_and_left_out(end: str, number: int, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("deadly.toml").write_text(
-        'extends = "smoke"\nname = "deadly"\n[search]\nalgorithms = ["rs"]\nevaluations = 60\nruns = 1\ntime_limit = 2.0\n')
+        'extends = "smoke"\nname = "deadly"\n[search]\nalgorithms = ["rs"]\nevaluations = 40\nruns = 1\n'
+        + ("time_limit = 2.0\n" if end == "hang" else ""))
     ended(started("study", "deadly.toml", "--out", "healthy"), 0)
     healthy = load("healthy").evaluations
     masses = np.sort(healthy["mass"].unique())
