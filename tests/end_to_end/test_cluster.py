@@ -85,7 +85,7 @@ def test_a_simulation_that_hangs_is_stopped_on_a_cluster_too(scheduler: tuple[su
         '[search]\nalgorithms = ["rs"]\nruns = 1\nevaluations = 10\ntime_limit = 2\n')
     _, address = scheduler
     worker(start, address, "--nanny")
-    errors = ended(started("study", "dozing.toml", "--cluster", address, "--out", "out"), 1)
+    errors = ended(started("study", "dozing.toml", "--cluster", address, "--out", "out"), 2)
     assert "workers of the cluster died" in errors
 
 
