@@ -10,7 +10,7 @@ import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.shipped import STUDIES
-from safevar_sumo.study import load_study, study_names
+from safevar_sumo.study import load_study, study_names, write_study
 
 
 @pytest.mark.parametrize("name", study_names())
@@ -45,13 +45,13 @@ def variant(tmp_path: Path, old: str, new: str) -> str:
 @pytest.mark.parametrize(("old", "new", "told"), [
     ("runs = 30", "runs = 30\ntime_limit = inf", "search.time_limit = inf"),
     ("runs = 30", "runs = 30\ntime_limit = 0", "search.time_limit = 0"),
-    ("ttc_threshold = 1.5", "ttc_threshold = 1.5\nttc = 2", "metrics: Object contains unknown field `ttc`"),
+    ("ttc_threshold = 1.5", "ttc_threshold = 1.5\nttc = 2", "metrics.ttc: there is no such key"),
     ("ttc_threshold = 1.5", "ttc_threshold = '1.5'", "metrics.ttc_threshold = '1.5'"),
     ("ttc_threshold = 1.5", "ttc_threshold = nan", "metrics.ttc_threshold = nan"),
     ("ttc_threshold = 1.5", "ttc_threshold = -1", "metrics.ttc_threshold = -1"),
     ("population = 50", "population = 1", "search.population = 1"),
     ("population = 50", "population = 50.5", "search.population = 50.5"),
-    ("runs = 30", "", "search: Object missing required field `runs`"),
+    ("runs = 30", "", "search.runs is missing"),
     ("lower = 4200, upper = 7000", "lower = 7000, upper = 4200", "vehicle.characteristics.max_rpm: lower = 7000.0 and upper = 4200.0"),
     ("lower = 4200, upper = 7000", "lower = 5900, upper = 7000", "vehicle.characteristics.max_rpm.original = 5800.0"),
     ("original = 5800", "original = nan", "vehicle.characteristics.max_rpm.original = nan"),
@@ -69,6 +69,70 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
     assert told in message
     assert path in message or "extends" in new
     assert len(message.splitlines()) <= 2
+
+
+@pytest.mark.parametrize(("text", "told"), [
+    ("[ads.parameters]\nlatency = 2024-05-01", "ads.parameters.latency = 2024-05-01, a date or time"),
+    ("[ads.parameters]\nmodel = { when = [07:30:00] }", "ads.parameters.model.when.0 = 07:30:00"),
+    ("[ads.parameters]\nseed = 18446744073709551616", "ads.parameters.seed = an integer of 65 bits"),
+    (f"[ads.parameters]\nseed = 1{'0' * 5000}", "digits"),
+    ("[search]\nruns = 1_000_000", "search.runs = 1000000"),
+    ("[search]\nevaluations = 9223372036854775807", "search.evaluations"),
+    (f"[ads.parameters]\n{'.'.join('a' * 3000)} = 1", "nested too deeply"),
+    (f"[ads.parameters]\n{'k' * 300} = 1", "is no name"),
+    ('[calibration."ads.parameters.brake_gap"]\nlower = "a"', "calibration.'ads.parameters.brake_gap'.lower = 'a'"),
+    ('[calibration."ads.parameters.brake_gap"]\nlow = 1', "calibration.'ads.parameters.brake_gap'.low: there is no such key"),
+    ('[published]\ntet = "much"', "published.tet = 'much'"),
+    ('title = "a\\u001b[31mred"', "title = "),
+    ("nothing = 1", "nothing: there is no such key\nlegal: one of ads, calibration"),
+    ("[origin]\nplaces = []", "origin"),
+    ("[vehicle]\ncharacteristics = 3", "vehicle.characteristics = 3"),
+    ("search = 3", "search = 3"),
+    ("extends = 3\n", "extends"),
+])
+def test_what_nobody_can_use_is_refused_by_its_key(text: str, told: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(text if text.startswith("extends") else f'extends = "smoke"\nname = "mine"\n{text}\n')
+    with pytest.raises(InputError) as caught:
+        load_study(str(path))
+    assert told in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+def test_all_mistakes_of_a_file_are_told_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('extends = "smoke"\nname = "mine"\n[search]\nruns = 0\npopulation = "x"\nseeds = 1\n'
+                    "[vehicle.characteristics.mass]\nunit = 3\n")
+    with pytest.raises(InputError, match="4 mistakes") as caught:
+        load_study(str(path))
+    for key in ("search.runs = 0", "search.population = 'x'", "search.seeds", "vehicle.characteristics.mass.unit = 3"):
+        assert key in str(caught.value)
+
+
+@pytest.mark.parametrize(("text", "inherits"), [
+    ('weather = "fog"', False), ('[ads]\nmodel = "krauss"', False), ("[ads.parameters]\nlatency = 0.1", True),
+    ("[scenario.parameters]\nduration = 5.0", True), ("[search]\nruns = 3", True), ('[ads]\nmodel = "world_on_rails"', True),
+])
+def test_another_system_inherits_neither_title_nor_published_values(text: str, inherits: bool, tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text(f'extends = "sun"\n{text}\n')
+    study, sun = load_study(str(tmp_path / "mine.toml")), load_study("sun")
+    assert study.name == "mine", "a study without a name is called as its file"
+    assert (study.title == sun.title) == inherits
+    assert (study.published == sun.published) == inherits
+    assert bool(study.origin.remarks) != inherits
+    changed = load_study("sun", weather="fog")
+    assert (changed.title, changed.published) == ("sun", {})
+    own = load_study("rain")
+    assert own.published["safety_degree"] == 2.2
+    assert not own.origin.remarks
+
+
+def test_a_written_study_is_called_as_its_file(tmp_path: Path) -> None:
+    write_study(tmp_path / "fitted.toml", load_study("sun"), "A comment\nof \x1b two lines.")
+    found = load_study(str(tmp_path / "fitted.toml"))
+    assert found.name == "fitted"
+    assert found.published == load_study("sun").published
 
 
 def test_a_study_may_extend_a_file_beside_it(tmp_path: Path) -> None:

@@ -7,11 +7,14 @@ import io
 import os
 import signal
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from safevar_sumo.errors import InputError, SafevarError
+
+if TYPE_CHECKING:
+    from safevar_sumo.study import Study
 
 INTERRUPTED = 130
 COMMANDS = {
@@ -114,3 +117,9 @@ def _fail(message: str, code: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is over: another Ctrl-C changes neither code nor message
     click.echo(f"safevar-sumo: {message}", err=True)
     sys.exit(code)
+
+
+def tell_remarks(study: Study) -> None:
+    """What a study's reader had to leave out, on the standard error."""
+    for remark in study.origin.remarks:
+        click.echo(f"note: {remark}", err=True)

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from safevar_sumo.cli.outputs import PICTURES, check_output
-from safevar_sumo.cli.program import commands
+from safevar_sumo.cli.program import commands, tell_remarks
 from safevar_sumo.computing import available_cores, evaluate_all, local_pool
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.progress import counted, counted_trials
@@ -43,6 +43,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, as_json: bool) -> None:
     """Compare STUDY with settings and metrics in the published package's CSV format."""
     chosen = load_study(study)
+    tell_remarks(chosen)
     system = assemble(chosen, study)
     if plot is not None:
         check_output(plot, "--plot", PICTURES)

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from safevar_sumo.api.running import a_pool, carried_out, prepared
 from safevar_sumo.campaign import BATCH, RunKey, all_runs, forecast
-from safevar_sumo.cli.program import commands
+from safevar_sumo.cli.program import commands, tell_remarks
 from safevar_sumo.errors import InputError
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.study import Study, load_study
@@ -38,6 +38,7 @@ def study(study: str, batch: int | None, out: Path | None, jobs: int | None, clu
           retry_failed: bool, quiet: bool, dry_run: bool, **options: Any) -> None:
     """Search STUDY; the same command again goes on where it was stopped."""
     chosen, system = prepared(_with_options(load_study(study), **options), study)
+    tell_remarks(chosen)
     keys = _selected(all_runs(chosen), only, shard)
     directory = out or Path("results") / chosen.name
     with a_pool(chosen, jobs, cluster) as pool:

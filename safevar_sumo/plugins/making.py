@@ -12,7 +12,7 @@ import msgspec
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins.guard import Guard
 from safevar_sumo.plugins.lookup import Member
-from safevar_sumo.study import invalid
+from safevar_sumo.study import converted
 
 
 def made(member: Member, parameters: Mapping[str, Any], name: str, key: str, source: str) -> Any:
@@ -32,10 +32,7 @@ def made(member: Member, parameters: Mapping[str, Any], name: str, key: str, sou
     """
     cls = member.what
     if issubclass(cls, msgspec.Struct):
-        try:
-            return msgspec.convert(parameters, cls)
-        except msgspec.ValidationError as error:
-            raise invalid(source, parameters, error, key) from None
+        return converted(source, parameters, cls, key)
     try:
         inspect.signature(cls).bind(**parameters)
     except TypeError as error:

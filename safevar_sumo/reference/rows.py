@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import csv
 import io
+import warnings
+from collections import Counter
 from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +25,8 @@ COLUMNS = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece
 OPTIONAL = "ave_dece"
 ALIASES = {"dampratezeroce": "dampratezerotce", "dampratezerocd": "dampratezerotcd", "wheelradius": "radius"}
 """Names of characteristics in the package's files that are not those of its paper, without case and underscores."""
+MOST_COLUMNS = 1000
+"""Of a file; the published ones have 18."""
 SHARE_DECIMALS = 3
 """The package rounds a change's share of the domain before it compares it with beta."""
 
@@ -105,15 +109,21 @@ def _table(path: Path, content: bytes) -> pd.DataFrame:
     try:
         text = content.decode("utf-8-sig")
         header = [name.strip() for name in next(csv.reader(io.StringIO(text, newline="")), [])]
-        table = pd.read_csv(io.StringIO(text, newline=""), dtype=str, skipinitialspace=True, index_col=False, na_filter=False,
-                            skip_blank_lines=False).fillna("")
+        twice = [name for name, number in Counter(header).items() if number > 1]
+        if len(header) > MOST_COLUMNS:
+            raise InputError(path, f"has {len(header)} columns", f"up to {MOST_COLUMNS}, in the format of the published package")
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            table = pd.read_csv(io.StringIO(text, newline=""), dtype=str, skipinitialspace=True, index_col=False, na_filter=False,
+                                skip_blank_lines=False).fillna("")
+    except pd.errors.ParserWarning:
+        raise InputError(path, "has rows with more values than its header has columns", "a value for each column") from None
     except pd.errors.EmptyDataError:
         raise InputError(path, "is empty", "a CSV file with a header and rows") from None
     except (pd.errors.ParserError, csv.Error, UnicodeDecodeError) as error:
         raise InputError(path, f"is not CSV: {str(error).splitlines()[0]}", "a CSV file with a header and rows") from None
     table.columns = table.columns.str.strip()
     table = table[(table != "").any(axis=1)]
-    twice = [name for name in header if header.count(name) > 1]
     if twice:
         raise InputError(path, f"has the column {twice[0]!r} twice", "one column of a name")
     if len(header) == 1:

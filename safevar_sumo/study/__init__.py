@@ -1,0 +1,29 @@
+"""A study: data only, read strictly from a TOML file."""
+
+from safevar_sumo.study.mistakes import converted, invalid
+from safevar_sumo.study.reading import load_study
+from safevar_sumo.study.schema import (
+    CharacteristicTable,
+    FitTable,
+    FreeParameter,
+    MatrixTable,
+    MatrixTest,
+    MetricsTable,
+    ModelTable,
+    Origin,
+    SearchTable,
+    Study,
+    StudyLike,
+    VehicleTable,
+    Weather,
+    label_of,
+    study_names,
+    study_path,
+    tables_of,
+)
+from safevar_sumo.study.writing import check_writable, write_study
+
+__all__ = [
+    "CharacteristicTable", "FitTable", "FreeParameter", "MatrixTable", "MatrixTest", "MetricsTable", "ModelTable", "Origin", "SearchTable",
+    "Study", "StudyLike", "VehicleTable", "Weather", "check_writable", "converted", "invalid", "label_of", "load_study", "study_names",
+    "study_path", "tables_of", "write_study"]

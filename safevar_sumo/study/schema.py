@@ -1,0 +1,239 @@
+"""What a study is: which vehicle, driven by which ADS, in which scenario and weather, searched how; and where its file lies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct
+
+from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.shipped import STUDIES
+from safevar_sumo.variation import Correlation, Distribution
+
+Positive = Annotated[float, Meta(gt=0, le=1e6)]
+PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
+Weight = Annotated[float, Meta(ge=0, le=1e6)]
+Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Parameters = dict[str, Any]
+NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
+OBJECTIVES = ("safety_degree", "f_diff", "f_num_diff")
+"""What the published study minimises."""
+
+
+class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One row of the characteristics table; the quantities are in `unit`, a change counts `weight` times in f_diff."""
+
+    unit: str
+    original: float
+    lower: float
+    upper: float
+    weight: Positive = 1.0
+
+
+class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A model by its name, or by `package.module:Name`, and its parameters."""
+
+    model: str
+    parameters: Parameters = {}
+
+
+class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The vehicle under test: its model, the model's parameters, and what may vary."""
+
+    model: str
+    characteristics: dict[str, CharacteristicTable]
+    parameters: Parameters = {}
+
+
+class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Weather as data: what it does to the road and to the sensors.
+
+    `road_friction` and `visibility` are factors on the dry, clear case [-]; `recognition_delay` is by how much later
+    than in clear weather an ADS makes somebody out [s].
+    """
+
+    name: str
+    road_friction: Annotated[float, Meta(gt=0, le=1.5)]
+    visibility: Annotated[float, Meta(gt=0, le=1.5)]
+    recognition_delay: Annotated[float, Meta(ge=0, le=5)] = 0.0
+
+
+class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Thresholds of the safety metrics.
+
+    `ttc_threshold` is TTC* [s]; `sampling_interval` [s] is the time between two samples that
+    TET, TIT and aveDece are computed from (a whole multiple of the simulation's step; by default the step).
+    `also` names further metrics as `package.module:Name`.
+    """
+
+    ttc_threshold: Positive
+    sampling_interval: Positive | None = None
+    also: list[str] = []
+
+
+class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is searched with: `runs` runs of every algorithm, each with `evaluations` simulations.
+
+    A batch of simulations that takes longer than `time_limit` [s] is taken for hung. `objectives` are minimised, a
+    metric in its unsafe direction. `parameters` are those of algorithms, by their labels; in a file they stand in tables
+    such as [search.nsga2].
+    """
+
+    algorithms: Annotated[list[str], Meta(min_length=1)]
+    population: Annotated[int, Meta(ge=2, le=100_000)]
+    evaluations: PositiveInt
+    runs: Annotated[int, Meta(ge=1, le=100_000)]
+    seed: Seed
+    time_limit: Annotated[float, Meta(gt=0, le=86400)] = 300.0
+    objectives: Annotated[list[str], Meta(min_length=2, max_length=6)] = msgspec.field(default_factory=lambda: list(OBJECTIVES))
+    parameters: dict[str, Parameters] = {}
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """What the algorithms are called in results, and how the study names them: of `package.module:Name` the Name."""
+        return {label_of(name): name for name in self.algorithms}
+
+
+def label_of(algorithm: str) -> str:
+    """What an algorithm is called in results: of `package.module:Name` the Name."""
+    return algorithm.rpartition(":")[2]
+
+
+class MatrixTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A test of a matrix: its scenario at every combination of the values in `over`, in every one of the weathers.
+
+    `parameters` are added to those of the study's scenario; with another `model` they stand alone.
+    """
+
+    name: Annotated[str, Meta(min_length=1)]
+    model: str = ""
+    parameters: Parameters = {}
+    over: dict[str, Annotated[list[Any], Meta(min_length=1)]] = {}
+    weathers: list[str] = []
+
+
+class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Several scenario points in which every setting is simulated.
+
+    `aggregate` is what becomes of their safety degrees: that of the point in which the setting comes off worst, or the mean.
+    """
+
+    tests: Annotated[list[MatrixTest], Meta(min_length=1)]
+    aggregate: Literal["worst", "mean"] = "worst"
+
+
+class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A parameter that may be calibrated: its bounds in `unit`, and what it means."""
+
+    lower: float
+    upper: float
+    unit: str
+    meaning: str
+
+
+class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where a study comes from; no part of what it is.
+
+    `called` is the path that names it on the command line, if its name does not; `places` are the folders of its file and
+    of those that it extends, in which its plug-ins are looked up first; `remarks` are what whoever uses it should know.
+    """
+
+    called: str = ""
+    places: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+
+class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How free parameters are found: what counts for how much, which rows are used, and from where the search starts.
+
+    The loss is `original` * mean_m(w_m (miss / (`tolerance` * published))^2) of the original vehicle
+    + mean over the files of sum_m(w_m (`rank` (1 - rho) + mean |error| / standard deviation)) + `collisions` * share of rows that
+    collide on one side alone, w_m being `weights` by metric. Of every `hold_out` rows one is used for nothing but to be reported.
+    `trials` sets of parameters are tried, in generations of `population`: half of them in searches from `starts` random places in
+    the bounds, the rest from the better of what these found and the study's own values. `seed` is the seed of all that.
+    """
+
+    trials: PositiveInt = 1200
+    seed: Annotated[int, Meta(ge=0, le=2**31)] = 1
+    starts: Annotated[int, Meta(ge=0, le=1000)] = 0
+    population: Annotated[int, Meta(ge=4, le=1000)] = 14
+    hold_out: Annotated[int, Meta(ge=2, le=1000)] = 2
+    tolerance: Annotated[float, Meta(gt=0, le=1)] = 0.05
+    original: Weight = 1.0
+    rank: Weight = 5.0
+    collisions: Weight = 10.0
+    weights: dict[str, Weight] = msgspec.field(
+        default_factory=lambda: {"safety_degree": 1.0, "tet": 0.3, "tit": 0.3, "ave_dece": 0.5})
+
+
+class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A whole study as its TOML file gives it; `load_study` reads one.
+
+    `matrix` are the scenario points that it is simulated in, if there is more than the one scenario;
+    `step_length` is the simulation's time step [s], by default the one of the network's options;
+    `published` are the original vehicle's metrics in the published study, by name, as far as there are any;
+    `repeatability` are standard deviations of repeats of one setting there;
+    `calibration` tells which parameters are free, by their keys in the file, such as `ads.parameters.corridor`, `fit` how they are found;
+    `variation` and `correlations` tell how characteristics vary in the world, by name: uniformly where nothing is said.
+    """
+
+    name: Annotated[str, Meta(pattern=NAME)]
+    title: str
+    scenario: ModelTable
+    weather: str | Weather
+    vehicle: VehicleTable
+    ads: ModelTable
+    metrics: MetricsTable
+    search: SearchTable
+    matrix: MatrixTable | None = None
+    step_length: Annotated[float, Meta(ge=0.001, le=1)] | None = None
+    published: dict[str, float] = {}
+    repeatability: dict[str, Annotated[float, Meta(gt=0, le=1e6)]] = {}
+    fit: FitTable = msgspec.field(default_factory=FitTable)
+    calibration: dict[str, FreeParameter] = {}
+    variation: dict[str, Distribution] = {}
+    correlations: list[Correlation] = []
+    origin: Origin = Origin()
+
+
+def tables_of(study: Study) -> dict[str, Any]:
+    """A study as plain tables, without where it comes from: what two equal studies have in common."""
+    tables: dict[str, Any] = msgspec.to_builtins(study)
+    del tables["origin"]
+    return tables
+
+
+StudyLike = str | Path | Mapping[str, Any] | Study
+"""A study by its name, the path of its file, its tables, or itself."""
+
+
+def study_names() -> list[str]:
+    """Names of the studies that come with the package."""
+    return sorted(path.stem for path in STUDIES.glob("*.toml"))
+
+
+def study_path(study: str) -> Path:
+    """The file of a study that is given by its name or by a path.
+
+    Raises
+    ------
+    InputError
+        If there is neither such a study nor such a file.
+    """
+    if study in study_names():
+        return STUDIES / f"{study}.toml"
+    path = Path(study)
+    if is_file(path):
+        return path
+    legal = f"{one_of(study_names())}, or the path of a study file (TOML)"
+    raise InputError("study", f"there is no study or file {study!r}", legal)
+
+
+def is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long, say
+        return False

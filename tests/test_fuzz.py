@@ -1,0 +1,153 @@
+"""Whatever is in a study file, a flag, a CSV file or an ADS: an answer or an error of one kind, never a traceback, and soon."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+from click.testing import CliRunner
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from safevar_sumo.ads.guarded import GuardedAds, PerVehicle
+from safevar_sumo.cli.program import commands
+from safevar_sumo.errors import ForeignError, InputError, SafevarError
+from safevar_sumo.plugins import Guard
+from safevar_sumo.records import Nominal, Observation
+from safevar_sumo.reference.rows import read_reference
+from safevar_sumo.simulation import assemble
+from safevar_sumo.study import Study, load_study, tables_of
+from safevar_sumo.study.reading import without_nothing
+from safevar_sumo.vehicles import CharacteristicSet
+
+TABLES = without_nothing(tables_of(load_study("smoke")))
+SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+SCALARS = st.one_of(st.integers(), st.floats(), st.text(max_size=20), st.booleans(), st.dates(), st.datetimes(), st.times())
+ANYTHING = st.recursive(
+    SCALARS, lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=8), inner, max_size=3)), max_leaves=6)
+SLOW = settings(max_examples=25, suppress_health_check=[
+    HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture])
+
+
+def paths(tables: dict[str, Any], before: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    """Every key of nested tables."""
+    inner = [path for key, value in tables.items() if isinstance(value, dict) for path in paths(value, (*before, key))]
+    return [*((*before, key) for key in tables), *inner]
+
+
+def replaced(tables: dict[str, Any], path: tuple[str, ...], value: object) -> dict[str, Any]:
+    key, *rest = path
+    return {**tables, key: value if not rest else replaced(tables[key], tuple(rest), value)}
+
+
+@SLOW
+@given(path=st.sampled_from(paths(TABLES)), value=ANYTHING)
+def test_a_study_with_anything_in_one_place_is_read_or_refused(path: tuple[str, ...], value: object) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "mine.toml"
+        try:
+            file.write_text(tomli_w.dumps(replaced(TABLES, path, value)), encoding="utf-8")
+        except (ValueError, UnicodeError):
+            return
+        try:
+            study = load_study(str(file))
+            assemble(study, str(file))
+        except InputError:
+            return
+        assert isinstance(study, Study)
+        numbers = list(study.vehicle.characteristics.values())
+        assert all(math.isfinite(row.original) and row.lower < row.upper for row in numbers)
+
+
+@SLOW
+@given(text=st.one_of(st.binary(max_size=200), st.text(max_size=200).map(lambda text: text.encode("utf-8", "surrogatepass"))))
+def test_any_bytes_are_a_study_or_refused(text: bytes) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "mine.toml"
+        file.write_bytes(text)
+        with suppress(InputError):
+            load_study(str(file))
+
+
+FLAGS = st.lists(st.one_of(
+    st.sampled_from(["--set", "--runs", "--only", "--shard", "--batch", "--seed", "--algorithms", "--json", "--no-filter", "--nothing"]),
+    st.text(max_size=10), st.integers().map(str), st.floats().map(str),
+    st.sampled_from(["mass=1", "mass=nan", "mass=1e999", "nsga2:0", "1/2"]),
+), max_size=4)
+
+
+@SLOW
+@pytest.mark.usefixtures("in_tmp")
+@given(command=st.sampled_from(["tables", "figures", "validate", "import", "calibrate"]), arguments=FLAGS)
+def test_flags_of_any_kind_are_taken_or_refused(command: str, arguments: list[str]) -> None:
+    done = CliRunner().invoke(commands, [command, *arguments])
+    assert done.exit_code != 0 or "--help" in arguments or "-h" in arguments
+    assert done.exception is None or isinstance(done.exception, SystemExit | SafevarError), (arguments, done.exception)
+
+
+CELLS = st.one_of(st.floats().map(str), st.text(max_size=6), st.just(""), st.just("1"))
+HEADER = [*SUN.names, "MaxPercentage", "SaftyDegree", "numbers", "TIT", "TET", "Dece"]
+
+
+@SLOW
+@given(header=st.one_of(st.just(HEADER), st.permutations(HEADER), st.lists(st.text(max_size=8), max_size=5)),
+       rows=st.lists(st.lists(CELLS, max_size=20), max_size=4), good=st.booleans())
+def test_any_csv_is_read_or_refused(header: list[str], rows: list[list[str]], good: bool) -> None:
+    original = [*map(str, SUN.original), "0.1", "2.5", "3", "0.4", "1.1", "5"]
+    lines = [",".join(header), *(",".join(row) for row in ([original] if good else [])), *(",".join(row) for row in rows)]
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "reference.csv"
+        file.write_bytes("\n".join(lines).encode("utf-8", "surrogatepass"))
+        try:
+            data = read_reference(file, SUN)
+        except InputError:
+            return
+        assert np.isfinite(data.settings).all()
+        assert ((data.settings >= SUN.lower) & (data.settings <= SUN.upper)).all()
+
+
+def test_a_csv_of_a_hundred_thousand_columns_is_refused_soon(tmp_path: Path) -> None:
+    file = tmp_path / "wide.csv"
+    file.write_text("\n".join([",".join(f"c{i}" for i in range(100_000)), ",".join(["1"] * 100_000)]))
+    with pytest.raises(InputError, match="100000 columns"):
+        read_reference(file, SUN)
+
+
+NOTHING = np.zeros(2)
+SEEN = Observation(0.0, NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, 1.0)
+KNOWN = Nominal(1.0, 1.0, 1.0, 1.0, 1.0, NOTHING, NOTHING, NOTHING, 1.0)
+COMMANDS = st.one_of(ANYTHING, st.none(), st.tuples(ANYTHING, ANYTHING), st.tuples(st.floats(), st.floats()),
+                     st.tuples(st.floats(0, 1), st.sampled_from([0, True, np.float32(0.5), np.array(0.5), np.array([0.5])])))
+
+
+class Returning:
+    """An ADS, for one vehicle or for many, that returns what it is given."""
+
+    def __init__(self, what: object) -> None:
+        self._what = what
+
+    def start(self, *_: object) -> None:
+        return None
+
+    def drive(self, *_: object) -> Any:
+        return self._what
+
+
+@settings(max_examples=100)
+@given(what=COMMANDS)
+def test_whatever_an_ads_commands_is_two_pedals_for_each_vehicle_or_an_error(what: object) -> None:
+    guard = Guard("mine.toml", "ads.model = 'mine:Mine'")
+    for ads in (GuardedAds(Returning((what, None)), guard), PerVehicle(lambda: Returning(what), guard)):  # type: ignore[arg-type, return-value]
+        try:
+            command, _ = ads.drive(SEEN, ads.start(2, KNOWN, 0.05))
+        except ForeignError:
+            continue
+        for pedal in command:
+            assert pedal.shape == (2,)
+            assert ((pedal >= 0) & (pedal <= 1)).all()
