@@ -8,6 +8,7 @@ from safevar_sumo.ads.aeb import Aeb
 from safevar_sumo.ads.apollo import Apollo
 from safevar_sumo.ads.base import Ads, ScalarAds
 from safevar_sumo.ads.competent_driver import CompetentDriver
+from safevar_sumo.ads.full_braking import FullBraking
 from safevar_sumo.ads.fuzzy_safety import FuzzySafety
 from safevar_sumo.ads.guarded import ADS_CONTRACT, SCALAR_ADS_CONTRACT, GuardedAds, PerVehicle
 from safevar_sumo.ads.idm import Idm
@@ -21,6 +22,7 @@ ADS: Mapping[str, type[Any]] = {
     "aeb": Aeb,
     "apollo": Apollo,
     "competent_driver": CompetentDriver,
+    "full_braking": FullBraking,
     "fuzzy_safety": FuzzySafety,
     "idm": Idm,
     "krauss": Krauss,

@@ -16,6 +16,7 @@ from safevar_sumo.answers.findings import Cause, Explained, Explanation
 from safevar_sumo.answers.necessity import distinct_causes, key_of, necessity
 from safevar_sumo.answers.robustness import robustness
 from safevar_sumo.answers.unsafe import Unsafe
+from safevar_sumo.answers.whose import whose_failures
 from safevar_sumo.computing import Pool
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import Handle
@@ -113,6 +114,8 @@ def _explained(found: Failures, bench: Bench, original: Evaluations, causes: Cau
     first, *others = courses(drives, np.concatenate([original.f_safe, here.f_safe]))
     hair = robustness(bench, here.settings, drives.trace.step, found.unsafe)
     shrunk = iter(boundaries(bench, [cause for row in rows for cause in causes[row]], found.unsafe))
+    collided = np.flatnonzero(here.collided)
+    whose = dict(zip(collided.tolist(), whose_failures(bench.study, here.settings[collided]), strict=True))
     explanations = []
     for i, row in enumerate(rows):
         of_it = []
@@ -129,5 +132,5 @@ def _explained(found: Failures, bench: Bench, original: Evaluations, causes: Cau
             outcome=str(here.outcome[i]), safety_degree=number(here.f_safe[i]),
             changed=tuple(name for name, is_changed in zip(names, changed, strict=True) if is_changed),
             necessary=tuple(names[column] for column in sorted(necessary(causes[row]))), causes=tuple(of_it), robustness=hair[i],
-            because=because(first, others[i])))
+            because=because(first, others[i]), whose=str(whose.get(i, ""))))
     return tuple(explanations)

@@ -45,7 +45,8 @@ class Cause:
 class Explanation:
     """One failure explained; `handle` is None for what did not come from results, `reasons` tell why it was chosen.
 
-    `safety_degree` is in m, or -m/s; `changed` and `necessary` are names; `causes` are all minimal ones.
+    `safety_degree` is in m, or -m/s; `changed` and `necessary` are names; `causes` are all minimal ones; `whose` tells of a
+    collision who would have avoided it in the same vehicle.
     """
 
     handle: Handle | None
@@ -58,6 +59,7 @@ class Explanation:
     causes: tuple[Cause, ...]
     robustness: Robustness
     because: Because
+    whose: str = ""
 
     def record(self) -> dict[str, Any]:
         """As `explain --json` prints it."""
@@ -67,7 +69,8 @@ class Explanation:
             "safety_degree": self.safety_degree, "changed": list(self.changed),
             "minimal_causes": [{name: getattr(cause, name) for name in ("changes", "boundary", "fraction", "outcome", "safety_degree")}
                                for cause in self.causes],
-            "robustness": self.robustness.share, "because": sentence(self.because)}
+            "robustness": self.robustness.share, "because": sentence(self.because),
+            "whose": self.whose}
 
 
 @dataclass(frozen=True, kw_only=True)

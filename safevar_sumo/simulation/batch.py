@@ -16,6 +16,8 @@ from safevar_sumo.simulation.sumo import Engine, SumoWorld, world_on
 from safevar_sumo.simulation.system import System
 from safevar_sumo.vehicles import at_start
 
+SURE_BRAKES = 9.0
+"""SUMO puts nobody onto the road who might not stop before what is ahead; there everybody brakes so hard at least [m/s^2]."""
 Watcher = Callable[[SumoWorld], None]
 
 
@@ -63,8 +65,10 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step)
-    world.set_types(vehicle.sumo_type(prepared))
+    types = vehicle.sumo_type(prepared)
+    world.set_types(types._replace(decel=np.maximum(types.decel, SURE_BRAKES)))
     world.depart()
+    world.set_types(types)
     length = world.vehicle_length(VUT)
 
     state = at_start(vehicle, prepared, world.speeds())

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from safevar_sumo.campaign import Campaign, Forecast
 from safevar_sumo.computing import Pool
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import failure_lines, record, solutions_frame
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -36,13 +36,16 @@ def print_forecast(console: Console, study: Study, runs: int, told: Forecast) ->
 def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path, pool: Pool) -> None:
     """The answer; per algorithm what was found, beside the original vehicle; the most critical setting; what RQ1 and RQ2 say of it."""
     from safevar_sumo.analysis import brief, case_of  # takes longer to load than all the rest
-    from safevar_sumo.answers import lead
+    from safevar_sumo.answers import lead, summary
 
     names = tuple(study.vehicle.characteristics)
     solutions = solutions_frame(names, campaign.solutions.items())
     if len(solutions):
         for line in lead(study, solutions, campaign.original, pool):
             console.print(line, soft_wrap=True, markup=False, highlight=False)
+        collided = solutions.loc[solutions["outcome"] == str(Outcome.COLLISION), list(names)].to_numpy(dtype=float)
+        if len(collided):
+            console.print(summary(study, collided), soft_wrap=True, markup=False, highlight=False)
         more = f"Why, and how far: python -m safevar_sumo explain {shlex.quote(str(directory))}"
         console.print(more, soft_wrap=True, markup=False, highlight=False)
     found = {"original vehicle": campaign.original}

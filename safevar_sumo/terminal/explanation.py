@@ -45,6 +45,8 @@ def _print_one(console: Console, place: str, one: Explanation, members: Characte
     if len(one.causes) > 1:
         _say(console, f"Needed by all of them: {', '.join(one.necessary) or 'nothing'}.")
     _say(console, f"Because: {sentence(one.because)}")
+    if one.whose:
+        _say(console, f"In the same vehicle: {one.whose}.")
     console.print(_side_by_side(one.because))
     if one.causes:
         shares = ", ".join(f"{share:.0%} at {step:g} s a step" for step, share in one.robustness.by_step.items())

@@ -22,7 +22,7 @@ GUARD = Guard("study 'mine'", "ads.model = 'my_module:Wrong'", __file__)
 STUDIES = {load_study(name).ads.model: load_study(name) for name in study_names()}
 NATIVE = load_study("native")
 SYSTEMS = {name: assemble(STUDIES.get(name, msgspec.structs.replace(NATIVE, ads=ModelTable(model=name)))) for name in ADS}
-TAKE_OVER = {"aeb", "competent_driver", "fuzzy_safety", "r157", "rss"}
+TAKE_OVER = {"aeb", "competent_driver", "full_braking", "fuzzy_safety", "r157", "rss"}
 """They keep the speed that they are given."""
 KNOWN = assemble(load_study("sun")).nominal
 

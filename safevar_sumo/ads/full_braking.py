@@ -1,0 +1,39 @@
+"""Full braking at the first possible moment: what nobody can do better in the lane."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.ads.reacting import Reaction, react, unaware
+from safevar_sumo.ads.way import in_the_way
+from safevar_sumo.records import Command, Nominal, Observation
+
+Positive = Annotated[float, Meta(gt=0, le=1e3)]
+AS_HARD_AS_CAN_BE = 1e6
+"""More than any brake does [m/s^2]: the pedal is on the floor."""
+
+
+class FullBraking(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Holds its speed; brakes fully, at once, when somebody is in its way or on course to be there when it is.
+
+    Parameters
+    ----------
+    cruise_speed
+        Speed that it holds [m/s], by default the one that it starts with.
+    corridor
+        Half the width of its way [m].
+    """
+
+    cruise_speed: Positive | None = None
+    corridor: Positive = 1.4
+
+    def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
+        return unaware(n, nominal, step)
+
+    def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+        hardest = np.full_like(seen.speed, AS_HARD_AS_CAN_BE)
+        return react(seen, memory, in_the_way(seen, self.corridor), hardest, reaction_time=0.0, jerk=AS_HARD_AS_CAN_BE / memory.step,
+                     cruise_speed=self.cruise_speed)
