@@ -196,7 +196,7 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
         for i, axis in enumerate(axes[2:].flat):
             axis.set_ylim(min(lowest) - margin, max(highest) + margin)
             if i % columns == 0:
-                axis.set_ylabel("error of SD\n(here - reference)")
+                axis.set_ylabel("error of SD")
         figure.suptitle(title.replace("$", r"\$"))
         try:
             figure.savefig(path, dpi=150, metadata=_UNDATED.get(path.suffix.lower()))
