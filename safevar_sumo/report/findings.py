@@ -22,7 +22,7 @@ CAUSES = 6
 """Minimal causes that a report shows, at the most."""
 REPLAYS = 10
 """Solutions that a report shows, at the most; explained ones come on top."""
-LIMIT = 20_000
+LIMIT = 12_000
 """Simulations, about, that the minimal causes of a study may take."""
 FIRST = ("fewest", "smallest", "most_severe")
 """What is shown before anything else."""

@@ -11,6 +11,7 @@ from markupsafe import Markup
 from safevar_sumo.answers.bench import Progress, silent
 from safevar_sumo.errors import InputError
 from safevar_sumo.report.findings import causes, explanations, necessity, replays
+from safevar_sumo.report.limits import LIMITS
 from safevar_sumo.report.material import Material, gather
 from safevar_sumo.report.questions import figures, front, tables
 from safevar_sumo.report.tested import tested
@@ -23,11 +24,18 @@ SECTIONS = {
     "tested": "What was tested",
     "verdict": "Verdict",
     "causes": "What does it, and how it looks",
+    "tolerance": "How far each characteristic may go",
+    "risk": "How likely it is",
+    "rules": "Where failures lie, as rules",
     "questions": "The research questions",
     "trust": "What was not tested, and how far to trust it",
     "reproduce": "How to make every number again",
 }
 """The sections of a report by the names that `--only` takes, in their order."""
+
+
+PARTS = {"causes": "explain", **{name: name for name in LIMITS}}
+"""Sections that take simulations, and the commands that make them alone."""
 
 
 def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), jobs: int | None = None, progress: Progress = silent) -> str:
@@ -62,7 +70,7 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
         title=f"Safety report: {', '.join(case.name for case in cases)}", sections={name: SECTIONS[name] for name in wanted},
         studies=studies,
         tables=tables(cases) if asked else [], figures=figures(cases) if asked else [],
-        commands=reproduce(materials, ["explain"] if "causes" in wanted else []) if "reproduce" in wanted else [],
+        commands=reproduce(materials, [PARTS[name] for name in PARTS if name in wanted]) if "reproduce" in wanted else [],
         player=player_parts(), css=_part("report.css"), js=_part("report.js"))
     progress("tables and figures", 1, 1)
     return page + "\n"
@@ -71,6 +79,8 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
 def _study(material: Material, wanted: Sequence[str], jobs: int | None, progress: Progress) -> Mapping[str, Any]:
     """What one study gives to every section that is wanted."""
     explained = explanations(material, jobs, progress) if "causes" in wanted and material.system is not None else None
+    limits = {name: make(material, jobs, _named(progress, material)) for name, make in LIMITS.items()
+              if name in wanted and material.system is not None}
     progress(f"{material.case.name}: replays", 0, 1)
     shown = replays(material, explained) if "causes" in wanted else []
     made: dict[str, Callable[[], Any]] = {
@@ -81,7 +91,12 @@ def _study(material: Material, wanted: Sequence[str], jobs: int | None, progress
         "trust": lambda: trust(material, explained)}
     return {"name": material.case.name, "title": material.case.study.title, "anchor": material.anchor(), "replays": shown,
             "has_system": material.system is not None, "front": front(material, [one["handle"] for one in shown]) if shown else None,
-            **{name: make() for name, make in made.items() if name in wanted or (name == "necessity" and "causes" in wanted)}}
+            **limits, **{name: make() for name, make in made.items() if name in wanted or (name == "necessity" and "causes" in wanted)}}
+
+
+def _named(progress: Progress, material: Material) -> Progress:
+    """Progress that tells of which study it is."""
+    return lambda what, done, total: progress(f"{material.case.name}: {what}", done, total)
 
 
 def _part(name: str) -> Markup:

@@ -16,7 +16,8 @@ from click.testing import CliRunner
 from safevar_sumo.analysis import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.report import SECTIONS, findings, make_report
+from safevar_sumo.report import SECTIONS, findings, limits, make_report
+from safevar_sumo.report.limits import LIMITS
 from safevar_sumo.report.page import gather
 from safevar_sumo.report.svg import Dot, scatter
 
@@ -75,10 +76,32 @@ class Explained:
         return self._records
 
 
+class Limit:
+    """What `tolerance`, `risk` and `rules` give of a vehicle of which one characteristic matters."""
+
+    rules = ()
+    samples, unsafe_share, remark, unsafe, verdict = 32, 0.25, "", "collision", "Unsafe alone: tireFric."
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def record(self) -> dict[str, Any]:
+        if self._name == "risk":
+            return {"study": "it", "unsafe": "collision", "samples": 32, "failures": 8, "probability": 0.25, "interval": [0.1, 0.4],
+                    "confidence": 0.95, "sensitivity": [
+                        {"characteristic": "tireFric", "first_order": 0.8, "total": 0.9, "first_order_interval": [0, 1],
+                         "total_interval": [0, 1]}]}
+        return {"study": "it", "unsafe": "collision", "pairs": [], "joint": {"factor": 0.5, "confidence": 0.95, "samples": 64}, "alone": [
+            {"characteristic": "tireFric", "unit": "-", "original": 3.5, "safe": [1.5, 4.0], "unsafe": [[0.5, 1.5]]}]}
+
+
 @pytest.fixture(scope="module")
 def page(slippery: Path) -> str:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(findings, "explain", lambda case, **_: Explained(case))
+        patch.setattr(limits, "SAMPLES", 32)
+        for name in LIMITS:
+            patch.setattr(limits.answers, name, lambda *_, name=name, **__: Limit(name))
         return make_report([slippery], jobs=1)
 
 
@@ -88,6 +111,8 @@ def never_again(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("explained twice")
 
     monkeypatch.setattr(findings, "explain", explain)
+    for name in LIMITS:
+        monkeypatch.setattr(limits.answers, name, explain)
 
 
 def test_the_page_is_sound_html_and_whole_in_itself(page: str) -> None:
@@ -112,7 +137,8 @@ def test_the_sections_stand_in_their_order_and_tell_what_was_found(page: str, sl
     assert f"hits at {-worst:.1f} m/s" in page
     assert f"stops with {case.original['safety_degree']:.2f} m to spare" in page
     assert "The smallest change that makes it collide" in page
-    for words in ("NSGA-II (1 runs)", "wet leaves", "RQ1: found settings", "RQ3.2", "from seed 1"):
+    for words in ("Unsafe alone: tireFric.", "within 50 % of the way", "<strong>25.00 %</strong>", "No rule was found",
+                  "NSGA-II (1 runs)", "wet leaves", "RQ1: found settings", "RQ3.2", "from seed 1"):
         assert words in page
 
 
@@ -131,7 +157,8 @@ def test_every_replay_that_is_linked_is_there_and_hits_as_recorded(page: str, sl
 
 
 @pytest.mark.usefixtures("never_again")
-@pytest.mark.parametrize("only", [["verdict", "causes", "trust"], pytest.param(list(SECTIONS), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("only", [["verdict", "causes", "trust"], ["tolerance", "risk", "rules"],
+                                  pytest.param(list(SECTIONS), marks=pytest.mark.slow)])
 def test_the_same_results_give_the_same_bytes_and_what_was_explained_stays(only: list[str], page: str, slippery: Path) -> None:
     pages = {make_report([slippery], only=only, jobs=1) for _ in range(2)}
     assert len(pages) == 1
@@ -151,10 +178,12 @@ def test_what_was_explained_of_other_results_is_not_taken(
 
 
 @pytest.mark.slow
-def test_causes_are_explained_on_the_way(slippery: Path, tmp_path: Path) -> None:
+def test_parts_are_computed_on_the_way(slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "SAMPLES", 256)
     shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))
-    page = make_report([tmp_path / "copy"], only=["verdict", "causes"])
+    page = make_report([tmp_path / "copy"], only=["verdict", "causes", "tolerance", "risk", "rules"])
     assert "Cause 1: " in page
+    assert page.count('<svg class="chart"') >= 4
     assert "The smallest change that makes it collide" in page
 
 
@@ -186,7 +215,7 @@ def test_studies_stand_side_by_side(slippery: Path, tmp_path: Path) -> None:
 
 def test_results_without_a_solution_have_a_report(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "begun", ignore=shutil.ignore_patterns("answers", "nsga2*", "rs*", "solutions.csv"))
-    page = make_report([tmp_path / "begun"], jobs=1)
+    page = make_report([tmp_path / "begun"], only=["tested", "verdict", "causes", "questions", "trust", "reproduce"], jobs=1)
     assert "No solution was found" in page
     assert Outline(page).open == []
 

@@ -1,0 +1,107 @@
+"""How far characteristics may go, how likely a failure is, and in which region failures lie."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from markupsafe import Markup
+
+from safevar_sumo import answers
+from safevar_sumo.answers.bench import Progress
+from safevar_sumo.report.material import Material
+from safevar_sumo.report.stored import stored
+from safevar_sumo.report.svg import Bar, rows
+from safevar_sumo.results import unsafe_rows
+from safevar_sumo.showing.comparison import number, spaced
+from safevar_sumo.vehicles import Characteristic
+
+SAMPLES = 4000
+"""Vehicles that risk is estimated from, and that rules are made of and judged by."""
+Found = dict[str, Any]
+
+
+def tolerance(material: Material, jobs: int | None, progress: Progress) -> Found:
+    """Every characteristic's safe interval alone, as bars over its domain, and the factor for all together."""
+    def compute() -> Found:
+        told = answers.tolerance(material.case.study, unsafe=_unsafe(material), jobs=jobs, progress=progress)
+        return {**told.record(), "verdict": told.verdict}
+
+    found = stored(material, "tolerance", compute)
+    return {"verdict": found["verdict"], "unsafe": found["unsafe"], "joint": found["joint"], "chart": _bars(material, found["alone"])}
+
+
+def risk(material: Material, jobs: int | None, progress: Progress) -> Found:
+    """The probability of a failure with its interval, and what decides, as bars."""
+    def compute() -> Found:
+        return answers.risk(material.case.study, samples=SAMPLES, unsafe=_unsafe(material), jobs=jobs, progress=progress).record()
+
+    found = stored(material, "risk", compute)
+    varied = "[variation]" if getattr(material.case.study, "variation", None) else "uniformly over their domains"
+    return {**found, "varied": varied, "chart": _sensitivity(material, found["sensitivity"])}
+
+
+def rules(material: Material, jobs: int | None, progress: Progress) -> Found:
+    """Rules in words, with what they are worth on vehicles that they were not made from."""
+    def compute() -> Found:
+        told = answers.rules(material.case.study, samples=SAMPLES, unsafe=_unsafe(material), jobs=jobs, progress=progress)
+        words = [answers.rule_in_words(rule, material.case.characteristics, told.unsafe) for rule in told.rules]
+        return {"words": words, "samples": told.samples, "share": told.unsafe_share, "remark": told.remark, "unsafe": str(told.unsafe)}
+
+    found: Found = stored(material, "rules", compute)
+    return found
+
+
+LIMITS: Mapping[str, Callable[[Material, int | None, Progress], Found]] = {"tolerance": tolerance, "risk": risk, "rules": rules}
+"""The sections that ask what the whole domain holds, by name."""
+
+
+def _unsafe(material: Material) -> str | None:
+    """What counts as unsafe all over the page: what does among the solutions."""
+    degree = material.case.original["safety_degree"]
+    unsafe = unsafe_rows(material.case.solutions, degree)
+    if (material.case.solutions["outcome"] == "collision").any() or math.isnan(degree):
+        return "collision"
+    return f"below={degree / 2!r}" if len(unsafe) else None
+
+
+def _bars(material: Material, alone: list[Found]) -> Markup:
+    members = {member.name: member for member in material.case.characteristics}
+    names, pieces, marks, ends = [], [], [], []
+    for one in alone:
+        member = members[one["characteristic"]]
+        safe, unsafe = one["safe"], one["unsafe"]
+        bars = [] if safe is None else [_bar(member, safe, "safe")]
+        names.append(member.name)
+        pieces.append([*bars, *(_bar(member, interval, "unsafe") for interval in unsafe)])
+        marks.append(_share(member, member.original))
+        ends.append((f"{number(member.lower)}{spaced(member.unit)}", f"{number(member.upper)}{spaced(member.unit)}"))
+    told = f"{material.case.name}: where each characteristic alone is safe and where it is unsafe; a mark at the original"
+    return rows(told, names, pieces, marks, ends)
+
+
+def _bar(member: Characteristic, interval: Sequence[float], look: str) -> Bar:
+    low, high = interval
+    words = f"{member.name} from {number(low)} to {number(high)}{spaced(member.unit)}: {look}"
+    return Bar(_share(member, low), _share(member, high), look, words)
+
+
+def _part(name: str, share: float, look: str, how: str) -> Bar:
+    return Bar(0, min(max(share, 0.0), 1.0), look, f"{name}: {share:.0%} {how}")
+
+
+def _share(member: Characteristic, value: float) -> float:
+    return (value - member.lower) / (member.upper - member.lower)
+
+
+def _sensitivity(material: Material, sensitivity: list[Found]) -> Markup | None:
+    known = [one for one in sensitivity if one["total"] is not None]
+    ordered = sorted(known, key=lambda one: (-one["total"], one["characteristic"]))
+    if not ordered:
+        return None
+    pieces = [[_part(one["characteristic"], one["total"], "weak", "together with others"),
+               _part(one["characteristic"], one["first_order"] or 0.0, "safe", "alone")] for one in ordered]
+    return rows(f"{material.case.name}: share of the safety degree's variance that each characteristic decides",
+                [one["characteristic"] for one in ordered], pieces, [None] * len(ordered),
+                [("", f"alone {one['first_order'] or 0:.0%}, with others {one['total']:.0%}") for one in ordered])
