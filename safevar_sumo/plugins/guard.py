@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import traceback
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from safevar_sumo.errors import ForeignError, told
 from safevar_sumo.records import BoolArray, FloatArray
 
 _OURS = str(Path(__file__).resolve().parents[1])
+_IMPORTS = str(Path(importlib.__file__).parent)
 INSTALLED = "site-packages"
 INFINITE = float("inf")
 
@@ -122,7 +124,7 @@ class Guard(NamedTuple):
         frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
         if isinstance(error, SyntaxError) and error.filename:
             frames.append((error.filename, error.lineno))
-        outside = [frame for frame in frames if not frame[0].startswith((_OURS, "<frozen"))]
+        outside = [frame for frame in frames if not frame[0].startswith((_OURS, _IMPORTS, "<frozen"))]
         own = [frame for frame in outside if self.folder and frame[0].startswith(self.folder)
                and (INSTALLED in self.folder or INSTALLED not in frame[0])]
         return "{}:{}".format(*(own or outside)[-1]) if outside else ""

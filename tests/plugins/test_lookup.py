@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -113,3 +114,11 @@ def test_a_module_that_fails_is_told_with_its_line_and_can_be_mended(module: str
     assert told.format(folder / "mine.py") in str(caught.value)
     assert mine(CONSTANT.format(0.3)).members[1].module == "mine"
     assert "mine" in sys.modules
+
+
+def test_a_numpy_py_in_the_working_directory_is_not_numpy(tmp_path: Path) -> None:
+    for name in ("numpy", "random"):
+        (tmp_path / f"{name}.py").write_text("raise RuntimeError('not this one')\n")
+    command = [sys.executable, "-m", "safevar_sumo", "study", "smoke", "--runs", "1", "--evaluations", "10", "--jobs", "1", "--quiet"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
