@@ -142,7 +142,9 @@ def sensitivity_figure(told: Risk) -> Figure:
         axis.set_yticks(np.arange(len(names)), [plain(name) for name in names])
         axis.set_title(plain(what), fontsize=FONT)
         axis.set_xlabel("share of the variance [-]")
-        axis.set_xlim(left=0)
+        axis.set_xlim(0, 1)
+        if rows["total"].isna().all():
+            axis.text(0.5, 0.5, "too few settings are unsafe,\nor safe, to tell", transform=axis.transAxes, ha="center", fontsize=FONT)
         axis.grid(visible=False, axis="y")
     axes[1].set_yticklabels([])
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=FONT)

@@ -74,7 +74,7 @@ def _nearest(bench: Bench, settings: FloatArray, is_unsafe: BoolArray, unsafe: U
     """For every plane the unsafe setting nearest to the original: the nearest of the grid, taken back as far as it stays unsafe."""
     members = bench.characteristics
     distances = np.sum(((settings - members.original) / (members.upper - members.lower)) ** 2, axis=-1)
-    distances = np.where(is_unsafe, distances, np.inf).reshape(len(settings), -1)
+    distances = np.where(is_unsafe, distances, np.inf).reshape(len(settings), SIDE * SIDE)
     found = [i for i in range(len(settings)) if is_unsafe[i].any()]
     ends = [settings[i].reshape(-1, len(members))[np.argmin(distances[i])] for i in found]
     lines = [Line(members.original, end, 0.0) for end in ends]

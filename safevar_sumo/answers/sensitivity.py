@@ -14,6 +14,8 @@ from safevar_sumo.records import FloatArray
 
 BASE = 512
 """Base points of Saltelli's design; it has n + 2 times as many settings."""
+FEWEST = 100
+"""Unsafe and safe settings in the design that the sensitivity of being unsafe can be told from."""
 RESAMPLES = 200
 """Bootstrap samples that the intervals come from."""
 
@@ -25,7 +27,8 @@ def sensitivities(bench: Bench, world: World, unsafe: Unsafe, confidence: float)
     -------
     tuple of pandas.DataFrame
         One row per characteristic: `characteristic`, `first_order`, `total` [share of the variance], and the intervals'
-        ends `first_order_lower`, `first_order_upper`, `total_lower`, `total_upper`; NaN where nothing varies.
+        ends `first_order_lower`, `first_order_upper`, `total_lower`, `total_upper`; NaN where nothing varies, or too few
+        settings are unsafe (or safe) to tell.
     """
     from SALib.sample import sobol  # takes a second to load
 
@@ -34,8 +37,10 @@ def sensitivities(bench: Bench, world: World, unsafe: Unsafe, confidence: float)
     points = sobol.sample(problem, BASE, calc_second_order=False, seed=seed)
     evaluations = bench.evaluate(world.settings(np.asarray(points)), "what decides")
     degree = np.where(evaluations.valid, evaluations.f_safe, np.nan)
-    outputs = degree, np.where(evaluations.valid, unsafe.of(evaluations).astype(float), np.nan)
-    return _indices(problem, outputs[0], confidence, seed), _indices(problem, outputs[1], confidence, seed)
+    is_unsafe = np.where(evaluations.valid, unsafe.of(evaluations).astype(float), np.nan)
+    if min(np.count_nonzero(is_unsafe == outcome) for outcome in (0, 1)) < FEWEST:
+        is_unsafe[:] = np.nan
+    return _indices(problem, degree, confidence, seed), _indices(problem, is_unsafe, confidence, seed)
 
 
 def _indices(problem: dict[str, Any], output: FloatArray, confidence: float, seed: int) -> pd.DataFrame:

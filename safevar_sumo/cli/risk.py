@@ -11,6 +11,7 @@ from rich.console import Console
 from safevar_sumo.cli.outputs import PICTURES, check_output
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.simulating import jobs_option, json_option, study_of, unsafe_option
+from safevar_sumo.errors import InputError
 
 
 @commands.command()
@@ -34,6 +35,8 @@ def risk(place: str, samples: int, confidence: float, width: float | None, unsaf
     chosen = study_of(place)
     if plot is not None:
         check_output(plot, "--plot", PICTURES)
+        if chosen.correlations:
+            raise InputError("--plot", "sensitivity indices of correlated characteristics are not defined", "a study without correlations")
     with stages(Console(stderr=True)) as progress:
         told = answers.risk(chosen, samples=samples, confidence=confidence, width=width, unsafe=unsafe, jobs=jobs, progress=progress)
     if told.sensitivity is None:

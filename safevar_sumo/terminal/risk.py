@@ -32,6 +32,8 @@ def print_risk(console: Console, told: Risk) -> None:
         other = second.loc[row["characteristic"]]
         table.add_row(escape(row["characteristic"]), *(_index(one, name) for one in (row, other) for name in ("first_order", "total")))
     console.print(table)
+    if told.sensitivity_of_unsafe["total"].isna().all():
+        _say(console, "Too few settings are unsafe, or safe, to tell what decides that; the safety degree tells more.")
     console.print(f"Sobol indices, first order and total, with half of their {told.confidence:.0%} intervals.", highlight=False)
 
 

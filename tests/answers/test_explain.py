@@ -27,7 +27,7 @@ def case(slippery: Path) -> Case:
 
 @pytest.fixture(scope="module")
 def told(case: Case) -> Explained:
-    return explain(case, top=3, pool=Here())
+    return explain(case, top=2, pool=Here())
 
 
 def collides(case: Case, settings: list[dict[str, float]]) -> list[bool]:

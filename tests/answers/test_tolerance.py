@@ -97,6 +97,10 @@ def test_the_promised_record() -> None:
     assert list(record["joint"]) == ["factor", "confidence", "samples"]
 
 
+def test_one_characteristic_has_no_pair() -> None:
+    assert of(1, nowhere, pairs=True).pairs == []
+
+
 def test_an_unknown_characteristic_is_refused() -> None:
     study = made_up_study(2)
     with pytest.raises(InputError, match="'wings'"):
