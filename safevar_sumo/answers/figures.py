@@ -50,8 +50,12 @@ def profiles_figure(told: Tolerance) -> Figure:
     rows = -(-len(told.alone) // columns)
     title = f"{told.study.name}: one characteristic at a time (unsafe: {told.unsafe})"
     figure, axes = new_figure(title, rows, columns, (max(2.3 * columns, 4.6), 1.0 + 1.75 * rows))
+    degrees = np.concatenate([one.profile["safety_degree"].dropna() for one in told.alone])
+    margin = 0.05 * (np.ptp(degrees) if degrees.size else 0.0) or 0.5
     for axis, one in zip(axes.flat, told.alone, strict=False):
         _profile(axis, one)
+        if degrees.size:
+            axis.set_ylim(degrees.min() - margin, degrees.max() + margin)  # the same for all: a steep one is one that matters
     for axis in list(axes.flat)[len(told.alone):]:
         axis.set_axis_off()
     figure.supylabel(DEGREE, fontsize=FONT)
