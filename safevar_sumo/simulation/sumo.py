@@ -83,6 +83,8 @@ class SumoWorld:
         SimulationError
             If a vehicle under test found no place.
         """
+        global _present
+        _present = self
         if self._standing is not None:
             self._standing.enter()
         self._api.simulationStep()
@@ -139,6 +141,21 @@ class SumoWorld:
             found = (self._left[name][1] if name in self._left else position(name) for name in self.ids(actor))
             self._positions[actor] = np.fromiter(chain.from_iterable(found), float, 2 * self.n).reshape(self.n, 2)
         return self._positions[actor]
+
+    @property
+    def api(self) -> Any:
+        """libsumo, or traci."""
+        return self._api
+
+    def has_left(self, name: str) -> bool:
+        """Whether a vehicle under test is off the road for good."""
+        return name in self._left
+
+    def names(self) -> frozenset[str]:
+        """What vehicles, persons, roads and types are called in the originals of the copies."""
+        api = self._api
+        kinds = (api.vehicle, api.person, api.edge, api.lane, api.route, api.vehicletype, api.junction)
+        return frozenset(name.removeprefix(":").partition(".")[2] for kind in kinds for name in kind.getIDList())
 
     def whereabouts(self) -> dict[str, tuple[float, float, float]]:
         """Where everybody is who is on the road, by id: front bumper or person [m], heading clockwise from north [degrees]."""
@@ -226,6 +243,16 @@ def open_world(files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, op
         raise _failure(error) from None
     finally:
         _close(api)
+
+
+_present: SumoWorld | None = None
+"""The world that is being driven in this process: SUMO is one a process, too."""
+
+
+def present_world() -> SumoWorld:
+    """The world that is being driven."""
+    assert _present is not None
+    return _present
 
 
 _standing: StandingSumo | None = None

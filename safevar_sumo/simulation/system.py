@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,6 +22,7 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.simulation.measuring import TAKEN, Measuring, measuring_of
 from safevar_sumo.simulation.network import OPTIONS, folder_of, is_folder
 from safevar_sumo.simulation.options import check_options
+from safevar_sumo.simulation.traci_controller import TraciController
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather
 from safevar_sumo.vehicles import VEHICLE_CONTRACT, VEHICLES, CharacteristicSet, GuardedVehicle, Vehicle, calibration_drive
 
@@ -97,6 +99,18 @@ def models_of(study: Study, source: str) -> Models:
     return Models(vehicle[0], ads[0], scenario[0], weather_of(study.weather, source), (vehicle[1], ads[1], scenario[1]))
 
 
+def _traci(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
+    """A function `step(traci, vehicle_id)` or a class with that method, written for SUMO."""
+    member, name = lookup.find({}, choice.model, "ads.model"), f"ads.model = {choice.model!r}"
+    what, make = member.what, partial(made, member, choice.parameters, name, "ads.parameters", lookup.source)
+    if not callable(getattr(what, "step", None) if inspect.isclass(what) else what):
+        raise InputError(lookup.source, f"{name} has no step", "a function step(traci, vehicle_id), or a class with that method")
+    if not inspect.isclass(what):
+        function = partial(what, **choice.parameters)
+        make = partial(lambda: function)
+    return TraciController(make, member.guard or Guard(lookup.source, name)), member
+
+
 def _matrix(study: Study, source: str) -> tuple[Point, ...]:
     """The points of a study's matrix, each by a name of its own."""
     points = [] if study.matrix is None else [point for test in study.matrix.tests for point in _points_of(test, study, source)]
@@ -163,6 +177,8 @@ def _scenario(choice: ModelTable, lookup: Lookup) -> tuple[Scenario, Member]:
 
 
 def _ads(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
+    if choice.kind == "traci":
+        return _traci(choice, lookup)
     member = lookup.class_of(ADS, choice.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT)
     name = f"ads.model = {choice.model!r}"
     make = partial(made, member, choice.parameters, name, "ads.parameters", lookup.source)

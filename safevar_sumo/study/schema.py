@@ -34,10 +34,14 @@ class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A model by its name, or by `package.module:Name`, and its parameters."""
+    """A model by its name, or by `package.module:Name`, and its parameters.
+
+    An ADS of the kind `traci` is a controller written for SUMO's TraCI.
+    """
 
     model: str
     parameters: Parameters = {}
+    kind: Literal["", "traci"] = ""
 
 
 class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
