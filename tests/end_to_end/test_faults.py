@@ -322,11 +322,10 @@ libsumo.vehicletype.setMass = deadly
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("end", "number", "why"), [
-    ("refuse", 2, "SUMO failed: That is too heavy."),
-    pytest.param("hang", 1, "the simulation took longer than 2 s", marks=pytest.mark.slow),
-    pytest.param("exit", 2, "the worker process died (exit code 3)", marks=pytest.mark.slow),
-    pytest.param("kill", 1, "the worker process died (exit code -9)", marks=pytest.mark.slow)])
+    ("refuse", 2, "SUMO failed: That is too heavy."), ("hang", 1, "the simulation took longer than 2 s"),
+    ("exit", 2, "the worker process died (exit code 3)"), ("kill", 1, "the worker process died (exit code -9)")])
 def test_settings_that_sumo_dies_of_are_recorded_and_left_out(end: str, number: int, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("deadly.toml").write_text(
         'extends = "smoke"\nname = "deadly"\n[search]\nalgorithms = ["rs"]\nevaluations = 40\nruns = 1\n'
@@ -366,6 +365,7 @@ def test_settings_that_sumo_dies_of_are_recorded_and_left_out(end: str, number: 
     pd.testing.assert_frame_equal(load("out").evaluations, healthy)
 
 
+@pytest.mark.slow
 def test_an_outage_of_the_cache_ends_the_study_and_changes_no_byte(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cache = Path("cache").resolve()
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))

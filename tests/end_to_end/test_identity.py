@@ -73,6 +73,7 @@ def test_results_go_with_the_files_that_they_were_computed_with() -> None:
     assert Path("out/solutions.csv").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_files_that_are_edited_meanwhile_mix_nothing() -> None:
     Path("mine.toml").write_text(STUDY.replace("evaluations = 30", "evaluations = 400"))
     process = started("study", "mine.toml", "--out", "out", "--jobs", "1", "--batch", "1")
