@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from typed import refused
 
 from safevar_sumo.shipped import STUDIES
 
@@ -26,13 +27,6 @@ def run(*arguments: str, expect: int = 0, **options: object) -> subprocess.Compl
     assert done.returncode == expect, f"{done.returncode}\n{done.stdout}\n{done.stderr}"
     assert "Traceback" not in done.stdout + done.stderr
     return done  # type: ignore[no-any-return]
-
-
-def refused(*arguments: str, told: tuple[str, ...]) -> None:
-    done = run(*arguments, expect=2)
-    for part in told:
-        assert part in done.stderr, done.stderr
-    assert len(done.stderr.strip().splitlines()) <= 2 or done.stderr.startswith("Usage:"), done.stderr
 
 
 def test_study_leaves_manifest_and_solutions_and_nothing_else(in_tmp: Path) -> None:
@@ -192,7 +186,7 @@ def test_bad_input_ends_with_code_2_and_says_what_is_legal(arguments: list[str],
 @pytest.mark.parametrize(("old", "new", "told"), [
     ('model = "carla"', 'model = "carl"', ("vehicle.model", "carl", "lgsvl")),
     ('model = "world_on_rails"', 'model = "wor"', ("ads.model", "wor", "apollo")),
-    ('model = "pedestrian_crossing"', 'model = "crossing"', ("scenario.model", "crossing", "lead_vehicle_stopped")),
+    ('model = "pedestrian_crossing"', 'model = "crosing"', ("scenario.model", "crosing", "lead_vehicle_stopped")),
     ('weather = "clear"', 'weather = "hail"', ("weather", "hail", "hard_rain")),
     ("tireFric         =", "tyreFric         =", ("tyreFric", "tireFric")),
     ("ttc_threshold = 1.5", "ttc_threshold = 1.5\nsampling_interval = 0.07", ("metrics.sampling_interval = 0.07", "0.05 s")),

@@ -2,52 +2,25 @@
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 import subprocess
 import sys
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import pytest
 from test_commands import run as run_process
+from typed import refused
+from typed import run_here as run
 
 from safevar_sumo.analysis import load_cases
-from safevar_sumo.cli import main
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
 
 QUESTIONS = ("rq1", "rq2", "rq3.1", "rq3.2", "rq3.3", "collisions")
 FORMATS = {"text": "smoke", "markdown": "| ", "latex": r"\toprule", "csv": "setting,", "json": '"setting": "smoke"'}
-
-
-class Done(NamedTuple):
-    stdout: str
-    stderr: str
-
-
-def run(*arguments: str, expect: int = 0) -> Done:
-    """The program in this process, for it starts no other and its imports take longer than all it does."""
-    out, err, code = io.StringIO(), io.StringIO(), None
-    with redirect_stdout(out), redirect_stderr(err), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["safevar-sumo", *arguments])
-        try:
-            main()
-        except SystemExit as end:
-            code = end.code
-    assert code == expect, f"{code}\n{out.getvalue()}\n{err.getvalue()}"
-    return Done(out.getvalue(), err.getvalue())
-
-
-def refused(*arguments: str, told: tuple[str, ...]) -> None:
-    done = run(*arguments, expect=2)
-    for part in told:
-        assert part in done.stderr, done.stderr
-    assert len(done.stderr.strip().splitlines()) <= 2 or done.stderr.startswith("Usage:"), done.stderr
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner
-from test_commands import refused, run
+from test_commands import run
+from typed import refused
 
 from safevar_sumo.cli import reference
 from safevar_sumo.cli.program import commands
