@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from rich.console import Console
 
+from safevar_sumo.cli.completion import complete_study
 from safevar_sumo.cli.outputs import PICTURES, check_output
 from safevar_sumo.cli.program import commands, tell_remarks
 from safevar_sumo.computing import available_cores, evaluate_all, local_pool
@@ -35,7 +36,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 
 @commands.command()
-@click.argument("study")
+@click.argument("study", shell_complete=complete_study)
 @click.argument("reference", type=click.Path(path_type=Path), metavar="REFERENCE.csv")
 @click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw here against reference.")
@@ -66,7 +67,7 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
 
 
 @commands.command(name="calibrate")
-@click.argument("study")
+@click.argument("study", shell_complete=complete_study)
 @click.argument("references", type=click.Path(path_type=Path), nargs=-1, metavar="[REFERENCE.csv]...")
 @click.option("--trials", type=click.IntRange(min=1), help="How many sets of parameters are tried.  [default: the study's]")
 @click.option("--seed", type=click.IntRange(min=0, max=2**31), help="Seed of the search.  [default: the study's]")
@@ -110,7 +111,7 @@ def calibrate_command(study: str, references: tuple[Path, ...], trials: int | No
 
 
 @commands.command(name="import")
-@click.argument("study")
+@click.argument("study", shell_complete=complete_study)
 @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory of the results.")
 @click.option("--nsga2", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of NSGA-II.")
 @click.option("--rs", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of random search.")

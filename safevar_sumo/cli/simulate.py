@@ -14,6 +14,7 @@ from safevar_sumo.api import Simulation
 from safevar_sumo.api.once import beside_the_original
 from safevar_sumo.api.settings import evaluated
 from safevar_sumo.cli.changes import read_changes, settings_of
+from safevar_sumo.cli.completion import complete_changes, complete_study
 from safevar_sumo.cli.outputs import refuse_inputs
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.showing import Shown, showing_options
@@ -28,9 +29,9 @@ from safevar_sumo.terminal.simulation import print_simulation, print_sweep
 
 
 @commands.command(name="simulate")
-@click.argument("study", metavar="STUDY|DIR")
+@click.argument("study", metavar="STUDY|DIR", shell_complete=complete_study)
 @replay_options
-@click.option("--set", "changes", multiple=True, metavar="NAME=VALUE",
+@click.option("--set", "changes", multiple=True, metavar="NAME=VALUE", shell_complete=complete_changes,
               help="A characteristic's value in its unit, +10% of the original, or a sweep FROM..TO; may be repeated for others.")
 @click.option("--no-filter", is_flag=True, help="Keep changes that are smaller than the filter's thresholds.")
 @click.option("--beyond", is_flag=True, help="Take values beyond the domains too.")

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from safevar_sumo.api.running import a_pool, carried_out, prepared
 from safevar_sumo.campaign import BATCH, RunKey, all_runs, forecast
+from safevar_sumo.cli.completion import complete_study
 from safevar_sumo.cli.program import commands, tell_remarks
 from safevar_sumo.errors import InputError
 from safevar_sumo.progress import CampaignProgress
@@ -19,7 +20,7 @@ from safevar_sumo.terminal.campaign import print_forecast, print_summary
 
 
 @commands.command()
-@click.argument("study")
+@click.argument("study", shell_complete=complete_study)
 @click.option("--runs", type=click.IntRange(1, 100_000), help="Runs of each algorithm.")
 @click.option("--evaluations", type=click.IntRange(1, 10_000_000), help="Simulations of each run.")
 @click.option("--algorithms", help="Which algorithms, separated by commas.")
