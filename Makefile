@@ -24,6 +24,7 @@ docs: .venv/installed
 benchmark: .venv/installed
 	$(RUN) benchmarks/evaluation.py
 	$(RUN) benchmarks/campaign.py
+	$(RUN) benchmarks/growth.py
 
 .venv/installed: setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

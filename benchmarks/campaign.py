@@ -1,46 +1,43 @@
-"""What a campaign costs beside its simulations: one run of each of a study's algorithms on this machine.
+"""What a campaign costs beside its simulations, and what more workers bring: ratios of one run on one machine.
 
-    python benchmarks/campaign.py [STUDY [EVALUATIONS]]
+    python benchmarks/campaign.py [STUDY] [--runs N] [--evaluations N] [--json]
 
-Time outside the simulation is what a worker has over when the bare time of the same batches, computed by one process
-with nothing else to do, is taken away: search, journal and hand-over, and what two workers cost each other. Workers
-start, and build the network, before the clock does. Only an idle machine tells the truth on the clock; processor time
-says on a busy one, too, what is not simulation.
+Time outside the simulation is what is left of all processor time when that of the same batches, computed by one process
+with nothing else to do, is taken away: search, journal and hand-over. Workers start, and load the network, before the
+clock does. What two workers bring is told by the clock: only an idle machine tells the truth.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 import tempfile
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 import psutil
+from evaluation import bare
+from measuring import Record, clock_seconds, processor_seconds, told
 
-from safevar_sumo.campaign import RunKey, all_runs, carry_out
-from safevar_sumo.computing import evaluate_batch, local_pool, packed
-from safevar_sumo.computing.local import LocalPool
+from safevar_sumo.campaign import BATCH, RunKey, all_runs, carry_out
+from safevar_sumo.computing import Pool, cluster_pool, evaluate_batch, local_pool, packed
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import ResultsDirectory
+from safevar_sumo.simulation import assemble, simulate
+from safevar_sumo.simulation.staging import staged
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 
-RUNS = 2
-"""Runs of each algorithm, so that two workers are not idle at the end."""
 
-
-class Counting:
-    """Hears how many settings were simulated, and says nothing."""
-
-    simulated = 0
+class Silent:
+    """Hears how a campaign goes on, and says nothing."""
 
     def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
-        self.simulated += simulated
+        pass
 
     def finished(self, key: RunKey, asked: int) -> None:
         pass
@@ -52,74 +49,106 @@ class Counting:
 class Recording:
     """A pool that keeps the batches that went through it."""
 
-    def __init__(self, pool: LocalPool) -> None:
-        self._pool, self.workers = pool, pool.workers
+    def __init__(self, pool: Pool) -> None:
+        self._pool = pool
         self.batches: list[FloatArray] = []
+
+    @property
+    def workers(self) -> int:
+        return self._pool.workers
 
     def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
         self.batches.append(settings)
         return self._pool.submit(study, settings)
 
 
-def warm(pool: LocalPool, study: Study) -> None:
-    """Have every worker started and the network built."""
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    settings = np.repeat(characteristics.original[np.newaxis], study.search.population, axis=0)
-    for future in [pool.submit(packed(study), settings) for _ in range(4 * pool.workers)]:
-        future.result()
-
-
 class Cost(NamedTuple):
-    """Seconds on the clock, and of processors."""
+    """What a campaign took [s of the clock, s of processors], and its batches."""
 
     clock: float
     processor: float
+    batches: list[FloatArray]
+
+    @property
+    def simulated(self) -> int:
+        return sum(map(len, self.batches))
 
 
-def processor_time() -> float:
-    """Processor seconds of this process and its workers so far."""
+def processors() -> float:
+    """Processor seconds of this process and all that it started, so far."""
     me = psutil.Process()
-    return sum(sum(one.cpu_times()[:2]) for one in (me, *me.children()))
+    return sum(sum(one.cpu_times()[:2]) for one in (me, *me.children(recursive=True)))
 
 
-def cost(measured: Callable[[], object]) -> Cost:
-    """What a call costs."""
-    clock, processor = time.perf_counter(), processor_time()
-    measured()
-    return Cost(time.perf_counter() - clock, processor_time() - processor)
+def drawn(study: Study, n: int, seed: int = 1) -> FloatArray:
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    rng = np.random.default_rng(seed)
+    return characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (n, len(characteristics))))
 
 
-def campaign(study: Study, jobs: int) -> tuple[int, Cost, list[FloatArray]]:
-    """How many settings a campaign simulates, what it costs, and its batches."""
-    with tempfile.TemporaryDirectory() as folder, local_pool(jobs, study.search.time_limit) as pool:
-        warm(pool, study)
-        counting, recording = Counting(), Recording(pool)
-        results = ResultsDirectory(Path(folder), study)
-        spent = cost(lambda: carry_out(study, all_runs(study), results, recording, counting))
-    return counting.simulated, spent, recording.batches
+def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
+    """Carry out a study in a pool that is at work already."""
+    with tempfile.TemporaryDirectory() as folder, opened as pool:
+        for future in [pool.submit(packed(study), drawn(study, BATCH)) for _ in range(4 * pool.workers)]:
+            future.result()
+        recording = Recording(pool)
+        before = processors()
+        clock = clock_seconds(lambda: carry_out(study, all_runs(study), ResultsDirectory(Path(folder), study), recording, Silent()))
+        return Cost(clock, processors() - before, recording.batches)
 
 
-def simulation(study: Study, batches: list[FloatArray]) -> Cost:
-    """What the same batches cost one process that has nothing else to do."""
+def simulation(study: Study, batches: list[FloatArray]) -> float:
+    """Processor seconds of the same batches in one process that has nothing else to do."""
     work = packed(study)
-    evaluate_batch(work, batches[-1])
-    return cost(lambda: [evaluate_batch(work, settings) for settings in batches])
+    evaluate_batch(work, max(batches, key=len))
+    return processor_seconds(lambda: [evaluate_batch(work, settings) for settings in batches])
 
 
-def main(name: str, evaluations: int) -> None:
-    """Measure one and two workers and print what they do in a second."""
-    study = load_study(name)
-    study = msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, runs=RUNS, evaluations=evaluations))
-    rates = []
-    for jobs in (1, 2):
-        simulated, spent, batches = campaign(study, jobs)
-        alone = simulation(study, batches)
-        rates.append(simulated / spent.clock)
-        print(f"{name}, {jobs} worker{'s' if jobs > 1 else ''}: {rates[-1]:.0f} evaluations/s; outside the simulation "
-              f"{1 - alone.clock / (jobs * spent.clock):.0%} of the workers' time, {1 - alone.processor / spent.processor:.0%} of all "
-              "processor time")
-    print(f"2 workers against one: {rates[1] / rates[0]:.2f} times as fast")
+def floor(study: Study) -> float:
+    """Processor seconds that bare libsumo takes to load and step the network for one setting of a population."""
+    system, n = assemble(study), study.search.population
+    steps = len(simulate(system, drawn(study, n)).trace.time)
+    network = staged(system.points[0].scenario)
+    return float(np.median([bare(network, n, steps)[0] for _ in range(9)])) / n
+
+
+@contextmanager
+def two_dask_workers(study: Study) -> Iterator[Pool]:
+    """A cluster on this machine."""
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster, \
+            cluster_pool(cluster.scheduler_address, study.search.time_limit) as pool:
+        yield pool
+
+
+def records_of(study: Study) -> Iterator[Record]:
+    """Measure one and two workers, and two of a cluster."""
+    def record(measure: str, ratio: float) -> Record:
+        return Record(study.name, measure, study.search.population, ratio)
+
+    pools: dict[str, Callable[[], AbstractContextManager[Pool]]] = {
+        "one": lambda: local_pool(1, study.search.time_limit), "two": lambda: local_pool(2, study.search.time_limit),
+        "cluster": lambda: two_dask_workers(study)}
+    one = campaign(study, pools["one"]())
+    yield record("campaign", one.processor / one.simulated / floor(study))
+    yield record("outside_simulation", 1 - simulation(study, one.batches) / one.processor)
+    two = campaign(study, pools["two"]())
+    yield record("two_workers", one.clock / two.clock)
+    yield record("cluster", two.clock / campaign(study, pools["cluster"]()).clock)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="What a campaign costs beside its simulations.")
+    parser.add_argument("study", nargs="?", default="rain", metavar="STUDY")
+    parser.add_argument("--runs", type=int, default=30)
+    parser.add_argument("--evaluations", type=int, default=500, help="of each run")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    study = load_study(arguments.study)
+    search = msgspec.structs.replace(study.search, algorithms=["nsga2"], runs=arguments.runs, evaluations=arguments.evaluations)
+    told(records_of(msgspec.structs.replace(study, search=search)), as_json=arguments.json)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1] if len(sys.argv) > 1 else "rain", int(sys.argv[2]) if len(sys.argv) > 2 else 2500)
+    main()

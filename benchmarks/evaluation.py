@@ -1,52 +1,74 @@
 """What an evaluation costs, beside what it could cost: ratios of one run on one machine.
 
-    python benchmarks/evaluation.py [STUDY]
+    python benchmarks/evaluation.py [STUDY...] [--json]
 
-The floor is bare libsumo that loads and steps the same network as many steps with nobody at the wheel. The TraCI
-socket is what one would write otherwise: one `sumo` process, reloaded for every setting, the same controller.
+The floor is bare libsumo that loads and steps the same network as many steps with nobody at the wheel; an evaluation
+finds its network loaded, as all but every 200th of a worker does. The TraCI socket is what one would write otherwise: one
+`sumo` process, reloaded for every setting, the same controller. Floor and evaluation take turns, and their processor
+time counts: so a machine that others use too disturbs them little.
 """
 
 from __future__ import annotations
 
+import argparse
 import statistics
-import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
+from dataclasses import replace
+from functools import partial
 from io import StringIO
 
 import libsumo
 import numpy as np
 import traci
+from measuring import Record, clock_seconds, medians_in_turn, processor_seconds, told
 
-from safevar_sumo.records import FloatArray
+from safevar_sumo.ads import ScalarAds
+from safevar_sumo.ads.guarded import PerVehicle
+from safevar_sumo.plugins import Guard
+from safevar_sumo.records import FloatArray, Observation
 from safevar_sumo.simulation import System, assemble, evaluate, simulate
 from safevar_sumo.simulation.batch import drive
 from safevar_sumo.simulation.network import copied_network
-from safevar_sumo.simulation.sumo import Engine, SumoWorld, sumo_command
+from safevar_sumo.simulation.staging import staged
+from safevar_sumo.simulation.sumo import Engine, SumoWorld, open_world, sumo_command
 from safevar_sumo.study import load_study
 
-REPETITIONS = 7
-POPULATIONS = (50, 200)
+POPULATIONS = (50, 200, 1000)
+SOCKET_SETTINGS = 10
+"""So many settings go through the socket."""
 
 
-def median_seconds(measured: Callable[[], object], repetitions: int = REPETITIONS) -> float:
-    """Median over repetitions, after one that does not count."""
-    measured()
-    times = []
-    for _ in range(repetitions):
-        start = time.perf_counter()
-        measured()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
+class Coasting(ScalarAds):
+    """The least that an ADS for one vehicle can do."""
+
+    def drive(self, seen: Observation) -> tuple[float, float]:
+        return (0.5, 0.0) if seen.gap > 10 else (0.0, 1.0)
 
 
-def bare(system: System, n: int, steps: int) -> None:
-    """Load n copies and step them; SUMO's own model drives."""
-    libsumo.start(sumo_command(Engine.LIBSUMO, copied_network(system.scenario.network, n)))
-    for _ in range(steps):
-        libsumo.simulationStep()
-    libsumo.close()
+def settings_of(system: System, n: int) -> FloatArray:
+    """The same settings in every run of a benchmark."""
+    characteristics = system.characteristics
+    rng = np.random.default_rng(1)
+    return characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (n, len(characteristics))))
+
+
+def bare(network: str, n: int, steps: int) -> tuple[float, float]:
+    """Processor seconds of loading n copies, stepping and closing them with SUMO's own model at the wheel; and of the steps alone."""
+    stepping = 0.0
+
+    def whole() -> None:
+        nonlocal stepping
+        with open_world(copied_network(network, n), n):
+            stepping = processor_seconds(lambda: [libsumo.simulationStep() for _ in range(steps)])
+
+    return processor_seconds(whole), stepping
+
+
+def warm(system: System, settings: FloatArray) -> float:
+    """Processor seconds of an evaluation on a network that is loaded."""
+    evaluate(system, settings)
+    return processor_seconds(lambda: evaluate(system, settings))
 
 
 @contextmanager
@@ -64,29 +86,51 @@ def through_socket(system: System, settings: FloatArray, command: list[str]) -> 
     """One setting after the other through one TraCI connection, the network reloaded each time."""
     for setting in settings:
         traci.load(command[1:])
-        drive(system, setting[np.newaxis], SumoWorld(traci, 1))
+        drive(system, setting[None], SumoWorld(traci, 1))
 
 
-def main(study: str) -> None:
-    """Measure a study's evaluations and print them as ratios."""
+def records_of(study: str, populations: tuple[int, ...] = POPULATIONS) -> Iterator[Record]:
+    """Measure a study's evaluations."""
     system = assemble(load_study(study))
-    characteristics = system.characteristics
-    rng = np.random.default_rng(1)
-    for n in POPULATIONS:
-        settings = characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (n, len(characteristics))))
+    network = staged(system.points[0].scenario)
+    for n in populations:
+        settings = settings_of(system, n)
         steps = len(simulate(system, settings).trace.time)
-        ours = median_seconds(lambda: evaluate(system, settings)) / n  # noqa: B023
-        floor = median_seconds(lambda: bare(system, n, steps)) / n  # noqa: B023
-        print(f"{study}, population of {n}, {steps} steps: {1e3 * ours:.2f} ms an evaluation")
-        print(f"  against bare libsumo, the floor:  {ours / floor:6.2f} times as long")
-        if n == POPULATIONS[0]:
-            singles = median_seconds(lambda: [evaluate(system, one[np.newaxis]) for one in settings], 3) / n  # noqa: B023
-            command = sumo_command(Engine.TRACI, copied_network(system.scenario.network, 1))
-            with socket_to(command):
-                socket = median_seconds(lambda: through_socket(system, settings[:10], command), 3) / 10  # noqa: B023
-            print(f"  against batches of 1:             {singles / ours:6.2f} times as fast")
-            print(f"  against a TraCI socket:           {socket / ours:6.2f} times as fast")
+        floors = [bare(network, n, steps) for _ in range(2)]
+
+        def floor(floors: list[tuple[float, float]] = floors, n: int = n, steps: int = steps) -> float:
+            floors.append(bare(network, n, steps))
+            return floors[-1][0]
+
+        loading, ours = medians_in_turn(floor, partial(warm, system, settings))
+        stepping = statistics.median(alone for _, alone in floors[2:])
+        yield Record(study, "bare_libsumo", n, ours / loading)
+        yield Record(study, "stepping_alone", n, ours / stepping)
+        if n == populations[0]:
+            yield from beside_others(study, system, settings)
+
+
+def beside_others(study: str, system: System, settings: FloatArray) -> Iterator[Record]:
+    """Against other ways to do the same, on the clock."""
+    n, few = len(settings), settings[:SOCKET_SETTINGS]
+    scalar = replace(system, ads=PerVehicle(Coasting, Guard("benchmark", "ads")))
+    evaluate(system, settings)
+    together, alone, coasting = medians_in_turn(
+        lambda: clock_seconds(lambda: evaluate(system, settings)),
+        lambda: clock_seconds(lambda: [evaluate(system, one[None]) for one in few]),
+        lambda: clock_seconds(lambda: evaluate(scalar, settings)), repetitions=5)
+    command = sumo_command(Engine.TRACI, copied_network(staged(system.points[0].scenario), 1))
+    with socket_to(command):
+        through_socket(system, few[:1], command)
+        (socket,) = medians_in_turn(lambda: clock_seconds(lambda: through_socket(system, few, command)), repetitions=3)
+    yield Record(study, "batches_of_1", n, alone / len(few) / (together / n))
+    yield Record(study, "scalar_ads", n, coasting / together)
+    yield Record(study, "traci_socket", n, socket / len(few) / (together / n))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1] if len(sys.argv) > 1 else "rain")
+    parser = argparse.ArgumentParser(description="What an evaluation costs, beside what it could cost.")
+    parser.add_argument("studies", nargs="*", default=["rain", "lgsvl"], metavar="STUDY")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    told((record for study in arguments.studies for record in records_of(study)), as_json=arguments.json)

@@ -1,0 +1,50 @@
+"""Whether a worker that lives long gets slower or larger: ratios of one run on one machine.
+
+    python benchmarks/growth.py [STUDY] [--evaluations N] [--json]
+
+A worker answers batches of settings drawn at random; its processor time and its resident memory are those of its process.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+
+import psutil
+from campaign import drawn
+from measuring import Record, told
+
+from safevar_sumo.campaign import BATCH
+from safevar_sumo.computing import local_pool, packed
+from safevar_sumo.study import Study, load_study
+
+FIRST = 5000
+"""Evaluations after which a worker counts as grown up."""
+
+
+def records_of(study: Study, evaluations: int) -> Iterator[Record]:
+    """Measure the first and the last `FIRST` evaluations of one worker, and its memory after both."""
+    work, spans = packed(study), []
+    with local_pool(1, study.search.time_limit) as pool:
+        pool.submit(work, drawn(study, BATCH)).result()
+        worker = next(child for child in psutil.Process().children() if "spawn_main" in " ".join(child.cmdline()))
+        first = 0
+        for done in range(0, evaluations, FIRST):
+            before = sum(worker.cpu_times()[:2])
+            for batch in range(FIRST // BATCH):
+                pool.submit(work, drawn(study, BATCH, seed=done + batch)).result()
+            spans.append(sum(worker.cpu_times()[:2]) - before)
+            first = first or worker.memory_info().rss
+        last = worker.memory_info().rss
+    yield Record(study.name, "growth_time", BATCH, spans[-1] / spans[0])
+    yield Record(study.name, "growth_memory", BATCH, last / first)
+    yield Record(study.name, "growth_mebibytes", BATCH, (last - first) / 2**20)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Whether a worker that lives long gets slower or larger.")
+    parser.add_argument("study", nargs="?", default="rain", metavar="STUDY")
+    parser.add_argument("--evaluations", type=int, default=100_000)
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    told(records_of(load_study(arguments.study), arguments.evaluations), as_json=arguments.json)
