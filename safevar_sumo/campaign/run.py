@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import accumulate
 from typing import Protocol
 
 import numpy as np
 
 from safevar_sumo.campaign.keys import RunKey
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import SPARE, Failure, Journal
 from safevar_sumo.search import Search
 
@@ -63,7 +64,7 @@ class Run:
         """Settings of this run that could not be simulated."""
         return [Failure(self.key.algorithm, self.key.run, position, evaluations.reason(i))
                 for position, evaluations, i in sorted(self._known.values(), key=lambda known: known[0])
-                if 0 <= position < self._budget and not evaluations.valid[i]]
+                if 0 <= position < self._budget and evaluations.outcome[i] == Outcome.SIMULATOR_ERROR]
 
     def advance(self) -> bool:
         """Answer the search as long as everything it asks for is known; whether it has ended."""
@@ -123,4 +124,6 @@ class Run:
     def _recalled(self, settings: FloatArray) -> Evaluations:
         """The evaluations of known settings, in their order."""
         found = [self._known[row.tobytes()] for row in settings]
-        return Evaluations.concatenate([evaluations.take([i]) for _, evaluations, i in found])
+        parts = list({id(evaluations): evaluations for _, evaluations, _ in found}.values())
+        starts = dict(zip(map(id, parts), accumulate(map(len, parts), initial=0), strict=False))
+        return Evaluations.concatenate(parts).take([starts[id(evaluations)] + i for _, evaluations, i in found])

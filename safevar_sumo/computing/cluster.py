@@ -80,11 +80,11 @@ class ClusterPool:
 
     @property
     def workers(self) -> int:
-        """Workers come and go; the scheduler is asked now and then."""
+        """Processes, whatever their threads: each computes one batch at a time. They come and go; the scheduler is asked now and then."""
         now = time.monotonic()
         if now - self._counted > SECONDS_BETWEEN_COUNTS:
             try:
-                self._workers = max(1, sum(self._client.nthreads().values()))
+                self._workers = max(1, len(self._client.nthreads()))
             except (OSError, TimeoutError) as error:
                 raise PoolLostError(f"the cluster does not answer any more: {error}") from None
             self._counted = now
