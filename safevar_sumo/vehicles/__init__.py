@@ -11,11 +11,13 @@ from safevar_sumo.vehicles.characteristics import Characteristic, Characteristic
 from safevar_sumo.vehicles.guarded import VEHICLE_CONTRACT, GuardedVehicle
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.sumo import SumoVehicle
+from safevar_sumo.vehicles.worn import WornVehicle
 
 VEHICLES: Mapping[str, type[Any]] = {
     "carla": Carla,
     "lgsvl": Lgsvl,
     "sumo": SumoVehicle,
+    "worn": WornVehicle,
 }
 
 __all__ = [

@@ -12,7 +12,7 @@ from safevar_sumo.simulation import System, assemble
 from safevar_sumo.study import load_study
 
 STEP = 0.05
-STUDY_OF = {"carla": "sun", "lgsvl": "lgsvl", "sumo": "native"}
+STUDY_OF = {"carla": "sun", "lgsvl": "lgsvl", "sumo": "native", "worn": "wear"}
 SYSTEMS: dict[str, System] = {model: assemble(load_study(study)) for model, study in STUDY_OF.items()}
 Pedals = Callable[[float], tuple[Any, Any]]
 

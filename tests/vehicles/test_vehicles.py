@@ -64,7 +64,8 @@ def test_energy_is_never_created(model: str) -> None:
         closed &= np.stack([state.acceleration for state in run.states[1:]]) <= 0
     assert np.count_nonzero(closed) > 1000
     assert np.all(gained[closed] <= 1e-9 * (1 + energy[:-1][closed]))
-    strongest = {"carla": 2 * 500 * 7000 * np.pi / 30, "lgsvl": 550 * 13000 * np.pi / 30, "sumo": 3.2 * 2100 * 60}[model]
+    strongest = {"carla": 2 * 500 * 7000 * np.pi / 30, "lgsvl": 550 * 13000 * np.pi / 30, "sumo": 3.2 * 2100 * 60,
+                 "worn": 3900.0 * 60}[model]
     assert np.all(gained <= strongest * STEP)
 
 
@@ -135,8 +136,8 @@ def speed_at(time: float, pedals: Callable[[float], tuple[float, float]] = full_
     return lambda model, population: drive(model, population, pedals, time, road=road).speed[-1]
 
 
-def stopping_distance(brake: float) -> Callable[..., np.ndarray]:
-    return lambda model, population: drive(model, population, lambda time: (0.0, brake), 15, rolling=8.0).distance[-1]
+def stopping_distance(brake: float, road: float = 1.0) -> Callable[..., np.ndarray]:
+    return lambda model, population: drive(model, population, lambda time: (0.0, brake), 15, rolling=8.0, road=road).distance[-1]
 
 
 def coasting_loss(start: float, duration: float) -> Callable[..., np.ndarray]:
@@ -170,8 +171,13 @@ ACTS = {
         "mass": (speed_at(3), -1), "accel": (speed_at(3), +1), "decel": (stopping_distance(0.6), -1), "maxSpeed": (speed_at(60), +1),
         "tau": (speed_at(1), -1), "brakeDelay": (stopping_distance(0.6), +1), "brakeGain": (stopping_distance(0.6), -1),
     },
+    "worn": {
+        "treadDepth": (stopping_distance(1.0, road=0.85), -1), "brakeTorque": (stopping_distance(0.6), -1),
+        "brakeResponse": (stopping_distance(0.6), +1), "payload": (stopping_distance(0.6), +1),
+    },
 }
-SENSED = {"sumo": {"sensorRange", "reactionTime"}}
+SENSED = {"sumo": {"sensorRange", "reactionTime"}, "worn": {"sensorRange", "sensorLatency", "payloadCentre"}}
+"""They act on what is seen, or on the limits of single axles (test_worn.py)."""
 
 
 @pytest.mark.parametrize(("model", "name"), [(model, name) for model, acting in ACTS.items() for name in acting])

@@ -1,0 +1,134 @@
+"""SUMO's vehicle type with what engineers call wear: tyres, brakes, load and sensors that are not what they were."""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from safevar_sumo.records import Command, FloatArray, Observation
+from safevar_sumo.vehicles.base import Characteristics, SumoType
+from safevar_sumo.vehicles.delay import delayed, history, remembered
+
+GRAVITY = 9.81  # m/s^2
+NEW_TREAD, LEGAL_TREAD = 8.0, 1.6
+"""Tread depth of a new tyre, and the least that is legal in Europe [mm]."""
+Positive = Annotated[float, Meta(gt=0, le=1e5)]
+
+
+class _Prepared(NamedTuple):
+    """Constants of a run, SI, shape (N,)."""
+
+    step: float
+    mass: FloatArray
+    drive: FloatArray
+    brake: FloatArray
+    grip: FloatArray
+    front_load: FloatArray
+    rear_load: FloatArray
+    response: FloatArray
+    sensor_range: FloatArray
+    latency: FloatArray
+
+
+class WornState(NamedTuple):
+    """State of N vehicles: m/s, pedals as the actuators have them, and what is still under way."""
+
+    speed: FloatArray
+    throttle: FloatArray
+    brake: FloatArray
+    gear: FloatArray
+    seen: FloatArray | None
+    brake_commands: FloatArray
+
+
+class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A car on two axles whose brakes lock neither: each brakes up to the friction on the load that it carries.
+
+    Parameters
+    ----------
+    kerb_mass, kerb_centre, wheelbase, centre_height
+        Of the empty car: mass [kg], its centre behind the front axle, wheelbase, height of the centre [m].
+    drive_force, brake_force, front_share
+        Largest forces of engine and brakes [N], and the front axle's share of the brakes' [-].
+    tyre_friction
+        Friction coefficient on a dry road [-].
+    tread_loss
+        Share of the friction that tyres worn down to 1.6 mm have lost on a wet road [-]. 0.27: they took 36.8 % more way to stop
+        from 80 km/h than tyres of 6.7 mm (MIRA for RoSPA, hot rolled asphalt); linear in the depth (assumption).
+    max_speed
+        [m/s]
+
+    Notes
+    -----
+    A road is wet where its friction is below the dry one's. Deceleration a: of a = F / m, of an axle at its limit
+    mu m (g x -+ a h) / L with the other braking its share, and of a = mu g, the least holds.
+    """
+
+    UNITS = {
+        "treadDepth": "mm", "brakeTorque": "-", "brakeResponse": "s", "payload": "kg", "payloadCentre": "m", "sensorRange": "m",
+        "sensorLatency": "s",
+    }
+
+    kerb_mass: Positive = 1500.0
+    kerb_centre: Positive = 1.2
+    wheelbase: Positive = 2.7
+    centre_height: Positive = 0.55
+    drive_force: Positive = 3900.0
+    brake_force: Positive = 16500.0
+    front_share: Annotated[float, Meta(gt=0, lt=1)] = 0.7
+    tyre_friction: Positive = 0.9
+    tread_loss: Annotated[float, Meta(ge=0, lt=1)] = 0.27
+    max_speed: Positive = 55.56
+
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> _Prepared:
+        c = characteristics
+        mass = self.kerb_mass + c["payload"]
+        centre = (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"]) / mass / self.wheelbase
+        worn = np.minimum(np.maximum((NEW_TREAD - c["treadDepth"]) / (NEW_TREAD - LEGAL_TREAD), 0.0), 1.0)
+        wet = np.where(np.asarray(road_friction) < 1, 1 - self.tread_loss * worn, 1.0)
+        return _Prepared(
+            step=step, mass=mass, drive=self.drive_force / mass, brake=c["brakeTorque"] * (self.brake_force / mass),
+            grip=self.tyre_friction * road_friction * wet, front_load=1 - centre, rear_load=centre, response=c["brakeResponse"],
+            sensor_range=c["sensorRange"], latency=c["sensorLatency"])
+
+    def sumo_type(self, prepared: _Prepared) -> SumoType:
+        p = prepared
+        full = self._deceleration(p, np.ones_like(p.mass))
+        return SumoType(mass=p.mass, accel=np.minimum(p.drive, p.grip * GRAVITY), decel=full,
+                        max_speed=np.full_like(p.mass, self.max_speed), tau=p.response + p.step)
+
+    def at_rest(self, prepared: _Prepared) -> WornState:
+        nothing = np.zeros_like(prepared.mass)
+        return WornState(nothing, nothing, nothing, nothing + 1, None, history(float(np.max(prepared.response)), prepared.step, nothing))
+
+    def at_speed(self, prepared: _Prepared, speed: FloatArray) -> WornState:
+        """Nothing resists: whoever rolls goes on with the pedals released."""
+        return self.at_rest(prepared)._replace(speed=speed)
+
+    def sense(self, prepared: _Prepared, state: WornState, seen: Observation) -> tuple[Observation, WornState]:
+        """Dirty sensors report what was `sensorLatency` ago, and nothing beyond `sensorRange` times the visibility."""
+        p, obstacle_speed = prepared, np.broadcast_to(seen.obstacle_speed, seen.gap.shape)
+        now = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed, obstacle_speed])
+        past = history(float(np.max(p.latency)), p.step, now) if state.seen is None else remembered(state.seen, now)
+        gap, closing_speed, lateral, lateral_speed, obstacle_speed = delayed(past, p.latency, p.step)
+        detected = gap <= p.sensor_range * seen.visibility
+        late = seen._replace(gap=np.where(detected, gap, np.inf), closing_speed=closing_speed, lateral=lateral,
+                             lateral_speed=lateral_speed, obstacle_speed=obstacle_speed)
+        return late, state._replace(seen=past)
+
+    def advance(self, prepared: _Prepared, state: WornState, command: Command) -> WornState:
+        p = prepared
+        commands = remembered(state.brake_commands, command.brake)
+        brake = delayed(commands, p.response, p.step)
+        gained = np.where(brake > 0, -self._deceleration(p, brake), np.minimum(command.throttle * p.drive, p.grip * GRAVITY))
+        speed = np.minimum(np.maximum(state.speed + gained * p.step, 0.0), np.maximum(self.max_speed, state.speed))
+        return state._replace(speed=speed, throttle=np.where(brake > 0, 0.0, command.throttle), brake=brake, brake_commands=commands)
+
+    def _deceleration(self, p: _Prepared, pedal: FloatArray) -> FloatArray:
+        """Of both axles together [m/s^2]."""
+        wanted, lever = pedal * p.brake, p.grip * (self.centre_height / self.wheelbase)
+        rear_slides = (self.front_share * wanted + p.grip * GRAVITY * p.rear_load) / (1 + lever)
+        front_slides = ((1 - self.front_share) * wanted + p.grip * GRAVITY * p.front_load) / (1 - lever)
+        return np.minimum(np.minimum(wanted, p.grip * GRAVITY), np.minimum(rear_slides, front_slides))
