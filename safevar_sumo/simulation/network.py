@@ -31,6 +31,7 @@ _IDS = {
     "node": ("id",), "edge": ("id", "from", "to"), "connection": ("from", "to"), "crossing": ("node", "edges"),
     "walkingArea": ("node", "edges"), "vType": ("id",), "person": ("id", "type"), "walk": ("edges", "from", "to"),
     "vehicle": ("id", "type", "route"), "route": ("id", "edges"), "stop": ("lane", "edge"),
+    "trip": ("id", "type", "from", "to", "via"), "flow": ("id", "type", "route", "from", "to", "via"),
 }
 
 
