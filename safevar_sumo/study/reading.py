@@ -16,7 +16,7 @@ from safevar_sumo.study.checks import implausible, unusable
 from safevar_sumo.study.mistakes import converted, refuse
 from safevar_sumo.study.schema import NAME, Origin, SearchTable, Study, StudyLike, is_file, study_path, tables_of
 
-REPLACED = ("calibration", "published")
+REPLACED = ("calibration", "published", "repeatability")
 """Tables that a study does not inherit in part from the one that it extends."""
 OF_ONE_SYSTEM = ("title", "published", "repeatability")
 """What holds for one vehicle, ADS, scenario and weather alone: with another one it is not inherited."""

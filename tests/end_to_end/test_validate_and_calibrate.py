@@ -89,8 +89,9 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
     for word in ("CMA-ES", "seed 3", "mine.csv, SHA-256", "Cost"):
         assert word in head
     assert load_study("found.toml").vehicle.characteristics == load_study("mine.toml").vehicle.characteristics
-    run("calibrate", "mine.toml", str(data), "--trials", "37", "--seed", "3", "--jobs", "1", "--out", "again.toml")
-    assert Path("again.toml").read_bytes() == Path("found.toml").read_bytes()
+    Path("again").mkdir()
+    run("calibrate", "mine.toml", str(data), "--trials", "37", "--seed", "3", "--jobs", "1", "--out", "again/found.toml")
+    assert Path("again/found.toml").read_bytes() == Path("found.toml").read_bytes()
 
 
 def test_calibrate_without_data_fits_the_original_vehicle_alone(in_tmp: Path) -> None:
