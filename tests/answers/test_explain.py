@@ -27,7 +27,7 @@ def case(slippery: Path) -> Case:
 
 @pytest.fixture(scope="module")
 def told(case: Case) -> Explained:
-    return explain(case, top=2, pool=Here())
+    return explain(case, top=3, pool=Here())
 
 
 def collides(case: Case, settings: list[dict[str, float]]) -> list[bool]:
@@ -60,7 +60,7 @@ def test_the_records_are_those_of_the_solutions(case: Case, told: Explained) -> 
     known = [str(handle) for handle in handles(case.solutions)]
     for one in records:
         assert list(one) == ["algorithm", "run", "index", "setting", "outcome", "safety_degree", "changed", "minimal_causes", "robustness",
-                             "because"]
+                             "because", "whose"]
         row = case.solutions.iloc[known.index(f"{one['algorithm']}:{one['run']}:{one['index']}")]
         assert one["setting"] == row[list(case.characteristics.names)].to_dict()
         assert (one["outcome"], one["safety_degree"]) == (row["outcome"], row["safety_degree"])
