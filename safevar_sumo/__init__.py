@@ -27,6 +27,8 @@ if TYPE_CHECKING:
         tolerance,
     )
     from safevar_sumo.errors import InputError, SafevarError, SimulationError
+    from safevar_sumo.report import make_report
+    from safevar_sumo.showing import Comparison, animate, compare, draw_comparison, show_in_gui
     from safevar_sumo.study import Study, Weather, load_study, study_names
 
     __version__: str
@@ -39,13 +41,16 @@ _ROOM_OF = {
     "tables": "api", "Tables": "api",
     "figures": "api", "Figures": "api",
     "explain": "api", "tolerance": "api", "risk": "api", "rules": "api",
+    "Comparison": "showing", "compare": "showing", "draw_comparison": "showing", "animate": "showing", "show_in_gui": "showing",
+    "make_report": "report",
     "SafevarError": "errors", "InputError": "errors", "SimulationError": "errors",
 }
 """Every public name and the room that it comes from."""
 
 __all__ = [
-    "Figures", "InputError", "Results", "SafevarError", "Simulation", "SimulationError", "Study", "Tables", "Weather", "__version__",
-    "evaluate", "explain", "figures", "load", "load_study", "risk", "rules", "run", "simulate", "study_names", "tables", "tolerance",
+    "Comparison", "Figures", "InputError", "Results", "SafevarError", "Simulation", "SimulationError", "Study", "Tables", "Weather",
+    "__version__", "animate", "compare", "draw_comparison", "evaluate", "explain", "figures", "load", "load_study", "make_report", "risk",
+    "rules", "run", "show_in_gui", "simulate", "study_names", "tables", "tolerance",
 ]
 
 if not TYPE_CHECKING:  # a type checker is to know the names above, and no others
