@@ -29,7 +29,8 @@ def test_the_published_settings_are_searched_as_published() -> None:
 def test_rain_differs_from_sun_in_weather_alone() -> None:
     sun, rain = load_study("sun"), load_study("rain")
     assert rain.weather != sun.weather
-    same = {"name": sun.name, "title": sun.title, "published": sun.published, "calibration": sun.calibration}
+    same = {"name": sun.name, "title": sun.title, "published": sun.published, "calibration": sun.calibration,
+            "repeatability": sun.repeatability, "fit": sun.fit}
     assert msgspec.structs.replace(rain, weather=sun.weather, **same) == sun
     assert set(rain.calibration) == {"weather.road_friction", "weather.recognition_delay"}
 

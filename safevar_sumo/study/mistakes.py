@@ -40,7 +40,7 @@ def refuse(found: Iterable[InputError]) -> None:
         told = [f"{one.problem}{f' (legal: {one.legal})' if one.legal else ''}" for one in several[:MOST_TOLD]]
         if len(several) > MOST_TOLD:
             told.append(f"and {len(several) - MOST_TOLD} more")
-        raise InputError(several[0].source, f"{len(several)} mistakes\n" + "\n".join(f"  {one}" for one in told))
+        raise InputError(several[0].source, f"{len(several)} mistakes: {'; '.join(told)}")
 
 
 def mistakes(source: object, raw: Any, kind: Any, where: str = "") -> Iterator[InputError]:

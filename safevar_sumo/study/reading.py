@@ -115,7 +115,8 @@ def _extended(raw: _Raw, path: Path, seen: tuple[Path, ...]) -> _Raw:
     extended = _read(beside if is_file(beside) else study_path(base), (*seen, path))
     over = _overridden(extended, tables, raw.source)
     places = tuple(dict.fromkeys((*raw.origin.places, *extended.origin.places)))
-    return over._replace(origin=msgspec.structs.replace(over.origin, called=raw.origin.called, places=places))
+    remarks = () if path.parent == STUDIES else over.origin.remarks  # who made a study of ours knew what it leaves out
+    return over._replace(origin=msgspec.structs.replace(over.origin, called=raw.origin.called, places=places, remarks=remarks))
 
 
 def _overridden(base: _Raw, over: Mapping[str, Any], source: object) -> _Raw:
@@ -124,7 +125,7 @@ def _overridden(base: _Raw, over: Mapping[str, Any], source: object) -> _Raw:
     other = [key for key in ("weather", "vehicle", "ads", "scenario") if _kind(tables.get(key)) != _kind(base.tables.get(key))]
     remarks = base.origin.remarks
     if other:
-        lost = [key for key in OF_ONE_SYSTEM if key in base.tables and key not in over]
+        lost = [key for key in OF_ONE_SYSTEM[:2] if key in base.tables and key not in over]
         tables = {**{key: value for key, value in tables.items() if key not in OF_ONE_SYSTEM}, "title": tables.get("name", ""),
                   **{key: over[key] for key in OF_ONE_SYSTEM if key in over}}
         if lost:
