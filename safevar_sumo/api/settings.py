@@ -101,8 +101,9 @@ def _numbers(settings: Any) -> FloatArray:
 
 
 def _check(asked: FloatArray, characteristics: CharacteristicSet, beyond: bool) -> None:
-    inside = np.isfinite(asked) & (beyond | ((asked >= characteristics.lower) & (asked <= characteristics.upper)))
-    for row, column in np.argwhere(~inside)[:1]:
+    lower, upper = characteristics.lower, characteristics.upper
+    legal = np.isfinite(asked) & ((asked > 0) | (lower <= 0)) if beyond else (asked >= lower) & (asked <= upper)
+    for row, column in np.argwhere(~legal)[:1]:
         characteristics.members[column].check(float(asked[row, column]), f"settings, row {row}", beyond=beyond)
 
 

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from safevar_sumo.cli.outputs import PICTURES, check_output
 from safevar_sumo.cli.program import commands
+from safevar_sumo.cli.ranges import Within
 from safevar_sumo.cli.simulating import jobs_option, json_option, study_of, unsafe_option
 from safevar_sumo.errors import InputError
 
@@ -18,9 +19,9 @@ from safevar_sumo.errors import InputError
 @click.argument("place", metavar="STUDY|DIR")
 @click.option("--samples", type=click.IntRange(1, 100_000_000), default=10_000, show_default=True, metavar="N",
               help="How many vehicles are drawn at the most.")
-@click.option("--confidence", type=click.FloatRange(0, 1, min_open=True, max_open=True), default=0.95, show_default=True,
+@click.option("--confidence", type=Within(0, 1, min_open=True, max_open=True), default=0.95, show_default=True,
               help="Confidence of the intervals.")
-@click.option("--width", type=click.FloatRange(0, 1, min_open=True), help="Stop as soon as the interval of the probability is no wider.")
+@click.option("--width", type=Within(0, 1, min_open=True), help="Stop as soon as the interval of the probability is no wider.")
 @unsafe_option
 @jobs_option
 @json_option

@@ -10,6 +10,7 @@ import click
 import numpy as np
 
 from safevar_sumo.cli.outputs import PICTURES, check_output, refuse_inputs
+from safevar_sumo.cli.ranges import Within
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.simulation import System, at_worst
@@ -66,7 +67,7 @@ class Shown(NamedTuple):
 def showing_options(command: Command) -> Command:
     """The options that `Shown` is made of."""
     for option in (
-            click.option("--slower", type=click.FloatRange(0.01, 1000), default=1.0, show_default=True, metavar="TIMES",
+            click.option("--slower", type=Within(0.01, 1000), default=1.0, show_default=True, metavar="TIMES",
                          help="How many times slower than real time --gui plays."),
             click.option("--gui", is_flag=True, help="Show both in sumo-gui, each on its road."),
             click.option("--animate", type=FILE, metavar="FILE", help="Show both from above, moving: gif, mp4 or html."),

@@ -10,12 +10,13 @@ from rich.console import Console
 from rich.live import Live
 
 from safevar_sumo.cli.program import commands
+from safevar_sumo.cli.ranges import Within
 
 
 @commands.command()
 @click.argument("directory", metavar="DIR")
 @click.option("--watch", is_flag=True, help="Look again and again until the study is finished.")
-@click.option("--every", type=click.FloatRange(0.1, 86400), default=2.0, show_default=True, metavar="SECONDS",
+@click.option("--every", type=Within(0.1, 86400), default=2.0, show_default=True, metavar="SECONDS",
               help="How long --watch waits between two looks.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; with --watch, a line for every look.")
 def status(directory: str, watch: bool, every: float, as_json: bool) -> None:

@@ -101,7 +101,7 @@ class Journal:
         if frames and frames[0] != owner:
             if any(isinstance(frame, Batch) for frame in frames):
                 raise InputError(self.path, "belongs to another study, run or version", "another --out")
-            frames, end, size = [], 0, end
+            frames, end, size = [], 0, 0
             self._cut_at(0)
         if end < size:
             self.cut = size - end

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Drives, Evaluations, FloatArray, Outcome, Trace
 from safevar_sumo.scenarios import VUT, Point
 from safevar_sumo.simulation.parts import Parts
@@ -93,9 +94,17 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
         if watch is None:
             world.leave(verdict.ended)
         state = vehicle.advance(prepared, state, command)
+        _refuse_no_number(state.speed, settings, system.characteristics.names)
         world.advance(np.where(verdict.open, state.speed, 0.0))
     trace = log.trace(sample + 1, step, length)
     return Drives(trace=trace, encounter=parts.encounter(trace), outcome=verdict.outcome(), collision_speed=verdict.collision_speed)
+
+
+def _refuse_no_number(speed: FloatArray, settings: FloatArray, names: Sequence[str]) -> None:
+    """SUMO takes a speed that is no number for 0: a vehicle whose physics have broken down would pass for a careful one."""
+    for copy in np.flatnonzero(~np.isfinite(speed))[:1]:
+        values = ", ".join(f"{name} = {value:g}" for name, value in zip(names, settings[copy], strict=True))
+        raise InputError("vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with")
 
 
 def _road_friction(points: Sequence[Point], n: int) -> Any:

@@ -35,16 +35,21 @@ class Characteristic:
         return next(share for least, share in FILTER_SHARES if width >= least) * width
 
     def check(self, value: float, source: object, *, beyond: bool = False) -> None:
-        """Refuse a value outside the domain, or with `beyond` only what is no finite number.
+        """Refuse a value outside the domain, or with `beyond` only what is no finite number or has lost the domain's sign.
 
         Raises
         ------
         InputError
-            If the value is not in [lower, upper] or not a number.
+            If the value is not in [lower, upper], not a number, or not above 0 where the whole domain is.
         """
-        if not (math.isfinite(value) and (beyond or self.lower <= value <= self.upper)):
-            legal = "a finite number" if beyond else f"a number in [{self.lower:g}, {self.upper:g}] {self.unit}"
+        if not (self.can_be(value) if beyond else self.lower <= value <= self.upper):
+            above = " above 0" if self.lower > 0 else ""
+            legal = f"a finite number{above}" if beyond else f"a number in [{self.lower:g}, {self.upper:g}] {self.unit}"
             raise InputError(source, f"{self.name} = {value}", legal)
+
+    def can_be(self, value: float) -> bool:
+        """Whether a value means anything: finite, and above 0 if the whole domain is (nothing has a mass of -5 kg)."""
+        return math.isfinite(value) and (value > 0 or self.lower <= 0)
 
 
 @dataclass(frozen=True)
@@ -107,7 +112,7 @@ class CharacteristicSet:
         return np.asarray(np.count_nonzero(self.changed(filtered), axis=1), dtype=float)
 
     def setting(self, values: Mapping[str, float], source: object, *, beyond: bool = False) -> FloatArray:
-        """The original setting with some values replaced, checked; shape (n,). With `beyond` any finite value will do.
+        """The original setting with some values replaced, checked; shape (n,). With `beyond` any value that can be will do.
 
         Raises
         ------

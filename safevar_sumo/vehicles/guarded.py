@@ -58,7 +58,9 @@ class GuardedVehicle:
             for name in SumoType._fields))
 
     def at_rest(self, prepared: _Prepared) -> _State:
-        return self._state("at_rest", prepared.n, self._guard.call("at_rest", self._vehicle.at_rest, prepared.theirs))
+        state = self._state("at_rest", prepared.n, self._guard.call("at_rest", self._vehicle.at_rest, prepared.theirs))
+        self._guard.numbers("at_rest", "speed", state.speed, (prepared.n,), 0.0, 0.0)
+        return state
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> _State:
         if not hasattr(self._vehicle, "at_speed"):

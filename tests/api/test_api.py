@@ -91,6 +91,19 @@ def test_values_beyond_the_domain_need_to_be_asked_for() -> None:
         sv.simulate("sun", {"tireFric": np.inf}, beyond=True)
 
 
+@pytest.mark.parametrize("value", [0.0, -5.0])
+def test_what_no_vehicle_can_have_is_not_beyond_the_domain_but_refused(value: float) -> None:
+    with pytest.raises(sv.InputError, match=r"mass = .*\nlegal: a finite number above 0"):
+        sv.simulate("sun", {"mass": value}, beyond=True)
+    with pytest.raises(sv.InputError, match=r"mass = .*\nlegal: a finite number above 0"):
+        sv.evaluate("sun", pd.DataFrame({"mass": [2500.0, value]}), beyond=True)
+
+
+def test_physics_that_break_down_are_told_and_do_not_pass_for_a_vehicle_that_stands() -> None:
+    with pytest.raises(sv.InputError, match=r"vehicle: its speed is nan with .*radius = 1e\+300"), np.errstate(all="ignore"):
+        sv.simulate("smoke", {"radius": 1e300}, beyond=True)
+
+
 def test_evaluate_is_simulate_row_by_row() -> None:
     asked = pd.DataFrame({"tireFric": [1.2, 3.45, 1.2], "mass": [2500.0, 2404.0, 2500.0]}, index=list("abc"))
     frame = sv.evaluate("sun", asked, jobs=1)

@@ -82,3 +82,11 @@ def test_no_module_below_the_commands_names_a_flag() -> None:
     for path in package.rglob("*.py"):
         if "cli" not in path.parts:
             assert not re.search(r'InputError\(\s*f?"-', path.read_text()), path
+
+
+@pytest.mark.parametrize("typed", [
+    "risk smoke --confidence nan", "risk smoke --width nan", "status . --every nan", "simulate smoke --gui --slower nan"])
+def test_a_range_of_numbers_does_not_hold_what_is_no_number(typed: str) -> None:
+    told = CliRunner().invoke(commands, typed.split())
+    assert told.exit_code == 2
+    assert "nan is not in the range" in told.stderr

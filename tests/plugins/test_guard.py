@@ -86,6 +86,7 @@ def vehicle(method: str, body: str) -> str:
     ("advance", "result = result._replace(speed=np.zeros(7))", "returned speed of shape (7,) from advance"),
     ("advance", "result = None", "returned None from advance"),
     ("at_rest", "result = result._replace(speed=None)", "returned speed = None from at_rest"),
+    ("at_rest", "result = result._replace(speed=result.speed + 9)", "returned speed = 9.0 from at_rest"),
     ("sense", "result = result[0]", "from sense"),
     ("sense", "result = (result[0]._replace(gap=result[0].gap * np.nan), result[1])", "returned gap = nan from sense"),
     ("sense", "result = (result[0]._replace(speed=result[0].gap + np.inf), result[1])", "returned speed = inf from sense"),

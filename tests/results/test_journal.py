@@ -243,7 +243,9 @@ def test_what_comes_after_a_failure_is_spare_once_it_is_tried_again(tmp_path: Pa
 
 def test_a_journal_without_evaluations_belongs_to_whoever_comes(tmp_path: Path) -> None:
     Journal(tmp_path / "a.journal", "study", "nsga2-00").close()
-    Journal(tmp_path / "a.journal", "other", "nsga2-00").close()
+    taken_over = Journal(tmp_path / "a.journal", "other", "nsga2-00")
+    taken_over.close()
+    assert taken_over.cut == 0, "nothing was torn"
     assert owner_of(tmp_path / "a.journal") == "other"
     with pytest.raises(InputError, match="belongs to another study"):
         read_journal(tmp_path / "a.journal", "study", "nsga2-00")
