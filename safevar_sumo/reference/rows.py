@@ -25,6 +25,8 @@ COLUMNS = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece
 OPTIONAL = "ave_dece"
 ALIASES = {"dampratezeroce": "dampratezerotce", "dampratezerocd": "dampratezerotcd", "wheelradius": "radius"}
 """Names of characteristics in the package's files that are not those of its paper, without case and underscores."""
+MOST_BYTES = 2**28
+"""Of a CSV file; a device that never ends would take all memory."""
 MOST_COLUMNS = 1000
 """Of a file; the published ones have 18."""
 SHARE_DECIMALS = 3
@@ -99,9 +101,13 @@ def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> 
 def _content(path: Path) -> bytes:
     """A file's bytes, read once: what comes through a pipe cannot be read again."""
     try:
-        return path.read_bytes()
+        with open(path, "rb") as file:
+            content = file.read(MOST_BYTES + 1)
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror or error}", "a CSV file") from None
+    if len(content) > MOST_BYTES:
+        raise InputError(path, f"has more than {MOST_BYTES} bytes", "a CSV file in the format of the published package")
+    return content
 
 
 def _table(path: Path, content: bytes) -> pd.DataFrame:

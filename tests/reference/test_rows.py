@@ -103,6 +103,13 @@ def test_a_file_without_any_usable_row_is_refused(tmp_path: Path) -> None:
         read_reference(tmp_path / "data.csv", SUN)
 
 
+def test_a_file_without_an_end_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("safevar_sumo.reference.rows.MOST_BYTES", 1000)
+    (tmp_path / "endless.csv").write_bytes(b"\0" * 1001)
+    with pytest.raises(InputError, match="more than 1000 bytes"):
+        read_reference(tmp_path / "endless.csv", SUN)
+
+
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         read_reference(tmp_path / "nothing.csv", SUN)
