@@ -7,6 +7,9 @@ import io
 import os
 import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -45,7 +48,8 @@ class OnDemand(click.Group):
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         if name in COMMANDS:
-            importlib.import_module(f"safevar_sumo.cli.{COMMANDS[name][0]}")
+            with _interrupted_at_once():
+                importlib.import_module(f"safevar_sumo.cli.{COMMANDS[name][0]}")
         return super().get_command(ctx, name)
 
     def invoke(self, ctx: click.Context) -> Any:
@@ -97,6 +101,22 @@ def main() -> None:
         _drop_output()
         _fail(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}", 1)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+@contextmanager
+def _interrupted_at_once() -> Iterator[None]:
+    """While modules load, Ctrl-C ends the program: nothing is under way, and compiled modules swallow an exception raised then."""
+    def leave(*_: object) -> None:
+        os.write(2, b"safevar-sumo: interrupted\n")
+        os._exit(INTERRUPTED)
+
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, leave) if in_main_thread else None
+    try:
+        yield
+    finally:
+        if in_main_thread:
+            signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)
 
 
 def _have_standard_streams() -> None:

@@ -72,8 +72,9 @@ def test_simulate_tells_of_the_setting_and_of_the_original_beside_it() -> None:
 
 
 def test_a_trace_tells_where_the_obstacle_was_and_what_the_ads_saw_of_it() -> None:
-    """Hard rain has everything but the vehicle's own speed made out two steps late."""
-    trace = sv.simulate("rain").trace
+    """This weather has everything but the vehicle's own speed made out two steps late."""
+    late_by_two = {"name": "late", "road_friction": 1.0, "visibility": 1.0, "recognition_delay": 0.1}
+    trace = sv.simulate(sv.load_study("sun", weather=late_by_two)).trace
     assert (trace["seen speed [m/s]"] == trace["speed [m/s]"]).all()
     late = trace["lateral [m]"].shift(2).bfill()
     assert np.allclose(trace["seen lateral [m]"][3:], late[3:])

@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 
 import numpy as np
 import psutil
@@ -80,8 +81,9 @@ def test_a_worker_that_was_killed_while_it_started_costs_nothing(pool: LocalPool
         while not (young := processes()):
             time.sleep(0.005)
         os.kill(young[0].pid, signal.SIGKILL)
-        while psutil.pid_exists(young[0].pid) and young[0].status() != psutil.STATUS_ZOMBIE:
-            time.sleep(0.005)
+        with suppress(psutil.NoSuchProcess):
+            while young[0].status() != psutil.STATUS_ZOMBIE:
+                time.sleep(0.005)
         time.sleep(0.05)
     assert future.result(timeout=30).valid.all()
 

@@ -43,7 +43,10 @@ def test_study_leaves_manifest_and_solutions_and_nothing_else(in_tmp: Path) -> N
         assert word in done.stdout
 
 
-@pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize("study", ["rain", pytest.param("lgsvl", marks=SLOW), pytest.param("native", marks=SLOW)])
 def test_the_same_bytes_for_every_batch_size_and_from_run_to_run(study: str, in_tmp: Path) -> None:
     contents = set()
     for out, batch in (("a", "1"), ("b", "7"), ("c", "50"), ("d", "50")):
@@ -104,7 +107,7 @@ def test_list_names_everything_in_text_and_json() -> None:
     carla = next(row for row in catalogue["vehicles"] if row["name"] == "carla")
     mass = next(row for row in carla["characteristics"] if row["name"] == "mass")
     assert mass == {"name": "mass", "unit": "kg", "original": 2404, "lower": 2040, "upper": 2700, "threshold": pytest.approx(13.2)}
-    text = run("list").stdout
+    text = run("list", env={**os.environ, "COLUMNS": "200"}).stdout
     for rows in catalogue.values():
         for row in rows:
             assert row["name"] in text

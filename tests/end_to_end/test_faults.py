@@ -224,7 +224,7 @@ def test_a_run_in_the_hands_of_another_process_is_not_started_twice(whole: Path)
 
 def test_a_full_disk_is_told_and_what_was_written_stays_valid(whole: Path) -> None:
     def little_room() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (15_000, resource.RLIM_INFINITY))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (19_000, resource.RLIM_INFINITY))
 
     told = ended(started("study", "small.toml", "--out", "out", "--jobs", "1", preexec_fn=little_room), 1)
     assert "cannot be written: File too large; what was written before stays valid" in told

@@ -11,8 +11,10 @@ from test_commands import run
 
 from safevar_sumo.study import study_names
 
+LONG = ("euro_ncap_car_to_car", "euro_ncap_pedestrian", "wear")
 
-@pytest.mark.parametrize("study", study_names())
+
+@pytest.mark.parametrize("study", [pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in study_names()])
 def test_a_short_search_finds_less_safe_settings(study: str, in_tmp: Path) -> None:
     run("study", study, "--algorithms", "nsga2", "--runs", "1", "--evaluations", "400", "--out", "out", "--quiet")
     original = json.loads(Path("out/manifest.json").read_text())["original"]

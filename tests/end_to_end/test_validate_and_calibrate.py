@@ -133,8 +133,8 @@ def test_calibrate_does_not_write_over_what_it_starts_from(data: Path, in_tmp: P
 def test_settings_that_cannot_be_simulated_are_told(data: Path, in_tmp: Path) -> None:
     Path("hasty.toml").write_text('extends = "sun"\nname = "hasty"\n[search]\ntime_limit = 0.001\n')
     pd.read_csv(data).head(1).to_csv("one.csv", index=False)
-    assert "not one of its 1 rows could be simulated" in run("validate", "hasty.toml", "one.csv", expect=1).stderr
-    assert "cannot be simulated with its own values" in run("calibrate", "hasty.toml", "one.csv", "--trials", "1", expect=1).stderr
+    assert "the original vehicle cannot be simulated either" in run("validate", "hasty.toml", "one.csv", expect=1).stderr
+    assert "the original vehicle cannot be simulated either" in run("calibrate", "hasty.toml", "one.csv", "--trials", "1", expect=1).stderr
 
 
 def test_an_interrupted_calibration_leaves_the_best_so_far(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
