@@ -52,7 +52,7 @@ def test_sweeps_are_combined_over_the_base() -> None:
 def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them() -> None:
     told = simulate("rain", "--set", "tireFric=1.1", "--set", "mass=2600", "--set", "dragCoeff=0.301")
     assert "original" in told.stdout
-    assert "The original vehicle stops, at the nearest " in told.stdout
+    assert "The original vehicle stops, at the nearest 1.92 m" in told.stdout
     assert "less safe than the original" in told.stdout
     assert "note: dragCoeff = 0.301 is so near the original that the filter put 0.3 back" in told.stderr
     assert "changed vehicle" not in simulate("rain").stdout
@@ -92,3 +92,10 @@ def test_titles_are_no_markup_and_control_nothing(title: str, width: str, in_tmp
     assert told.exception is None
     assert "\x1b" not in told.stdout
     assert max(map(len, told.stdout.partition("The original")[0].splitlines())) <= int(width)
+
+
+def test_a_title_with_control_characters_is_refused(in_tmp: Path) -> None:
+    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\ntitle = "a\\u001b[31mb\\nc"\n')
+    told = CliRunner().invoke(commands, ["simulate", "mine.toml"])
+    assert isinstance(told.exception, InputError)
+    assert "control characters" in str(told.exception)
