@@ -31,7 +31,8 @@ from safevar_sumo.simulation import System, assemble, evaluate, simulate
 from safevar_sumo.simulation.batch import drive
 from safevar_sumo.simulation.network import copied_network
 from safevar_sumo.simulation.staging import staged
-from safevar_sumo.simulation.sumo import Engine, SumoWorld, open_world, sumo_command
+from safevar_sumo.simulation.sumo import Engine, open_world, sumo_command
+from safevar_sumo.simulation.world import SumoWorld
 from safevar_sumo.study import load_study
 
 POPULATIONS = (50, 200, 1000)

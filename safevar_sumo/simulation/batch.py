@@ -13,8 +13,9 @@ from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Drives, E
 from safevar_sumo.scenarios import VUT, Point
 from safevar_sumo.simulation.parts import Parts
 from safevar_sumo.simulation.staging import staged
-from safevar_sumo.simulation.sumo import Engine, SumoWorld, world_on
+from safevar_sumo.simulation.sumo import Engine, world_on
 from safevar_sumo.simulation.system import System
+from safevar_sumo.simulation.world import SumoWorld
 from safevar_sumo.vehicles import at_start
 
 SURE_BRAKES = 9.0

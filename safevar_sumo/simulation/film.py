@@ -12,8 +12,8 @@ import numpy as np
 from safevar_sumo.records import Drives, FloatArray
 from safevar_sumo.simulation.matrix import at_worst, simulate
 from safevar_sumo.simulation.network import copied_network, copy_and_name
-from safevar_sumo.simulation.sumo import SumoWorld
 from safevar_sumo.simulation.system import System
+from safevar_sumo.simulation.world import SumoWorld
 
 
 class Lane(NamedTuple):

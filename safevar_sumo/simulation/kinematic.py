@@ -18,8 +18,9 @@ from safevar_sumo.scenarios import VUT
 from safevar_sumo.simulation.batch import drive, step_options
 from safevar_sumo.simulation.network import copied_id, copied_network
 from safevar_sumo.simulation.staging import staged
-from safevar_sumo.simulation.sumo import Engine, SumoWorld, open_world
+from safevar_sumo.simulation.sumo import Engine, open_world
 from safevar_sumo.simulation.system import System
+from safevar_sumo.simulation.world import SumoWorld
 from safevar_sumo.vehicles import SumoType
 
 

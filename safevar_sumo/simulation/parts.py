@@ -10,7 +10,7 @@ import numpy as np
 from safevar_sumo.records import Encounter, FloatArray, Observation, Trace
 from safevar_sumo.scenarios import Point, Scene
 from safevar_sumo.simulation.perception import Perception
-from safevar_sumo.simulation.sumo import SumoWorld
+from safevar_sumo.simulation.world import SumoWorld
 
 R = TypeVar("R", Scene, Observation)
 

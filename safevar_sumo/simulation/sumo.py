@@ -7,32 +7,22 @@ from __future__ import annotations
 
 import os
 import sys
-import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from enum import StrEnum
 from io import StringIO
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
-from safevar_sumo.records import FloatArray
-from safevar_sumo.scenarios import VUT, Lane
-from safevar_sumo.simulation.network import CopiedNetwork, copied_id, copied_network, empty_fingerprint, empty_network, round_up
+from safevar_sumo.simulation.network import CopiedNetwork, copied_network, empty_fingerprint, empty_network, round_up
 from safevar_sumo.simulation.standing import StandingSumo
 from safevar_sumo.simulation.traffic import Traffic, repeatable_traffic
-from safevar_sumo.vehicles import SumoType
+from safevar_sumo.simulation.world import SumoWorld
 
-# Speed mode: SUMO obeys every speed that is set and yields to nobody on a junction (TraCI "set speed mode", bit 5).
-OBEY = 32
 CONNECTION_ATTEMPTS = 15
 """How often, a second apart, traci tries to reach a SUMO that it has started."""
-# Lane change mode: none at all (TraCI "set lane change mode").
-KEEP_LANE = 0
 
 
 class Engine(StrEnum):
@@ -41,172 +31,6 @@ class Engine(StrEnum):
     LIBSUMO = "libsumo"
     TRACI = "traci"
     GUI = "gui"
-
-
-class SumoWorld:
-    """N copies of a network under simulation; made by `open_world`. Shapes: (N,) or (N, 2)."""
-
-    def __init__(self, api: Any, n: int, *, first: int = 0, watched: bool = False, standing: StandingSumo | None = None,
-                 whole: SumoWorld | None = None) -> None:
-        self._api, self.n, self._first, self._standing = api, n, first, standing
-        self._parts, self._whole = list[SumoWorld](), whole
-        self._left: dict[str, tuple[float, tuple[float, float]]] = {}
-        """Speed and position of vehicles under test that have left the road."""
-        self._ids: dict[str, list[str]] = {}
-        self._positions: dict[str, FloatArray] = {}
-        self._copy_of = {name: copy for copy, name in enumerate(self.ids(VUT))}
-        self.step_length: float = api.simulation.getDeltaT()
-        self._pause = self.step_length if watched else 0.0
-
-    def ids(self, name: str) -> list[str]:
-        """The ids of an actor in its copies."""
-        if name not in self._ids:
-            self._ids[name] = [copied_id(copy, name) for copy in range(self._first, self._first + self.n)]
-        return self._ids[name]
-
-    def set_types(self, types: SumoType) -> None:
-        """Make the vehicles under test the SUMO vehicle types that their settings say."""
-        vehicletype = self._api.vehicletype
-        for name, mass, accel, decel, max_speed, tau in zip(self.ids(VUT), *(values.tolist() for values in types), strict=True):
-            vehicletype.setMass(name, mass)
-            vehicletype.setAccel(name, accel)
-            vehicletype.setDecel(name, decel)
-            vehicletype.setEmergencyDecel(name, decel)
-            vehicletype.setMaxSpeed(name, max_speed)
-            vehicletype.setTau(name, tau)
-
-    def depart(self) -> None:
-        """Insert everybody, and take the vehicles under test into our hands.
-
-        Raises
-        ------
-        SimulationError
-            If a vehicle under test found no place.
-        """
-        global _present
-        _present = self
-        if self._standing is not None:
-            self._standing.enter()
-        self._api.simulationStep()
-        if self._standing is not None:
-            self._standing.shift()
-        departed = set(self._api.vehicle.getIDList())
-        for name in self.ids(VUT):
-            if name not in departed:
-                raise SimulationError(f"SUMO found no place for vehicle {name!r}: look at the network's traffic file")
-            self._api.vehicle.setSpeedMode(name, OBEY)
-            self._api.vehicle.setLaneChangeMode(name, KEEP_LANE)
-
-    def advance(self, speeds: FloatArray) -> None:
-        """One simulation step in which the vehicles under test reach `speeds` [m/s]."""
-        set_speed = _direct(self._api, "vehicle", "setSpeed")
-        for name, speed in zip(self.ids(VUT), speeds.tolist(), strict=True):
-            if name not in self._left:
-                set_speed(name, speed)
-        self._api.simulationStep()
-        for world in (self, *self._parts):
-            world._positions.clear()
-        if self._pause:
-            time.sleep(self._pause)
-
-    def collisions(self) -> dict[int, float]:
-        """Copies whose vehicle under test collides in this step, and its speed [m/s]."""
-        return {
-            self._copy_of[collision.collider]: collision.colliderSpeed
-            for collision in self._api.simulation.getCollisions() if collision.collider in self._copy_of}
-
-    def leave(self, copies: Iterable[int]) -> None:
-        """Take vehicles under test off the road whose runs are over: they are told to be as they were, and cost nothing."""
-        vehicle, names = self._api.vehicle, self.ids(VUT)
-        for name in (names[copy] for copy in copies):
-            self._left[name] = vehicle.getSpeed(name), vehicle.getPosition(name)
-            vehicle.remove(name)
-
-    def speeds(self) -> FloatArray:
-        """Speeds of the vehicles under test as SUMO has them [m/s]."""
-        speed = _direct(self._api, "vehicle", "getSpeed")
-        return np.array([self._left[name][0] if name in self._left else speed(name) for name in self.ids(VUT)])
-
-    def vehicle_positions(self, actor: str) -> FloatArray:
-        return self._looked_up(actor, _direct(self._api, "vehicle", "getPosition"))
-
-    def person_positions(self, actor: str) -> FloatArray:
-        return self._looked_up(actor, _direct(self._api, "person", "getPosition"))
-
-    def _looked_up(self, actor: str, position: Callable[[str], tuple[float, float]]) -> FloatArray:
-        """Positions in this step; whoever asks again gets the same array."""
-        if self._whole is not None and actor == VUT:
-            return self._whole.vehicle_positions(VUT)[self._first:self._first + self.n]
-        if actor not in self._positions:
-            found = (self._left[name][1] if name in self._left else position(name) for name in self.ids(actor))
-            self._positions[actor] = np.fromiter(chain.from_iterable(found), float, 2 * self.n).reshape(self.n, 2)
-        return self._positions[actor]
-
-    @property
-    def api(self) -> Any:
-        """libsumo, or traci."""
-        return self._api
-
-    def has_left(self, name: str) -> bool:
-        """Whether a vehicle under test is off the road for good."""
-        return name in self._left
-
-    def names(self) -> frozenset[str]:
-        """What vehicles, persons, roads and types are called in the originals of the copies."""
-        api = self._api
-        kinds = (api.vehicle, api.person, api.edge, api.lane, api.route, api.vehicletype, api.junction)
-        return frozenset(name.removeprefix(":").partition(".")[2] for kind in kinds for name in kind.getIDList())
-
-    def whereabouts(self) -> dict[str, tuple[float, float, float]]:
-        """Where everybody is who is on the road, by id: front bumper or person [m], heading clockwise from north [degrees]."""
-        kinds = (self._api.vehicle, self._api.person)
-        return {name: (*kind.getPosition(name), kind.getAngle(name)) for kind in kinds for name in kind.getIDList()}
-
-    def measures(self, name: str) -> tuple[bool, float, float]:
-        """Whether the one of this id is a person, and its length and width [m]."""
-        is_person = name in self._api.person.getIDList()
-        kind = self._api.person if is_person else self._api.vehicle
-        return is_person, kind.getLength(name), kind.getWidth(name)
-
-    def vehicle_length(self, actor: str) -> float:
-        return float(self._api.vehicle.getLength(self.ids(actor)[0]))
-
-    def vehicle_width(self, actor: str) -> float:
-        return float(self._api.vehicle.getWidth(self.ids(actor)[0]))
-
-    def lane(self, lane: str) -> Lane:
-        shape = self._api.lane.getShape(copied_id(0, lane))
-        return Lane(shape[0], shape[-1])
-
-    def lane_start(self, lane: str) -> tuple[float, float]:
-        x, y = self._api.lane.getShape(copied_id(0, lane))[0]
-        return x, y
-
-    def person_width(self, actor: str) -> float:
-        return float(self._api.person.getWidth(self.ids(actor)[0]))
-
-    def walk(self, person: str, speed: float) -> None:
-        for name in self.ids(person):
-            self._api.person.setSpeed(name, speed)
-
-    def drive(self, vehicle: str, speed: float) -> None:
-        for name in self.ids(vehicle):
-            self._api.vehicle.setSpeedMode(name, OBEY)
-            self._api.vehicle.setSpeed(name, speed)
-
-    def part(self, first: int, n: int) -> SumoWorld:
-        """The world of `n` copies alone, from the `first`."""
-        part = SumoWorld(self._api, n, first=first, whole=self)
-        part._left = self._left
-        self._parts.append(part)
-        return part
-
-    def turn_back(self, person: str) -> None:
-        api = self._api.person
-        for name in self.ids(person):
-            back = [api.getRoadID(name), api.getEdges(name)[0]]
-            api.appendWalkingStage(name, back, 0.0, speed=api.getSpeed(name))
-            api.removeStage(name, 0)
 
 
 @contextmanager
@@ -235,24 +59,14 @@ def world_on(folder: str, n: int, engine: Engine = Engine.LIBSUMO, options: Sequ
 @contextmanager
 def open_world(files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, options: Sequence[str] = ()) -> Iterator[SumoWorld]:
     """Start SUMO on `n` copies of a network with their traffic, and close it whatever happens; raises as `world_on`."""
-    api = _api(engine)
+    api = engine_api(engine)
     try:
-        _start(api, engine, [*sumo_command(engine, files), *options])
+        start_engine(api, engine, [*sumo_command(engine, files), *options])
         yield SumoWorld(api, n, watched=engine is Engine.GUI)
     except (api.TraCIException, api.FatalTraCIError) as error:
         raise _failure(error) from None
     finally:
-        _close(api)
-
-
-_present: SumoWorld | None = None
-"""The world that is being driven in this process: SUMO is one a process, too."""
-
-
-def present_world() -> SumoWorld:
-    """The world that is being driven."""
-    assert _present is not None
-    return _present
+        stop_engine(api)
 
 
 _standing: StandingSumo | None = None
@@ -263,17 +77,17 @@ _standing: StandingSumo | None = None
 def _standing_world(folder: str, traffic: Sequence[Traffic], options: Sequence[str]) -> Iterator[SumoWorld]:
     """Worlds in the SUMO of this process, which stays open unless one fails."""
     global _standing
-    api, n, wanted = _api(Engine.LIBSUMO), len(traffic), (empty_fingerprint(folder), *options)
+    api, n, wanted = engine_api(Engine.LIBSUMO), len(traffic), (empty_fingerprint(folder), *options)
     try:
         if _standing is None or not _standing.serves(wanted, n):
             copies = round_up(n)
-            _start(api, Engine.LIBSUMO, [*sumo_command(Engine.LIBSUMO, empty_network(folder, copies)), *options])
+            start_engine(api, Engine.LIBSUMO, [*sumo_command(Engine.LIBSUMO, empty_network(folder, copies)), *options])
             _standing = StandingSumo(api, wanted, copies)
         _standing.expect(traffic)
         yield SumoWorld(api, n, standing=_standing)
     except BaseException as error:
         _standing = None
-        _close(api)
+        stop_engine(api)
         if isinstance(error, (api.TraCIException, api.FatalTraCIError)):
             raise _failure(error) from None
         raise
@@ -283,13 +97,7 @@ def _failure(error: Exception) -> SimulationError:
     return SimulationError(f"SUMO failed: {str(error).strip() or 'it closed the connection'}")
 
 
-def _direct(api: Any, domain: str, name: str) -> Callable[..., Any]:
-    """A function of SUMO's without libsumo's Python wrapper, which costs as much as the call; traci has none."""
-    compiled = getattr(api, "_libsumo", None)
-    return getattr(getattr(api, domain), name) if compiled is None else getattr(compiled, f"{domain}_{name}")  # type: ignore[no-any-return]
-
-
-def _api(engine: Engine) -> Any:
+def engine_api(engine: Engine) -> Any:
     if engine is Engine.LIBSUMO:
         import libsumo
 
@@ -299,29 +107,17 @@ def _api(engine: Engine) -> Any:
     return traci
 
 
-engine_of = _api
-
-
-def start_engine(api: Any, engine: Engine, arguments: Sequence[str]) -> None:
-    """Start an engine's program with these arguments."""
-    _start(api, engine, [_binary(engine), *arguments])
-
-
-def stop_engine(api: Any) -> None:
-    """Release what `start_engine` has started; see `_close`."""
-    _close(api)
-
-
 def sumo_command(engine: Engine, files: CopiedNetwork) -> list[str]:
     """The command line that starts SUMO on copies of a network."""
     window = ["--start", "true", "--quit-on-end", "true", "--window-size", "1200,700"] if engine is Engine.GUI else []
     return [
-        _binary(engine), "-c", str(files.options), "-n", str(files.network), "-r", str(files.traffic),
+        binary(engine), "-c", str(files.options), "-n", str(files.network), "-r", str(files.traffic),
         "--no-step-log", "true", "--no-warnings", "true", "--xml-validation", "never", "--xml-validation.net", "never",
         "--xml-validation.routes", "never", *window]
 
 
-def _start(api: Any, engine: Engine, command: list[str]) -> None:
+def start_engine(api: Any, engine: Engine, command: list[str]) -> None:
+    """Start an engine's program with this command line."""
     global _standing
     if engine is Engine.LIBSUMO:
         _standing = None  # libsumo exists once in a process
@@ -337,7 +133,8 @@ def _start(api: Any, engine: Engine, command: list[str]) -> None:
         api.start(command, numRetries=CONNECTION_ATTEMPTS)
 
 
-def _binary(engine: Engine) -> str:
+def binary(engine: Engine) -> str:
+    """The program of an engine."""
     if engine is Engine.LIBSUMO:
         return "sumo"
     import sumo
@@ -345,7 +142,7 @@ def _binary(engine: Engine) -> str:
     return str(Path(sumo.SUMO_HOME) / "bin" / ("sumo-gui" if engine is Engine.GUI else "sumo"))
 
 
-def _close(api: Any) -> None:
+def stop_engine(api: Any) -> None:
     """Release SUMO; if it never started or its window was closed, there is nothing left to release."""
     with suppress(api.TraCIException, api.FatalTraCIError):
         api.close()

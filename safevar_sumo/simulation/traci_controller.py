@@ -17,7 +17,7 @@ from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.simulation.network import copied_id
-from safevar_sumo.simulation.sumo import SumoWorld, present_world
+from safevar_sumo.simulation.world import SumoWorld, present_world
 from safevar_sumo.vehicles import SumoType
 
 WISHES = "setSpeed, slowDown, setAcceleration, setAccel, setDecel, setMaxSpeed, setSpeedMode"

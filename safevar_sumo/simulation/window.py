@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.simulation.network import copied_network
-from safevar_sumo.simulation.sumo import Engine, engine_of, start_engine, stop_engine
+from safevar_sumo.simulation.sumo import Engine, binary, engine_api, start_engine, stop_engine
 
 BRAKE_LIGHT = 8
 """Signal of a vehicle (TraCI, "change vehicle state": bit 3)."""
@@ -112,13 +112,13 @@ def open_window(network: str, step: float, width: int = 1200, height: int = 700)
     with tempfile.TemporaryDirectory() as folder:
         settings = Path(folder) / "view.xml"
         settings.write_text(SETTINGS.format(letters=LETTERS), encoding="utf-8")
-        api = engine_of(Engine.GUI)
+        api = engine_api(Engine.GUI)
         command = ["-n", str(copied_network(network, 1).network), "--step-length", repr(step), "--collision.action", "none",
                    "--gui-settings-file", str(settings), "--start", "true", "--quit-on-end", "true", "--no-step-log", "true",
                    "--no-warnings", "true", "--window-size", f"{width},{height}", "--time-to-teleport", "-1",
                    "--xml-validation", "never", "--xml-validation.net", "never"]
         try:
-            start_engine(api, Engine.GUI, command)
+            start_engine(api, Engine.GUI, [binary(Engine.GUI), *command])
             yield Window(api)
         except (api.TraCIException, api.FatalTraCIError) as error:
             raise SimulationError(f"sumo-gui failed: {str(error).strip() or 'its window was closed'}") from None

@@ -1,0 +1,204 @@
+"""N copies of a network under simulation, and what is asked of SUMO about the actors on them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from itertools import chain
+from typing import Any
+
+import numpy as np
+
+from safevar_sumo.errors import SimulationError
+from safevar_sumo.records import FloatArray
+from safevar_sumo.scenarios import VUT, Lane
+from safevar_sumo.simulation.network import copied_id
+from safevar_sumo.simulation.standing import StandingSumo
+from safevar_sumo.vehicles import SumoType
+
+# Speed mode: SUMO obeys every speed that is set and yields to nobody on a junction (TraCI "set speed mode", bit 5).
+OBEY = 32
+# Lane change mode: none at all (TraCI "set lane change mode").
+KEEP_LANE = 0
+
+
+class SumoWorld:
+    """N copies of a network under simulation; made by `open_world`. Shapes: (N,) or (N, 2)."""
+
+    def __init__(self, api: Any, n: int, *, first: int = 0, watched: bool = False, standing: StandingSumo | None = None,
+                 whole: SumoWorld | None = None) -> None:
+        self._api, self.n, self._first, self._standing = api, n, first, standing
+        self._parts, self._whole = list[SumoWorld](), whole
+        self._left: dict[str, tuple[float, tuple[float, float]]] = {}
+        """Speed and position of vehicles under test that have left the road."""
+        self._ids: dict[str, list[str]] = {}
+        self._positions: dict[str, FloatArray] = {}
+        self._copy_of = {name: copy for copy, name in enumerate(self.ids(VUT))}
+        self.step_length: float = api.simulation.getDeltaT()
+        self._pause = self.step_length if watched else 0.0
+
+    def ids(self, name: str) -> list[str]:
+        """The ids of an actor in its copies."""
+        if name not in self._ids:
+            self._ids[name] = [copied_id(copy, name) for copy in range(self._first, self._first + self.n)]
+        return self._ids[name]
+
+    def set_types(self, types: SumoType) -> None:
+        """Make the vehicles under test the SUMO vehicle types that their settings say."""
+        vehicletype = self._api.vehicletype
+        for name, mass, accel, decel, max_speed, tau in zip(self.ids(VUT), *(values.tolist() for values in types), strict=True):
+            vehicletype.setMass(name, mass)
+            vehicletype.setAccel(name, accel)
+            vehicletype.setDecel(name, decel)
+            vehicletype.setEmergencyDecel(name, decel)
+            vehicletype.setMaxSpeed(name, max_speed)
+            vehicletype.setTau(name, tau)
+
+    def depart(self) -> None:
+        """Insert everybody, and take the vehicles under test into our hands.
+
+        Raises
+        ------
+        SimulationError
+            If a vehicle under test found no place.
+        """
+        global _present
+        _present = self
+        if self._standing is not None:
+            self._standing.enter()
+        self._api.simulationStep()
+        if self._standing is not None:
+            self._standing.shift()
+        departed = set(self._api.vehicle.getIDList())
+        for name in self.ids(VUT):
+            if name not in departed:
+                raise SimulationError(f"SUMO found no place for vehicle {name!r}: look at the network's traffic file")
+            self._api.vehicle.setSpeedMode(name, OBEY)
+            self._api.vehicle.setLaneChangeMode(name, KEEP_LANE)
+
+    def advance(self, speeds: FloatArray) -> None:
+        """One simulation step in which the vehicles under test reach `speeds` [m/s]."""
+        set_speed = _direct(self._api, "vehicle", "setSpeed")
+        for name, speed in zip(self.ids(VUT), speeds.tolist(), strict=True):
+            if name not in self._left:
+                set_speed(name, speed)
+        self._api.simulationStep()
+        for world in (self, *self._parts):
+            world._positions.clear()
+        if self._pause:
+            time.sleep(self._pause)
+
+    def collisions(self) -> dict[int, float]:
+        """Copies whose vehicle under test collides in this step, and its speed [m/s]."""
+        return {
+            self._copy_of[collision.collider]: collision.colliderSpeed
+            for collision in self._api.simulation.getCollisions() if collision.collider in self._copy_of}
+
+    def leave(self, copies: Iterable[int]) -> None:
+        """Take vehicles under test off the road whose runs are over: they are told to be as they were, and cost nothing."""
+        vehicle, names = self._api.vehicle, self.ids(VUT)
+        for name in (names[copy] for copy in copies):
+            self._left[name] = vehicle.getSpeed(name), vehicle.getPosition(name)
+            vehicle.remove(name)
+
+    def speeds(self) -> FloatArray:
+        """Speeds of the vehicles under test as SUMO has them [m/s]."""
+        speed = _direct(self._api, "vehicle", "getSpeed")
+        return np.array([self._left[name][0] if name in self._left else speed(name) for name in self.ids(VUT)])
+
+    def vehicle_positions(self, actor: str) -> FloatArray:
+        return self._looked_up(actor, _direct(self._api, "vehicle", "getPosition"))
+
+    def person_positions(self, actor: str) -> FloatArray:
+        return self._looked_up(actor, _direct(self._api, "person", "getPosition"))
+
+    def _looked_up(self, actor: str, position: Callable[[str], tuple[float, float]]) -> FloatArray:
+        """Positions in this step; whoever asks again gets the same array."""
+        if self._whole is not None and actor == VUT:
+            return self._whole.vehicle_positions(VUT)[self._first:self._first + self.n]
+        if actor not in self._positions:
+            found = (self._left[name][1] if name in self._left else position(name) for name in self.ids(actor))
+            self._positions[actor] = np.fromiter(chain.from_iterable(found), float, 2 * self.n).reshape(self.n, 2)
+        return self._positions[actor]
+
+    @property
+    def api(self) -> Any:
+        """libsumo, or traci."""
+        return self._api
+
+    def has_left(self, name: str) -> bool:
+        """Whether a vehicle under test is off the road for good."""
+        return name in self._left
+
+    def names(self) -> frozenset[str]:
+        """What vehicles, persons, roads and types are called in the originals of the copies."""
+        api = self._api
+        kinds = (api.vehicle, api.person, api.edge, api.lane, api.route, api.vehicletype, api.junction)
+        return frozenset(name.removeprefix(":").partition(".")[2] for kind in kinds for name in kind.getIDList())
+
+    def whereabouts(self) -> dict[str, tuple[float, float, float]]:
+        """Where everybody is who is on the road, by id: front bumper or person [m], heading clockwise from north [degrees]."""
+        kinds = (self._api.vehicle, self._api.person)
+        return {name: (*kind.getPosition(name), kind.getAngle(name)) for kind in kinds for name in kind.getIDList()}
+
+    def measures(self, name: str) -> tuple[bool, float, float]:
+        """Whether the one of this id is a person, and its length and width [m]."""
+        is_person = name in self._api.person.getIDList()
+        kind = self._api.person if is_person else self._api.vehicle
+        return is_person, kind.getLength(name), kind.getWidth(name)
+
+    def vehicle_length(self, actor: str) -> float:
+        return float(self._api.vehicle.getLength(self.ids(actor)[0]))
+
+    def vehicle_width(self, actor: str) -> float:
+        return float(self._api.vehicle.getWidth(self.ids(actor)[0]))
+
+    def lane(self, lane: str) -> Lane:
+        shape = self._api.lane.getShape(copied_id(0, lane))
+        return Lane(shape[0], shape[-1])
+
+    def lane_start(self, lane: str) -> tuple[float, float]:
+        x, y = self._api.lane.getShape(copied_id(0, lane))[0]
+        return x, y
+
+    def person_width(self, actor: str) -> float:
+        return float(self._api.person.getWidth(self.ids(actor)[0]))
+
+    def walk(self, person: str, speed: float) -> None:
+        for name in self.ids(person):
+            self._api.person.setSpeed(name, speed)
+
+    def drive(self, vehicle: str, speed: float) -> None:
+        for name in self.ids(vehicle):
+            self._api.vehicle.setSpeedMode(name, OBEY)
+            self._api.vehicle.setSpeed(name, speed)
+
+    def part(self, first: int, n: int) -> SumoWorld:
+        """The world of `n` copies alone, from the `first`."""
+        part = SumoWorld(self._api, n, first=first, whole=self)
+        part._left = self._left
+        self._parts.append(part)
+        return part
+
+    def turn_back(self, person: str) -> None:
+        api = self._api.person
+        for name in self.ids(person):
+            back = [api.getRoadID(name), api.getEdges(name)[0]]
+            api.appendWalkingStage(name, back, 0.0, speed=api.getSpeed(name))
+            api.removeStage(name, 0)
+
+
+_present: SumoWorld | None = None
+"""The world that is being driven in this process: SUMO is one a process, too."""
+
+
+def present_world() -> SumoWorld:
+    """The world that is being driven."""
+    assert _present is not None
+    return _present
+
+
+def _direct(api: Any, domain: str, name: str) -> Callable[..., Any]:
+    """A function of SUMO's without libsumo's Python wrapper, which costs as much as the call; traci has none."""
+    compiled = getattr(api, "_libsumo", None)
+    return getattr(getattr(api, domain), name) if compiled is None else getattr(compiled, f"{domain}_{name}")  # type: ignore[no-any-return]
