@@ -15,7 +15,8 @@ from safevar_sumo.simulation import System, assemble
 from safevar_sumo.study import load_study, study_names
 
 collect_ignore = [] if os.name == "posix" else [
-    "computing/test_local_pool.py", "end_to_end/test_cluster.py", "end_to_end/test_faults.py", "end_to_end/test_identity.py"]
+    "computing/test_local_pool.py",
+    *(f"end_to_end/test_{name}.py" for name in ("cluster", "faults", "identities", "interruptions", "shares", "worlds_that_fail"))]
 """Tests that kill, stop and interrupt processes as POSIX has it."""
 
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)

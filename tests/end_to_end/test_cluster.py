@@ -14,19 +14,18 @@ import numpy as np
 import psutil
 import pytest
 from processes import ended, killed, started, until, written
+from small import solutions
 
 from safevar_sumo.computing import cluster
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import load
 
-STUDY = 'extends = "smoke"\nname = "small"\n[search]\nalgorithms = ["nsga2", "rs", "safe_fuzzer"]\nevaluations = 150\n'
 Start = Callable[..., subprocess.Popen[str]]
 
 
 @pytest.fixture
-def start(in_tmp: Path) -> Iterator[Start]:
+def start(small: None) -> Iterator[Start]:
     """Starts a program of Dask's in a process group of its own; all are ended with the test."""
-    Path("small.toml").write_text(STUDY)
     running: list[subprocess.Popen[str]] = []
 
     def begin(program: str, *arguments: str) -> subprocess.Popen[str]:
@@ -61,7 +60,8 @@ def busy(process: subprocess.Popen[str]) -> bool:
     return any("libsumo" in one.path for one in psutil.Process(process.pid).memory_maps())
 
 
-def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(scheduler: tuple[subprocess.Popen[str], str], start: Start) -> None:
+def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(
+        scheduler: tuple[subprocess.Popen[str], str], start: Start, whole: Path) -> None:
     _, address = scheduler
     workers = [worker(start, address, "--no-nanny") for _ in range(2)]
     until(lambda: all("Registered to" in Path(f"worker-{i}.log").read_text() for i in (1, 2)), workers[0])
@@ -71,8 +71,7 @@ def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(scheduler: tupl
     killed(workers[0])
     ended(process, 0)
     assert workers[1].poll() is None
-    ended(started("study", "small.toml", "--out", "here", "--jobs", "1"), 0)
-    assert Path("out/solutions.csv").read_bytes() == Path("here/solutions.csv").read_bytes()
+    assert solutions("out") == solutions(whole)
     assert (load("out").evaluations["outcome"] != "simulator-error").all()
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from test_campaign import FormulaPool, Told
+from formulas import FormulaPool, Told
 
 from safevar_sumo.campaign import all_runs, carry_out
 from safevar_sumo.errors import SafevarError

@@ -1,0 +1,186 @@
+"""Runs driven over pools whose evaluations are formulas: reordered, alone and together, with more or fewer of them."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from formulas import SUN, FormulaPool, Told, carried_out, evaluated, solutions, with_search
+
+from safevar_sumo.campaign import RunKey, all_runs, carry_out, run_generator
+from safevar_sumo.campaign.gathering import BATCHES_PER_WORKER
+from safevar_sumo.computing import PoolLostError
+from safevar_sumo.records import Evaluations
+from safevar_sumo.results import ResultsDirectory, load
+from safevar_sumo.study import Study, tables_of
+
+
+def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches(study: Study, tmp_path: Path) -> None:
+    carried_out(study, tmp_path / "a")
+    for name, pool, batch in (("b", FormulaPool(workers=7), None), ("c", FormulaPool(workers=3, shuffled=True), 3),
+                              ("d", FormulaPool(workers=2, shuffled=True), 1)):
+        carried_out(study, tmp_path / name, pool, batch=batch)
+        assert solutions(tmp_path / name) == solutions(tmp_path / "a")
+        pd.testing.assert_frame_equal(load(tmp_path / name).evaluations, load(tmp_path / "a").evaluations)
+
+
+class Sizes(FormulaPool):
+    """Keeps the batches' sizes."""
+
+    def __init__(self, workers: int) -> None:
+        super().__init__(workers)
+        self.sizes: list[int] = []
+
+    def submit(self, study: bytes, settings: np.ndarray) -> Future[Evaluations]:
+        self.sizes.append(len(settings))
+        return super().submit(study, settings)
+
+
+def test_runs_share_batches_and_one_run_is_shared_out(study: Study, tmp_path: Path) -> None:
+    large = with_search(study, population=40, evaluations=400, runs=10, algorithms=["rs"])
+    together, alone = Sizes(workers=2), Sizes(workers=2)
+    carried_out(large, tmp_path / "together", together)
+    carried_out(large, tmp_path / "alone", alone, keys=[RunKey("rs", 3)])
+    assert np.mean(together.sizes[1:]) > 3 * large.search.population
+    assert alone.sizes[1:3] == [20, 20]
+    one, other = (load(tmp_path / name).evaluations.query("algorithm == 'rs' and run == 3") for name in ("together", "alone"))
+    pd.testing.assert_frame_equal(one.reset_index(drop=True), other.reset_index(drop=True))
+
+
+def test_another_seed_finds_other_solutions(study: Study, tmp_path: Path) -> None:
+    carried_out(study, tmp_path / "a")
+    carried_out(with_search(study, seed=2), tmp_path / "b")
+    assert solutions(tmp_path / "a") != solutions(tmp_path / "b")
+
+
+def test_a_campaign_that_breaks_down_anywhere_is_resumed_where_it_was(study: Study, tmp_path: Path) -> None:
+    whole = FormulaPool()
+    carried_out(study, tmp_path / "whole", whole)
+    for lasts in (1, 2, 3, 7, 20, 41):
+        out, first, second = tmp_path / str(lasts), FormulaPool(lasts=lasts), FormulaPool()
+        with pytest.raises(PoolLostError, match="broken down"):
+            carried_out(study, out, first, batch=study.search.population)
+        carried_out(study, out, second)
+        assert solutions(out) == solutions(tmp_path / "whole")
+        assert set(first.simulated + second.simulated) == set(whole.simulated)
+        under_way = BATCHES_PER_WORKER * study.search.population
+        assert len(first.simulated) + len(second.simulated) <= len(whole.simulated) + under_way
+
+
+def test_a_finished_campaign_answers_without_simulating(study: Study, tmp_path: Path) -> None:
+    first, told = carried_out(study, tmp_path)
+    before = solutions(tmp_path)
+    again, told_again = carried_out(study, tmp_path, FormulaPool(lasts=0))
+    assert solutions(tmp_path) == before
+    assert again.failures == first.failures == []
+    assert told_again.simulated == 0
+    assert told_again.finished_runs == told.finished_runs == dict.fromkeys(all_runs(study), study.search.evaluations)
+
+
+def test_a_setting_is_simulated_once_in_a_run(study: Study, tmp_path: Path) -> None:
+    one = with_search(study, algorithms=["nsga2"], runs=1)
+    pool = FormulaPool()
+    _, told = carried_out(one, tmp_path, pool)
+    assert len(pool.simulated) == len(set(pool.simulated)) == told.simulated + 1
+    assert told.simulated <= told.asked == study.search.evaluations
+
+
+def test_more_runs_extend_and_fewer_leave_out(study: Study, tmp_path: Path) -> None:
+    pools = [FormulaPool() for _ in range(3)]
+    carried_out(with_search(study, runs=3), tmp_path / "whole", pools[0])
+    carried_out(with_search(study, runs=1), tmp_path / "grown", pools[1])
+    carried_out(with_search(study, runs=3), tmp_path / "grown", pools[2])
+    assert solutions(tmp_path / "grown") == solutions(tmp_path / "whole")
+    assert len(pools[1].simulated) + len(pools[2].simulated) == len(pools[0].simulated), "each setting once"
+
+
+@pytest.mark.parametrize("key", [RunKey("nsga2", 1), RunKey("rs", 0), RunKey("safe_fuzzer", 1)])
+def test_a_run_alone_is_the_same_as_in_the_whole(study: Study, tmp_path: Path, key: RunKey) -> None:
+    campaign, _ = carried_out(study, tmp_path / "whole")
+    alone = carry_out(study, [key], ResultsDirectory(tmp_path / "alone", study), FormulaPool(), Told())
+    assert list(alone.solutions) == [key]
+    assert np.array_equal(alone.solutions[key].settings, campaign.solutions[key].settings)
+    assert np.array_equal(alone.solutions[key].objectives, campaign.solutions[key].objectives)
+
+
+def test_runs_have_random_numbers_of_their_own(study: Study) -> None:
+    first = {tuple(run_generator(study, key).random(3)) for key in all_runs(with_search(study, runs=30))}
+    assert len(first) == 90
+    one, other = (run_generator(which, RunKey("rs", 7)).random(3) for which in (study, with_search(study, runs=9)))
+    assert np.array_equal(one, other)
+
+
+def test_a_run_in_other_hands_is_left_to_them(study: Study, tmp_path: Path) -> None:
+    carried_out(study, tmp_path / "whole")
+    results = ResultsDirectory(tmp_path / "out", study)
+    theirs = [results.journal("rs-01"), results.journal("original")]
+    campaign = carry_out(study, all_runs(study), results, FormulaPool(), Told())
+    assert campaign.busy == [RunKey("rs", 1)]
+    assert set(campaign.solutions) == set(all_runs(study)) - {RunKey("rs", 1)}
+    for journal in theirs:
+        journal.close()
+    carried_out(study, tmp_path / "out")
+    assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")
+
+
+def test_journals_are_given_back_whatever_happens(study: Study, tmp_path: Path) -> None:
+    with pytest.raises(PoolLostError):
+        carried_out(study, tmp_path, FormulaPool(lasts=5))
+    for path in (tmp_path / "runs").iterdir():
+        results = ResultsDirectory(tmp_path, study)
+        results.journal(path.stem).close()
+
+
+@pytest.mark.parametrize("budgets", [(60, 100), (55, 130), (100, 60), (550, 800)])
+def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_others(
+        study: Study, tmp_path: Path, budgets: tuple[int, int]) -> None:
+    first, second = (with_search(study, evaluations=budget, runs=1) for budget in budgets)
+    pools = [FormulaPool() for _ in range(3)]
+    carried_out(first, tmp_path / "out", pools[0])
+    carried_out(second, tmp_path / "out", pools[1])
+    carried_out(second, tmp_path / "fresh", pools[2])
+    assert solutions(tmp_path / "out") == solutions(tmp_path / "fresh")
+    found, fresh = load(tmp_path / "out"), load(tmp_path / "fresh")
+    pd.testing.assert_frame_equal(found.evaluations, fresh.evaluations)
+    pd.testing.assert_frame_equal(found.solutions, fresh.solutions)
+    assert len(set(pools[0].simulated)) + len(set(pools[1].simulated)) == len(set(pools[0].simulated) | set(pools[1].simulated))
+    carried_out(first, tmp_path / "out", FormulaPool(lasts=0))
+
+
+def test_while_there_are_more_evaluations_to_come_a_run_is_unfinished(study: Study, tmp_path: Path) -> None:
+    carried_out(study, tmp_path)
+    with pytest.raises(PoolLostError):
+        carried_out(with_search(study, evaluations=300), tmp_path, FormulaPool(lasts=3))
+    found = load(tmp_path)
+    assert found.finished == ()
+    assert not (tmp_path / "solutions.csv").exists()
+
+
+def test_every_evaluation_is_read_in_the_order_in_which_it_was_asked_for(study: Study, tmp_path: Path) -> None:
+    carried_out(study, tmp_path, FormulaPool(workers=4, shuffled=True), batch=3)
+    results = load(tmp_path)
+    frame = results.evaluations
+    assert list(frame.columns[:3]) == ["algorithm", "run", "evaluation"]
+    for key in all_runs(study):
+        of_run = frame[(frame["algorithm"] == key.algorithm) & (frame["run"] == key.run)]
+        assert of_run["evaluation"].is_monotonic_increasing
+        assert of_run["evaluation"].iloc[0] == 0
+        assert of_run["evaluation"].iloc[-1] < study.search.evaluations
+    expected = evaluated(frame[list(SUN.names)].to_numpy())
+    assert np.array_equal(frame["f_safe"], expected.f_safe)
+    assert np.array_equal(frame["outcome"], expected.outcome)
+    assert results.solutions.to_csv(index=False, lineterminator="\n").encode() == solutions(tmp_path)
+    assert results.manifest["study"] == tables_of(study)
+
+
+def test_an_unfinished_directory_is_read_too(study: Study, tmp_path: Path) -> None:
+    pool = FormulaPool(lasts=15)
+    with pytest.raises(PoolLostError):
+        carried_out(study, tmp_path, pool, batch=study.search.population)
+    results = load(tmp_path)
+    in_flight = study.search.population
+    assert len(pool.simulated) - 1 - in_flight <= len(results.evaluations) <= len(pool.simulated) - 1, "all but the original vehicle's"
+    assert set(results.solutions["algorithm"]) <= {"nsga2"}
