@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 
 from safevar_sumo.errors import InputError
@@ -47,8 +48,6 @@ def compare(x: ArrayLike, y: ArrayLike) -> Comparison:
     InputError
         If a value is NaN.
     """
-    from scipy.stats import mannwhitneyu  # takes longer to load than most answers to find
-
     one, other = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if np.isnan(one).any() or np.isnan(other).any():
         raise InputError("Mann-Whitney U", "a value is NaN", "samples without undefined values")
@@ -56,7 +55,7 @@ def compare(x: ArrayLike, y: ArrayLike) -> Comparison:
         return Comparison(None, None, None, one.size, other.size, None)
     both = np.concatenate([one, other])
     exact = min(one.size, other.size) <= EXACT_UP_TO and np.unique(both).size == both.size
-    test = mannwhitneyu(one, other, alternative="two-sided", method="exact" if exact else "asymptotic")
+    test = scipy.stats.mannwhitneyu(one, other, alternative="two-sided", method="exact" if exact else "asymptotic")
     a12 = float(test.statistic) / (one.size * other.size)
     return Comparison(float(test.pvalue), a12, magnitude(a12), one.size, other.size, EXACT if exact else ASYMPTOTIC)
 

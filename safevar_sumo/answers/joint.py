@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import binomtest
+import scipy
 
 from safevar_sumo.answers.bench import Bench
 from safevar_sumo.answers.boundary import Line, first_unsafe
@@ -33,7 +33,7 @@ class Joint(NamedTuple):
 
     @property
     def unsafe_at_most(self) -> float:
-        return float(binomtest(0, self.samples, alternative="less").proportion_ci(self.confidence, method="exact").high)
+        return float(scipy.stats.binomtest(0, self.samples, alternative="less").proportion_ci(self.confidence, method="exact").high)
 
 
 def joint(bench: Bench, unsafe: Unsafe, known: FloatArray) -> Joint:

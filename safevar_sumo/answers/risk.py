@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import binomtest
+import scipy
 
 from safevar_sumo.answers.bench import Progress, open_bench, silent
 from safevar_sumo.answers.causes import number
@@ -67,7 +67,7 @@ class Risk:
 
 def interval_of(count: int, number: int, confidence: float) -> tuple[float, float]:
     """Clopper and Pearson's exact interval of a share."""
-    found = binomtest(count, number).proportion_ci(confidence, method="exact")
+    found = scipy.stats.binomtest(count, number).proportion_ci(confidence, method="exact")
     return float(found.low), float(found.high)
 
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import qmc
+import scipy
 
 from safevar_sumo.answers.bench import Bench
 from safevar_sumo.errors import InputError
@@ -85,7 +85,7 @@ def usual_in(bench: Bench, original: Evaluations) -> Unsafe:
 
 def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
     """Scrambled Sobol points in the unit cube, shape (number, dimensions); evenly spread where number is a power of two."""
-    points = qmc.Sobol(dimensions, rng=np.random.default_rng(seed)).random_base2(max(0, math.ceil(math.log2(number))))
+    points = scipy.stats.qmc.Sobol(dimensions, rng=np.random.default_rng(seed)).random_base2(max(0, math.ceil(math.log2(number))))
     return np.asarray(points[:number])
 
 

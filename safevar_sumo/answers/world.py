@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.records import FloatArray
@@ -47,7 +47,7 @@ class World:
     def settings(self, probabilities: FloatArray) -> FloatArray:
         """Settings at points of the unit cube, shape (N, n): independent there, correlated as the study says in the result."""
         if self._factor is not None:
-            probabilities = stats.norm.cdf(stats.norm.ppf(probabilities) @ self._factor.T)
+            probabilities = scipy.stats.norm.cdf(scipy.stats.norm.ppf(probabilities) @ self._factor.T)
         columns = [quantile(column) for quantile, column in zip(self._quantiles, probabilities.T, strict=True)]
         return np.clip(np.stack(columns, axis=1), self._members.lower, self._members.upper)
 
@@ -64,17 +64,17 @@ class World:
                 if isinstance(law, Uniform):
                     return lambda p: lower + p * (upper - lower)
                 mode = self._within(member, "mode", law.mode, member.original, lower, upper)
-                triangle = stats.triang((mode - lower) / (upper - lower), loc=lower, scale=upper - lower)
+                triangle = scipy.stats.triang((mode - lower) / (upper - lower), loc=lower, scale=upper - lower)
                 return lambda p: np.asarray(triangle.ppf(p))
             case Normal():
                 mean = self._within(member, "mean", law.mean, member.original)
-                cut = stats.truncnorm((low - mean) / law.deviation, (high - mean) / law.deviation, loc=mean, scale=law.deviation)
+                cut = scipy.stats.truncnorm((low - mean) / law.deviation, (high - mean) / law.deviation, loc=mean, scale=law.deviation)
                 return lambda p: np.asarray(cut.ppf(p))
             case Lognormal():
                 if low <= 0:
                     raise InputError(self._source, f"variation.{member.name}: lognormal, with a domain from {low:g} on", "a domain above 0")
                 middle, sigma = np.log(self._within(member, "median", law.median, member.original)), law.sigma
-                logarithm = stats.truncnorm((np.log(low) - middle) / sigma, (np.log(high) - middle) / sigma, loc=middle, scale=sigma)
+                logarithm = scipy.stats.truncnorm((np.log(low) - middle) / sigma, (np.log(high) - middle) / sigma, loc=middle, scale=sigma)
                 return lambda p: np.exp(logarithm.ppf(p))
 
     def _within(self, member: Characteristic, key: str, value: float | None, otherwise: float, low: float | None = None,

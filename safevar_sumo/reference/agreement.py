@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
@@ -135,9 +136,7 @@ def rank_correlation(one: FloatArray, other: FloatArray) -> float | None:
     """Spearman's rho; None for fewer than two rows or where one side is constant."""
     if len(one) < 2 or np.ptp(one) == 0 or np.ptp(other) == 0:
         return None
-    from scipy.stats import spearmanr  # only here: it takes long to load
-
-    return float(spearmanr(one, other).statistic)
+    return float(scipy.stats.spearmanr(one, other).statistic)
 
 
 def _both(reference: ReferenceData, here: Evaluations, metric: str) -> BoolArray:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from safevar_sumo.analysis.case import Case, collided
 from safevar_sumo.records import FloatArray
@@ -35,13 +36,11 @@ class Nearness(NamedTuple):
 
 def nearness(case: Case, references: Sequence[ReferenceData]) -> list[Nearness]:
     """By algorithm; references are rows of this study's vehicle."""
-    from scipy.spatial import cKDTree  # only here: it takes long to load
-
     domains = case.characteristics
     width = domains.upper - domains.lower
     rows = np.concatenate([data.settings for data in references]) / width
     safety = np.concatenate([data.metrics["safety_degree"] for data in references])
-    tree, number = cKDTree(rows), min(NEIGHBOURS, len(rows))
+    tree, number = scipy.spatial.cKDTree(rows), min(NEIGHBOURS, len(rows))
     among = tree.query(rows, number + 1)[0][:, 1:] if len(rows) > number else np.full((1, 1), np.nan)
     found = []
     for algorithm in case.algorithms:

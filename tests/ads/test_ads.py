@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -46,6 +46,7 @@ def approach(ads: Ads, known: Nominal, speed: np.ndarray, gap: np.ndarray) -> np
     return np.stack(pedals)
 
 
+@settings(max_examples=40)
 @given(speed=arrays(float, 6, elements=st.floats(0, 15)), gap=arrays(float, 6, elements=st.floats(0.5, 80)))
 def test_pedals_stay_in_range_and_no_vehicle_knows_of_another(speed: np.ndarray, gap: np.ndarray) -> None:
     for system in SYSTEMS.values():

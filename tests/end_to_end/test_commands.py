@@ -19,7 +19,7 @@ from typed import refused
 from safevar_sumo.shipped import STUDIES
 
 SAFEVAR = [sys.executable, "-m", "safevar_sumo"]
-SMALL = ["--runs", "1", "--evaluations", "40"]
+SMALL = ["--algorithms", "rs", "--runs", "1", "--evaluations", "40"]
 
 
 def run(*arguments: str, expect: int = 0, **options: object) -> subprocess.CompletedProcess[str]:
@@ -50,7 +50,7 @@ SLOW = pytest.mark.slow
 def test_the_same_bytes_for_every_batch_size_and_from_run_to_run(study: str, in_tmp: Path) -> None:
     contents = set()
     for out, batch in (("a", "1"), ("b", "7"), ("c", "50"), ("d", "50")):
-        run("study", study, "--runs", "1", "--evaluations", "60", "--batch", batch, "--out", out)
+        run("study", study, "--algorithms", "nsga2", "--runs", "1", "--evaluations", "60", "--batch", batch, "--out", out, "--quiet")
         contents.add(((in_tmp / out / "solutions.csv").read_bytes(), (in_tmp / out / "manifest.json").read_bytes()))
     assert len(contents) == 1
 

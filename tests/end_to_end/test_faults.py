@@ -37,7 +37,7 @@ def killed_and_resumed(times: int) -> None:
 
 
 def test_killed_at_random_moments_and_resumed(whole: Path) -> None:
-    killed_and_resumed(5)
+    killed_and_resumed(3)
     assert solutions("out") == solutions(whole)
 
 
