@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.campaign.gathering import BATCH, Gathering
-from safevar_sumo.campaign.isolation import check_isolation
 from safevar_sumo.campaign.keys import RunKey, algorithm_of, run_generator
+from safevar_sumo.campaign.rechecking import Rechecking
 from safevar_sumo.campaign.run import Observer, Run
-from safevar_sumo.computing import PersistentPool, Pool, first_of, packed, result_of
+from safevar_sumo.computing import PersistentPool, Pool, check_isolation, first_of, packed, result_of
 from safevar_sumo.metrics import SAFEVAR, Scoring
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ORIGINAL, Failure, JournalBusy, ResultsDirectory
@@ -65,17 +65,21 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
                       population=study.search.population, scoring=results.scoring)
     campaign = Campaign(original, {}, [], [], results.scoring)
     waiting, runs = deque(keys), set[Run]()
-    gathering = Gathering(persistent, work, batch or BATCH)
+    gathering, rechecking = Gathering(persistent, work, batch or BATCH), Rechecking(study, results, persistent)
 
     def go_on(run: Run) -> None:
         """Let a run go as far as it can, then ask for what it misses."""
-        if run.advance():
-            campaign.solutions[run.key] = run.result
-            campaign.failures.extend(run.failures)
-            runs.discard(run)
-            run.close()
-        else:
+        if not run.advance():
             gathering.ask(run, run.missing)
+        elif run.finished or not rechecking.ask(run):
+            finish(run)
+
+    def finish(run: Run) -> None:
+        run.finish()
+        campaign.solutions[run.key] = run.result
+        campaign.failures.extend(run.failures)
+        runs.discard(run)
+        run.close()
 
     try:
         while waiting or runs:
@@ -90,7 +94,11 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
                 runs.add(run := Run(key, search, journal, observer, study.search.evaluations, retry=retry_failed))
                 go_on(run)
             gathering.send()
-            for future in first_of(gathering.under_way):
+            for future in first_of([*gathering.under_way, *rechecking.under_way]):
+                if future in rechecking.under_way:
+                    if ended := rechecking.take(future):
+                        finish(ended)
+                    continue
                 for run, evaluations in gathering.take(future):
                     if run.take(evaluations):
                         go_on(run)

@@ -36,6 +36,13 @@ class Run:
         How many evaluations the search may ask for.
     retry
         Whether settings that could not be simulated are tried again.
+
+    Attributes
+    ----------
+    result
+        What the search returns, once it has ended.
+    finished
+        Whether the journal says so.
     """
 
     def __init__(self, key: RunKey, search: Search, journal: Journal, observer: Observer, budget: int, *, retry: bool = False) -> None:
@@ -46,6 +53,7 @@ class Run:
         self._settings: FloatArray | None = None
         self._fresh = 0
         self.result: Evaluations
+        self.finished = False
         if journal.cut:
             observer.warned(f"{journal.path}: the last {journal.cut} bytes were torn; what they held is simulated again")
         if retry and journal.content.evaluations is not None and not journal.content.evaluations.valid.all():
@@ -71,7 +79,7 @@ class Run:
         done = self._journal.content.result(self._budget)
         if done is not None:
             self.result = self._journal.content.by_position(done.positions)
-            self._observer.finished(self.key, done.asked)
+            self._asked, self.finished = done.asked, True
             return True
         if self._settings is None:
             self._settings = next(self._search)
@@ -84,10 +92,25 @@ class Run:
                 self._settings = self._search.send(evaluations)
             except StopIteration as end:
                 self.result = end.value
-                self._journal.finish([self._known[row.tobytes()][0] for row in self.result.settings], self._asked, self._budget)
-                self._observer.finished(self.key, self._asked)
                 return True
         return False
+
+    def samples(self) -> list[Evaluations]:
+        """Of its evaluations the most severe one, which will be looked at, and the last one, in which most has come together."""
+        scored = [known for known in self._known.values()
+                  if 0 <= known[0] < self._budget and known[1].outcome[known[2]] != Outcome.SIMULATOR_ERROR]
+        if not scored:
+            return []
+        severe = min(scored, key=lambda known: (np.nan_to_num(known[1].f_safe[known[2]], nan=np.inf), known[0]))
+        last = max(scored, key=lambda known: known[0])
+        return [evaluations.take([i]) for _, evaluations, i in ([severe] if severe is last else [severe, last])]
+
+    def finish(self) -> None:
+        """Journal the result of a search that has ended."""
+        if not self.finished:
+            self._journal.finish([self._known[row.tobytes()][0] for row in self.result.settings], self._asked, self._budget)
+        self.finished = True
+        self._observer.finished(self.key, self._asked)
 
     def take(self, evaluations: Evaluations) -> bool:
         """Journal and learn a computed batch; whether that was all that was missing."""

@@ -11,6 +11,7 @@ import msgspec
 
 from safevar_sumo.computing.identity import Inputs, changed, inputs_of, networks_of
 from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.plugins import forget_foreign
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.simulation import System, assemble, evaluate, score, simulate_alone
 from safevar_sumo.study import Study
@@ -44,9 +45,16 @@ class _Work(msgspec.Struct, frozen=True):
     study: Study
     inputs: Inputs
     alone: bool
+    afresh: bool
 
 
-def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, alone: bool = False) -> bytes:
+class _How(msgspec.Struct, frozen=True):
+    """What of that is to be known before models are loaded."""
+
+    afresh: bool
+
+
+def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, alone: bool = False, afresh: bool = False) -> bytes:
     """A study as it travels to a worker.
 
     Parameters
@@ -56,10 +64,12 @@ def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, alone: bool
         they are now.
     alone
         To be simulated beside one copy of the network for all settings (`simulate_alone`).
+    afresh
+        By models that are loaded anew, with nothing in their modules and classes that earlier batches left there.
     """
     if inputs is None:
         inputs = inputs_of(study, assemble(study))
-    return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED if layer in inputs}, alone))
+    return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED if layer in inputs}, alone, afresh))
 
 
 def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
@@ -70,7 +80,11 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
     InputError
         If the study's files are not those that the campaign began with.
     """
-    system, network, alone = _system(work)
+    if msgspec.msgpack.decode(work, type=_How).afresh:
+        forget_foreign()
+        system, network, alone = _system.__wrapped__(work)
+    else:
+        system, network, alone = _system(work)
     _refuse_changes(network, {"network": networks_of(system)})
     beside = alone and not system.matrix
     evaluations = score(system, settings, simulate_alone(system, settings)) if beside else evaluate(system, settings)

@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 
 from safevar_sumo.computing.base import Pool, PoolLostError, WorkerLostError
+from safevar_sumo.computing.isolation import foreign_names
 from safevar_sumo.errors import EnvironmentFault, ForeignError, SafevarError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
@@ -44,10 +45,8 @@ class PersistentPool:
     """
 
     def __init__(self, pool: Pool, study: Study) -> None:
-        self._pool, self._source, self._in_a_row = pool, study.origin.called or study.name, 0
-        self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-        names = [study.vehicle.model, study.ads.model, study.scenario.model, *study.metrics.also, *study.search.objectives]
-        self._foreign = [name for name in dict.fromkeys(names) if ":" in name]
+        self._pool, self._study, self._in_a_row = pool, study, 0
+        self._characteristics, self._foreign = CharacteristicSet.of(study.vehicle.characteristics), foreign_names(study)
 
     @property
     def workers(self) -> int:
@@ -173,12 +172,18 @@ class PersistentPool:
         self._computed(study, halves[0], first_done)
 
     def _blamed(self, error: WorkerLostError) -> ForeignError:
-        """A process that ends with a user's code in it is that code's, as far as anybody can tell."""
-        return ForeignError(f"study {self._source!r}", f"{error}, again and again, with {' and '.join(self._foreign)} in it")
+        """A process that ends or hangs with a user's code in it is that code's fault, as far as anybody can tell."""
+        problem = f"{error}, again and again, with {' and '.join(self._foreign)} in it; a process that is gone cannot tell file and line"
+        return ForeignError(f"study {self._study.name!r}", problem, "code that neither ends nor blocks its process")
 
     def _told(self, error: ForeignError, setting: FloatArray) -> ForeignError:
         """The error with a command that reproduces it."""
-        changes = [f"--set {member.name}={value!r}" for member, value in zip(self._characteristics, setting[0].tolist(), strict=True)
-                   if value != member.original]
-        command = " ".join(["python -m safevar_sumo simulate", shlex.quote(self._source), *changes])
-        return ForeignError(error.source, f"{error.problem}; again by: {command}", error.legal)
+        return ForeignError(error.source, f"{error.problem}; again by: {reproducing(self._study, setting[0])}", error.legal)
+
+
+def reproducing(study: Study, setting: FloatArray) -> str:
+    """The command that simulates a setting, shape (n,), again."""
+    changes = [f"--set {member.name}={value!r}"
+               for member, value in zip(CharacteristicSet.of(study.vehicle.characteristics), setting.tolist(), strict=True)
+               if value != member.original]
+    return " ".join(["python -m safevar_sumo simulate", shlex.quote(study.origin.called or study.name), *changes])

@@ -3,7 +3,7 @@
 from safevar_sumo.plugins.contract import Contract
 from safevar_sumo.plugins.guard import Guard
 from safevar_sumo.plugins.lending import lent
-from safevar_sumo.plugins.lookup import Lookup, Member, make_reachable
+from safevar_sumo.plugins.lookup import Lookup, Member, forget_foreign, make_reachable
 from safevar_sumo.plugins.making import made
 
-__all__ = ["Contract", "Guard", "Lookup", "Member", "lent", "made", "make_reachable"]
+__all__ = ["Contract", "Guard", "Lookup", "Member", "forget_foreign", "lent", "made", "make_reachable"]

@@ -171,6 +171,11 @@ def make_reachable(places: Iterable[str]) -> None:
     sys.path[start:start] = _reachable
 
 
+def forget_foreign() -> None:
+    """Drop all modules that were loaded from users' folders: who looks one up next has it loaded anew."""
+    _forget(list(_loaded))
+
+
 def _forget_all_but(places: Iterable[str]) -> None:
     """Drop what was loaded from folders that are not this study's, and all of a folder in which a file has changed."""
     stale = {one.folder for one in _loaded.values() if one.folder not in places or _digest(one.file) != one.digest}

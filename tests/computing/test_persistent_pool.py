@@ -130,7 +130,8 @@ def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> No
 
 
 def test_a_process_that_ends_with_a_users_code_in_it_is_an_error() -> None:
-    with pytest.raises(ForeignError, match=r"exit code -9\), again and again, with my_ads:Mine in it; again by: .* --set \w+=4302\.0"):
+    told = r"exit code -9\), again and again, with ads.model = 'my_ads:Mine' in it; .* cannot tell file and line; again by: .*=4302\.0"
+    with pytest.raises(ForeignError, match=told):
         PersistentPool(ToldPool(deadly(4302)), FOREIGN).submit(b"", settings(8)).result(timeout=5)
 
 

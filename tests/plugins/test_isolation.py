@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from beside import SCALAR, Mine
 
-from safevar_sumo.campaign.isolation import check_isolation
+from safevar_sumo.computing import check_isolation
 from safevar_sumo.errors import ForeignError, InputError
 from safevar_sumo.records import Evaluations
 from safevar_sumo.shipped import NETWORKS

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from beside import InThisProcess
 from click.testing import CliRunner
 
 import safevar_sumo as sv
@@ -73,21 +74,3 @@ def search_in_this_process(study: Path, out: Path) -> sv.Results:
     chosen, system = prepared(str(study))
     carried_out(chosen, system, all_runs(chosen), out, InThisProcess(), Unheard(), None)
     return sv.load(out)
-
-
-class InThisProcess:
-    """A pool that computes at once."""
-
-    workers = 1
-
-    def submit(self, study: bytes, settings: np.ndarray):  # type: ignore[no-untyped-def]
-        from concurrent.futures import Future
-
-        from safevar_sumo.computing import evaluate_batch
-
-        future: Future = Future()  # type: ignore[type-arg]
-        try:
-            future.set_result(evaluate_batch(study, settings))
-        except Exception as error:
-            future.set_exception(error)
-        return future

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.computing import result_of
+from safevar_sumo.computing.interrupts import result_of
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
@@ -40,8 +40,7 @@ def check_isolation(study: Study, characteristics: CharacteristicSet, submit: Su
     ForeignError
         Naming the models, the first result that differs, and what to do.
     """
-    foreign = foreign_names(study)
-    if not foreign:
+    if not foreign_names(study):
         return
     settings = _far_apart(characteristics)
     order = np.arange(len(settings))
@@ -52,10 +51,24 @@ def check_isolation(study: Study, characteristics: CharacteristicSet, submit: Su
              for way, batches in running.items()}
     for way, results in found.items():
         for row, result in results.items():
-            told = _difference(found["together"][row], result)
-            if told:
-                problem = f"with {' and '.join(foreign)} a result depends on what else is simulated: {told[0]} is {told[1]} together and "
-                raise ForeignError(f"study {study.name!r}", f"{problem}{told[2]} {way}", LEGAL)
+            refuse_difference(study, {"together": found["together"][row], way: result})
+
+
+def refuse_difference(study: Study, ways: dict[str, Evaluations], again: str = "") -> None:
+    """Refuse two evaluations of one setting that differ, by how they came about; `again` is a command that has one of them again.
+
+    Raises
+    ------
+    ForeignError
+        As `check_isolation`.
+    """
+    (here, one), (there, other) = next(iter(ways.items())), list(ways.items())[-1]
+    told = _difference(one, other)
+    if told:
+        name, value, others = told
+        problem = (f"with {' and '.join(foreign_names(study))} a result depends on what else is simulated: "
+                   f"{name} is {value} {here} and {others} {there}")
+        raise ForeignError(f"study {study.name!r}", f"{problem}{again and f'; again by: {again}'}", LEGAL)
 
 
 def _far_apart(characteristics: CharacteristicSet) -> FloatArray:
