@@ -19,6 +19,7 @@ import pandas as pd
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import refuse_other_than_file
 from safevar_sumo.vehicles import CharacteristicSet
 
 COLUMNS = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
@@ -101,6 +102,7 @@ def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> 
 def _content(path: Path) -> bytes:
     """A file's bytes, read once: what comes through a pipe cannot be read again."""
     try:
+        refuse_other_than_file(path, streams=True)
         with open(path, "rb") as file:
             content = file.read(MOST_BYTES + 1)
     except OSError as error:

@@ -13,6 +13,7 @@ from safevar_sumo.report.material import Material
 from safevar_sumo.results import write_whole
 from safevar_sumo.results.manifest import MANIFEST
 from safevar_sumo.results.store import SOLUTIONS
+from safevar_sumo.study import refuse_other_than_file
 
 FOLDER = "answers"
 """Of a results directory."""
@@ -25,6 +26,7 @@ def stored(material: Material, name: str, compute: Callable[[], Any]) -> Any:
     """
     file, identity = material.place / FOLDER / f"{name}.json", _identity(material)
     try:
+        refuse_other_than_file(file)
         kept = json.loads(file.read_text(encoding="utf-8"))
         if kept["identity"] == identity:
             return kept["value"]

@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 
 from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.study import refuse_other_than_file
 
 
 def make_directory(path: Path) -> None:
@@ -72,15 +73,3 @@ def sync_directory(path: Path) -> None:
             raise
     finally:
         os.close(handle)
-
-
-def refuse_other_than_file(path: Path) -> None:
-    """Refuse what exists and is no regular file: a pipe would be waited for, for ever.
-
-    Raises
-    ------
-    InputError
-        If it is something else.
-    """
-    if path.exists() and not path.is_file():
-        raise InputError(path, "is no regular file", "a file")

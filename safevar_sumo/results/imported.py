@@ -13,10 +13,10 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results.files import make_directory, refuse_other_than_file, write_whole
+from safevar_sumo.results.files import make_directory, write_whole
 from safevar_sumo.results.manifest import FORMAT, MANIFEST, read_manifest
 from safevar_sumo.results.store import RUNS, SOLUTIONS, solutions_frame
-from safevar_sumo.study import Study, tables_of
+from safevar_sumo.study import Study, refuse_other_than_file, tables_of
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -15,7 +15,7 @@ import portalocker
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results.files import make_durable, refuse_other_than_file, sync_directory
+from safevar_sumo.results.files import make_durable, sync_directory
 from safevar_sumo.results.frames import (
     FORMAT,
     MAGIC,
@@ -31,6 +31,7 @@ from safevar_sumo.results.frames import (
     encoded,
     read_frames,
 )
+from safevar_sumo.study import refuse_other_than_file
 
 
 class JournalBusy(SafevarError):

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.results.files import refuse_other_than_file
-from safevar_sumo.study import Study, tables_of
+from safevar_sumo.study import Study, refuse_other_than_file, tables_of
 
 MANIFEST = "manifest.json"
 FORMAT = 2

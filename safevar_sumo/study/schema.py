@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,6 +12,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.shipped import STUDIES
+from safevar_sumo.study.files import refuse_other_than_file
 from safevar_sumo.variation import Correlation, Distribution
 
 Positive = Annotated[float, Meta(gt=0, le=1e6)]
@@ -232,6 +234,9 @@ def study_path(study: str) -> Path:
     path = Path(study)
     if is_file(path):
         return path
+    with suppress(OSError):
+        if not path.is_dir():
+            refuse_other_than_file(path)
     legal = f"{one_of(study_names())}, or the path of a study file (TOML)"
     raise InputError("study", f"there is no study or file {study!r}", legal)
 

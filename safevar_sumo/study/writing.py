@@ -9,6 +9,7 @@ import msgspec
 import tomli_w
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.study.files import refuse_other_than_file
 from safevar_sumo.study.reading import without_nothing
 from safevar_sumo.study.schema import NAME, Study, tables_of
 
@@ -40,8 +41,9 @@ def check_writable(path: Path, source: str = "out") -> None:
     InputError
         If it cannot be written.
     """
-    is_new = not path.exists()
     try:
+        refuse_other_than_file(path, source, streams=True)
+        is_new = not path.exists()
         with path.open("a"):
             pass
         if is_new:
