@@ -45,7 +45,7 @@ class Observation(NamedTuple):
     while the obstacle is not detected [m]; `lateral` is the obstacle's offset from the middle of the
     vehicle's lane, negative on the side that it comes from, infinite while it is out of sight [m].
     `closing_speed` is by how much the gap shrinks, `obstacle_speed` the obstacle's own speed along the vehicle's way [m/s];
-    `throttle` is where the accelerator stands [-].
+    `throttle` and `brake` are where the pedals stand [-].
     """
 
     time: float
@@ -57,6 +57,7 @@ class Observation(NamedTuple):
     visibility: float | FloatArray
     obstacle_speed: FloatArray = NOTHING
     throttle: FloatArray = NOTHING
+    brake: FloatArray = NOTHING
 
 
 class Command(NamedTuple):

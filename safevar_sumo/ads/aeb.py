@@ -7,7 +7,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.pedals import pedals, trim
+from safevar_sumo.ads.pedals import Trim, pedals, trim
 from safevar_sumo.ads.way import in_the_way
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
@@ -18,13 +18,13 @@ LEAST_DECELERATION = 0.5
 
 
 class _Memory(NamedTuple):
-    """The original vehicle; time between calls [s]; speed to hold and pedal that holds it, of the first look; stage 0 to 2,
+    """The original vehicle; time between calls [s]; speed to hold and pedals that hold it, of the first look; stage 0 to 2,
     whether it has ever braked; the obstacle's speed a call ago [m/s].
     """
 
     nominal: Nominal
     step: float
-    cruise: tuple[FloatArray, FloatArray] | None
+    cruise: tuple[FloatArray, Trim] | None
     stage: FloatArray
     intervened: BoolArray
     obstacle_speed: FloatArray

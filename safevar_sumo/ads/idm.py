@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.pedals import pedals, trim
+from safevar_sumo.ads.pedals import Trim, pedals, trim
 from safevar_sumo.ads.way import FARTHEST, in_the_way
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
@@ -17,11 +17,11 @@ LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
 
 
 class Memory(NamedTuple):
-    """The original vehicle; time between calls [s]; trim of the accelerator, of the first look."""
+    """The original vehicle; time between calls [s]; trim of the pedals, of the first look."""
 
     nominal: Nominal
     step: float
-    trimmed: FloatArray | None
+    trimmed: Trim | None
 
 
 class Idm(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
@@ -14,19 +16,26 @@ def looked_up(table: FloatArray, speeds: FloatArray, speed: FloatArray) -> Float
     return np.asarray(table[row] + (table[row + 1] - table[row]) * (place - row))
 
 
-def trim(nominal: Nominal, seen: Observation) -> FloatArray:
-    """How much farther the accelerator of a rolling vehicle stands than the original's would to hold its speed [-].
+class Trim(NamedTuple):
+    """How much farther the pedals of a rolling vehicle stand than the original's would on a level road to hold its speed [-]."""
 
-    Who has driven at a speed for a while has found the pedal that holds it.
-    """
-    return np.where(seen.speed > 0, seen.throttle - _throttle(nominal, seen.speed, np.zeros_like(seen.speed)), 0.0)
+    throttle: FloatArray
+    brake: FloatArray
 
 
-def pedals(nominal: Nominal, speed: FloatArray, acceleration: FloatArray, trimmed: FloatArray) -> Command:
+def trim(nominal: Nominal, seen: Observation) -> Trim:
+    """Who has driven at a speed for a while has found the pedals that hold it."""
+    rolls = seen.speed > 0
+    throttle = np.where(rolls, seen.throttle - _throttle(nominal, seen.speed, np.zeros_like(seen.speed)), 0.0)
+    coasts = looked_up(nominal.coasting, nominal.speeds, seen.speed) / nominal.braking
+    return Trim(throttle, np.where(rolls & (seen.brake > 0), seen.brake + coasts, 0.0))
+
+
+def pedals(nominal: Nominal, speed: FloatArray, acceleration: FloatArray, trimmed: Trim) -> Command:
     """Pedals for an acceleration [m/s^2] at a speed [m/s], from the tables of the original vehicle and a `trim`."""
-    beyond = acceleration + looked_up(nominal.coasting, nominal.speeds, speed)
+    beyond = acceleration + looked_up(nominal.coasting, nominal.speeds, speed) - nominal.braking * trimmed.brake
     brake = np.minimum(np.maximum(-beyond / nominal.braking, 0.0), 1.0)
-    throttle = np.minimum(np.maximum(_throttle(nominal, speed, acceleration) + trimmed, 0.0), 1.0)
+    throttle = np.minimum(np.maximum(_throttle(nominal, speed, acceleration) + trimmed.throttle, 0.0), 1.0)
     return Command(np.where(beyond < 0, 0.0, throttle), brake)
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.ads.pedals import pedals, trim
+from safevar_sumo.ads.pedals import Trim, pedals, trim
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 GRAVITY = 9.81  # m/s^2
@@ -24,14 +24,14 @@ TIME_ROUNDING = 1e-9
 
 
 class Reaction(NamedTuple):
-    """The original vehicle; time between calls [s]; speed to hold [m/s] and the pedal's trim, of the first look.
+    """The original vehicle; time between calls [s]; speed to hold [m/s] and the pedals' trim, of the first look.
 
     `waited` is the time since the danger was first seen, negative before [s]; `asked` the deceleration [m/s^2], both (N,).
     """
 
     nominal: Nominal
     step: float
-    held: tuple[FloatArray, FloatArray] | None
+    held: tuple[FloatArray, Trim] | None
     waited: FloatArray
     asked: FloatArray
 

@@ -72,16 +72,22 @@ def _spelled(name: str, parameters: tuple[str, ...]) -> str:
 
 
 def _parameters(member: Any) -> tuple[str, ...]:
-    """Names of a method's parameters without the first, which is the instance or the class."""
-    return tuple(inspect.signature(getattr(member, "__func__", member)).parameters)[1:]
+    """Names of a method's parameters without the first, which is the instance or the class, and those that may be missing."""
+    parameters = inspect.signature(getattr(member, "__func__", member)).parameters.values()
+    return tuple(one.name for one in parameters if one.default is one.empty)[1:]
 
 
 def _takes(what: type, name: str, number: int) -> bool:
     """Whether a method can be called with so many arguments."""
     static = inspect.getattr_static(what, name)
     own = 1 if inspect.isfunction(static) else 0
+    return takes(getattr(what, name), own + number)
+
+
+def takes(function: Any, number: int) -> bool:
+    """Whether a function can be called with so many arguments, as far as its signature tells."""
     try:
-        inspect.signature(getattr(what, name)).bind(*[None] * (own + number))
+        inspect.signature(function).bind(*[None] * number)
     except TypeError:
         return False
     except ValueError:  # a method without a signature, of a compiled class say

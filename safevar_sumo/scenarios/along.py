@@ -8,7 +8,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import Encounter, Trace
 from safevar_sumo.scenarios.ahead import Ahead, Memory, encounter, right_of
-from safevar_sumo.scenarios.base import Actors, Roads, Scene, World
+from safevar_sumo.scenarios.base import Actors, Grade, Roads, Scene, World
 from safevar_sumo.scenarios.euro_ncap import BODIES, KMH, VUT_LENGTH, VUT_WIDTH, Body, Range, Walk
 
 PROTOCOL = Range(10, 60, (50, 10, 25, 75, 90))
@@ -29,6 +29,8 @@ class Along(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Time from the start to the impact if nobody brakes, and on from there to the end of the run [s].
     vut_length, vut_width
         The vehicle under test [m].
+    grade
+        By how much the road rises over the way, negative where it falls [%].
     """
 
     speed: Annotated[float, Meta(gt=0, le=250)] = 40.0
@@ -40,6 +42,7 @@ class Along(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     time_after: Annotated[float, Meta(gt=0, le=60)] = 4.0
     vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
     vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
+    grade: Grade = 0.0
     network: str = "along"
 
     @property
@@ -49,7 +52,7 @@ class Along(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def remarks(self) -> list[str]:
         """What is outside the protocol."""
-        return PROTOCOL.remarks("CPLA", self.speed, self.impact_location)
+        return PROTOCOL.remarks("CPLA", self.speed, self.impact_location, self.grade)
 
     def actors(self, roads: Roads) -> Actors:
         return self._ahead.actors(self.target, Body(self.vut_length, self.vut_width), self.speed * KMH)

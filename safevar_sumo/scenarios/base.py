@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol
+
+from msgspec import Meta
 
 from safevar_sumo.records import EVERYWHERE, NOTHING, BoolArray, Encounter, FloatArray, Trace
 from safevar_sumo.study import Weather
 
 VUT = "vut"
 """Id of the vehicle under test in every network's traffic."""
+STEEPEST = 30.0
+"""Of a road [%]."""
+Grade = Annotated[float, Meta(ge=-STEEPEST, le=STEEPEST)]
 Coordinates = tuple[float, float]
 Actors = Mapping[str, Mapping[str, str] | None]
 """Changes to a network's traffic file: attributes to set, or None to leave it out, by the XPath of an element below its root."""
@@ -84,7 +89,9 @@ class Scenario(Protocol):
     `network` is a folder of `sumo_nets/`, or the path of a folder with the same files;
     `duration` is the length of a run [s].
 
-    It may have `actors(roads) -> Actors`, what its parameters make of the network's traffic, and `remarks() -> list[str]`,
+    It may have a `grade`, by how much its road rises over the way [%]: SUMO's plane is then that road, and gravity acts in the
+    vehicles. It may have `actors(roads) -> Actors`, what its parameters make of the network's traffic, and
+    `remarks() -> list[str]`,
     what a user should know of them.
     """
 

@@ -10,7 +10,7 @@ from msgspec import Meta, Struct
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, Trace
 from safevar_sumo.scenarios.ahead import Ahead, Memory, encounter, right_of
-from safevar_sumo.scenarios.base import Actors, Roads, Scene, World
+from safevar_sumo.scenarios.base import Actors, Grade, Roads, Scene, World
 from safevar_sumo.scenarios.euro_ncap import KMH, VUT_LENGTH, VUT_WIDTH, Body, Range
 
 CAR = Body(4.023, 1.712)
@@ -44,6 +44,8 @@ class CarToCar(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Time from the impact if nobody brakes to the end of the run [s].
     vut_length, vut_width
         The vehicle under test [m].
+    grade
+        By how much the road rises over the way, negative where it falls [%].
     """
 
     test: Literal["CCRs", "CCRm", "CCRb"] = "CCRs"
@@ -56,6 +58,7 @@ class CarToCar(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     time_after: Annotated[float, Meta(gt=0, le=60)] = 5.0
     vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
     vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
+    grade: Grade = 0.0
     network: str = "car_to_car"
 
     @property
@@ -65,7 +68,7 @@ class CarToCar(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def remarks(self) -> list[str]:
         """What is outside the protocol."""
-        return PROTOCOL[self.test].remarks(self.test, self.speed, self.impact_location)
+        return PROTOCOL[self.test].remarks(self.test, self.speed, self.impact_location, self.grade)
 
     def actors(self, roads: Roads) -> Actors:
         return self._ahead.actors("car", Body(self.vut_length, self.vut_width), self.speed * KMH)

@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import VUT, Actors, Roads, Scene, World
+from safevar_sumo.scenarios.base import VUT, Actors, Grade, Roads, Scene, World
 from safevar_sumo.scenarios.euro_ncap import BODIES, KMH, VUT_LENGTH, VUT_WIDTH, Range, Walk, beside, lateral_of
 from safevar_sumo.scenarios.frame import Frame
 
@@ -83,6 +83,8 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Time from the start to the impact, and on from there to the end of the run [s].
     vut_length, vut_width
         The vehicle under test [m].
+    grade
+        By how much the road rises over the way, negative where it falls [%].
 
     Notes
     -----
@@ -103,6 +105,7 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     time_after: Annotated[float, Meta(gt=0, le=60)] = 4.0
     vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
     vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
+    grade: Grade = 0.0
     network: str = "crossing"
 
     @property
@@ -112,7 +115,7 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def remarks(self) -> list[str]:
         """What is outside the protocol."""
-        return TESTS[self.test].range.remarks(self.test, self.speed, self.impact_location)
+        return TESTS[self.test].range.remarks(self.test, self.speed, self.impact_location, self.grade)
 
     def actors(self, roads: Roads) -> Actors:
         """The vehicle `time_to_impact` before the pedestrian's path, the pedestrian beside it, and the parked cars or none."""

@@ -35,14 +35,16 @@ class Range(NamedTuple):
     fastest: float
     locations: tuple[float, ...]
 
-    def remarks(self, test: str, speed: float, location: float) -> list[str]:
-        """What is outside the protocol's standard and extended ranges."""
+    def remarks(self, test: str, speed: float, location: float, grade: float) -> list[str]:
+        """What is outside the protocol's standard and extended ranges, and its level road."""
         found = []
         if not self.slowest <= speed <= self.fastest:
             found.append(f"{test}: speed = {speed:g} km/h is outside the protocol's {self.slowest:g} to {self.fastest:g} km/h")
         if location not in self.locations:
             legal = ", ".join(f"{one:g}" for one in self.locations)
             found.append(f"{test}: impact_location = {location:g} % is none of the protocol's {legal} %")
+        if grade:
+            found.append(f"{test}: grade = {grade:g} %, and the protocol's road is level")
         return found
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from safevar_sumo.plugins import Contract, Guard, lent
 from safevar_sumo.records import Encounter, Trace
-from safevar_sumo.scenarios.base import Actors, Roads, Scenario, Scene, World
+from safevar_sumo.scenarios.base import STEEPEST, Actors, Roads, Scenario, Scene, World
 
 SCENARIO_CONTRACT = Contract.of(Scenario, "a scenario")
 LONGEST = 3600.0
@@ -27,6 +27,8 @@ class GuardedScenario:
         self.network = network
         duration = guard.numbers("__init__", "duration", guard.field("__init__", scenario, "duration"), (), 0.0, LONGEST, above=True)
         self.duration = float(duration)
+        grade = guard.numbers("__init__", "grade", getattr(scenario, "grade", 0.0), (), -STEEPEST, STEEPEST)
+        self.grade = float(grade)
 
     def actors(self, roads: Roads) -> Actors:
         """What it makes of the network's traffic; nothing, if it says nothing of that."""

@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import VUT, Scene, World
+from safevar_sumo.scenarios.base import VUT, Grade, Scene, World
 
 PARKED = "parked_ahead"
 
@@ -27,6 +27,8 @@ class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_field
     ----------
     duration
         Length of a run [s].
+    grade
+        By how much the road rises over the way, negative where it falls [%].
 
     Notes
     -----
@@ -35,6 +37,7 @@ class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     network: str = "lead_vehicle_stopped"
     duration: Annotated[float, Meta(gt=0, le=3600)] = 16.0
+    grade: Grade = 0.0
 
     def begin(self, world: World) -> _Memory:
         rear = world.vehicle_positions(PARKED)[:, 0] - world.vehicle_length(PARKED)

@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import VUT, Scene, World
+from safevar_sumo.scenarios.base import VUT, Grade, Scene, World
 
 Positive = Annotated[float, Meta(gt=0, le=3600)]
 PEDESTRIAN = "pedestrian"
@@ -35,6 +35,8 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
         How far past the middle of the lane the pedestrian turns round [m]; nothing: it walks on.
     lane_width
         Beyond half of it from the lane's middle the pedestrian has left the lane [m].
+    grade
+        By how much the road rises over the way, negative where it falls [%].
 
     Notes
     -----
@@ -45,6 +47,7 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
     duration: Positive = 9.5
     turns_after: float | None = 0.7
     lane_width: Positive = 3.5
+    grade: Grade = 0.0
 
     def begin(self, world: World) -> _Memory:
         lateral = world.person_positions(PEDESTRIAN)[:, 1] - world.vehicle_positions(VUT)[:, 1]

@@ -16,7 +16,7 @@ from safevar_sumo.simulation.staging import staged
 from safevar_sumo.simulation.sumo import Engine, world_on
 from safevar_sumo.simulation.system import System
 from safevar_sumo.simulation.world import SumoWorld
-from safevar_sumo.vehicles import at_start
+from safevar_sumo.vehicles import Slope, at_start, slope_of
 
 SURE_BRAKES = 9.0
 """SUMO puts nobody onto the road who might not stop before what is ahead; there everybody brakes so hard at least [m/s^2]."""
@@ -66,7 +66,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
     """
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step)
+    prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_slope(system.points, n))
     types = vehicle.sumo_type(prepared)
     world.set_types(types._replace(decel=np.maximum(types.decel, SURE_BRAKES)))
     world.depart()
@@ -84,7 +84,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
         speed = world.speeds()
         scene = parts.scene()
         active = verdict.judge(speed, scene.over, world.collisions(), last=sample >= parts.last)
-        seen = parts.seen(sample * step, speed, scene)._replace(throttle=state.throttle)
+        seen = parts.seen(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
         seen, state = vehicle.sense(prepared, state, seen)
         command, driver = system.ads.drive(seen, driver)
         log.write(sample, position=world.vehicle_positions(VUT)[:, 0], speed=speed, gap=scene.gap, lateral=scene.lateral,
@@ -112,6 +112,12 @@ def _road_friction(points: Sequence[Point], n: int) -> Any:
     """Factor on the tyres' friction: a number, or shape (n,) where the points differ."""
     factors = [point.weather.road_friction for point in points]
     return factors[0] if len(set(factors)) == 1 else np.repeat(factors, n // len(points))
+
+
+def _slope(points: Sequence[Point], n: int) -> list[Slope]:
+    """Of the points' roads, each for its part of the vehicles; nothing where all are level: not every vehicle takes one."""
+    grades = [getattr(point.scenario, "grade", 0.0) for point in points]
+    return [slope_of(np.repeat(grades, n // len(points)))] if any(grades) else []
 
 
 class _Log:

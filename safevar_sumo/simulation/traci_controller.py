@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.ads.pedals import pedals, trim
+from safevar_sumo.ads.pedals import Trim, pedals, trim
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Guard
-from safevar_sumo.records import Command, FloatArray, Nominal, Observation
+from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.simulation.network import copied_id
 from safevar_sumo.simulation.world import SumoWorld, present_world
@@ -60,12 +60,12 @@ class TraciController:
 
 
 class _Memory(NamedTuple):
-    """The original vehicle, a view and a controller for each vehicle, and the accelerator's trim of the first look."""
+    """The original vehicle, a view and a controller for each vehicle, and the pedals' trim of the first look."""
 
     nominal: Nominal
     views: list[_Traci]
     controllers: list[Any]
-    trimmed: FloatArray | None
+    trimmed: Trim | None
 
 
 class _Wish:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from safevar_sumo.records import Command, FloatArray, Observation
+from safevar_sumo.vehicles.slope import LEVEL, Slope
 
 Characteristics = Mapping[str, FloatArray]
 """Name -> values of N vehicles in the model's table units, each of shape (N,)."""
@@ -46,8 +47,11 @@ class Vehicle(Protocol):
 
     UNITS: Mapping[str, str]
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> Any:
-        """Everything that stays the same in a run, `step` seconds a step, once computed."""
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL) -> Any:
+        """Everything that stays the same in a run, `step` seconds a step, once computed.
+
+        A vehicle whose method takes no `slope` drives on level roads only.
+        """
 
     def sumo_type(self, prepared: Any) -> SumoType:
         """The SUMO vehicle types that these vehicles are."""

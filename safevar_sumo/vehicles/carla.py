@@ -15,11 +15,11 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
+from safevar_sumo.vehicles.slope import GRAVITY, LEVEL, Slope
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 # Numbers that meet arrays in every step are arrays themselves: numpy would convert a float each time, which takes as long again.
 ONE, NEUTRAL, FIRST = map(np.array, (1.0, 0.0, 1.0))
-GRAVITY = 9.81  # m/s^2
 RPM = 2 * math.pi / 60  # rad/s per r/min
 ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default
 # Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) r/min, N m, stretched over max_rpm.
@@ -48,7 +48,8 @@ class _Prepared(NamedTuple):
     """Constants of a run, SI; arrays of shape (N,).
 
     `throttle_rates` and `brake_rates` are the most that a pedal falls and rises in a substep; with `per_step`, divided by
-    the tyres' step; `speed_by_force` and `speed_by_air` are what a force, and the square of a speed, make of a speed in it.
+    the tyres' step; `speed_by_force` and `speed_by_air` are what a force, and the square of a speed, make of a speed in it,
+    `speed_by_slope` what the slope's `pull` takes from it. Below `standstill` a braked vehicle is held.
     """
 
     substeps: int
@@ -75,6 +76,9 @@ class _Prepared(NamedTuple):
     air_drag: FloatArray
     speed_by_force: FloatArray
     speed_by_air: FloatArray
+    pull: FloatArray
+    speed_by_slope: FloatArray
+    standstill: FloatArray
     assumed_height: FloatArray
     slip_offset: FloatArray
     nothing: FloatArray
@@ -130,16 +134,16 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     camera_height: Annotated[float, Meta(ge=0.1, le=10)]
     camera_design_radius: Annotated[float, Meta(ge=0.1, le=1)] = 0.355
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> _Prepared:
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL) -> _Prepared:
         c = characteristics
         radius = c["radius"] / 100
-        grip = c["tireFric"] * (self.tyre_friction * road_friction) * c["mass"] * GRAVITY
+        grip = c["tireFric"] * (self.tyre_friction * road_friction) * c["mass"] * slope.down
         substeps = math.ceil(step / SUBSTEP - TIME_ROUNDING)
         substep = step / substeps
         tyre_step = substep / TYRE_STEPS
         wheel_inertia, wheel_damping = WHEELS * 0.5 * WHEEL_MASS * radius * radius, WHEELS * c["dampRate"]
         air_drag, speed_by_force = 0.5 * AIR_DENSITY * FRONTAL_AREA * c["dragCoeff"], tyre_step / c["mass"]
-        return _Prepared(
+        prepared = _Prepared(
             substeps=substeps, step=substep, mass=c["mass"], radius=radius,
             throttle_rates=(np.array(-self.throttle_fall * substep), np.array(self.throttle_rise * substep)),
             brake_rates=(np.array(-self.brake_fall * substep), np.array(self.brake_rise * substep)),
@@ -152,8 +156,11 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             damping_engaged=c["dampRateZeroT_CE"], damping_neutral=c["dampRateZeroT_CD"], shift_time=c["gearSwitchTime"],
             shift_ends=c["gearSwitchTime"] - TIME_ROUNDING,
             air_drag=air_drag, speed_by_force=speed_by_force, speed_by_air=speed_by_force * air_drag,
+            pull=c["mass"] * slope.back, speed_by_slope=np.zeros_like(radius) + slope.back * tyre_step,
             assumed_height=self.camera_height / (self.camera_height + (radius - self.camera_design_radius)),
-            slip_offset=np.full_like(radius, self.slip_offset), nothing=np.zeros_like(radius))
+            slip_offset=np.full_like(radius, self.slip_offset), nothing=np.zeros_like(radius), standstill=np.zeros_like(radius))
+        creeps = self._rim_at(prepared._replace(pull=np.abs(prepared.pull)), prepared.nothing)[0]
+        return prepared._replace(standstill=STANDSTILL + creeps)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
@@ -170,7 +177,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return CarlaState(*(nothing for _ in CarlaState._fields))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> CarlaState:
-        """What stays as it is under the throttle that holds the speed: every equation of `_roll` with its change set to zero.
+        """What stays as it is under the pedals that hold the speed: every equation of `_roll` with its change set to zero.
 
         The gear is the one that the gearbox has when it comes from below; a switch that it would take back is just over.
         """
@@ -182,20 +189,27 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             gear += wheel_speed * ratio > SHIFT_UP * p.engine_limit
         ratio = OVERALL_RATIOS[gear.astype(np.intp)]
         through_clutch = (p.wheel_damping * wheel_speed + p.radius * force) / ratio
+        # Downhill the engine brakes, and the brake takes what is left; then w_e = G w_w + m / k_c with m = -c_e w_e.
+        dragged = -p.damping_engaged * ratio * wheel_speed / (1 + p.damping_engaged / p.clutch)
+        brake = np.minimum(np.maximum(ratio * (dragged - through_clutch) / p.brake_torque, 0.0), 1.0)
+        through_clutch = np.maximum(through_clutch, dragged)
         engine_speed = np.minimum(ratio * wheel_speed + through_clutch / p.clutch, p.engine_limit)
         state = CarlaState(speed, wheel_speed, engine_speed, gear, gear, nothing, nothing, nothing)
         pull = self._torque(p, state) - (p.damping_full - p.damping_engaged) * engine_speed
-        throttle = np.minimum((p.damping_engaged * engine_speed + through_clutch) / np.maximum(pull, 1.0), 1.0)
+        throttle = (p.damping_engaged * engine_speed + through_clutch) / np.maximum(pull, 1.0)
+        throttle = np.where(brake > 0, 0.0, np.minimum(throttle, 1.0))
         lugs = (gear > 1) & (engine_speed < SHIFT_DOWN * p.engine_limit)
-        return state._replace(throttle=throttle, since_shift=np.where(lugs, p.shift_time, AUTOBOX_LATENCY))
+        return state._replace(throttle=throttle, brake=brake, since_shift=np.where(lugs, p.shift_time, AUTOBOX_LATENCY))
 
     def _rim_at(self, p: _Prepared, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Speed of the wheels' rim at which the tyres push as hard as the air resists [m/s], and that force [N]."""
-        force = np.minimum(p.air_drag * speed * speed, p.grip)
+        """Speed of the wheels' rim at which the tyres push as hard as air and slope resist [m/s], and that force [N]."""
+        force = np.minimum(np.maximum(p.air_drag * speed * speed + p.pull, -p.grip), p.grip)
+        share = np.abs(force) / p.grip
         left = np.ones_like(speed)
         for _ in range(NEWTON_STEPS):  # left^3 = 1 - force / grip; see `_tyre_force`
-            left = left - (left * left * left - 1 + force / p.grip) / (3 * left * left)
-        return (p.slip_stiffness * speed + p.slip_offset * (1 - left)) / (p.slip_stiffness - 1 + left), force
+            left = left - (left * left * left - 1 + share) / (3 * left * left)
+        pushes = (p.slip_stiffness * speed + p.slip_offset * (1 - left)) / (p.slip_stiffness - 1 + left)
+        return np.where(force < 0, speed - (speed + p.slip_offset) * (1 - left) / p.slip_stiffness, pushes), force
 
     def sense(self, prepared: _Prepared, state: CarlaState, seen: Observation) -> tuple[Observation, CarlaState]:
         """The camera stands where the wheels put it."""
@@ -206,7 +220,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             state = self._pedals(prepared, state, command)
             state = _shift(prepared, state)
             state = self._roll(prepared, state)
-        moves, nothing = (state.brake <= prepared.nothing) | (state.speed >= STANDSTILL), prepared.nothing
+        moves, nothing = (state.brake <= prepared.nothing) | (state.speed >= prepared.standstill), prepared.nothing
         return state._replace(speed=np.where(moves, state.speed, nothing), wheel_speed=np.where(moves, state.wheel_speed, nothing))
 
     def _pedals(self, p: _Prepared, s: CarlaState, command: Command) -> CarlaState:
@@ -221,7 +235,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
         I_e dw_e/dt = throttle T(w_e) - c_e w_e - k_c (w_e - G w_w)
         I_w dw_w/dt = G k_c (w_e - G w_w) - d w_w - T_brake - r F
-        m dv/dt = F - D v |v|
+        m dv/dt = F - D v |v| - m g sin
 
         The force F is explicit. It ends the slip within a step at most, and never reverses it: so it cannot ring.
         """
@@ -239,7 +253,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         rim_keeps, rim_by_engine = p.wheel_inertia_per_step / wheel, through_clutch * rim_by_torque
         rim_loses = s.brake * p.brake_torque * rim_by_torque
         rim_by_force, speed_by_force = p.radius * rim_by_torque, p.speed_by_force
-        speed_loses = p.speed_by_air * s.speed * s.speed
+        speed_loses = p.speed_by_air * s.speed * s.speed + p.speed_by_slope
         slip_by_force = rim_by_force + speed_by_force
         engine_by_rim = through_clutch / (engine * p.radius)
 

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from safevar_sumo.errors import ForeignError
-from safevar_sumo.plugins import Contract, Guard, lent
+from safevar_sumo.plugins import Contract, Guard, lent, takes
 from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType, Vehicle
+from safevar_sumo.vehicles.slope import LEVEL, Slope
 
 VEHICLE_CONTRACT = Contract.of(Vehicle, "a vehicle", optional=("at_speed",))
 FASTEST = 1000.0
@@ -47,9 +48,13 @@ class GuardedVehicle:
             raise guard.wrong("__init__", "UNITS", units, "a mapping from names of characteristics to their units")
         self.UNITS = dict(units)
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> _Prepared:
-        n = len(next(iter(characteristics.values())))
-        return _Prepared(n, self._guard.call("prepare", self._vehicle.prepare, lent(characteristics), road_friction, step))
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL) -> _Prepared:
+        n, method = len(next(iter(characteristics.values()))), self._vehicle.prepare
+        if slope is not LEVEL and not takes(method, 4):
+            problem = f"{self._guard.name} has no slope in prepare(characteristics, road_friction, step, slope), and the road has a grade"
+            raise ForeignError(self._guard.source, problem, "a vehicle with it, or scenarios with grade 0")
+        given = (lent(characteristics), road_friction, step, *([] if slope is LEVEL else [lent(slope)]))
+        return _Prepared(n, self._guard.call("prepare", method, *given))
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         given = self._guard.call("sumo_type", self._vehicle.sumo_type, prepared.theirs)

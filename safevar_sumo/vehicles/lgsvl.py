@@ -15,8 +15,8 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
+from safevar_sumo.vehicles.slope import LEVEL, Slope
 
-GRAVITY = 9.81  # m/s^2
 RPM = 30 / math.pi  # r/min per rad/s
 RADIANS = math.pi / 180  # rad per degree
 WHEELS = 4
@@ -46,7 +46,11 @@ class _Prepared(NamedTuple):
     step: float
     substep: float
     mass: FloatArray
+    weight: FloatArray  # onto the road [N]
     body: FloatArray
+    back: float | FloatArray  # g sin of the slope
+    slowed: float | FloatArray  # by it in a substep
+    standstill: float | FloatArray
     radius: FloatArray
     inertia: FloatArray
     damping: FloatArray
@@ -104,19 +108,22 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     wheel_damping_share: Annotated[float, Meta(ge=0, le=1)]
     steering_design_angle: Annotated[float, Meta(gt=0, lt=90)] = 39.4
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> _Prepared:
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL) -> _Prepared:
         c = characteristics
-        return _Prepared(
-            step=step, substep=step / SUBSTEPS, mass=c["mass"], body=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"],
+        prepared = _Prepared(
+            step=step, substep=step / SUBSTEPS, mass=c["mass"], weight=c["mass"] * slope.down, back=slope.back,
+            slowed=slope.back * (step / SUBSTEPS), standstill=STANDSTILL, body=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"],
             radius=c["radius"], inertia=WHEELS * 0.5 * c["wheelMass"] * c["radius"] * c["radius"],
             damping=WHEELS * self.wheel_damping_share * c["wheelDamping"], brake_torque=WHEELS * c["maxBrakeTorque"],
             motor_torque=c["maxMotorTorque"], least_rpm=c["minRpm"], largest_rpm=c["maxRpm"],
             steering=c["maxSteeringAngle"] * RADIANS, rolling_drag=c["tireDragCoeff"], shift_time=c["shiftTime"],
             slip_limit=c["tractionControlSlipLimit"], friction=FRICTION * road_friction)
+        creeps = _rim_at(prepared, np.zeros_like(prepared.mass), np.abs(prepared.body * prepared.back))
+        return prepared._replace(standstill=STANDSTILL + creeps)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
-        grip = p.friction * p.mass * GRAVITY
+        grip = p.friction * p.weight
         drive = p.motor_torque * (GEAR_RATIOS[0] * FINAL_RATIO) / p.radius
         return SumoType(
             mass=p.mass,
@@ -134,12 +141,12 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             heading=nothing + HEADING_ERROR, throttle=nothing, brake=nothing)
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> LgsvlState:
-        """What stays as it is under the accelerator that holds the speed: every equation with its change set to zero.
+        """What stays as it is under the pedals that hold the speed: every equation with its change set to zero.
 
         The lane keeping has no error left; the gear is the one that the gearbox has when it comes from below.
         """
         p, nothing = prepared, np.zeros_like(prepared.mass)
-        force = (AIR_DRAG * speed + p.rolling_drag) * speed
+        force = (AIR_DRAG * speed + p.rolling_drag) * speed + p.body * p.back
         rim = _rim_at(p, speed, force)
         wheel_speed = rim / p.radius
         gear = nothing + 1
@@ -149,11 +156,13 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         gearing = ratio * FINAL_RATIO
         engine_rpm = p.least_rpm + wheel_speed * gearing * RPM
         full = _torque_share(engine_rpm / p.largest_rpm) * gearing * p.motor_torque
-        throttle = np.minimum((p.damping * wheel_speed + p.radius * force) / np.maximum(full, 1.0), 1.0)
+        needed = p.damping * wheel_speed + p.radius * force
+        throttle = np.minimum(np.maximum(needed, 0.0) / np.maximum(full, 1.0), 1.0)
+        brake = np.minimum(np.maximum(-needed, 0.0) / p.brake_torque, 1.0)
         return LgsvlState(
             speed=speed, wheel_speed=wheel_speed, engine_rpm=engine_rpm, gear=gear, old_ratio=ratio, new_ratio=ratio,
             since_shift=nothing + SHIFT_DELAY, traction_torque=p.motor_torque, lateral=nothing, heading=nothing,
-            throttle=throttle, brake=nothing)
+            throttle=throttle, brake=brake)
 
     def sense(self, prepared: _Prepared, state: LgsvlState, seen: Observation) -> tuple[Observation, LgsvlState]:
         return seen, state
@@ -206,7 +215,7 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
     """One implicit Euler step of engine speed, wheel and body, linear in the new speeds.
 
     I dw/dt = T_drive - T_brake - d w - r K (r w - v)
-    m dv/dt = K (r w - v) - (D_air v + D_tyre + D_corner) v
+    m dv/dt = K (r w - v) - (D_air v + D_tyre + D_corner) v - m g sin
     """
     h, r = p.substep, p.radius
     wanted = p.least_rpm + s.wheel_speed * gearing * RPM
@@ -221,11 +230,12 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
     stiffness = _tyre_stiffness(p, s.speed, rim, slipping)
     pull = h * r * stiffness
     body = p.body + h * (stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag)
-    push = p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body * s.speed / body
+    moving = s.speed - p.slowed
+    push = p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body * moving / body
     wheel_speed = np.maximum(push, 0.0) / (p.inertia + h * p.damping + pull * r - pull * pull / body)
-    speed = (p.body * s.speed + pull * wheel_speed) / body
+    speed = np.maximum((p.body * moving + pull * wheel_speed) / body, 0.0)
     return s._replace(
-        speed=np.where((wheel_speed <= 0) & (speed < STANDSTILL), 0.0, speed), wheel_speed=wheel_speed, engine_rpm=engine_rpm,
+        speed=np.where((wheel_speed <= 0) & (speed < p.standstill), 0.0, speed), wheel_speed=wheel_speed, engine_rpm=engine_rpm,
         traction_torque=np.minimum(np.maximum(traction, 0.0), p.motor_torque))
 
 
@@ -236,10 +246,11 @@ def _torque_share(share: FloatArray) -> FloatArray:
 
 def _rim_at(p: _Prepared, speed: FloatArray, force: FloatArray) -> FloatArray:
     """Speed of the wheels' rim at which the tyres push with `force` [m/s]: the rising part of `_tyre_stiffness` solved for it."""
-    share = np.minimum(force / (p.friction * (p.mass * GRAVITY + DOWNFORCE * speed * speed)), 1.0)
+    share = np.minimum(np.abs(force) / (p.friction * (p.weight + DOWNFORCE * speed * speed)), 1.0)
     slip = PEAK_SLIP * share / (1 + np.sqrt(1 - share))
     slow = speed + SLIP_FLOOR * slip
-    return np.asarray(np.where(slow <= SLIP_FLOOR, slow, speed / (1 - slip)))
+    pushes = np.where(slow <= SLIP_FLOOR, slow, speed / (1 - slip))
+    return np.asarray(np.where(force < 0, speed - np.maximum(speed, SLIP_FLOOR) * slip, pushes))
 
 
 def _tyre_stiffness(p: _Prepared, speed: FloatArray, rim: FloatArray, slipping: FloatArray) -> FloatArray:
@@ -249,5 +260,5 @@ def _tyre_stiffness(p: _Prepared, speed: FloatArray, rim: FloatArray, slipping: 
     rising = (2 - slip / PEAK_SLIP) / PEAK_SLIP
     beyond = np.minimum((slip - PEAK_SLIP) / (SLIDING_SLIP - PEAK_SLIP), 1.0)
     falling = (1 - (1 - SLIDING_FRICTION) * beyond) / np.maximum(slip, PEAK_SLIP)
-    load = p.mass * GRAVITY + DOWNFORCE * speed * speed
+    load = p.weight + DOWNFORCE * speed * speed
     return np.asarray(p.friction * load * np.where(slip < PEAK_SLIP, rising, falling) / denominator)

@@ -10,8 +10,7 @@ from msgspec import Meta, Struct
 from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
 from safevar_sumo.vehicles.delay import delayed, history, remembered
-
-GRAVITY = 9.81  # m/s^2
+from safevar_sumo.vehicles.slope import LEVEL, Slope
 
 
 class _Prepared(NamedTuple):
@@ -21,17 +20,18 @@ class _Prepared(NamedTuple):
     mass: FloatArray
     accel: FloatArray
     decel: FloatArray
-    grip: float
+    grip: float | FloatArray
     max_speed: FloatArray
     tau: FloatArray
     sensor_range: FloatArray
     reaction_time: FloatArray
     brake_delay: FloatArray
     brake_gain: FloatArray
+    back: float | FloatArray
 
 
 class SumoState(NamedTuple):
-    """State of N vehicles: m/s, m/s^2, pedals as the actuators have them, and what is still under way."""
+    """State of N vehicles: m/s, m/s^2 that the wheels give, pedals as the actuators have them, and what is still under way."""
 
     speed: FloatArray
     acceleration: FloatArray
@@ -61,13 +61,14 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     reference_mass: Annotated[float, Meta(gt=0)] = 1500.0
     tyre_friction: Annotated[float, Meta(gt=0)] = 0.9
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> _Prepared:
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL) -> _Prepared:
         c = characteristics
         load = self.reference_mass / c["mass"]
         return _Prepared(
             step=step, mass=c["mass"], accel=c["accel"] * load, decel=c["decel"] * load,
-            grip=self.tyre_friction * road_friction * GRAVITY, max_speed=c["maxSpeed"], tau=c["tau"], sensor_range=c["sensorRange"],
-            reaction_time=c["reactionTime"], brake_delay=c["brakeDelay"], brake_gain=c["brakeGain"])
+            grip=self.tyre_friction * road_friction * slope.down, max_speed=c["maxSpeed"], tau=c["tau"], sensor_range=c["sensorRange"],
+            reaction_time=c["reactionTime"], brake_delay=c["brakeDelay"], brake_gain=c["brakeGain"],
+            back=slope.back)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
@@ -79,8 +80,12 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return SumoState(nothing, nothing, nothing, nothing, nothing + 1, None, commands)
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> SumoState:
-        """Nothing resists: whoever rolls goes on with the pedals released."""
-        return self.at_rest(prepared)._replace(speed=speed)
+        """Nothing but a slope resists: the pedals hold against that, released on a level road."""
+        p, rest = prepared, self.at_rest(prepared)
+        brake = np.minimum(np.maximum(-p.back / (p.brake_gain * p.decel), 0.0), 1.0)
+        throttle = np.minimum(np.maximum(p.back / p.accel, 0.0), 1.0)
+        return rest._replace(speed=speed, acceleration=rest.acceleration + p.back, throttle=throttle, brake=brake,
+                             brake_commands=rest.brake_commands + brake)
 
     def sense(self, prepared: _Prepared, state: SumoState, seen: Observation) -> tuple[Observation, SumoState]:
         """Sensors report what was `reactionTime` ago, and nothing beyond `sensorRange` times the visibility."""
@@ -95,16 +100,16 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return late, state._replace(seen=past)
 
     def advance(self, prepared: _Prepared, state: SumoState, command: Command) -> SumoState:
-        """Acceleration follows the pedals with time constant tau; dv/dt = a, da/dt = (wanted - a) / tau."""
+        """What the wheels do follows the pedals with time constant tau; dv/dt = a - g sin, da/dt = (wanted - a) / tau."""
         p = prepared
         commands = remembered(state.brake_commands, command.brake)
         brake = delayed(commands, p.brake_delay, p.step)
         wanted = np.where(brake > 0, -brake * p.brake_gain * p.decel, command.throttle * p.accel)
         wanted = np.minimum(np.maximum(wanted, -p.grip), p.grip)
         acceleration = state.acceleration + (wanted - state.acceleration) * (p.step / (p.tau + p.step))
-        speed = np.minimum(np.maximum(state.speed + acceleration * p.step, 0.0), np.maximum(p.max_speed, state.speed))
         # Whoever brakes is not driven on by what is left of the last acceleration.
-        speed = np.where(brake > 0, np.minimum(speed, state.speed), speed)
+        acceleration = np.where(brake > 0, np.minimum(acceleration, 0.0), acceleration)
+        speed = np.minimum(np.maximum(state.speed + (acceleration - p.back) * p.step, 0.0), np.maximum(p.max_speed, state.speed))
         return state._replace(
-            speed=speed, acceleration=(speed - state.speed) / p.step, throttle=np.where(brake > 0, 0.0, command.throttle),
+            speed=speed, acceleration=(speed - state.speed) / p.step + p.back, throttle=np.where(brake > 0, 0.0, command.throttle),
             brake=brake, brake_commands=commands)

@@ -10,8 +10,8 @@ from msgspec import Meta, Struct
 from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
 from safevar_sumo.vehicles.delay import delayed, history, remembered
+from safevar_sumo.vehicles.slope import LEVEL, Slope
 
-GRAVITY = 9.81  # m/s^2
 NEW_TREAD, LEGAL_TREAD = 8.0, 1.6
 """Tread depth of a new tyre, and the least that is legal in Europe [mm]."""
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
@@ -30,6 +30,7 @@ class _Prepared(NamedTuple):
     response: FloatArray
     sensor_range: FloatArray
     latency: FloatArray
+    slope: Slope
 
 
 class WornState(NamedTuple):
@@ -63,7 +64,8 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     Notes
     -----
     A road is wet where its friction is below the dry one's. Deceleration a: of a = F / m, of an axle at its limit
-    mu m (g x -+ a h) / L with the other braking its share, and of a = mu g, the least holds.
+    mu m (g x -+ a h) / L with the other braking its share, and of a = mu g, the least holds. On a slope g is what presses onto the
+    road, and what pulls along it acts beside a. Nobody rolls back.
     """
 
     UNITS = {
@@ -82,7 +84,7 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     tread_loss: Annotated[float, Meta(ge=0, lt=1)] = 0.27
     max_speed: Positive = 55.56
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float) -> _Prepared:
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL) -> _Prepared:
         c = characteristics
         mass = self.kerb_mass + c["payload"]
         centre = (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"]) / mass / self.wheelbase
@@ -91,12 +93,12 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return _Prepared(
             step=step, mass=mass, drive=self.drive_force / mass, brake=c["brakeTorque"] * (self.brake_force / mass),
             grip=self.tyre_friction * road_friction * wet, front_load=1 - centre, rear_load=centre, response=c["brakeResponse"],
-            sensor_range=c["sensorRange"], latency=c["sensorLatency"])
+            sensor_range=c["sensorRange"], latency=c["sensorLatency"], slope=slope)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
         full = self._deceleration(p, np.ones_like(p.mass))
-        return SumoType(mass=p.mass, accel=np.minimum(p.drive, p.grip * GRAVITY), decel=full,
+        return SumoType(mass=p.mass, accel=np.minimum(p.drive, p.grip * p.slope.down), decel=full,
                         max_speed=np.full_like(p.mass, self.max_speed), tau=p.response + p.step)
 
     def at_rest(self, prepared: _Prepared) -> WornState:
@@ -104,8 +106,11 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return WornState(nothing, nothing, nothing, nothing + 1, None, history(float(np.max(prepared.response)), prepared.step, nothing))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> WornState:
-        """Nothing resists: whoever rolls goes on with the pedals released."""
-        return self.at_rest(prepared)._replace(speed=speed)
+        """Nothing but a slope resists: the pedals hold against that, released on a level road."""
+        p, rest = prepared, self.at_rest(prepared)
+        brake = np.minimum(np.maximum(-p.slope.back / p.brake, 0.0), 1.0)
+        throttle = np.minimum(np.maximum(p.slope.back / p.drive, 0.0), 1.0)
+        return rest._replace(speed=speed, throttle=throttle, brake=brake, brake_commands=rest.brake_commands + brake)
 
     def sense(self, prepared: _Prepared, state: WornState, seen: Observation) -> tuple[Observation, WornState]:
         """Dirty sensors report what was `sensorLatency` ago, and nothing beyond `sensorRange` times the visibility."""
@@ -122,13 +127,13 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         p = prepared
         commands = remembered(state.brake_commands, command.brake)
         brake = delayed(commands, p.response, p.step)
-        gained = np.where(brake > 0, -self._deceleration(p, brake), np.minimum(command.throttle * p.drive, p.grip * GRAVITY))
-        speed = np.minimum(np.maximum(state.speed + gained * p.step, 0.0), np.maximum(self.max_speed, state.speed))
+        gained = np.where(brake > 0, -self._deceleration(p, brake), np.minimum(command.throttle * p.drive, p.grip * p.slope.down))
+        speed = np.minimum(np.maximum(state.speed + (gained - p.slope.back) * p.step, 0.0), np.maximum(self.max_speed, state.speed))
         return state._replace(speed=speed, throttle=np.where(brake > 0, 0.0, command.throttle), brake=brake, brake_commands=commands)
 
     def _deceleration(self, p: _Prepared, pedal: FloatArray) -> FloatArray:
         """Of both axles together [m/s^2]."""
         wanted, lever = pedal * p.brake, p.grip * (self.centre_height / self.wheelbase)
-        rear_slides = (self.front_share * wanted + p.grip * GRAVITY * p.rear_load) / (1 + lever)
-        front_slides = ((1 - self.front_share) * wanted + p.grip * GRAVITY * p.front_load) / (1 - lever)
-        return np.minimum(np.minimum(wanted, p.grip * GRAVITY), np.minimum(rear_slides, front_slides))
+        rear_slides = (self.front_share * wanted + p.grip * p.slope.down * p.rear_load) / (1 + lever)
+        front_slides = ((1 - self.front_share) * wanted + p.grip * p.slope.down * p.front_load) / (1 - lever)
+        return np.minimum(np.minimum(wanted, p.grip * p.slope.down), np.minimum(rear_slides, front_slides))

@@ -17,7 +17,7 @@ NATIVE = assemble(load_study("native"))
 
 
 class Hold:
-    """Keeps the accelerator where it is; brakes vehicle i fully from `brakes_at[i]` on [s]."""
+    """Keeps the pedals where they are; brakes vehicle i fully from `brakes_at[i]` on [s]."""
 
     def __init__(self, brakes_at: FloatArray | None = None) -> None:
         self._brakes_at = np.inf if brakes_at is None else brakes_at
@@ -26,9 +26,9 @@ class Hold:
         return None
 
     def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
-        memory = seen.throttle if memory is None else memory
+        throttle, brake = memory = memory or (seen.throttle, seen.brake)
         brakes = np.broadcast_to(seen.time >= self._brakes_at, seen.speed.shape)
-        return Command(np.where(brakes, 0.0, memory), np.where(brakes, 1.0, 0.0)), memory
+        return Command(np.where(brakes, 0.0, throttle), np.where(brakes, 1.0, brake)), memory
 
 
 def driven(scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = CARLA) -> Drives:

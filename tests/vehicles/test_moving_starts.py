@@ -14,22 +14,22 @@ from safevar_sumo.records import Command
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.simulation import assemble, simulate
 from safevar_sumo.study import load_study
-from safevar_sumo.vehicles import at_start
+from safevar_sumo.vehicles import at_start, slope_of
 
 SPEEDS = (10, 20, 30, 40, 50, 60)  # km/h, where the original vehicles' gearboxes hold their gear
 
 
-def moving(model: str, settings: np.ndarray, speed: float) -> tuple[object, object]:
+def moving(model: str, settings: np.ndarray, speed: float, grade: float = 0.0) -> tuple[object, object]:
     system = SYSTEMS[model]
     values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    prepared = system.vehicle.prepare(values, 1.0, STEP)
+    prepared = system.vehicle.prepare(values, 1.0, STEP, slope_of(np.full(len(settings), grade)))
     return prepared, at_start(system.vehicle, prepared, np.full(len(settings), speed))
 
 
 @pytest.mark.parametrize("model", sorted(SYSTEMS))
-@pytest.mark.parametrize("kmh", SPEEDS)
-def test_nothing_changes_while_the_pedals_stay(model: str, kmh: float) -> None:
-    prepared, state = moving(model, original(model), kmh / 3.6)
+@pytest.mark.parametrize(("kmh", "grade"), [*((kmh, 0) for kmh in SPEEDS), (20, 6), (40, -3), (40, -12)])
+def test_nothing_changes_while_the_pedals_stay(model: str, kmh: float, grade: float) -> None:
+    prepared, state = moving(model, original(model), kmh / 3.6, grade)
     before, pedals = state, Command(state.throttle, state.brake)  # type: ignore[attr-defined]
     assert state.speed == pytest.approx(kmh / 3.6)  # type: ignore[attr-defined]
     for _ in range(200):

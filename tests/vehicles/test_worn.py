@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from safevar_sumo.records import Observation
-from safevar_sumo.vehicles.worn import GRAVITY, WornVehicle
+from safevar_sumo.vehicles.slope import GRAVITY
+from safevar_sumo.vehicles.worn import WornVehicle
 
 CAR = WornVehicle()
 HEALTHY = {"treadDepth": 8.0, "brakeTorque": 1.0, "brakeResponse": 0.1, "payload": 75.0, "payloadCentre": 1.4, "sensorRange": 80.0,
