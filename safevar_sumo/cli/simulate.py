@@ -22,6 +22,7 @@ from safevar_sumo.cli.target import Target, replay_options, target_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import record
+from safevar_sumo.scenarios import tags
 from safevar_sumo.simulation import System, assemble, at_every_point, named_point, point_record, remarks_of
 from safevar_sumo.study import check_writable
 from safevar_sumo.terminal.matrix import print_matrix
@@ -100,6 +101,7 @@ def _tell(target: Target, system: System, found: Simulation, as_json: bool) -> N
     else:
         print_simulation(Console(), found)
         print_matrix(Console(), points)
+        Console().print(f"NHTSA's pre-crash types: {tags(system.points)}.", soft_wrap=True, markup=False, highlight=False)
     for remark in dict.fromkeys(remark for one in system.points for remark in remarks_of(one.scenario)):
         click.echo(f"note: {remark}", err=True)
     for name, value in found.put_back.items():

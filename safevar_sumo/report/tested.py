@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from safevar_sumo.ads import ADS
 from safevar_sumo.analysis.case import ALGORITHM_TITLES
 from safevar_sumo.report.material import Material
-from safevar_sumo.scenarios import SCENARIOS
+from safevar_sumo.scenarios import SCENARIOS, Point, tags
 from safevar_sumo.showing.comparison import number
 from safevar_sumo.vehicles import VEHICLES
 
@@ -21,12 +21,29 @@ def tested(material: Material) -> dict[str, Any]:
     return {
         "who": f"A vehicle ({_described(VEHICLES, study.vehicle.model)}) of which {number_of} characteristics may vary is driven by "
                f"{study.ads.model} ({_described(ADS, study.ads.model)}) in the scenario {study.scenario.model} "
-               f"({_described(SCENARIOS, study.scenario.model)}), weather: {case.weather.name}.",
+               f"({_described(SCENARIOS, study.scenario.model)}), {_where(material)}.",
+        "tags": "" if material.system is None else f"NHTSA's pre-crash types: {tags(material.system.points)}.",
         "how": _how(material),
         "characteristics": [
             {"name": one.name, "unit": "" if one.unit == "-" else one.unit, "original": number(one.original), "lower": number(one.lower),
              "upper": number(one.upper), "threshold": number(one.threshold)} for one in case.characteristics],
         "remarks": [*case.remarks, *([material.lacking] if material.lacking else [])]}
+
+
+def _where(material: Material) -> str:
+    """The weather, or how many points a matrix has, and in which weathers."""
+    points = () if material.system is None else material.system.matrix
+    if not points:
+        return f"weather: {material.case.weather.name}"
+    return f"every vehicle at all {len(points)} points of a matrix: {', '.join(_tests(points))}"
+
+
+def _tests(points: Sequence[Point]) -> list[str]:
+    """Every test of a matrix with the number of its points and their weathers."""
+    of_test: dict[str, list[str]] = {}
+    for point in points:
+        of_test.setdefault(str(dict(point.place)["test"]), []).append(point.weather.name)
+    return [f"{test} ({len(weathers)}, {' and '.join(dict.fromkeys(weathers))})" for test, weathers in of_test.items()]
 
 
 def _how(material: Material) -> str:

@@ -10,6 +10,7 @@ from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.guarded import SCENARIO_CONTRACT, GuardedScenario
 from safevar_sumo.scenarios.lead_vehicle_stopped import LeadVehicleStopped
 from safevar_sumo.scenarios.pedestrian_crossing import PedestrianCrossing
+from safevar_sumo.scenarios.pre_crash import PreCrash, tags
 from safevar_sumo.scenarios.weather import WEATHERS, weather_of
 
 SCENARIOS: Mapping[str, type[Any]] = {
@@ -21,4 +22,5 @@ SCENARIOS: Mapping[str, type[Any]] = {
 }
 
 __all__ = [
-    "SCENARIOS", "SCENARIO_CONTRACT", "VUT", "WEATHERS", "GuardedScenario", "Lane", "Point", "Scenario", "Scene", "World", "weather_of"]
+    "SCENARIOS", "SCENARIO_CONTRACT", "VUT", "WEATHERS", "GuardedScenario", "Lane", "Point", "PreCrash", "Scenario", "Scene", "World",
+    "tags", "weather_of"]

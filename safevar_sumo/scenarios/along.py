@@ -10,6 +10,7 @@ from safevar_sumo.records import Encounter, Trace
 from safevar_sumo.scenarios.ahead import Ahead, Memory, encounter, right_of
 from safevar_sumo.scenarios.base import Actors, Grade, Roads, Scene, World
 from safevar_sumo.scenarios.euro_ncap import BODIES, KMH, VUT_LENGTH, VUT_WIDTH, Body, Range, Walk
+from safevar_sumo.scenarios.pre_crash import PreCrash
 
 PROTOCOL = Range(10, 60, (50, 10, 25, 75, 90))
 
@@ -44,6 +45,7 @@ class Along(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
     grade: Grade = 0.0
     network: str = "along"
+    pre_crash = PreCrash.PEDESTRIAN
 
     @property
     def duration(self) -> float:

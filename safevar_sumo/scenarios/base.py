@@ -90,8 +90,8 @@ class Scenario(Protocol):
     `duration` is the length of a run [s].
 
     It may have a `grade`, by how much its road rises over the way [%]: SUMO's plane is then that road, and gravity acts in the
-    vehicles. It may have `actors(roads) -> Actors`, what its parameters make of the network's traffic, and
-    `remarks() -> list[str]`,
+    vehicles. It may have a `pre_crash`, what type of NHTSA's it is of. It may have `actors(roads) -> Actors`, what its
+    parameters make of the network's traffic, and `remarks() -> list[str]`,
     what a user should know of them.
     """
 

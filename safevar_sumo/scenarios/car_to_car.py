@@ -1,4 +1,4 @@
-"""Euro NCAP's rear ends: CCRs, CCRm, CCRb; NHTSA's lead vehicle stopped, moving at lower constant speed, and decelerating."""
+"""Euro NCAP's rear ends: CCRs, CCRm, CCRb."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from safevar_sumo.records import Encounter, Trace
 from safevar_sumo.scenarios.ahead import Ahead, Memory, encounter, right_of
 from safevar_sumo.scenarios.base import Actors, Grade, Roads, Scene, World
 from safevar_sumo.scenarios.euro_ncap import KMH, VUT_LENGTH, VUT_WIDTH, Body, Range
+from safevar_sumo.scenarios.pre_crash import PreCrash
 
 CAR = Body(4.023, 1.712)
 """Euro NCAP's global vehicle target [m]."""
 LOCATIONS = (0.0, 25.0, 50.0, 75.0, 100.0)
 PROTOCOL = {"CCRs": Range(10, 50, LOCATIONS), "CCRm": Range(30, 130, LOCATIONS), "CCRb": Range(30, 80, LOCATIONS)}
+PRE_CRASH = {"CCRs": PreCrash.LEAD_STOPPED, "CCRm": PreCrash.LEAD_SLOWER, "CCRb": PreCrash.LEAD_DECELERATING}
 CRAWL = 2.0
 """Speed down to which the braking target brakes [km/h]."""
 HEADWAY = {"CCRs": 5.0, "CCRm": 5.0, "CCRb": 1.0}
@@ -60,6 +62,11 @@ class CarToCar(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
     grade: Grade = 0.0
     network: str = "car_to_car"
+
+    @property
+    def pre_crash(self) -> PreCrash:
+        """NHTSA's type."""
+        return PRE_CRASH[self.test]
 
     @property
     def duration(self) -> float:

@@ -1,4 +1,4 @@
-"""Euro NCAP's pedestrians who cross the way, CPFA, CPNA and CPNCO: NHTSA's "pedestrian crash without prior vehicle manoeuvre"."""
+"""Euro NCAP's pedestrians who cross the way, CPFA, CPNA and CPNCO."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from safevar_sumo.records import BoolArray, Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import VUT, Actors, Grade, Roads, Scene, World
 from safevar_sumo.scenarios.euro_ncap import BODIES, KMH, VUT_LENGTH, VUT_WIDTH, Range, Walk, beside, lateral_of
 from safevar_sumo.scenarios.frame import Frame
+from safevar_sumo.scenarios.pre_crash import PreCrash
 
 PEDESTRIAN = "pedestrian"
 APPROACH, CROSSING, KERB = "approach_0", ":crossing_c0_0", "kerb_0"
@@ -107,6 +108,7 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
     grade: Grade = 0.0
     network: str = "crossing"
+    pre_crash = PreCrash.PEDESTRIAN
 
     @property
     def duration(self) -> float:

@@ -28,7 +28,7 @@ class GuardedScenario:
         duration = guard.numbers("__init__", "duration", guard.field("__init__", scenario, "duration"), (), 0.0, LONGEST, above=True)
         self.duration = float(duration)
         grade = guard.numbers("__init__", "grade", getattr(scenario, "grade", 0.0), (), -STEEPEST, STEEPEST)
-        self.grade = float(grade)
+        self.grade, self.pre_crash = float(grade), str(getattr(scenario, "pre_crash", ""))
 
     def actors(self, roads: Roads) -> Actors:
         """What it makes of the network's traffic; nothing, if it says nothing of that."""

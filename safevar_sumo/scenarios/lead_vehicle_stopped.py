@@ -1,4 +1,4 @@
-"""NHTSA pre-crash scenario "lead vehicle stopped": both lanes ahead are blocked by parked vehicles."""
+"""Both lanes ahead are blocked by parked vehicles."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import VUT, Grade, Scene, World
+from safevar_sumo.scenarios.pre_crash import PreCrash
 
 PARKED = "parked_ahead"
 
@@ -38,6 +39,7 @@ class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_field
     network: str = "lead_vehicle_stopped"
     duration: Annotated[float, Meta(gt=0, le=3600)] = 16.0
     grade: Grade = 0.0
+    pre_crash = PreCrash.LEAD_STOPPED
 
     def begin(self, world: World) -> _Memory:
         rear = world.vehicle_positions(PARKED)[:, 0] - world.vehicle_length(PARKED)

@@ -1,4 +1,4 @@
-"""NHTSA pre-crash scenario "pedestrian crash with prior vehicle manoeuvre": a pedestrian walks into the lane."""
+"""A pedestrian walks into the lane."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import VUT, Grade, Scene, World
+from safevar_sumo.scenarios.pre_crash import PreCrash
 
 Positive = Annotated[float, Meta(gt=0, le=3600)]
 PEDESTRIAN = "pedestrian"
@@ -48,6 +49,7 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
     turns_after: float | None = 0.7
     lane_width: Positive = 3.5
     grade: Grade = 0.0
+    pre_crash = PreCrash.PEDESTRIAN_AFTER_MANOEUVRE
 
     def begin(self, world: World) -> _Memory:
         lateral = world.person_positions(PEDESTRIAN)[:, 1] - world.vehicle_positions(VUT)[:, 1]
