@@ -6,7 +6,7 @@ import json
 import platform
 
 import pytest
-from small import FILE, STUDIES, computed, platform_here
+from renew import FILE, STUDIES, computed, platform_here
 
 GOLDEN = json.loads(FILE.read_text(encoding="utf-8"))
 
@@ -17,7 +17,7 @@ def test_a_shipped_studys_results_are_those_of_ever(name: str) -> None:
     numbers = {key: value for key, value in expected["original"].items() if isinstance(value, float)}
     assert {key: here["original"][key] for key in numbers} == pytest.approx(numbers, rel=1e-6), "other results, not only other bits"
     if platform_here() == GOLDEN["platform"]:
-        assert here == expected, "results have changed: if that is meant, renew them with tests/golden/small.py and say why"
+        assert here == expected, "results have changed: if that is meant, renew them with tests/golden/renew.py and say why"
 
 
 @pytest.mark.skipif((platform.system(), platform.machine()) != ("Linux", "x86_64"), reason="bytes are promised for Linux on x86-64")
