@@ -72,13 +72,13 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return _Memory(nominal, step, nothing > 0, nothing, nothing, nothing)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        waits = (seen.speed == 0) & (seen.time < self.first_command - FIRST_COMMAND_ROUNDING)
-        if waits.all():
-            return Command(np.zeros_like(seen.speed), np.zeros_like(seen.speed)), memory
         planned = self._plan(seen, memory)
-        throttle, brake = self._pedals(seen, planned)
+        command = self._pedals(seen, planned)
+        if seen.time >= self.first_command - FIRST_COMMAND_ROUNDING:
+            return command, planned
+        waits = seen.speed == 0
         kept = (np.where(waits, old, new) for old, new in zip(memory[2:], planned[2:], strict=True))
-        return Command(np.where(waits, 0.0, throttle), np.where(waits, 0.0, brake)), _Memory(memory.nominal, memory.step, *kept)
+        return Command(*(np.where(waits, 0.0, pedal) for pedal in command)), _Memory(memory.nominal, memory.step, *kept)
 
     def _plan(self, seen: Observation, memory: _Memory) -> _Memory:
         """The acceleration to ask for: cruise, or v^2 / (2 d) to stand before the obstacle; then creep and hold."""
@@ -91,28 +91,30 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         planned = v * v / (2 * np.maximum(distance - lost, LEAST_DISTANCE))
         begins = (planned > self.comfortable_deceleration) & ~memory.stops
         stops = memory.stops | begins
-        # A plan is continuous in time: it began within the last step, when the needed deceleration passed the limit.
-        rise = np.maximum(planned - memory.planned, 1e-9)
-        part = np.where(begins, np.minimum((planned - self.comfortable_deceleration) / rise, 1.0), 1.0)
+        base, most = memory.asked, np.array(self.jerk * memory.step)
+        if np.count_nonzero(begins):
+            # A plan is continuous in time: it began within the last step, when the needed deceleration passed the limit.
+            rise = np.maximum(planned - memory.planned, 1e-9)
+            part = np.where(begins, np.minimum((planned - self.comfortable_deceleration) / rise, 1.0), 1.0)
+            base, most = np.where(begins, np.minimum(base, 0.0), base), most * part
 
         braking = np.minimum(needed, self.largest_deceleration)
         braking = np.minimum(braking, np.maximum(v - self.creep_speed, 0.0) / TAPER_TIME)
         cruising = np.minimum(self.cruise_gain * (self.cruise_speed - v), self.cruise_acceleration)
-        base = np.where(begins, np.minimum(memory.asked, 0.0), memory.asked)
-        change = np.maximum(np.where(stops, -braking, cruising) - base, -self.jerk * memory.step * part)
-        asked = base + np.minimum(change, self.jerk * memory.step * part)
+        asked = base + np.minimum(np.maximum(np.where(stops, -braking, cruising) - base, -most), most)
 
         creeps = stops & (v < self.creep_speed + CREEP_MARGIN)
-        crept = memory.crept + np.where(creeps, memory.step, 0.0)
-        asked = np.where(crept > self.creep_time, -HOLDING_DECELERATION, np.where(creeps, 0.0, asked))
+        crept = memory.crept + memory.step * creeps
+        asked[creeps] = 0.0
+        asked[crept > self.creep_time] = -HOLDING_DECELERATION
         return memory._replace(stops=stops, planned=planned, asked=asked, crept=crept)
 
     def _pedals(self, seen: Observation, memory: _Memory) -> Command:
         """Through the calibration table of the original vehicle."""
         nominal = memory.nominal
-        coasting = looked_up(nominal.coasting, nominal.speeds, seen.speed)
-        full = looked_up(nominal.full_throttle, nominal.speeds, seen.speed)
+        coasting, full = looked_up(nominal.speeds, seen.speed, nominal.coasting, nominal.full_throttle)
         beyond = memory.asked + coasting
         throttle = np.minimum(np.maximum(beyond / (full + coasting), 0.0), 1.0)
         brake = np.minimum(np.maximum(-beyond / nominal.braking, 0.0), 1.0)
-        return Command(np.where(memory.stops, 0.0, throttle), np.where(memory.stops, brake, 0.0))
+        throttle[memory.stops], brake[~memory.stops] = 0.0, 0.0
+        return Command(throttle, brake)

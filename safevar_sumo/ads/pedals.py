@@ -9,11 +9,13 @@ import numpy as np
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
 
-def looked_up(table: FloatArray, speeds: FloatArray, speed: FloatArray) -> FloatArray:
-    """Linear between the rows of a table over equally spaced speeds."""
+def looked_up(speeds: FloatArray, speed: FloatArray, *tables: FloatArray) -> list[FloatArray]:
+    """Linear between the rows of tables over equally spaced speeds."""
     place = np.minimum(speed / speeds[1], len(speeds) - 1.001)
     row = place.astype(np.intp)
-    return np.asarray(table[row] + (table[row + 1] - table[row]) * (place - row))
+    share, next_row = place - row, row + 1
+    values = ((table[row], table[next_row]) for table in tables)
+    return [here + (there - here) * share for here, there in values]
 
 
 class Trim(NamedTuple):
@@ -27,18 +29,19 @@ def trim(nominal: Nominal, seen: Observation) -> Trim:
     """Who has driven at a speed for a while has found the pedals that hold it."""
     rolls = seen.speed > 0
     throttle = np.where(rolls, seen.throttle - _throttle(nominal, seen.speed, np.zeros_like(seen.speed)), 0.0)
-    coasts = looked_up(nominal.coasting, nominal.speeds, seen.speed) / nominal.braking
-    return Trim(throttle, np.where(rolls & (seen.brake > 0), seen.brake + coasts, 0.0))
+    (coasting,) = looked_up(nominal.speeds, seen.speed, nominal.coasting)
+    return Trim(throttle, np.where(rolls & (seen.brake > 0), seen.brake + coasting / nominal.braking, 0.0))
 
 
 def pedals(nominal: Nominal, speed: FloatArray, acceleration: FloatArray, trimmed: Trim) -> Command:
     """Pedals for an acceleration [m/s^2] at a speed [m/s], from the tables of the original vehicle and a `trim`."""
-    beyond = acceleration + looked_up(nominal.coasting, nominal.speeds, speed) - nominal.braking * trimmed.brake
+    (coasting,) = looked_up(nominal.speeds, speed, nominal.coasting)
+    beyond = acceleration + coasting - nominal.braking * trimmed.brake
     brake = np.minimum(np.maximum(-beyond / nominal.braking, 0.0), 1.0)
     throttle = np.minimum(np.maximum(_throttle(nominal, speed, acceleration) + trimmed.throttle, 0.0), 1.0)
     return Command(np.where(beyond < 0, 0.0, throttle), brake)
 
 
 def _throttle(nominal: Nominal, speed: FloatArray, acceleration: FloatArray) -> FloatArray:
-    coasting = looked_up(nominal.coasting, nominal.speeds, speed)
-    return (acceleration + coasting) / (looked_up(nominal.full_throttle, nominal.speeds, speed) + coasting)
+    coasting, full = looked_up(nominal.speeds, speed, nominal.coasting, nominal.full_throttle)
+    return (acceleration + coasting) / (full + coasting)

@@ -103,7 +103,8 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
 
 def _refuse_no_number(speed: FloatArray, settings: FloatArray, names: Sequence[str]) -> None:
     """SUMO takes a speed that is no number for 0: a vehicle whose physics have broken down would pass for a careful one."""
-    for copy in np.flatnonzero(~np.isfinite(speed))[:1]:
+    if np.count_nonzero(np.isfinite(speed)) < len(speed):
+        copy = np.flatnonzero(~np.isfinite(speed))[0]
         values = ", ".join(f"{name} = {value:g}" for name, value in zip(names, settings[copy], strict=True))
         raise InputError("vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from itertools import chain
 from typing import Any
 
@@ -29,11 +29,16 @@ class SumoWorld:
                  whole: SumoWorld | None = None) -> None:
         self._api, self.n, self._first, self._standing = api, n, first, standing
         self._parts, self._whole = list[SumoWorld](), whole
-        self._left: dict[str, tuple[float, tuple[float, float]]] = {}
-        """Speed and position of vehicles under test that have left the road."""
+        self._last_speeds, self._last_positions = np.zeros(n), np.zeros((n, 2))
+        """Speeds and positions of vehicles under test that have left the road."""
+        self._speeds_now: FloatArray | None = None
         self._ids: dict[str, list[str]] = {}
         self._positions: dict[str, FloatArray] = {}
         self._copy_of = {name: copy for copy, name in enumerate(self.ids(VUT))}
+        self._driving, self._rows = dict(self._copy_of), np.arange(len(self._copy_of))
+        """Copies whose vehicle under test is on the road."""
+        self._told = np.full(len(self._rows), np.nan)
+        """Speeds that the vehicles under test were last told to reach."""
         self.step_length: float = api.simulation.getDeltaT()
         self._pause = self.step_length if watched else 0.0
 
@@ -78,13 +83,15 @@ class SumoWorld:
 
     def advance(self, speeds: FloatArray) -> None:
         """One simulation step in which the vehicles under test reach `speeds` [m/s]."""
-        set_speed = _direct(self._api, "vehicle", "setSpeed")
-        for name, speed in zip(self.ids(VUT), speeds.tolist(), strict=True):
-            if name not in self._left:
-                set_speed(name, speed)
+        set_speed, names = _direct(self._api, "vehicle", "setSpeed"), self.ids(VUT)
+        changed = self._rows[(speeds != self._told)[self._rows]]
+        for copy, speed in zip(changed.tolist(), speeds[changed].tolist(), strict=True):
+            set_speed(names[copy], speed)
+        self._told = speeds
         self._api.simulationStep()
         for world in (self, *self._parts):
             world._positions.clear()
+            world._speeds_now = None
         if self._pause:
             time.sleep(self._pause)
 
@@ -94,17 +101,24 @@ class SumoWorld:
             self._copy_of[collision.collider]: collision.colliderSpeed
             for collision in self._api.simulation.getCollisions() if collision.collider in self._copy_of}
 
-    def leave(self, copies: Iterable[int]) -> None:
+    def leave(self, copies: Sequence[int]) -> None:
         """Take vehicles under test off the road whose runs are over: they are told to be as they were, and cost nothing."""
-        vehicle, names = self._api.vehicle, self.ids(VUT)
-        for name in (names[copy] for copy in copies):
-            self._left[name] = vehicle.getSpeed(name), vehicle.getPosition(name)
-            vehicle.remove(name)
+        if not copies:
+            return
+        self._last_speeds[copies], self._last_positions[copies] = self.speeds()[copies], self.vehicle_positions(VUT)[copies]
+        for name in [self.ids(VUT)[copy] for copy in copies]:
+            self._api.vehicle.remove(name)
+            del self._driving[name]
+        self._rows = np.array([*self._driving.values()], dtype=np.intp)
 
     def speeds(self) -> FloatArray:
-        """Speeds of the vehicles under test as SUMO has them [m/s]."""
-        speed = _direct(self._api, "vehicle", "getSpeed")
-        return np.array([self._left[name][0] if name in self._left else speed(name) for name in self.ids(VUT)])
+        """Speeds of the vehicles under test as SUMO has them in this step [m/s]; whoever asks again gets the same array."""
+        if self._whole is not None:
+            return self._whole.speeds()[self._first:self._first + self.n]
+        if self._speeds_now is None:
+            self._speeds_now = self._last_speeds.copy()
+            self._speeds_now[self._rows] = [*map(_direct(self._api, "vehicle", "getSpeed"), self._driving)]
+        return self._speeds_now
 
     def vehicle_positions(self, actor: str) -> FloatArray:
         return self._looked_up(actor, _direct(self._api, "vehicle", "getPosition"))
@@ -117,8 +131,12 @@ class SumoWorld:
         if self._whole is not None and actor == VUT:
             return self._whole.vehicle_positions(VUT)[self._first:self._first + self.n]
         if actor not in self._positions:
-            found = (self._left[name][1] if name in self._left else position(name) for name in self.ids(actor))
-            self._positions[actor] = np.fromiter(chain.from_iterable(found), float, 2 * self.n).reshape(self.n, 2)
+            names = self._driving if actor == VUT else self.ids(actor)
+            found = np.fromiter(chain.from_iterable(map(position, names)), float, 2 * len(names)).reshape(-1, 2)
+            if len(names) < self.n:
+                found, on_the_road = self._last_positions.copy(), found
+                found[self._rows] = on_the_road
+            self._positions[actor] = found
         return self._positions[actor]
 
     @property
@@ -128,7 +146,7 @@ class SumoWorld:
 
     def has_left(self, name: str) -> bool:
         """Whether a vehicle under test is off the road for good."""
-        return name in self._left
+        return name not in self._driving
 
     def names(self) -> frozenset[str]:
         """What vehicles, persons, roads and types are called in the originals of the copies."""
@@ -176,7 +194,6 @@ class SumoWorld:
     def part(self, first: int, n: int) -> SumoWorld:
         """The world of `n` copies alone, from the `first`."""
         part = SumoWorld(self._api, n, first=first, whole=self)
-        part._left = self._left
         self._parts.append(part)
         return part
 

@@ -195,7 +195,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         through_clutch = np.maximum(through_clutch, dragged)
         engine_speed = np.minimum(ratio * wheel_speed + through_clutch / p.clutch, p.engine_limit)
         state = CarlaState(speed, wheel_speed, engine_speed, gear, gear, nothing, nothing, nothing)
-        pull = self._torque(p, state) - (p.damping_full - p.damping_engaged) * engine_speed
+        pull = self._torque(p, engine_speed) - (p.damping_full - p.damping_engaged) * engine_speed
         throttle = (p.damping_engaged * engine_speed + through_clutch) / np.maximum(pull, 1.0)
         throttle = np.where(brake > 0, 0.0, np.minimum(throttle, 1.0))
         lugs = (gear > 1) & (engine_speed < SHIFT_DOWN * p.engine_limit)
@@ -216,22 +216,19 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return seen._replace(gap=seen.gap * prepared.assumed_height), state
 
     def advance(self, prepared: _Prepared, state: CarlaState, command: Command) -> CarlaState:
-        for _ in range(prepared.substeps):
-            state = self._pedals(prepared, state, command)
-            state = _shift(prepared, state)
-            state = self._roll(prepared, state)
-        moves, nothing = (state.brake <= prepared.nothing) | (state.speed >= prepared.standstill), prepared.nothing
-        return state._replace(speed=np.where(moves, state.speed, nothing), wheel_speed=np.where(moves, state.wheel_speed, nothing))
+        p, s = prepared, state
+        for _ in range(p.substeps):
+            throttle = _follows(command.throttle, s.throttle, p.throttle_rates)
+            brake = _follows(command.brake, s.brake, p.brake_rates)
+            gears = _shift(p, s, throttle)
+            s = CarlaState(*self._roll(p, s, gears[0], throttle, brake), *gears, throttle, brake)
+        held = (s.brake > p.nothing) & (s.speed < p.standstill)
+        s.speed[held] = s.wheel_speed[held] = NEUTRAL
+        return s
 
-    def _pedals(self, p: _Prepared, s: CarlaState, command: Command) -> CarlaState:
-        """Pedals follow their commands at finite rates."""
-        (throttle_falls, throttle_rises), (brake_falls, brake_rises) = p.throttle_rates, p.brake_rates
-        return s._replace(
-            throttle=s.throttle + np.minimum(np.maximum(command.throttle - s.throttle, throttle_falls), throttle_rises),
-            brake=s.brake + np.minimum(np.maximum(command.brake - s.brake, brake_falls), brake_rises))
-
-    def _roll(self, p: _Prepared, s: CarlaState) -> CarlaState:
-        """Engine, clutch, wheels, tyres and body over one substep.
+    def _roll(self, p: _Prepared, s: CarlaState, gear: FloatArray, throttle: FloatArray,
+              brake: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Engine, clutch, wheels, tyres and body over one substep: speeds of the vehicle, its wheels and its engine.
 
         I_e dw_e/dt = throttle T(w_e) - c_e w_e - k_c (w_e - G w_w)
         I_w dw_w/dt = G k_c (w_e - G w_w) - d w_w - T_brake - r F
@@ -239,19 +236,18 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
         The force F is explicit. It ends the slip within a step at most, and never reverses it: so it cannot ring.
         """
-        gear = s.gear.astype(np.intp)
-        in_gear = s.gear > NEUTRAL
-        ratio = OVERALL_RATIOS[gear]
+        in_gear = gear > NEUTRAL
+        ratio = OVERALL_RATIOS[gear.astype(np.intp)]
         clutch = p.clutch * in_gear
         through_clutch = ratio * clutch
         closed = np.where(in_gear, p.damping_engaged, p.damping_neutral)
-        engine = p.engine_inertia_per_step + closed + (p.damping_full - closed) * s.throttle + clutch
+        engine = p.engine_inertia_per_step + closed + (p.damping_full - closed) * throttle + clutch
         wheel = p.wheel_coasts + through_clutch * ratio * (ONE - clutch / engine)
         # What a step makes of each speed (that of a wheel at its rim), of torques and of the tyres' force:
-        engine_keeps, engine_gains = p.engine_inertia_per_step / engine, s.throttle * self._torque(p, s) / engine
+        engine_keeps, engine_gains = p.engine_inertia_per_step / engine, throttle * self._torque(p, s.engine_speed) / engine
         rim_by_torque = p.radius / wheel
         rim_keeps, rim_by_engine = p.wheel_inertia_per_step / wheel, through_clutch * rim_by_torque
-        rim_loses = s.brake * p.brake_torque * rim_by_torque
+        rim_loses = brake * p.brake_torque * rim_by_torque
         rim_by_force, speed_by_force = p.radius * rim_by_torque, p.speed_by_force
         speed_loses = p.speed_by_air * s.speed * s.speed + p.speed_by_slope
         slip_by_force = rim_by_force + speed_by_force
@@ -267,7 +263,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             rim = np.maximum(rim_free - rim_by_force * force, p.nothing)
             engine_speed = np.minimum(engine_free + engine_by_rim * rim, p.engine_limit)
             speed = np.maximum(speed + speed_by_force * force - speed_loses, p.nothing)
-        return s._replace(speed=speed, wheel_speed=rim / p.radius, engine_speed=engine_speed)
+        return speed, rim / p.radius, engine_speed
 
     def _tyre_force(self, p: _Prepared, speed: FloatArray, rim: FloatArray) -> FloatArray:
         """Force of the tyres along the way [N] (`PxVehicleComputeTireForceDefault` without lateral slip).
@@ -279,22 +275,35 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         left = np.maximum(relative_to - p.slip_stiffness * np.abs(slides), p.nothing) / relative_to
         return np.asarray(np.copysign(p.grip - p.grip * left * left * left, slides))
 
-    def _torque(self, p: _Prepared, s: CarlaState) -> FloatArray:
+    def _torque(self, p: _Prepared, engine_speed: FloatArray) -> FloatArray:
         """Engine torque at full throttle [N m]: linear between the points of the curve, zero above its end."""
-        x = s.engine_speed / p.engine_limit
+        x = engine_speed / p.engine_limit
         rising = TORQUE_IDLE + TORQUE_RISE * x
         falling = TORQUE_PEAK - TORQUE_FALL * (x - PEAK_AT)
-        return self.engine_torque * np.where(x <= ONE, np.minimum(rising, falling), p.nothing)
+        torque = np.asarray(self.engine_torque * np.minimum(rising, falling))
+        torque[x > ONE] = NEUTRAL
+        return torque
 
 
-def _shift(p: _Prepared, s: CarlaState) -> CarlaState:
-    """Automatic gearbox: a switch, the first one out of neutral included, takes its time, spent in neutral."""
+def _follows(commanded: FloatArray, pedal: FloatArray, rates: tuple[FloatArray, FloatArray]) -> FloatArray:
+    """Where a pedal is that follows its command at finite rates."""
+    falls, rises = rates
+    return pedal + np.minimum(np.maximum(commanded - pedal, falls), rises)
+
+
+def _shift(p: _Prepared, s: CarlaState, throttle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Automatic gearbox: gear, target gear, time since a shift. A switch, the first one out of neutral included, is spent in neutral."""
     settled = s.gear == s.target_gear
     automatic = settled & (s.since_shift >= AUTOBOX_LATENCY)
     relative = s.engine_speed / p.engine_limit
-    up = np.where(s.gear > NEUTRAL, automatic & (relative > SHIFT_UP) & (s.gear < TOP), settled & (s.throttle > p.nothing))
+    sets_off = settled & (s.gear <= NEUTRAL) & (throttle > p.nothing)
+    up = sets_off | automatic & (relative > SHIFT_UP) & (s.gear > NEUTRAL) & (s.gear < TOP)
     down = automatic & (relative < SHIFT_DOWN) & (s.gear > FIRST)
-    target = s.target_gear + up - down
-    since_shift = np.where(target == s.target_gear, s.since_shift + p.step, p.nothing)
-    gear = np.where((target == s.gear) | (since_shift >= p.shift_ends), target, NEUTRAL)
-    return s._replace(gear=gear, target_gear=target, since_shift=since_shift)
+    switches = up | down
+    target, since_shift = s.target_gear, s.since_shift + p.step
+    if np.count_nonzero(switches):
+        target = target + up - down
+        since_shift[switches] = NEUTRAL
+    elif np.count_nonzero(settled) == len(settled):
+        return s.gear, target, since_shift
+    return np.where((target == s.gear) | (since_shift >= p.shift_ends), target, NEUTRAL), target, since_shift

@@ -17,43 +17,57 @@ from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
 from safevar_sumo.vehicles.slope import LEVEL, Slope
 
-RPM = 30 / math.pi  # r/min per rad/s
+# Numbers that meet arrays in every step are arrays themselves: numpy would convert a float each time, which takes as long again.
+NOTHING, ONE, TWO, HALF = map(np.array, (0.0, 1.0, 2.0, 0.5))
+RPM = np.array(30 / math.pi)  # r/min per rad/s
 RADIANS = math.pi / 180  # rad per degree
 WHEELS = 4
 GEAR_RATIOS = np.array([4.17, 3.14, 2.11, 1.67, 1.28, 1.0, 0.84, 0.67])  # VehicleSMI
-FINAL_RATIO = 2.56  # VehicleSMI
-SHIFT_DELAY = 0.7  # s, least time between two changes of gear; VehicleSMI
-SHIFT_UP, SHIFT_DOWN = 0.33, 0.13  # of maxRpm (assumption)
+FIRST, LAST = map(np.array, (1.0, len(GEAR_RATIOS)))
+FINAL_RATIO = np.array(2.56)  # VehicleSMI
+SHIFT_DELAY = np.array(0.7)  # s, least time between two changes of gear; VehicleSMI
+SHIFT_UP, SHIFT_DOWN = map(np.array, (0.33, 0.13))  # of maxRpm (assumption)
 RPM_RATE = 20.0  # 1/s, the engine speed follows the wheels with a lag of 1/20 s; VehicleSMI
 TRACTION_START = 1 - 0.675  # of maxMotorTorque, the traction control's torque at the start; VehicleSMI
 TRACTION_RATE = 6.75 / 0.02  # N m/s, by which it rises and falls; VehicleSMI, at 50 Hz
-AIR_DRAG, DOWNFORCE = 1.0, 2.0  # N s^2/m^2; VehicleSMI
+AIR_DRAG, DOWNFORCE = map(np.array, (1.0, 2.0))  # N s^2/m^2; VehicleSMI
 # Unity's WheelCollider: forward friction rises to its extremum and falls to its asymptote.
-PEAK_SLIP, SLIDING_SLIP, SLIDING_FRICTION = 0.4, 0.8, 0.5
+PEAK_SLIP, SLIDING_SLIP, SLIDING_FRICTION = map(np.array, (0.4, 0.8, 0.5))
+SLIPS_BEYOND, FRICTION_LOST = map(np.array, (SLIDING_SLIP - PEAK_SLIP, 1 - SLIDING_FRICTION))
 FRICTION = 1.0  # at the extremum
-SLIP_FLOOR = 4.0  # m/s, least speed that a slip is relative to (assumption, as PhysX has it)
-STANDSTILL = 0.05  # m/s, below which locked wheels hold the vehicle (assumption)
-WHEELBASE = 2.85  # m
+SLIP_FLOOR = np.array(4.0)  # m/s, least speed that a slip is relative to (assumption, as PhysX has it)
+LEAST_RIM = np.array(1e-3)  # m/s, that a slip limit is relative to
+STANDSTILL = np.array(0.05)  # m/s, below which locked wheels hold the vehicle (assumption)
+WHEELBASE = np.array(2.85)  # m
 # The lane keeping has an error to correct: assumption, so that the steering angle has something to act on.
 LATERAL_ERROR, HEADING_ERROR = 0.10, 0.01  # m, rad
-LATERAL_GAIN, HEADING_GAIN = 0.02, 0.35  # rad/m, rad/rad
+LATERAL_GAIN, HEADING_GAIN = map(np.array, (0.02, 0.35))  # rad/m, rad/rad
+TORQUE_IDLE, TORQUE_BEND = map(np.array, (0.4, 2.4))  # of maxMotorTorque (assumption)
 SUBSTEPS = 2
 
 
 class _Prepared(NamedTuple):
-    """Constants of a run, SI but engine speeds in r/min, shape (N,)."""
+    """Constants of a run, SI but engine speeds in r/min, shape (N,) or ().
 
-    step: float
-    substep: float
+    `pedals_follow` and `engine_follows` are the shares of an error that are gone after a step, and after a substep;
+    `traction_change` is what the traction control adds or takes away in a substep.
+    """
+
+    step: FloatArray
+    substep: FloatArray
+    pedals_follow: FloatArray
+    engine_follows: FloatArray
     mass: FloatArray
     weight: FloatArray  # onto the road [N]
     body: FloatArray
     back: float | FloatArray  # g sin of the slope
-    slowed: float | FloatArray  # by it in a substep
-    standstill: float | FloatArray
+    slowed: FloatArray  # by it in a substep
+    standstill: FloatArray
     radius: FloatArray
+    pull_by_stiffness: FloatArray
     inertia: FloatArray
     damping: FloatArray
+    damped_inertia: FloatArray
     brake_torque: FloatArray
     motor_torque: FloatArray
     least_rpm: FloatArray
@@ -62,7 +76,8 @@ class _Prepared(NamedTuple):
     rolling_drag: FloatArray
     shift_time: FloatArray
     slip_limit: FloatArray
-    friction: float
+    traction_change: FloatArray
+    friction: FloatArray
 
 
 class LgsvlState(NamedTuple):
@@ -109,15 +124,18 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     steering_design_angle: Annotated[float, Meta(gt=0, lt=90)] = 39.4
 
     def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL) -> _Prepared:
-        c = characteristics
+        c, substep = characteristics, step / SUBSTEPS
+        inertia = WHEELS * 0.5 * c["wheelMass"] * c["radius"] * c["radius"]
+        damping = WHEELS * self.wheel_damping_share * c["wheelDamping"]
         prepared = _Prepared(
-            step=step, substep=step / SUBSTEPS, mass=c["mass"], weight=c["mass"] * slope.down, back=slope.back,
-            slowed=slope.back * (step / SUBSTEPS), standstill=STANDSTILL, body=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"],
-            radius=c["radius"], inertia=WHEELS * 0.5 * c["wheelMass"] * c["radius"] * c["radius"],
-            damping=WHEELS * self.wheel_damping_share * c["wheelDamping"], brake_torque=WHEELS * c["maxBrakeTorque"],
-            motor_torque=c["maxMotorTorque"], least_rpm=c["minRpm"], largest_rpm=c["maxRpm"],
-            steering=c["maxSteeringAngle"] * RADIANS, rolling_drag=c["tireDragCoeff"], shift_time=c["shiftTime"],
-            slip_limit=c["tractionControlSlipLimit"], friction=FRICTION * road_friction)
+            step=np.array(step), substep=np.array(substep), pedals_follow=np.array(step / (step + self.pedal_lag)),
+            engine_follows=np.array(RPM_RATE * substep / (1 + RPM_RATE * substep)), mass=c["mass"], weight=c["mass"] * slope.down,
+            body=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"], back=slope.back, slowed=np.asarray(slope.back * substep),
+            standstill=STANDSTILL, radius=c["radius"], pull_by_stiffness=substep * c["radius"], inertia=inertia, damping=damping,
+            damped_inertia=inertia + substep * damping, brake_torque=WHEELS * c["maxBrakeTorque"], motor_torque=c["maxMotorTorque"],
+            least_rpm=c["minRpm"], largest_rpm=c["maxRpm"], steering=c["maxSteeringAngle"] * RADIANS, rolling_drag=c["tireDragCoeff"],
+            shift_time=c["shiftTime"], slip_limit=c["tractionControlSlipLimit"], traction_change=np.array(TRACTION_RATE * substep),
+            friction=np.asarray(FRICTION * road_friction))
         creeps = _rim_at(prepared, np.zeros_like(prepared.mass), np.abs(prepared.body * prepared.back))
         return prepared._replace(standstill=STANDSTILL + creeps)
 
@@ -168,47 +186,48 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return seen, state
 
     def advance(self, prepared: _Prepared, state: LgsvlState, command: Command) -> LgsvlState:
-        follows = prepared.step / (prepared.step + self.pedal_lag)
-        state = state._replace(
-            throttle=state.throttle + (command.throttle - state.throttle) * follows,
-            brake=state.brake + (command.brake - state.brake) * follows)
-        state, cornering_drag = self._steer(prepared, state)
-        state = _shift(prepared, state)
-        gearing = _ratio(prepared, state) * FINAL_RATIO
+        p = prepared
+        lateral, heading, cornering_drag = self._steer(p, state)
+        state = _shifted(p, state)._replace(
+            throttle=state.throttle + (command.throttle - state.throttle) * p.pedals_follow,
+            brake=state.brake + (command.brake - state.brake) * p.pedals_follow, lateral=lateral, heading=heading)
+        gearing = _ratio(p, state) * FINAL_RATIO
         for _ in range(SUBSTEPS):
-            state = _roll(prepared, state, gearing, cornering_drag)
-        return state._replace(since_shift=state.since_shift + prepared.step)
+            state = _roll(p, state, gearing, cornering_drag)
+        return state._replace(since_shift=state.since_shift + p.step)
 
-    def _steer(self, p: _Prepared, s: LgsvlState) -> tuple[LgsvlState, FloatArray]:
-        """Lane keeping, a kinematic bicycle at small angles; returns the cornering drag too [N s/m].
+    def _steer(self, p: _Prepared, s: LgsvlState) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Lane keeping, a kinematic bicycle at small angles: lateral place, heading, and the cornering drag [N s/m].
 
         The lane keeping commands a share of the full angle that is right for the vehicle that it was made for.
         """
         share = -(LATERAL_GAIN * s.lateral + HEADING_GAIN * s.heading) / (self.steering_design_angle * RADIANS)
-        angle = np.minimum(np.maximum(share, -1.0), 1.0) * p.steering
+        angle = np.minimum(np.maximum(share, -ONE), ONE) * p.steering
         curvature = angle / WHEELBASE
         heading = s.heading + s.speed * curvature * p.step
-        lateral = s.lateral + s.speed * p.step * 0.5 * (s.heading + heading)
-        return s._replace(heading=heading, lateral=lateral), p.mass * np.abs(curvature * angle) * s.speed
+        lateral = s.lateral + s.speed * p.step * HALF * (s.heading + heading)
+        return lateral, heading, p.mass * np.abs(curvature * angle) * s.speed
 
 
-def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
+def _shifted(p: _Prepared, s: LgsvlState) -> LgsvlState:
     """Automatic gearbox by engine speed; during shiftTime the ratio goes over from the old one to the new."""
     share = s.engine_rpm / p.largest_rpm
     free = s.since_shift >= SHIFT_DELAY
-    up = free & (share > SHIFT_UP) & (s.gear < len(GEAR_RATIOS))
-    down = free & (share < SHIFT_DOWN) & (s.gear > 1)
+    up = free & (share > SHIFT_UP) & (s.gear < LAST)
+    down = free & (share < SHIFT_DOWN) & (s.gear > FIRST)
     changes = up | down
+    if not np.count_nonzero(changes):
+        return s
     gear = s.gear + up - down
     return s._replace(
         gear=gear, old_ratio=np.where(changes, _ratio(p, s), s.old_ratio),
         new_ratio=np.where(changes, GEAR_RATIOS[gear.astype(np.intp) - 1], s.new_ratio),
-        since_shift=np.where(changes, 0.0, s.since_shift))
+        since_shift=np.where(changes, NOTHING, s.since_shift))
 
 
 def _ratio(p: _Prepared, s: LgsvlState) -> FloatArray:
     """The gear ratio in use."""
-    return np.asarray(s.old_ratio + (s.new_ratio - s.old_ratio) * np.minimum(s.since_shift / p.shift_time, 1.0))
+    return np.asarray(s.old_ratio + (s.new_ratio - s.old_ratio) * np.minimum(s.since_shift / p.shift_time, ONE))
 
 
 def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: FloatArray) -> LgsvlState:
@@ -217,31 +236,33 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
     I dw/dt = T_drive - T_brake - d w - r K (r w - v)
     m dv/dt = K (r w - v) - (D_air v + D_tyre + D_corner) v - m g sin
     """
-    h, r = p.substep, p.radius
+    h = p.substep
     wanted = p.least_rpm + s.wheel_speed * gearing * RPM
-    engine_rpm = s.engine_rpm + (wanted - s.engine_rpm) * (RPM_RATE * h / (1 + RPM_RATE * h))
+    engine_rpm = s.engine_rpm + (wanted - s.engine_rpm) * p.engine_follows
     drive = _torque_share(engine_rpm / p.largest_rpm) * gearing * s.traction_torque * s.throttle
 
-    rim = r * s.wheel_speed
+    rim = p.radius * s.wheel_speed
     slipping = rim - s.speed
-    spins = slipping > p.slip_limit * np.maximum(rim, 1e-3)
-    traction = s.traction_torque + np.where(spins, -TRACTION_RATE * h, TRACTION_RATE * h)
+    spins = slipping > p.slip_limit * np.maximum(rim, LEAST_RIM)
+    traction = s.traction_torque + np.where(spins, -p.traction_change, p.traction_change)
 
     stiffness = _tyre_stiffness(p, s.speed, rim, slipping)
-    pull = h * r * stiffness
+    pull = p.pull_by_stiffness * stiffness
     body = p.body + h * (stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag)
     moving = s.speed - p.slowed
     push = p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body * moving / body
-    wheel_speed = np.maximum(push, 0.0) / (p.inertia + h * p.damping + pull * r - pull * pull / body)
-    speed = np.maximum((p.body * moving + pull * wheel_speed) / body, 0.0)
-    return s._replace(
-        speed=np.where((wheel_speed <= 0) & (speed < p.standstill), 0.0, speed), wheel_speed=wheel_speed, engine_rpm=engine_rpm,
-        traction_torque=np.minimum(np.maximum(traction, 0.0), p.motor_torque))
+    wheel_speed = np.maximum(push, NOTHING) / (p.damped_inertia + pull * p.radius - pull * pull / body)
+    speed = np.maximum((p.body * moving + pull * wheel_speed) / body, NOTHING)
+    speed[(wheel_speed <= NOTHING) & (speed < p.standstill)] = NOTHING
+    return s._replace(speed=speed, wheel_speed=wheel_speed, engine_rpm=engine_rpm,
+                      traction_torque=np.minimum(np.maximum(traction, NOTHING), p.motor_torque))
 
 
 def _torque_share(share: FloatArray) -> FloatArray:
     """Engine torque over the largest one, at a share of maxRpm: a parabola, zero above the end (assumption)."""
-    return np.where(share < 1, 0.4 + 2.4 * share * (1 - share), 0.0)
+    torque = TORQUE_IDLE + TORQUE_BEND * share * (ONE - share)
+    torque[share >= ONE] = NOTHING
+    return torque
 
 
 def _rim_at(p: _Prepared, speed: FloatArray, force: FloatArray) -> FloatArray:
@@ -257,8 +278,8 @@ def _tyre_stiffness(p: _Prepared, speed: FloatArray, rim: FloatArray, slipping: 
     """Force per speed of slipping [N s/m] of Unity's WheelCollider: a parabola to the extremum, then down to the asymptote."""
     denominator = np.maximum(np.maximum(speed, rim), SLIP_FLOOR)
     slip = np.abs(slipping) / denominator
-    rising = (2 - slip / PEAK_SLIP) / PEAK_SLIP
-    beyond = np.minimum((slip - PEAK_SLIP) / (SLIDING_SLIP - PEAK_SLIP), 1.0)
-    falling = (1 - (1 - SLIDING_FRICTION) * beyond) / np.maximum(slip, PEAK_SLIP)
+    rising = (TWO - slip / PEAK_SLIP) / PEAK_SLIP
+    beyond = np.minimum((slip - PEAK_SLIP) / SLIPS_BEYOND, ONE)
+    falling = (ONE - FRICTION_LOST * beyond) / np.maximum(slip, PEAK_SLIP)
     load = p.weight + DOWNFORCE * speed * speed
     return np.asarray(p.friction * load * np.where(slip < PEAK_SLIP, rising, falling) / denominator)

@@ -44,7 +44,7 @@ def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_
         one = np.ones(1)
         state = vehicle.at_rest(p)._replace(gear=gear * one, target_gear=gear * one, since_shift=since * one, throttle=one,
                                             engine_speed=share * limit * one)
-        return float(_shift(p, state).target_gear[0])
+        return float(_shift(p, state, state.throttle)[1][0])
 
     assert [target(1, 0.649), target(1, 0.651), target(1, 0.651, 1.9)] == [1, 2, 1]
     assert [target(2, 0.501), target(2, 0.499), target(2, 0.499, 1.9), target(1, 0.1), target(4, 0.9)] == [2, 1, 2, 1, 4]
@@ -56,7 +56,7 @@ def test_carlas_engine_pulls_nothing_beyond_its_limit_and_its_curve_has_its_poin
 
     def torque(rpm: float) -> float:
         state = vehicle.at_rest(p)._replace(engine_speed=np.full(1, rpm / 5800 * limit))
-        return float(vehicle._torque(p, state)[0]) / vehicle.engine_torque
+        return float(vehicle._torque(p, state.engine_speed)[0]) / vehicle.engine_torque
 
     assert [torque(rpm) for rpm in (0, 945, 1890, 3810, 5730)] == pytest.approx([400, 450, 500, 450, 400])
     assert torque(5801) == 0
