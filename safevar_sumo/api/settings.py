@@ -101,8 +101,7 @@ def _numbers(settings: Any) -> FloatArray:
 
 
 def _check(asked: FloatArray, characteristics: CharacteristicSet, beyond: bool) -> None:
-    lower, upper = characteristics.lower, characteristics.upper
-    legal = np.isfinite(asked) & ((asked > 0) | (lower <= 0)) if beyond else (asked >= lower) & (asked <= upper)
+    legal = np.column_stack([one.is_legal(values, beyond=beyond) for one, values in zip(characteristics, asked.T, strict=True)])
     for row, column in np.argwhere(~legal)[:1]:
         characteristics.members[column].check(float(asked[row, column]), f"settings, row {row}", beyond=beyond)
 

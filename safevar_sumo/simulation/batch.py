@@ -16,13 +16,14 @@ from safevar_sumo.simulation.staging import staged
 from safevar_sumo.simulation.sumo import Engine, world_on
 from safevar_sumo.simulation.system import System
 from safevar_sumo.simulation.world import SumoWorld
-from safevar_sumo.vehicles import Slope, at_start, slope_of
+from safevar_sumo.vehicles import CharacteristicSet, Slope, at_start, slope_of
 
 SURE_BRAKES = 9.0
 """SUMO puts nobody onto the road who might not stop before what is ahead; there everybody brakes so hard at least [m/s^2]."""
 Watcher = Callable[[SumoWorld], None]
 
 
+@np.errstate(all="ignore")
 def score(system: System, settings: FloatArray, run: Drives) -> Evaluations:
     """Metrics and objectives of simulated settings."""
     return Evaluations(
@@ -59,6 +60,7 @@ def step_options(system: System) -> tuple[str, ...]:
     return () if system.step_length is None else ("--step-length", repr(system.step_length))
 
 
+@np.errstate(all="ignore")
 def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher | None = None) -> Drives:
     """Drive the vehicles of an open world that nobody has stepped yet; see `drive_all`.
 
@@ -95,17 +97,21 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
         if watch is None:
             world.leave(verdict.ended)
         state = vehicle.advance(prepared, state, command)
-        _refuse_no_number(state.speed, settings, system.characteristics.names)
+        _refuse_no_number(state.speed, settings, system.characteristics)
         world.advance(np.where(verdict.open, state.speed, 0.0))
     trace = log.trace(sample + 1, step, length)
     return Drives(trace=trace, encounter=parts.encounter(trace), outcome=verdict.outcome(), collision_speed=verdict.collision_speed)
 
 
-def _refuse_no_number(speed: FloatArray, settings: FloatArray, names: Sequence[str]) -> None:
-    """SUMO takes a speed that is no number for 0: a vehicle whose physics have broken down would pass for a careful one."""
+def _refuse_no_number(speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet) -> None:
+    """SUMO takes a speed that is no number for 0: a vehicle whose physics have broken down would pass for a careful one.
+
+    It stands for numpy's warnings of overflows, which tell neither characteristic nor value.
+    """
     if np.count_nonzero(np.isfinite(speed)) < len(speed):
         copy = np.flatnonzero(~np.isfinite(speed))[0]
-        values = ", ".join(f"{name} = {value:g}" for name, value in zip(names, settings[copy], strict=True))
+        values = ", ".join(f"{one.name} = {value:g}" for one, value in zip(characteristics, settings[copy], strict=True)
+                           if value != one.original) or "the original's values"
         raise InputError("vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with")
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import CharacteristicTable
 
+FARTHEST = 1000.0
+"""By so much no value is farther from 0 than its domain: what lies beyond is a slip, and no physics hold there."""
 # beta of method section 2, by the least width of the domain that it holds for.
 FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
 
@@ -34,22 +36,32 @@ class Characteristic:
         width = self.upper - self.lower
         return next(share for least, share in FILTER_SHARES if width >= least) * width
 
+    @property
+    def farthest(self) -> float:
+        """Largest magnitude that is taken when values beyond the domain are asked for."""
+        return FARTHEST * max(abs(self.lower), abs(self.upper))
+
     def check(self, value: float, source: object, *, beyond: bool = False) -> None:
-        """Refuse a value outside the domain, or with `beyond` only what is no finite number or has lost the domain's sign.
+        """Refuse a value outside the domain, or with `beyond` only what means nothing (`is_legal`).
 
         Raises
         ------
         InputError
-            If the value is not in [lower, upper], not a number, or not above 0 where the whole domain is.
+            Naming the value and what is legal.
         """
-        if not (self.can_be(value) if beyond else self.lower <= value <= self.upper):
+        if not self.is_legal(value, beyond=beyond):
             above = " above 0" if self.lower > 0 else ""
-            legal = f"a finite number{above}" if beyond else f"a number in [{self.lower:g}, {self.upper:g}] {self.unit}"
-            raise InputError(source, f"{self.name} = {value}", legal)
+            farther, within = f"a finite number{above}, up to {self.farthest:g}", f"a number in [{self.lower:g}, {self.upper:g}]"
+            raise InputError(source, f"{self.name} = {value}", f"{farther if beyond else within} {self.unit}")
 
-    def can_be(self, value: float) -> bool:
-        """Whether a value means anything: finite, and above 0 if the whole domain is (nothing has a mass of -5 kg)."""
-        return math.isfinite(value) and (value > 0 or self.lower <= 0)
+    def is_legal(self, values: Any, *, beyond: bool = False) -> Any:
+        """Whether values, a number or an array, are in the domain; with `beyond`, whether they mean anything.
+
+        That is not a thousand times as far as the domain, and above 0 if that is (nothing has a mass of -5 kg).
+        """
+        if beyond:
+            return (np.abs(values) <= self.farthest) & ((values > 0) | (self.lower <= 0))
+        return (values >= self.lower) & (values <= self.upper)
 
 
 @dataclass(frozen=True)

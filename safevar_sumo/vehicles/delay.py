@@ -4,11 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
+
+LONGEST = 3600.0
+"""[s]"""
 
 
 def history(longest: float, step: float, sample: FloatArray) -> FloatArray:
-    """Room for delays up to `longest` seconds, filled with a first sample of shape (..., N); newest first."""
+    """Room for delays up to `longest` seconds, filled with a first sample of shape (..., N); newest first.
+
+    Raises
+    ------
+    InputError
+        If nobody simulates that long.
+    """
+    if not longest <= LONGEST:
+        raise InputError("vehicle", f"one of its delays is {longest:g} s", f"up to {LONGEST:g} s")
     length = int(longest / step) + 2
     return np.repeat(sample[np.newaxis], length, axis=0)
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 from importlib.metadata import version
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pandas as pd
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.simulation import assemble, simulate
 from safevar_sumo.study import load_study, tables_of
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -92,17 +95,31 @@ def test_values_beyond_the_domain_need_to_be_asked_for() -> None:
         sv.simulate("sun", {"tireFric": np.inf}, beyond=True)
 
 
-@pytest.mark.parametrize("value", [0.0, -5.0])
+@pytest.mark.parametrize("value", [0.0, -5.0, 1e300])
 def test_what_no_vehicle_can_have_is_not_beyond_the_domain_but_refused(value: float) -> None:
-    with pytest.raises(sv.InputError, match=r"mass = .*\nlegal: a finite number above 0"):
+    with pytest.raises(sv.InputError, match=r"mass = .*\nlegal: a finite number above 0, up to 2.7e\+06 kg"):
         sv.simulate("sun", {"mass": value}, beyond=True)
     with pytest.raises(sv.InputError, match=r"mass = .*\nlegal: a finite number above 0"):
         sv.evaluate("sun", pd.DataFrame({"mass": [2500.0, value]}), beyond=True)
 
 
 def test_physics_that_break_down_are_told_and_do_not_pass_for_a_vehicle_that_stands() -> None:
-    with pytest.raises(sv.InputError, match=r"vehicle: its speed is nan with .*radius = 1e\+300"), np.errstate(all="ignore"):
-        sv.simulate("smoke", {"radius": 1e300}, beyond=True)
+    system = assemble(sv.load_study("smoke"))
+    settings = system.characteristics.original[np.newaxis].copy()
+    settings[0, system.characteristics.names.index("radius")] = 1e200
+    with warnings.catch_warnings(action="error"), pytest.raises(sv.InputError, match=r"vehicle: its speed is nan with radius = 1e\+200\n"):
+        simulate(system, settings)
+
+
+def test_a_delay_that_nobody_simulates_is_refused_before_memory_is_out() -> None:
+    with pytest.raises(sv.InputError, match=r"delays is 1e\+12 s\nlegal: up to 3600 s"):
+        sv.simulate(wide("native", "reactionTime"), {"reactionTime": 1e12})
+
+
+def wide(study: str, characteristic: str) -> sv.Study:
+    """The study with a domain without a sensible end."""
+    row = msgspec.to_builtins(sv.load_study(study).vehicle.characteristics[characteristic])
+    return sv.load_study(study, vehicle={"characteristics": {characteristic: {**row, "upper": 1e12}}})
 
 
 def test_evaluate_is_simulate_row_by_row() -> None:
