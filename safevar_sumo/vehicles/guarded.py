@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.plugins import Contract, Guard, lent, takes
 from safevar_sumo.records import Command, FloatArray, Observation
@@ -14,6 +16,7 @@ from safevar_sumo.vehicles.slope import LEVEL, Slope
 VEHICLE_CONTRACT = Contract.of(Vehicle, "a vehicle", optional=("at_speed",))
 FASTEST = 1000.0
 """No vehicle is faster [m/s]; what is has diverged."""
+ROUNDING = 1e-9
 _BOUNDS = {"speed": (0.0, FASTEST), "throttle": (0.0, 1.0), "brake": (0.0, 1.0)}
 
 
@@ -24,6 +27,7 @@ NOWHERE = ("gap", "lateral")
 class _Prepared(NamedTuple):
     n: int
     theirs: Any
+    types: SumoType
 
 
 class _State(NamedTuple):
@@ -54,13 +58,14 @@ class GuardedVehicle:
             problem = f"{self._guard.name} has no slope in prepare(characteristics, road_friction, step, slope), and the road has a grade"
             raise ForeignError(self._guard.source, problem, "a vehicle with it, or scenarios with grade 0")
         given = (lent(characteristics), road_friction, step, *([] if slope is LEVEL else [lent(slope)]))
-        return _Prepared(n, self._guard.call("prepare", method, *given))
+        theirs = self._guard.call("prepare", method, *given)
+        types = self._guard.call("sumo_type", self._vehicle.sumo_type, theirs)
+        return _Prepared(n, theirs, SumoType(*(
+            self._guard.numbers("sumo_type", name, self._guard.field("sumo_type", types, name), (n,), 0.0, above=True)
+            for name in SumoType._fields)))
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
-        given = self._guard.call("sumo_type", self._vehicle.sumo_type, prepared.theirs)
-        return SumoType(*(
-            self._guard.numbers("sumo_type", name, self._guard.field("sumo_type", given, name), (prepared.n,), 0.0, above=True)
-            for name in SumoType._fields))
+        return prepared.types
 
     def at_rest(self, prepared: _Prepared) -> _State:
         state = self._state("at_rest", prepared.n, self._guard.call("at_rest", self._vehicle.at_rest, prepared.theirs))
@@ -86,7 +91,14 @@ class GuardedVehicle:
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
         given = self._guard.call("advance", self._vehicle.advance, prepared.theirs, state.theirs, lent(command))
-        return self._state("advance", prepared.n, given)
+        state = self._state("advance", prepared.n, given)
+        self._refuse_faster(state.speed, prepared.types.max_speed)
+        return state
+
+    def _refuse_faster(self, speed: FloatArray, most: FloatArray) -> None:
+        """Refuse speeds above what the SUMO type allows: SUMO, which we tell the speed, lets them pass."""
+        for faster in np.flatnonzero(speed > most * (1 + ROUNDING))[:1]:
+            raise self._guard.wrong("advance", "speed", float(speed[faster]), f"up to max_speed = {most[faster]:g} of its sumo_type")
 
     def _state(self, method: str, n: int, theirs: Any) -> _State:
         read = {name: self._guard.numbers(method, name, self._guard.field(method, theirs, name), (n,), *_BOUNDS.get(name, ()))

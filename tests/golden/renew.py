@@ -18,7 +18,7 @@ from safevar_sumo.results import ResultsDirectory, load
 from safevar_sumo.simulation import assemble
 from safevar_sumo.study import Study, load_study
 
-STUDIES = ("sun", "rain", "lgsvl", "native")
+STUDIES = ("sun", "rain", "lgsvl", "native", "smoke")
 FILE = Path(__file__).with_name("golden.json")
 
 
