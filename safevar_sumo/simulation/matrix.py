@@ -15,7 +15,7 @@ from safevar_sumo.scenarios import Point
 from safevar_sumo.simulation.batch import Watcher, drive_all, score
 from safevar_sumo.simulation.network import empty_fingerprint
 from safevar_sumo.simulation.staging import staged
-from safevar_sumo.simulation.sumo import Engine
+from safevar_sumo.simulation.sumo import Engine, standing_network
 from safevar_sumo.simulation.system import System
 
 LARGEST_WORLD = 600
@@ -122,11 +122,13 @@ def named_point(system: System, name: str, source: object) -> System:
 
 
 def _together(points: Sequence[Point], most: int) -> Iterator[tuple[Point, ...]]:
-    """Points that share a network, as many as one simulation may have."""
+    """Points that share a network, as many as one simulation may have; first those on the network that is loaded already."""
     groups: dict[str, list[Point]] = {}
     for point in points:
         groups.setdefault(empty_fingerprint(staged(point.scenario)), []).append(point)
-    for group in groups.values():
+    standing = standing_network()
+    for network in sorted(groups, key=lambda one: one != standing):
+        group = groups[network]
         for start in range(0, len(group), most):
             yield tuple(group[start:start + most])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -23,7 +23,10 @@ class Parts:
         self._points, self._step = points, world.step_length
         self._rows = [slice(k * size, (k + 1) * size) for k in range(len(points))]
         self._worlds = [world] if len(points) == 1 else [world.part(rows.start, size) for rows in self._rows]
-        self._perceptions = [Perception(point.weather, self._step) for point in points]
+        weathers = [point.weather for point in points]
+        self._perceptions = [(Perception(weather, self._step), np.repeat([one == weather for one in weathers], size).nonzero()[0])
+                             for k, weather in enumerate(weathers) if weather not in weathers[:k]]
+        self._order = np.argsort(np.concatenate([rows for _, rows in self._perceptions]))
         self._memories = [point.scenario.begin(part) for point, part in zip(points, self._worlds, strict=True)]
         self.last = np.repeat([round(point.scenario.duration / self._step) for point in points], size)
 
@@ -33,16 +36,16 @@ class Parts:
         for k, (point, world) in enumerate(zip(self._points, self._worlds, strict=True)):
             scene, self._memories[k] = point.scenario.observe(world, self._step, self._memories[k])
             scenes.append(scene)
-        return scenes[0] if len(scenes) == 1 else _joined(scenes, self._size)
+        return scenes[0] if len(scenes) == 1 else _joined(scenes, [self._size] * len(scenes))
 
     def seen(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
         """What all vehicles see of it."""
-        if len(self._points) == 1:
-            return self._perceptions[0].observe(time, speed, scene)
-        observations = [
-            perception.observe(time, speed[rows], Scene._make(values[rows] for values in scene))
-            for perception, rows in zip(self._perceptions, self._rows, strict=True)]
-        return _joined(observations, self._size)._replace(time=time)
+        if len(self._perceptions) == 1:
+            return self._perceptions[0][0].observe(time, speed, scene)
+        observations = [perception.observe(time, speed[rows], Scene._make(values[rows] if values.ndim else values for values in scene))
+                        for perception, rows in self._perceptions]
+        joined = _joined(observations, [len(rows) for _, rows in self._perceptions])
+        return Observation._make(np.asarray(values)[self._order] if np.ndim(values) else values for values in joined)
 
     def encounter(self, trace: Trace) -> Encounter:
         """The geometry that the metrics are computed from."""
@@ -52,7 +55,12 @@ class Parts:
         return Encounter(*(np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True)))
 
 
-def _joined(records: Sequence[R], size: int) -> R:
-    """Records of arrays of shape (size,), or of what stands for one, as a record of longer arrays."""
-    columns = [[np.broadcast_to(values, (size,)) for values in column] for column in zip(*records, strict=True)]
-    return type(records[0])._make(map(np.concatenate, columns))
+def _joined(records: Sequence[R], sizes: Sequence[int]) -> R:
+    """Records of arrays of shape (size,), or of what stands for one, as a record of longer arrays, or of what stands for all."""
+    return type(records[0])._make(_concatenated(column, sizes) for column in zip(*records, strict=True))
+
+
+def _concatenated(parts: Sequence[Any], sizes: Sequence[int]) -> Any:
+    if np.ndim(parts[0]) == 0 and all(one is parts[0] for one in parts):
+        return parts[0]
+    return np.concatenate([one if np.ndim(one) else np.full(size, one) for one, size in zip(parts, sizes, strict=True)])

@@ -35,6 +35,11 @@ class StandingSumo:
         self._ways: set[str] = set()
         self._batches = 0
 
+    @property
+    def network(self) -> str:
+        """The network's fingerprint."""
+        return self._loaded[0]
+
     def serves(self, wanted: tuple[str, ...], n: int) -> bool:
         """Whether the next batch, of `n` settings, may be driven here."""
         return self._batches < BATCHES_PER_LOADING and n <= self._copies and wanted == self._loaded

@@ -18,7 +18,7 @@ from typing import Any
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
 from safevar_sumo.simulation.network import CopiedNetwork, copied_network, empty_fingerprint, empty_network, round_up
 from safevar_sumo.simulation.standing import StandingSumo
-from safevar_sumo.simulation.traffic import Traffic, repeatable_traffic
+from safevar_sumo.simulation.traffic import Traffic, common_checks, repeatable_traffic
 from safevar_sumo.simulation.world import SumoWorld
 
 CONNECTION_ATTEMPTS = 15
@@ -48,8 +48,9 @@ def world_on(folder: str, n: int, engine: Engine = Engine.LIBSUMO, options: Sequ
     folders = (folder, *others)
     traffic = [repeatable_traffic(one, options) if engine is Engine.LIBSUMO else None for one in folders]
     expected = [one for one in traffic if one is not None]
-    if len(expected) == len(folders):
-        with _standing_world(folder, [one for one in expected for _ in range(n)], options) as world:
+    checks = common_checks(expected)
+    if len(expected) == len(folders) and checks is not None:
+        with _standing_world(folder, [one for one in expected for _ in range(n)], (*options, "--insertion-checks", checks)) as world:
             yield world
     else:
         with open_world(copied_network(folder, n, *others), n * len(folders), engine, options) as world:
@@ -91,6 +92,11 @@ def _standing_world(folder: str, traffic: Sequence[Traffic], options: Sequence[s
         if isinstance(error, (api.TraCIException, api.FatalTraCIError)):
             raise _failure(error) from None
         raise
+
+
+def standing_network() -> str | None:
+    """What the network is like that this process has open: its `empty_fingerprint`."""
+    return None if _standing is None else _standing.network
 
 
 def _failure(error: Exception) -> SimulationError:

@@ -19,7 +19,7 @@ _TYPE = frozenset({
     "id", "vClass", "length", "width", "height", "minGap", "maxSpeed", "accel", "decel", "emergencyDecel", "tau", "mass", "sigma",
     "speedDev", "speedFactor", "color", "guiShape"})
 _PLACES = frozenset({"departLane", "departPos", "departSpeed", "arrivalLane", "arrivalPos", "arrivalSpeed"})
-_VEHICLE = _PLACES | {"id", "type", "route", "depart", "departPosLat", "color"}
+_VEHICLE = _PLACES | {"id", "type", "route", "depart", "departPosLat", "insertionChecks", "color"}
 _PERSON = frozenset({"id", "type", "depart", "departPos", "color"})
 _ROUTE = frozenset({"id", "edges"})
 _STOP = frozenset({"lane", "startPos", "endPos", "duration", "parking"})
@@ -33,6 +33,10 @@ _TIMED_ROADS = re.compile(rb"<tlLogic|type=\"rail_")
 _TRUTH = {"true": True, "false": False, "1": True, "0": False}
 LEAST_STOP = 0.2
 """Length of a stop of which the traffic file gives the end alone [m]; SUMO, `SUMOVehicleParserHelper`, 2 POSITION_EPS."""
+
+
+CHECKED = "all"
+"""SUMO's insertion checks, unless a vehicle asks for others."""
 
 
 class Stop(NamedTuple):
@@ -49,7 +53,7 @@ class Stop(NamedTuple):
 class Car(NamedTuple):
     """A vehicle of any kind; it departs at once, where and how fast the SUMO attributes in `places` say.
 
-    `left` is how far it stands to the left of its lane's middle [m].
+    `left` is how far it stands to the left of its lane's middle [m], `checks` which of SUMO's insertion checks it has to pass.
     """
 
     name: str
@@ -57,6 +61,7 @@ class Car(NamedTuple):
     edges: tuple[str, ...]
     places: dict[str, str]
     left: float
+    checks: str
     stops: tuple[Stop, ...]
 
 
@@ -91,6 +96,12 @@ def repeatable_traffic(folder: str, options: Sequence[str] = ()) -> Traffic | No
     if _timed(files.network) or not all(_OPTIONS.fullmatch(name.removeprefix("--")) for name in options[::2]):
         return None
     return _read((files.options.parent / TRAFFIC).read_bytes(), files.options.read_bytes())
+
+
+def common_checks(traffic: Sequence[Traffic]) -> str | None:
+    """The insertion checks of all cars, or nothing where they differ: of a car that is added SUMO takes them from an option."""
+    checks = {actor.checks for actors in traffic for actor in actors if isinstance(actor, Car)} or {CHECKED}
+    return checks.pop() if len(checks) == 1 else None
 
 
 @cache
@@ -135,9 +146,11 @@ def _car(element: ElementTree.Element, routes: dict[str | None, ElementTree.Elem
     route = inside[0] if inside else routes[element.attrib["route"]]
     _known(route, _ROUTE)
     places = {name: value for name, value in element.attrib.items() if name in _PLACES}
+    checks = element.get("insertionChecks", CHECKED)
+    _demand(checks in (CHECKED, "none"))
     _demand(float(element.attrib["depart"]) == 0 and not any(value.startswith("random") for value in places.values()))
     return Car(element.attrib["id"], element.attrib["type"], tuple(route.attrib["edges"].split()), places,
-               float(element.get("departPosLat", 0)), tuple(_stop(stop) for stop in element.findall("stop")))
+               float(element.get("departPosLat", 0)), checks, tuple(_stop(stop) for stop in element.findall("stop")))
 
 
 def _stop(element: ElementTree.Element) -> Stop:
