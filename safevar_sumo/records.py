@@ -104,7 +104,7 @@ class Trace:
     """T samples of N vehicles, `step` seconds apart; arrays of shape (T, N), `time` (T,).
 
     A vehicle's samples count while `active`; later ones are whatever SUMO did with the rest of the batch.
-    `vehicle_length`, `position`, `gap` and `lateral` in m, speeds in m/s, `throttle` and `brake` as commanded;
+    `vehicle_length`, `position` along the way, `gap` and `lateral` in m, speeds in m/s, `throttle` and `brake` as commanded;
     `obstacle_speed` is the obstacle's along the vehicle's way.
     """
 

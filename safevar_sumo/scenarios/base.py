@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, Protocol
 
 from msgspec import Meta
@@ -15,6 +16,8 @@ VUT = "vut"
 STEEPEST = 30.0
 """Of a road [%]."""
 Grade = Annotated[float, Meta(ge=-STEEPEST, le=STEEPEST)]
+BEND = 0.05
+"""So far the middle of a lane that counts as straight may stray [m]."""
 Coordinates = tuple[float, float]
 Actors = Mapping[str, Mapping[str, str] | None]
 """Changes to a network's traffic file: attributes to set, or None to leave it out, by the XPath of an element below its root."""
@@ -27,12 +30,31 @@ class Lane(NamedTuple):
     end: Coordinates
 
 
+class BentLane(Lane):
+    """A lane that is not straight: its id, and how far its middle line strays from the straight between its ends [m]."""
+
+    name: str
+    bend: float
+
+
+def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
+    """The lane whose middle line goes through these points [m]."""
+    (x, y), (to_x, to_y) = points[0], points[-1]
+    length = math.hypot(to_x - x, to_y - y)
+    strays = [abs((to_x - x) * (at_y - y) - (to_y - y) * (at_x - x)) / length if length else math.hypot(at_x - x, at_y - y)
+              for at_x, at_y in points]
+    if max(strays) <= BEND:
+        return Lane(points[0], points[-1])
+    bent = BentLane(points[0], points[-1])
+    bent.name, bent.bend = name, max(strays)
+    return bent
+
+
 class Roads(Protocol):
     """A network without anybody on it."""
 
     def lane(self, lane: str) -> Lane:
         """A lane by its id."""
-
 
 
 class World(Protocol):
@@ -55,6 +77,9 @@ class World(Protocol):
 
     def lane(self, lane: str) -> Lane:
         """A lane by its id, the same in all copies."""
+
+    def lane_of(self, vehicle: str) -> Lane:
+        """The lane that a vehicle is on, the same in all copies."""
 
     def person_width(self, actor: str) -> float:
         """Width of a person [m]."""

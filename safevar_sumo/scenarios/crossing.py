@@ -11,7 +11,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import VUT, Actors, Grade, Roads, Scene, World
 from safevar_sumo.scenarios.euro_ncap import BODIES, KMH, VUT_LENGTH, VUT_WIDTH, Range, Walk, beside, lateral_of
-from safevar_sumo.scenarios.frame import Frame
+from safevar_sumo.scenarios.frame import SKEW, Frame
 from safevar_sumo.scenarios.pre_crash import PreCrash
 
 PEDESTRIAN = "pedestrian"
@@ -123,6 +123,10 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """The vehicle `time_to_impact` before the pedestrian's path, the pedestrian beside it, and the parked cars or none."""
         frame, walks_on = Frame.of(roads.lane(APPROACH)), WAYS[self._of("side")]
         path, _ = frame.place_of(roads.lane(CROSSING).start)
+        leaves, _ = frame.place_of(roads.lane(CROSSING).end)
+        if abs(leaves - path) > SKEW:
+            raise InputError("scenario.parameters.network", f"the crossing {CROSSING!r} leads {leaves - path:.2f} m along the road",
+                             "a crossing at right angles")
         body = BODIES[self._of("target")]
         front = path - body.width / 2 - self.speed * KMH * self.time_to_impact
         if front - self.vut_length < 0:

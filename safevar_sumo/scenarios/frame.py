@@ -5,8 +5,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
-from safevar_sumo.scenarios.base import Coordinates, Lane
+from safevar_sumo.scenarios.base import BentLane, Coordinates, Lane
+
+SKEW = 0.05
+"""So far a crossing at right angles may lead along the road [m]."""
 
 
 class Frame(NamedTuple):
@@ -17,10 +21,24 @@ class Frame(NamedTuple):
 
     @classmethod
     def of(cls, lane: Lane) -> Frame:
-        """The frame of a lane, from its first point to its last."""
+        """The frame of a lane, from its first point to its last.
+
+        Raises
+        ------
+        InputError
+            If it is not straight.
+        """
         (x, y), (to_x, to_y) = lane.start, lane.end
+        if isinstance(lane, BentLane):
+            raise InputError("scenario.parameters.network", f"lane {lane.name!r} strays {lane.bend:.2f} m from the straight",
+                             "a straight lane")
         length = math.sqrt((to_x - x) * (to_x - x) + (to_y - y) * (to_y - y))
         return cls(lane.start, ((to_x - x) / length, (to_y - y) / length))
+
+    @classmethod
+    def through_origin(cls, lane: Lane) -> Frame:
+        """The frame of the network's coordinates turned the way that a lane leads: to the bit the same where it leads east."""
+        return cls((0.0, 0.0), cls.of(lane).direction)
 
     def along(self, positions: FloatArray) -> FloatArray:
         """Distance along the lane [m], shape (N,), of positions of shape (N, 2)."""

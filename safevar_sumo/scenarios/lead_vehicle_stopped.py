@@ -9,14 +9,16 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import VUT, Grade, Scene, World
+from safevar_sumo.scenarios.frame import Frame
 from safevar_sumo.scenarios.pre_crash import PreCrash
 
 PARKED = "parked_ahead"
 
 
 class _Memory(NamedTuple):
-    """Rear bumper of the parked vehicle [m] and arrays that never change; shape (N,)."""
+    """The way ahead, rear bumper of the parked vehicle along it [m] and arrays that never change; shape (N,)."""
 
+    frame: Frame
     rear: FloatArray
     nothing: FloatArray
 
@@ -42,11 +44,12 @@ class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_field
     pre_crash = PreCrash.LEAD_STOPPED
 
     def begin(self, world: World) -> _Memory:
-        rear = world.vehicle_positions(PARKED)[:, 0] - world.vehicle_length(PARKED)
-        return _Memory(rear, np.zeros_like(rear))
+        frame = Frame.through_origin(world.lane_of(VUT))
+        rear = frame.along(world.vehicle_positions(PARKED)) - world.vehicle_length(PARKED)
+        return _Memory(frame, rear, np.zeros_like(rear))
 
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
-        gap = memory.rear - world.vehicle_positions(VUT)[:, 0]
+        gap = memory.rear - memory.frame.along(world.vehicle_positions(VUT))
         return Scene(gap, memory.nothing, memory.nothing, memory.nothing > 0), memory
 
     def encounter(self, trace: Trace) -> Encounter:

@@ -7,8 +7,10 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import VUT, Grade, Scene, World
+from safevar_sumo.scenarios.frame import SKEW, Frame
 from safevar_sumo.scenarios.pre_crash import PreCrash
 
 Positive = Annotated[float, Meta(gt=0, le=3600)]
@@ -17,8 +19,9 @@ CROSSING_LANE = ":crossing_c0_0"
 
 
 class _Memory(NamedTuple):
-    """Where the paths cross, what lies behind it, the pedestrian's last place [m]; whether it has turned round."""
+    """The way ahead, where the paths cross, what lies behind it, the pedestrian's last place [m]; whether it has turned round."""
 
+    frame: Frame
     conflict_point: float
     clear_point: float
     place: FloatArray
@@ -52,19 +55,27 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
     pre_crash = PreCrash.PEDESTRIAN_AFTER_MANOEUVRE
 
     def begin(self, world: World) -> _Memory:
-        lateral = world.person_positions(PEDESTRIAN)[:, 1] - world.vehicle_positions(VUT)[:, 1]
-        path, half_width = world.lane_start(CROSSING_LANE)[0], world.person_width(PEDESTRIAN) / 2
-        return _Memory(path - half_width, path + half_width + world.vehicle_length(VUT), lateral, turned=False)
+        frame, crossing = Frame.through_origin(world.lane_of(VUT)), world.lane(CROSSING_LANE)
+        (path, _), (leaves, _) = frame.place_of(crossing.start), frame.place_of(crossing.end)
+        if abs(leaves - path) > SKEW:
+            raise InputError("scenario.parameters.network", f"the crossing {CROSSING_LANE!r} leads {leaves - path:.2f} m along the road",
+                             "a crossing at right angles")
+        lateral = frame.left(world.person_positions(PEDESTRIAN)) - frame.left(world.vehicle_positions(VUT))
+        if self.turns_after is not None and lateral[0] > self.turns_after:
+            raise InputError("scenario.parameters.network", f"the pedestrian begins {lateral[0]:.2f} m to the left of the vehicle",
+                             "to the right of it, or turns_after = None")
+        half_width = world.person_width(PEDESTRIAN) / 2
+        return _Memory(frame, path - half_width, path + half_width + world.vehicle_length(VUT), lateral, turned=False)
 
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
         vehicle = world.vehicle_positions(VUT)
-        lateral = world.person_positions(PEDESTRIAN)[:, 1] - vehicle[:, 1]
+        lateral = memory.frame.left(world.person_positions(PEDESTRIAN)) - memory.frame.left(vehicle)
         lateral_speed = (lateral - memory.place) / step
         goes_past = self.turns_after is not None and lateral[0] + step * lateral_speed[0] > self.turns_after
         if goes_past and not memory.turned:
             world.turn_back(PEDESTRIAN)
             memory = memory._replace(turned=True)
-        front = vehicle[:, 0]
+        front = memory.frame.along(vehicle)
         left = (np.abs(lateral) > self.lane_width / 2) & (lateral * lateral_speed > 0)
         passed = front > memory.clear_point
         return Scene(memory.conflict_point - front, lateral, lateral_speed, left | passed), memory._replace(place=lateral)

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Drives, Evaluations, FloatArray, Outcome, Trace
-from safevar_sumo.scenarios import VUT, Point
+from safevar_sumo.scenarios import VUT, Lane, Point
+from safevar_sumo.scenarios.frame import Frame
 from safevar_sumo.simulation.parts import Parts
 from safevar_sumo.simulation.staging import staged
 from safevar_sumo.simulation.sumo import Engine, world_on
@@ -73,7 +74,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
     world.set_types(types._replace(decel=np.maximum(types.decel, SURE_BRAKES)))
     world.depart()
     world.set_types(types)
-    length = world.vehicle_length(VUT)
+    length, way = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
 
     state = at_start(vehicle, prepared, world.speeds())
     driver = system.ads.start(n, system.nominal, step)
@@ -89,7 +90,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
         seen = parts.seen(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
         seen, state = vehicle.sense(prepared, state, seen)
         command, driver = system.ads.drive(seen, driver)
-        log.write(sample, position=world.vehicle_positions(VUT)[:, 0], speed=speed, gap=scene.gap, lateral=scene.lateral,
+        log.write(sample, position=way.along(world.vehicle_positions(VUT)), speed=speed, gap=scene.gap, lateral=scene.lateral,
                   lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active,
                   obstacle_speed=scene.obstacle_speed)
         if not verdict.open.any():

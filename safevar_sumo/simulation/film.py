@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.records import Drives, FloatArray
+from safevar_sumo.simulation.copies import copy_and_name
 from safevar_sumo.simulation.matrix import at_worst, simulate
-from safevar_sumo.simulation.network import copied_network, copy_and_name
+from safevar_sumo.simulation.network import built_network
 from safevar_sumo.simulation.system import System
 from safevar_sumo.simulation.world import SumoWorld
 
@@ -104,7 +105,7 @@ class _Camera:
 
 def road_of(network: str) -> tuple[Lane, ...]:
     """The lanes of a network, as netconvert built one copy of it."""
-    root = ElementTree.parse(copied_network(network, 1).network).getroot()
+    root = ElementTree.parse(built_network(network)).getroot()
     return tuple(_lane(edge.get("function", ""), lane) for edge in root.iter("edge") for lane in edge.iter("lane"))
 
 

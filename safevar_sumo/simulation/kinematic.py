@@ -16,7 +16,8 @@ import numpy as np
 from safevar_sumo.records import BoolArray, Drives, FloatArray
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.simulation.batch import drive, step_options
-from safevar_sumo.simulation.network import copied_id, copied_network
+from safevar_sumo.simulation.copies import copied_id
+from safevar_sumo.simulation.network import copied_network
 from safevar_sumo.simulation.staging import staged
 from safevar_sumo.simulation.sumo import Engine, open_world
 from safevar_sumo.simulation.system import System

@@ -1,38 +1,31 @@
 """N copies of a SUMO network and its traffic: same coordinates, no connection between them.
 
-They are built from the folder's plain-XML sources by netconvert, once, and kept in the user's cache
-folder by the content that they are made of.
+Netconvert builds the network once, as its folder's recipe says, and its elements are copied. Both are kept in the
+user's cache folder by the content that they are made of.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
 import subprocess
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
 from safevar_sumo.errors import EnvironmentFault, InputError
-from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.simulation import copies
 from safevar_sumo.simulation.cache import cached
+from safevar_sumo.simulation.copies import check_roads, parsed, write_demand, write_roads
+from safevar_sumo.simulation.options import TRAFFIC
+from safevar_sumo.simulation.sources import OPTIONS, Sources, sources_of
 
-SOURCES = ("network.nod.xml", "network.edg.xml", "network.con.xml")
-TRAFFIC = "traffic.rou.xml"
 ROADS = "network.net.xml"
 NOBODY = "nobody.rou.xml"
-OPTIONS = "scenario.sumocfg"
-RECIPE = ("--precision", "4", "--xml-validation", "never")
-"""Options of netconvert."""
-
-# Attributes that hold ids, by element; an attribute may hold several, separated by spaces.
-_IDS = {
-    "node": ("id",), "edge": ("id", "from", "to"), "connection": ("from", "to"), "crossing": ("node", "edges"),
-    "walkingArea": ("node", "edges"), "vType": ("id",), "person": ("id", "type"), "walk": ("edges", "from", "to"),
-    "vehicle": ("id", "type", "route"), "route": ("id", "edges"), "stop": ("lane", "edge"),
-    "trip": ("id", "type", "from", "to", "via"), "flow": ("id", "type", "route", "from", "to", "via"),
-}
+RECIPE = ("--xml-validation", "never")
+"""Options of netconvert in every network."""
 
 
 class CopiedNetwork(NamedTuple):
@@ -43,41 +36,36 @@ class CopiedNetwork(NamedTuple):
     options: Path
 
 
-def copied_id(copy: int, name: str) -> str:
-    """Id of `name` in a copy; internal edges keep their colon in front."""
-    return f":{copy}.{name[1:]}" if name.startswith(":") else f"{copy}.{name}"
-
-
-def copy_and_name(copied: str) -> tuple[int, str]:
-    """The copy that an id belongs to and what it is called in the original: the inverse of `copied_id`."""
-    colon = ":" if copied.startswith(":") else ""
-    copy, _, name = copied.removeprefix(":").partition(".")
-    return int(copy), colon + name
-
-
 def copied_network(folder: str, n: int, *others: str) -> CopiedNetwork:
-    """At least `n` copies of a network of `sumo_nets/` (or of a folder given by path) with traffic in `n` of them.
+    """At least `n` copies of a network with traffic in `n` of them; see `sources_of` for what `folder` may be.
 
-    With `others`, folders that differ from it in the traffic alone, the next `n` copies have the traffic of the next of them.
+    With `others`, which differ from it in the traffic alone, the next `n` copies have the traffic of the next of them.
 
     Raises
     ------
     InputError
-        If the folder or one of its sources is missing or is not XML.
+        If the folder or one of its sources is missing, is not XML, or netconvert refuses it.
     EnvironmentFault
-        If netconvert refuses the sources or the cache cannot be written.
+        If netconvert fails otherwise or the cache cannot be written.
     """
-    places = [folder_of(one) for one in (folder, *others)]
-    place = places[0]
-    roads = _cached(place, round_up(n * len(places)), [place / source for source in SOURCES], ROADS, _build_network)
-    traffic = _cached(place, n, [one / TRAFFIC for one in places], TRAFFIC, partial(_write_traffic, places))
-    return CopiedNetwork(roads, traffic, place / OPTIONS)
+    sources = sources_of(folder)
+    places = [sources.place, *(sources_of(one).place for one in others)]
+    size = round_up(n * len(places))
+    roads = cached(_name(sources, size, sources.roads), ROADS, partial(_copy_roads, sources, size))
+    contents = tuple((place / TRAFFIC).read_bytes() for place in places)
+    traffic = cached(f"{sources.place.name}-{n}-{_digest(contents, str(n))}", TRAFFIC, partial(_copy_demand, places, n))
+    return CopiedNetwork(roads, traffic, sources.place / OPTIONS)
 
 
 def empty_network(folder: str, n: int) -> CopiedNetwork:
     """The same copies with the types and routes of the traffic in `n` of them, and nobody there; raises as `copied_network`."""
-    files, place = copied_network(folder, n), folder_of(folder)
-    return files._replace(traffic=_cached(place, n, [place / TRAFFIC], NOBODY, _write_nobody))
+    files, sources = copied_network(folder, n), sources_of(folder)
+    return files._replace(traffic=cached(_name(sources, n, (TRAFFIC,)), NOBODY, partial(_copy_nobody, sources.place, n)))
+
+
+def built_network(folder: str) -> Path:
+    """The network itself, as netconvert built it or as it was given; raises as `copied_network`."""
+    return _built(sources_of(folder))
 
 
 def network_fingerprint(folder: str) -> str:
@@ -87,15 +75,17 @@ def network_fingerprint(folder: str) -> str:
 
 def network_files(folder: str) -> dict[str, str]:
     """A digest of every file that a network is made of, by name."""
-    place = folder_of(folder)
-    return {name: hashlib.sha256((place / name).read_bytes()).hexdigest()[:16] for name in (*SOURCES, TRAFFIC, OPTIONS)}
+    sources = sources_of(folder)
+    contents = sources.contents(*sources.files)
+    return {name: hashlib.sha256(content).hexdigest()[:16] for name, content in zip(sources.files, contents, strict=True)}
 
 
 def empty_fingerprint(folder: str) -> str:
     """Tells networks apart by everything but who is on them: sources, options, types and routes."""
-    place = folder_of(folder)
-    types = ElementTree.tostring(_nobody(parsed(place / TRAFFIC)))
-    return _digest((types, *((place / name).read_bytes() for name in (*SOURCES, OPTIONS))), 0)
+    sources = sources_of(folder)
+    nobody = ElementTree.Element("routes")
+    nobody.extend(child for child in parsed(sources.place / TRAFFIC) if _is_nobody(child))
+    return _digest((ElementTree.tostring(nobody), *sources.contents(*sources.roads, OPTIONS)), f"{sources.plain} {sources.options}")
 
 
 def netconvert_version() -> str:
@@ -103,25 +93,6 @@ def netconvert_version() -> str:
     from importlib.metadata import version
 
     return version("eclipse-sumo")
-
-
-def folder_of(folder: str) -> Path:
-    """A network's folder; raises as `copied_network`."""
-    for place in (NETWORKS / folder, Path(folder)):
-        if is_folder(place):
-            for name in (*SOURCES, TRAFFIC, OPTIONS):
-                if not (place / name).is_file():
-                    raise InputError(place, f"{name} is missing", f"a folder with {', '.join((*SOURCES, TRAFFIC, OPTIONS))}")
-            return place
-    names = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
-    raise InputError("scenario.parameters.network", f"there is no network {folder!r}", f"one of {', '.join(names)}, or a folder")
-
-
-def is_folder(place: Path) -> bool:
-    try:
-        return place.is_dir()
-    except OSError:  # a name that is too long, say
-        return False
 
 
 def round_up(n: int) -> int:
@@ -134,84 +105,67 @@ def round_up(n: int) -> int:
         size *= 10
 
 
-def _cached(place: Path, n: int, sources: list[Path], name: str, build: Callable[[Path, int, Path], None]) -> Path:
-    contents = tuple(source.read_bytes() for source in sources)
-    return cached(f"{place.name}-{n}-{_digest(contents, n)}", name, partial(build, place, n))
+def _name(sources: Sources, n: int, files: Sequence[str]) -> str:
+    """Where in the cache `n` copies are that are made from these files."""
+    digest = _digest(sources.contents(*files), f"{n} {sources.plain} {sources.options}")
+    return f"{sources.place.name}-{n}-{digest}"
 
 
 @cache
-def _digest(contents: tuple[bytes, ...], n: int) -> str:
-    """Of all that copies are made from: sources, their number, netconvert and its recipe, and the code below."""
-    digest = hashlib.sha256(f"{n} {netconvert_version()} {RECIPE}".encode() + Path(__file__).read_bytes())
+def _digest(contents: tuple[bytes, ...], made: str) -> str:
+    """Of all that copies are made from: sources, how they are `made`, netconvert and its recipe, and our code."""
+    code = b"".join(Path(str(module)).read_bytes() for module in (__file__, copies.__file__))
+    digest = hashlib.sha256(f"{made} {netconvert_version()} {RECIPE}".encode() + code)
     for content in contents:
         digest.update(len(content).to_bytes(8, "big") + content)
     return digest.hexdigest()[:16]
 
 
-def parsed(source: Path) -> ElementTree.Element:
-    """The root of an XML file.
-
-    Raises
-    ------
-    InputError
-        If it is not XML.
-    """
-    try:
-        return ElementTree.parse(source).getroot()
-    except ElementTree.ParseError as error:
-        raise InputError(source, f"is not XML: {error}") from None
+def _copy_roads(sources: Sources, n: int, into: Path) -> None:
+    write_roads(_checked(_built(sources)), n, into / ROADS)
 
 
-def _copies(sources: Sequence[Path], n: int) -> ElementTree.Element:
-    """The children of each file's root n times, one file after the other, every id prefixed with the copy's number."""
-    originals = [parsed(source) for source in sources]
-    root = ElementTree.Element(originals[0].tag, originals[0].attrib)
-    for copy, original in enumerate(original for original in originals for _ in range(n)):
-        root.extend(_prefixed(child, copy) for child in original)
+def _copy_demand(places: Sequence[Path], n: int, into: Path) -> None:
+    write_demand([parsed(place / TRAFFIC) for place in places], n, into / TRAFFIC, lambda child: True)
+
+
+def _copy_nobody(place: Path, n: int, into: Path) -> None:
+    write_demand([parsed(place / TRAFFIC)], n, into / NOBODY, _is_nobody)
+
+
+def _is_nobody(child: ElementTree.Element) -> bool:
+    """Whether a part of a traffic file is a type or a route, not somebody on the road."""
+    return child.tag not in ("vehicle", "person")
+
+
+def _built(sources: Sources) -> Path:
+    if sources.built:
+        return sources.place / sources.built
+    return cached(_name(sources, 0, sources.roads), ROADS, partial(_build, sources))
+
+
+def _checked(file: Path) -> ElementTree.Element:
+    root = parsed(file)
+    check_roads(root, file)
     return root
 
 
-def _prefixed(element: ElementTree.Element, copy: int) -> ElementTree.Element:
-    attributes = {
-        name: " ".join(copied_id(copy, one) for one in value.split()) if name in _IDS.get(element.tag, ()) else value
-        for name, value in element.attrib.items()}
-    result = ElementTree.Element(element.tag, attributes)
-    result.extend(_prefixed(child, copy) for child in element)
-    return result
-
-
-def _write(root: ElementTree.Element, file: Path) -> None:
-    ElementTree.ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
-
-
-def _write_traffic(places: Sequence[Path], place: Path, n: int, into: Path) -> None:
-    _write(_copies([one / TRAFFIC for one in places], n), into / TRAFFIC)
-
-
-def _write_nobody(place: Path, n: int, into: Path) -> None:
-    _write(_nobody(_copies([place / TRAFFIC], n)), into / NOBODY)
-
-
-def _nobody(traffic: ElementTree.Element) -> ElementTree.Element:
-    """Traffic without vehicles and persons."""
-    nobody = ElementTree.Element("routes")
-    nobody.extend(element for element in traffic if element.tag not in ("vehicle", "person"))
-    return nobody
-
-
-def _build_network(place: Path, n: int, into: Path) -> None:
+def _build(sources: Sources, into: Path) -> None:
     import sumo
 
-    for source in SOURCES:
-        _write(_copies([place / source], n), into / source)
-    nodes, edges, connections = (str(into / source) for source in SOURCES)
-    done = subprocess.run(
-        [str(Path(sumo.SUMO_HOME) / "bin" / "netconvert"), "-n", nodes, "-e", edges, "-x", connections,
-         "-o", str(into / ROADS), *RECIPE],
-        capture_output=True, text=True, check=False)
+    command = [str(Path(sumo.SUMO_HOME) / "bin" / "netconvert")]
+    for option, names in sources.plain:
+        command += [f"--{option}", ",".join(str(sources.place / name) for name in names)]
+    for option, value in sources.options:
+        command += [f"--{option}", value]
+    done = subprocess.run([*command, "-o", str(into / ROADS), *RECIPE], capture_output=True, text=True, errors="replace", check=False,
+                          env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME})
     if done.returncode != 0:
-        told = (done.stderr.strip() or f"exit code {done.returncode}").splitlines()[0]
-        raise EnvironmentFault(f"{place}: netconvert refuses the network: {told}")
+        lines = [line.strip() for line in done.stderr.splitlines() if line.strip() and not line.startswith(("Warning:", "Quitting"))]
+        told = " ".join(lines).removeprefix("Error: ")[:500]
+        if done.returncode < 0 or not told or ("Could not" in told and "output" in told) or "bad_alloc" in told:
+            raise EnvironmentFault(f"{sources.place}: netconvert fails: {told or f'exit code {done.returncode}'}")
+        raise InputError(sources.place, f"netconvert refuses the network: {told}", "sources that netconvert builds a network from")
     _keep_the_net_alone(into / ROADS)
 
 

@@ -7,15 +7,18 @@ import os
 import shutil
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 
 import platformdirs
 
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.scenarios import Lane, Scenario
-from safevar_sumo.scenarios.base import Actors
-from safevar_sumo.simulation.network import TRAFFIC, copied_id, copied_network, folder_of, parsed
+from safevar_sumo.scenarios.base import Actors, lane_through
+from safevar_sumo.simulation.copies import parsed
+from safevar_sumo.simulation.network import built_network
+from safevar_sumo.simulation.options import TRAFFIC, options_of
+from safevar_sumo.simulation.sources import OPTIONS, Sources, sources_of
 
 
 def staged(scenario: Scenario) -> str:
@@ -28,7 +31,7 @@ def staged(scenario: Scenario) -> str:
     """
     actors = getattr(scenario, "actors", None)
     changes = actors(_BuiltRoads(scenario.network)) if actors is not None else {}
-    return str(_folder_with(folder_of(scenario.network), changes)) if changes else scenario.network
+    return str(_network_with(sources_of(scenario.network), changes)) if changes else scenario.network
 
 
 class _BuiltRoads:
@@ -38,23 +41,25 @@ class _BuiltRoads:
         self._network = network
 
     def lane(self, lane: str) -> Lane:
-        shapes = _shapes(copied_network(self._network, 1).network)
-        if copied_id(0, lane) not in shapes:
-            raise InputError(folder_of(self._network), f"there is no lane {lane!r}")
-        return shapes[copied_id(0, lane)]
+        network = built_network(self._network)
+        shapes = _shapes(network, network.read_bytes())
+        if lane not in shapes:
+            raise InputError(sources_of(self._network).place, f"there is no lane {lane!r}")
+        return shapes[lane]
 
 
-@cache
-def _shapes(network: Path) -> dict[str, Lane]:
+@lru_cache(maxsize=100)
+def _shapes(network: Path, content: bytes) -> dict[str, Lane]:
     shapes = {}
-    for lane in parsed(network).iter("lane"):
-        points = [tuple(map(float, point.split(",")[:2])) for point in lane.attrib["shape"].split()]
-        shapes[lane.attrib["id"]] = Lane(points[0], points[-1])  # type: ignore[arg-type]
+    for lane in ElementTree.fromstring(content).iter("lane"):
+        points = [(float(x), float(y)) for x, y in (point.split(",")[:2] for point in lane.attrib["shape"].split())]
+        shapes[lane.attrib["id"]] = lane_through(lane.attrib["id"], points)
     return shapes
 
 
-def _folder_with(place: Path, actors: Actors) -> Path:
-    """A copy of a network's folder with changes to its traffic."""
+def _network_with(sources: Sources, actors: Actors) -> Path:
+    """A copy of a network with changes to its traffic."""
+    place = sources.place
     root = parsed(place / TRAFFIC)
     for path, attributes in actors.items():
         found = root.findall(path)
@@ -65,19 +70,23 @@ def _folder_with(place: Path, actors: Actors) -> Path:
                 root.remove(element)
             else:
                 element.attrib.update(attributes)
-    return _kept(place, ElementTree.tostring(root))
+    return _kept(sources, ElementTree.tostring(root), sources.contents(*sources.files)) / sources.built
 
 
 @lru_cache(maxsize=1000)
-def _kept(place: Path, traffic: bytes) -> Path:
-    digest = hashlib.sha256(b"".join([traffic, *(file.read_bytes() for file in sorted(place.iterdir()) if file.is_file())])).hexdigest()
-    target = platformdirs.user_cache_path("safevar_sumo") / "staged" / digest[:16] / place.name
+def _kept(sources: Sources, traffic: bytes, contents: tuple[bytes, ...]) -> Path:
+    place = sources.place
+    digest = hashlib.sha256(repr((sources.files, traffic, contents)).encode()).hexdigest()
+    target = platformdirs.user_cache_path("safevar_sumo") / "staged" / digest[:16] / (place.name or "network")
     if not target.is_dir():
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=target.parent) as folder:
-                copy = Path(folder) / place.name
-                shutil.copytree(place, copy)
+                copy = Path(folder) / target.name
+                copy.mkdir()
+                for name in (*sources.files, options_of(place / OPTIONS).get("gui-settings-file", "")):
+                    if (place / name).is_file():
+                        shutil.copy2(place / name, copy / name)
                 (copy / TRAFFIC).write_bytes(traffic)
                 os.replace(copy, target)
         except OSError as error:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from safevar_sumo.simulation.network import copied_id
+from safevar_sumo.simulation.copies import copied_id
 from safevar_sumo.simulation.traffic import Car, Traffic, Walker
 
 BATCHES_PER_LOADING = 200

@@ -19,9 +19,9 @@ from safevar_sumo.plugins import Guard, Lookup, Member, made
 from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, weather_of
 from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.simulation.checking import check_network
 from safevar_sumo.simulation.measuring import TAKEN, Measuring, measuring_of
-from safevar_sumo.simulation.network import OPTIONS, folder_of, is_folder
-from safevar_sumo.simulation.options import check_options
+from safevar_sumo.simulation.sources import is_network
 from safevar_sumo.simulation.traci_controller import TraciController
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather
 from safevar_sumo.vehicles import VEHICLE_CONTRACT, VEHICLES, CharacteristicSet, GuardedVehicle, Vehicle, calibration_drive
@@ -83,12 +83,14 @@ def assemble(study: Study, source: str = "") -> System:
     for name in study.published:
         if name not in measuring.metrics:
             raise InputError(source, f"published.{name} is no metric", one_of(measuring.metrics))
-    check_options(folder_of(models.scenario.network) / OPTIONS)
+    matrix = _matrix(study, source)
+    for network in dict.fromkeys(scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))):
+        check_network(network)
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     return System(
         characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
         metrics=study.metrics, nominal=calibration_drive(models.vehicle, characteristics),  # type: ignore[arg-type]
-        members=(*models.members, *measuring.members), measuring=measuring, step_length=study.step_length, matrix=_matrix(study, source),
+        members=(*models.members, *measuring.members), measuring=measuring, step_length=study.step_length, matrix=matrix,
         aggregate="worst" if study.matrix is None else study.matrix.aggregate)
 
 
@@ -139,8 +141,8 @@ def _points_of(test: MatrixTest, study: Study, source: str) -> Iterator[Point]:
 def _with_network(scenario: Any, places: Sequence[str]) -> Any:
     """The scenario on the folder beside the study, if it names one that lies there and is none of ours."""
     folder = scenario.network
-    found = next((str(Path(place, folder)) for place in places if is_folder(Path(place, folder))), folder)
-    if found == folder or is_folder(NETWORKS / folder):
+    found = next((str(Path(place, folder)) for place in places if is_network(Path(place, folder))), folder)
+    if found == folder or is_network(NETWORKS / folder):
         return scenario
     if isinstance(scenario, msgspec.Struct):
         return msgspec.structs.replace(scenario, network=found)

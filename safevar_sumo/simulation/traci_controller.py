@@ -16,7 +16,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.simulation.network import copied_id
+from safevar_sumo.simulation.copies import copied_id
 from safevar_sumo.simulation.world import SumoWorld, present_world
 from safevar_sumo.vehicles import SumoType
 

@@ -13,7 +13,8 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from safevar_sumo.simulation.network import TRAFFIC, copied_network
+from safevar_sumo.simulation.network import copied_network
+from safevar_sumo.simulation.options import TRAFFIC
 
 _TYPE = frozenset({
     "id", "vClass", "length", "width", "height", "minGap", "maxSpeed", "accel", "decel", "emergencyDecel", "tau", "mass", "sigma",

@@ -12,7 +12,8 @@ import numpy as np
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import VUT, Lane
-from safevar_sumo.simulation.network import copied_id
+from safevar_sumo.scenarios.base import lane_through
+from safevar_sumo.simulation.copies import copied_id, copy_and_name
 from safevar_sumo.simulation.standing import StandingSumo
 from safevar_sumo.vehicles import SumoType
 
@@ -172,8 +173,10 @@ class SumoWorld:
         return float(self._api.vehicle.getWidth(self.ids(actor)[0]))
 
     def lane(self, lane: str) -> Lane:
-        shape = self._api.lane.getShape(copied_id(0, lane))
-        return Lane(shape[0], shape[-1])
+        return lane_through(lane, self._api.lane.getShape(copied_id(0, lane)))
+
+    def lane_of(self, vehicle: str) -> Lane:
+        return self.lane(copy_and_name(self._api.vehicle.getLaneID(self.ids(vehicle)[0]))[1])
 
     def lane_start(self, lane: str) -> tuple[float, float]:
         x, y = self._api.lane.getShape(copied_id(0, lane))[0]

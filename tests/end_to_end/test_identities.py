@@ -115,7 +115,7 @@ def test_of_two_studies_that_start_together_one_gets_the_directory() -> None:
 def test_a_first_try_that_failed_leaves_the_directory_free() -> None:
     good = Path("my_net/network.edg.xml").read_text()
     Path("my_net/network.edg.xml").write_text('<edges><edge id="road" from="west" to="nowhere"/></edges>')
-    assert "netconvert refuses the network" in study(expect=1)
+    assert "netconvert refuses the network" in study(expect=2)
     Path("my_net/network.edg.xml").write_text(good)
     start = time.monotonic()
     study()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.records import Trace
+from safevar_sumo.scenarios import Lane
 from safevar_sumo.scenarios.lead_vehicle_stopped import LeadVehicleStopped
 from safevar_sumo.scenarios.pedestrian_crossing import PedestrianCrossing
 
@@ -28,8 +29,11 @@ class MadeUp:
     def vehicle_length(self, actor: str) -> float:
         return LENGTH if actor == "vut" else 7.0
 
-    def lane_start(self, lane: str) -> tuple[float, float]:
-        return PATH, 20.0
+    def lane(self, lane: str) -> Lane:
+        return Lane((PATH, 20.0), (PATH, 10.0))
+
+    def lane_of(self, vehicle: str) -> Lane:
+        return Lane((0.0, LANE), (90.0, LANE))
 
     def person_width(self, actor: str) -> float:
         return WIDTH
