@@ -1,17 +1,19 @@
 """What a campaign costs beside its simulations, and what more workers bring: ratios of one run on one machine.
 
-    python benchmarks/campaign.py [STUDY] [--runs N] [--evaluations N] [--json]
+    python benchmarks/campaign.py [STUDY] [--runs N] [--evaluations N] [--turns N] [--json]
 
 Time outside the simulation is what is left of all processor time when that of the same batches, computed by one process
 with nothing else to do, is taken away: search, journal and hand-over. Workers start, and load the network, before the
-clock does. What two workers bring is told by the clock: only an idle machine tells the truth.
+clock does. The floor is bare libsumo for one population. What two workers bring is told by the clock: only an idle
+machine tells the truth.
 """
 
 from __future__ import annotations
 
 import argparse
+import statistics
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -122,20 +124,21 @@ def two_dask_workers(study: Study) -> Iterator[Pool]:
         yield pool
 
 
-def records_of(study: Study) -> Iterator[Record]:
-    """Measure one and two workers, and two of a cluster."""
-    def record(measure: str, ratio: float) -> Record:
-        return Record(study.name, measure, study.search.population, ratio)
+def turn(study: Study) -> dict[str, float]:
+    """Every ratio once: what is compared is measured one right after the other."""
+    one = campaign(study, local_pool(1, study.search.time_limit))
+    alone, bare_each = simulation(study, one.batches), floor(study)
+    two = campaign(study, local_pool(2, study.search.time_limit))
+    cluster = campaign(study, two_dask_workers(study))
+    return {"campaign": one.processor / one.simulated / bare_each, "outside_simulation": 1 - alone / one.processor,
+            "two_workers": one.clock / two.clock, "cluster": two.clock / cluster.clock}
 
-    pools: dict[str, Callable[[], AbstractContextManager[Pool]]] = {
-        "one": lambda: local_pool(1, study.search.time_limit), "two": lambda: local_pool(2, study.search.time_limit),
-        "cluster": lambda: two_dask_workers(study)}
-    one = campaign(study, pools["one"]())
-    yield record("campaign", one.processor / one.simulated / floor(study))
-    yield record("outside_simulation", 1 - simulation(study, one.batches) / one.processor)
-    two = campaign(study, pools["two"]())
-    yield record("two_workers", one.clock / two.clock)
-    yield record("cluster", two.clock / campaign(study, pools["cluster"]()).clock)
+
+def records_of(study: Study, turns: int) -> Iterator[Record]:
+    """Measure one and two workers, and two of a cluster; medians of some turns."""
+    ratios = [turn(study) for _ in range(turns)]
+    for measure in ratios[0]:
+        yield Record(study.name, measure, study.search.population, statistics.median(one[measure] for one in ratios))
 
 
 def main() -> None:
@@ -143,11 +146,12 @@ def main() -> None:
     parser.add_argument("study", nargs="?", default="rain", metavar="STUDY")
     parser.add_argument("--runs", type=int, default=30)
     parser.add_argument("--evaluations", type=int, default=500, help="of each run")
+    parser.add_argument("--turns", type=int, default=3, help="how often everything is measured; medians are told")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     study = load_study(arguments.study)
     search = msgspec.structs.replace(study.search, algorithms=["nsga2"], runs=arguments.runs, evaluations=arguments.evaluations)
-    told(records_of(msgspec.structs.replace(study, search=search)), as_json=arguments.json)
+    told(records_of(msgspec.structs.replace(study, search=search), arguments.turns), as_json=arguments.json)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,9 @@
 
 The floor is bare libsumo that loads and steps the same network as many steps with nobody at the wheel; an evaluation
 finds its network loaded, as all but every 200th of a worker does. The TraCI socket is what one would write otherwise: one
-`sumo` process, reloaded for every setting, the same controller. Floor and evaluation take turns, and their processor
-time counts: so a machine that others use too disturbs them little.
+`sumo` process, reloaded for every setting, the same controller; who starts a process for each waits a second more, as
+traci tries again only then. What is compared takes turns, and where one process does the work its processor time
+counts: so a machine that others use too disturbs them little.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from measuring import Record, clock_seconds, medians_in_turn, processor_seconds,
 
 from safevar_sumo.ads import ScalarAds
 from safevar_sumo.ads.guarded import PerVehicle
+from safevar_sumo.campaign import BATCH
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import FloatArray, Observation
 from safevar_sumo.simulation import System, assemble, evaluate, simulate
@@ -107,7 +109,7 @@ def records_of(study: str, populations: tuple[int, ...] = POPULATIONS) -> Iterat
         stepping = statistics.median(alone for _, alone in floors[2:])
         yield Record(study, "bare_libsumo", n, ours / loading)
         yield Record(study, "stepping_alone", n, ours / stepping)
-        if n == populations[0]:
+        if n <= BATCH:
             yield from beside_others(study, system, settings)
 
 
@@ -116,14 +118,14 @@ def beside_others(study: str, system: System, settings: FloatArray) -> Iterator[
     n, few = len(settings), settings[:SOCKET_SETTINGS]
     scalar = replace(system, ads=PerVehicle(Coasting, Guard("benchmark", "ads")))
     evaluate(system, settings)
-    together, alone, coasting = medians_in_turn(
-        lambda: clock_seconds(lambda: evaluate(system, settings)),
-        lambda: clock_seconds(lambda: [evaluate(system, one[None]) for one in few]),
-        lambda: clock_seconds(lambda: evaluate(scalar, settings)), repetitions=5)
     command = sumo_command(Engine.TRACI, copied_network(staged(system.points[0].scenario), 1))
     with socket_to(command):
         through_socket(system, few[:1], command)
-        (socket,) = medians_in_turn(lambda: clock_seconds(lambda: through_socket(system, few, command)), repetitions=3)
+        together, alone, coasting, socket = medians_in_turn(
+            lambda: clock_seconds(lambda: evaluate(system, settings)),
+            lambda: clock_seconds(lambda: [evaluate(system, one[None]) for one in few]),
+            lambda: clock_seconds(lambda: evaluate(scalar, settings)),
+            lambda: clock_seconds(lambda: through_socket(system, few, command)), repetitions=5)
     yield Record(study, "batches_of_1", n, alone / len(few) / (together / n))
     yield Record(study, "scalar_ads", n, coasting / together)
     yield Record(study, "traci_socket", n, socket / len(few) / (together / n))

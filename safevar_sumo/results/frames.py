@@ -99,7 +99,7 @@ def batch_of(positions: list[int], evaluations: Evaluations) -> Batch:
     reasons = {row: evaluations.reasons[setting.tobytes()] for row, setting in enumerate(evaluations.settings)
                if setting.tobytes() in evaluations.reasons}
     return Batch(
-        positions=np.array(positions, dtype="<i4").tobytes(), outcome=bytes(OUTCOMES[Outcome(one)] for one in evaluations.outcome),
+        positions=np.array(positions, dtype="<i4").tobytes(), outcome=bytes(OUTCOMES[one] for one in evaluations.outcome.tolist()),
         settings=evaluations.settings.astype("<f8").tobytes(),
         numbers={name: values.astype("<f8").tobytes() for name, values in numbers.items()}, reasons=reasons)
 

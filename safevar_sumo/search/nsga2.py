@@ -18,8 +18,6 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 Probability = Annotated[float, Meta(ge=0, le=1)]
 Index = Annotated[float, Meta(ge=0, le=1000)]
-OBJECTIVES = 3
-"""Of the published study."""
 
 
 @cache
@@ -29,14 +27,11 @@ def _fitness(objectives: int) -> type[Any]:
 
 
 class _Individual(list[float]):
-    """Unfiltered values of a setting, its evaluation (of one row), and its rank in the population."""
+    """Unfiltered values of a setting; once evaluated, its fitness, the evaluations that it is a row of, and its rank."""
 
-    evaluation: Evaluations
+    fitness: base.Fitness
+    found: tuple[Evaluations, int]
     rank: int
-
-    def __init__(self, values: list[float]) -> None:
-        super().__init__(values)
-        self.fitness = _fitness(OBJECTIVES)()
 
 
 class Nsga2(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -59,17 +54,16 @@ class Nsga2(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         initial = problem.uniform(min(problem.population, problem.evaluations), rng)
         brood = [_Individual(values) for values in initial.tolist()]
         population: list[_Individual] = []
-        asked = 0
+        asked, fitness = 0, _fitness(len(problem.scoring.objectives))
         while brood:
             evaluated = yield characteristics.filter(np.array(brood))
             for i, (individual, objectives) in enumerate(zip(brood, problem.scoring.values(evaluated).tolist(), strict=True)):
-                individual.evaluation, individual.fitness = evaluated.take([i]), _fitness(len(objectives))()
-                individual.fitness.values = tuple(objectives)
+                individual.found, individual.fitness = (evaluated, i), fitness(tuple(objectives))
             asked += len(brood)
             good = [one for one, valid in zip(brood, problem.scoring.valid(evaluated), strict=True) if valid]
             population = _survivors(population + good, problem.population)
             brood = variation.offspring(population, min(problem.population, problem.evaluations - asked))
-        front = [one.evaluation for one in population if one.rank == 0]
+        front = [evaluations.take([row]) for evaluations, row in (one.found for one in population if one.rank == 0)]
         return Evaluations.concatenate(front) if front else evaluated.take([])
 
 

@@ -9,7 +9,7 @@ from problems import POPULATION, SUN, evaluated, searched, sphere
 
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.search import Problem
-from safevar_sumo.search.nsga2 import _Individual, _survivors, _tournament
+from safevar_sumo.search.nsga2 import _fitness, _Individual, _survivors, _tournament
 from safevar_sumo.search.safe_fuzzer import _improves, _Ranges, _scores
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
@@ -21,7 +21,7 @@ def individuals(*objectives: tuple[float, float, float]) -> list[_Individual]:
     made = []
     for values in objectives:
         one = _Individual(list(values))
-        one.fitness.values = values
+        one.fitness = _fitness(3)(values)
         made.append(one)
     return made
 
