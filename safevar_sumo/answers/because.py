@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.records import STANDSTILL, Drives, FloatArray
+from safevar_sumo.records import STANDSTILL, Drives
 
 FULL = 0.9
 """Share of the largest deceleration from which it counts as full."""
@@ -73,12 +73,13 @@ class Course(NamedTuple):
 class Because(NamedTuple):
     """Original and changed vehicle side by side; `parts` [m] add up to the distance lost, the remainder included.
 
-    `parts` is empty where one of the two never braked and there is nothing to compare.
+    `parts` is empty where one of the two never braked and there is nothing to compare; `place` names the point of a matrix.
     """
 
     original: Course
     changed: Course
     parts: dict[str, float]
+    place: str = ""
 
     @property
     def lost(self) -> float:
@@ -119,15 +120,15 @@ def _braking(drives: Drives, column: int, first: int, last: int) -> Braking | No
         full_speed=float(speed[full]), deceleration=lost / way if way > 0 and lost > 0 else float(losses.max()))
 
 
-def because(original: Course, changed: Course) -> Because:
-    """Compare a changed vehicle's drive with the original's."""
+def because(original: Course, changed: Course, place: str = "") -> Because:
+    """Compare a changed vehicle's drive with the original's at the same place."""
     one, other = original.braking, _as_the_original_would(changed, original)
     if one is None or other is None:
-        return Because(original, changed, {})
+        return Because(original, changed, {}, place)
     parts = _parts(one, other)
     left = original.closest - one.margin, changed.closest - other.margin
     rest = [0.0 if np.isnan(value) else value for value in left]
-    return Because(original, changed, {**parts, "remainder": rest[0] - rest[1]})
+    return Because(original, changed, {**parts, "remainder": rest[0] - rest[1]}, place)
 
 
 def _as_the_original_would(changed: Course, original: Course) -> Braking | None:
@@ -148,8 +149,3 @@ def _parts(one: Braking, other: Braking) -> dict[str, float]:
         "speed": (other.delay_speed - one.delay_speed) * mean_delay + (energies[1] - energies[0]) * mean_weakness,
         "delay": (other.delay - one.delay) * mean_speed,
         "deceleration": (weakness[1] - weakness[0]) * mean_energy}
-
-
-def courses(drives: Drives, safety_degrees: FloatArray) -> list[Course]:
-    """What there is to tell of each of N drives."""
-    return [course(drives, column, float(degree)) for column, degree in enumerate(safety_degrees)]

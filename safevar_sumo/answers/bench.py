@@ -11,8 +11,8 @@ import numpy as np
 from safevar_sumo.computing import Pool, available_cores, evaluate_all, local_pool
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import Drives, Evaluations, FloatArray
-from safevar_sumo.simulation import assemble, simulate
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.simulation import assemble
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -66,10 +66,6 @@ class Bench:
         if not evaluations.valid[0]:
             raise SimulationError(f"study {self.study.name!r} cannot be simulated with the original vehicle")
         return evaluations
-
-    def drives(self, settings: FloatArray) -> Drives:
-        """Settings as they go, step by step; simulated in this process."""
-        return simulate(assemble(self.study), settings)
 
     def with_step(self, step: float) -> Bench:
         """The same, simulated with another time step [s]."""

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from safevar_sumo.analysis import Case
-from safevar_sumo.answers.because import because, courses
 from safevar_sumo.answers.bench import Bench, Progress, open_bench, silent
 from safevar_sumo.answers.boundary import boundaries
 from safevar_sumo.answers.causes import MinimalCause, affordable, minimal_causes, necessary, number
@@ -16,10 +15,12 @@ from safevar_sumo.answers.findings import Cause, Explained, Explanation
 from safevar_sumo.answers.necessity import distinct_causes, key_of, necessity
 from safevar_sumo.answers.robustness import robustness
 from safevar_sumo.answers.unsafe import Unsafe
+from safevar_sumo.answers.where import where
 from safevar_sumo.answers.whose import whose_failures
 from safevar_sumo.computing import Pool
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import Handle
+from safevar_sumo.simulation import assemble
 from safevar_sumo.study import Study
 
 TOP = 8
@@ -60,6 +61,7 @@ def explain(source: Study | Case, *, solutions: Sequence[str] = (), unsafe: str 
     """
     study = source if isinstance(source, Study) else source.study
     means, named = Unsafe.given(unsafe), [Handle.parse(text) for text in solutions]
+    limit //= len(assemble(study).points)
     with open_bench(study, pool, jobs, progress) as bench:
         original = bench.original()
         found = failures_of(source, bench, original, named, means)
@@ -110,9 +112,8 @@ def _explained(found: Failures, bench: Bench, original: Evaluations, causes: Cau
         return ()
     rows = list(reasons)
     here, names = found.evaluations.take(rows), bench.characteristics.names
-    drives = bench.drives(np.concatenate([original.settings, here.settings]))
-    first, *others = courses(drives, np.concatenate([original.f_safe, here.f_safe]))
-    hair = robustness(bench, here.settings, drives.trace.step, found.unsafe)
+    beside, step = where(assemble(bench.study), original.settings, here.settings, found.unsafe)
+    hair = robustness(bench, here.settings, step, found.unsafe)
     shrunk = iter(boundaries(bench, [cause for row in rows for cause in causes[row]], found.unsafe))
     collided = np.flatnonzero(here.collided)
     whose = dict(zip(collided.tolist(), whose_failures(bench.study, here.settings[collided]), strict=True))
@@ -132,5 +133,5 @@ def _explained(found: Failures, bench: Bench, original: Evaluations, causes: Cau
             outcome=str(here.outcome[i]), safety_degree=number(here.f_safe[i]),
             changed=tuple(name for name, is_changed in zip(names, changed, strict=True) if is_changed),
             necessary=tuple(names[column] for column in sorted(necessary(causes[row]))), causes=tuple(of_it), robustness=hair[i],
-            because=because(first, others[i]), whose=str(whose.get(i, ""))))
+            because=beside[i].because, whose=str(whose.get(i, "")), points=beside[i].points))
     return tuple(explanations)

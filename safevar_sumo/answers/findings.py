@@ -46,7 +46,7 @@ class Explanation:
     """One failure explained; `handle` is None for what did not come from results, `reasons` tell why it was chosen.
 
     `safety_degree` is in m, or -m/s; `changed` and `necessary` are names; `causes` are all minimal ones; `whose` tells of a
-    collision who would have avoided it in the same vehicle.
+    collision who would have avoided it in the same vehicle; `points` are those of a matrix at which it is unsafe.
     """
 
     handle: Handle | None
@@ -60,6 +60,7 @@ class Explanation:
     robustness: Robustness
     because: Because
     whose: str = ""
+    points: tuple[str, ...] = ()
 
     def record(self) -> dict[str, Any]:
         """As `explain --json` prints it."""
@@ -69,8 +70,7 @@ class Explanation:
             "safety_degree": self.safety_degree, "changed": list(self.changed),
             "minimal_causes": [{name: getattr(cause, name) for name in ("changes", "boundary", "fraction", "outcome", "safety_degree")}
                                for cause in self.causes],
-            "robustness": self.robustness.share, "because": sentence(self.because),
-            "whose": self.whose}
+            "robustness": self.robustness.share, "because": sentence(self.because)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +110,8 @@ class Explained:
         """One row for each change of each minimal cause of each explanation.
 
         Columns: `failure`, counted from 0, `algorithm`, `run`, `index`, `cause`, counted from 0, `characteristic`, `unit`,
-        `original`, `value`, `boundary`, `alone` [unit], `fraction`, `outcome`, `safety_degree` [m or -m/s], `robustness`.
+        `original`, `value`, `boundary`, `alone` [unit], `fraction`, `outcome`, `safety_degree` [m or -m/s], `robustness`,
+        `whose`, and `points`, separated by semicolons.
         """
         rows = []
         for i, one in enumerate(self.explanations):
@@ -120,6 +121,6 @@ class Explained:
                     if member.name in cause.changes:
                         rows.append((i, algorithm, run, index, j, member.name, member.unit, member.original, cause.changes[member.name],
                                      cause.boundary[member.name], cause.alone[member.name], cause.fraction, cause.outcome,
-                                     cause.safety_degree, one.robustness.share))
+                                     cause.safety_degree, one.robustness.share, one.whose, "; ".join(one.points)))
         return pd.DataFrame(rows, columns=["failure", "algorithm", "run", "index", "cause", "characteristic", "unit", "original", "value",
-                                           "boundary", "alone", "fraction", "outcome", "safety_degree", "robustness"])
+                                           "boundary", "alone", "fraction", "outcome", "safety_degree", "robustness", "whose", "points"])

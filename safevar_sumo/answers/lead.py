@@ -8,10 +8,12 @@ from safevar_sumo.answers.bench import Bench
 from safevar_sumo.answers.causes import MinimalCause, minimal_causes
 from safevar_sumo.answers.explanation import REASONS
 from safevar_sumo.answers.unsafe import Unsafe
+from safevar_sumo.answers.where import points_in_words, points_of
 from safevar_sumo.answers.words import changes, number_of
 from safevar_sumo.computing import Pool
-from safevar_sumo.records import Evaluations, Outcome
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import chosen_handle, position_of, unsafe_rows
+from safevar_sumo.simulation import assemble, at_every_point
 from safevar_sumo.study import Study
 
 
@@ -37,12 +39,22 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
     handles = {reason: chosen_handle(solutions, degree, choice, study.name) for choice, reason in REASONS.items()}
     rows = solutions.iloc[[position_of(solutions, handle) for handle in handles.values()]]
     settings = rows[list(bench.characteristics.names)].to_numpy(dtype=float)
-    found = minimal_causes(bench, settings, means)
+    found, places = minimal_causes(bench, settings, means), _places(study, settings, means)
     lines = [f"Unsafe ({means}): {int(unsafe.sum())} of {number_of(len(solutions), 'solution')}."]
-    for (reason, handle), row, causes in zip(handles.items(), rows.to_dict("records"), found, strict=True):
+    for (reason, handle), row, causes, place in zip(handles.items(), rows.to_dict("records"), found, places, strict=True):
         size = f"{number_of(int(row['f_num_diff']), 'change')} of up to {row['f_diff']:.0%}"
-        lines.append(f"{reason.capitalize()}: {handle}, {row['outcome']}, SD {row['f_safe']:.2f}, {size}. {_in_words(bench, causes)}")
+        end = f"{row['outcome']}, SD {row['f_safe']:.2f}"
+        lines.append(f"{reason.capitalize()}: {handle}, {end}, {size}. {_in_words(bench, causes)}{place}")
     return lines
+
+
+def _places(study: Study, settings: FloatArray, unsafe: Unsafe) -> list[str]:
+    """At which points of a matrix each setting fails, in words; nothing in a study without one."""
+    system = assemble(study)
+    if not system.matrix:
+        return [""] * len(settings)
+    failing = points_of(system, at_every_point(system, settings), unsafe)
+    return [f" {points_in_words(points, len(system.matrix), most=3)}" for points in failing]
 
 
 def _in_words(bench: Bench, causes: list[MinimalCause]) -> str:

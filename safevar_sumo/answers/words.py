@@ -64,7 +64,8 @@ def how(course: Course) -> str:
 
 def sentence(told: Because) -> str:
     """Why the changed vehicle is less safe than the original, in one sentence or two."""
-    ends = f"The original {how(told.original)}; this one {how(told.changed)}."
+    at = f"At {told.place}: the" if told.place else "The"
+    ends = f"{at} original {how(told.original)}; this one {how(told.changed)}."
     one, other = told.original.braking, told.changed.braking
     if one is None and other is None:
         return f"{ends} Neither of them brakes."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import click
@@ -26,7 +27,10 @@ def report(directories: tuple[str, ...], out: Path, only: str | None, jobs: int 
 
     check_output(out, "--out", (".html", ".htm"))
     sections = [name.strip() for name in only.split(",")] if only is not None else []
-    with stages(Console(stderr=True)) as progress:
+    with stages(Console(stderr=True)) as progress, warnings.catch_warnings(record=True) as otherwise:
+        warnings.simplefilter("always", UserWarning)
         page = make_report(directories, sections, jobs, progress)
+    for one in otherwise:
+        click.echo(f"warning: {one.message}", err=True)
     write_whole(out, page)
     click.echo(f"Report: {out} ({len(page.encode()) / 1e6:.2f} MB)")

@@ -14,7 +14,7 @@ from safevar_sumo.report.material import Material
 from safevar_sumo.report.stored import stored
 from safevar_sumo.report.svg import Bar, rows
 from safevar_sumo.results import Handle, chosen_handle, unsafe_rows
-from safevar_sumo.showing.comparison import changes_in_words
+from safevar_sumo.showing.comparison import changes_in_words, differences
 
 Found = list[dict[str, Any]]
 """What `explain --json` prints."""
@@ -62,8 +62,10 @@ def causes(found: Found, material: Material) -> list[dict[str, Any]]:
             if key not in distinct or _size(material, cause) < _size(material, distinct[key]["cause"]):
                 distinct[key] = {"cause": cause, "because": failure["because"], "robustness": failure["robustness"],
                                  "handle": handle_of(failure)}
-    ordered = sorted(distinct.values(), key=lambda one: _size(material, one["cause"]))
-    return [_told(material, place, one) for place, one in enumerate(ordered[:CAUSES], 1)]
+    ordered = sorted(distinct.values(), key=lambda one: _size(material, one["cause"]))[:CAUSES]
+    if ordered:
+        material.again([material.setting_with(one["cause"]["changes"]) for one in ordered])
+    return [_told(material, place, one) for place, one in enumerate(ordered, 1)]
 
 
 def smallest_cause(found: Found) -> dict[str, Any] | None:
@@ -91,20 +93,24 @@ def _told(material: Material, place: int, one: dict[str, Any]) -> dict[str, Any]
     comparison = material.compared(setting)
     return {"title": f"Cause {place}: {', '.join(cause['changes'])}", "anchor": material.anchor("cause", place), "rows": table,
             "end": comparison.verdict(comparison.rows[-1]), "because": one["because"], "robustness": one["robustness"],
-            "handle": one["handle"],
+            "handle": one["handle"], "where": material.where(setting),
             "whole": material.anchor("replay", one["handle"]), "boundary": changes_in_words(material.case.characteristics, boundary),
             "fraction": cause["fraction"], "replay": material.replay(setting)}
 
 
 def replays(material: Material, explained: Found | None) -> list[dict[str, Any]]:
     """The solutions worth a look: the chosen ones, the explained ones, and unsafe ones that no other beats in every objective."""
-    told = []
-    for place, handle in enumerate(_chosen(material, explained)):
+    told, chosen = [], _chosen(material, explained)
+    if material.system is not None and chosen:
+        material.again([material.setting_of(Handle.parse(handle)) for handle in chosen])
+    for place, handle in enumerate(chosen):
         row, setting = material.solutions[handle], material.setting_of(Handle.parse(handle))
         one = {"handle": handle, "anchor": material.anchor("replay", handle), "f_safe": row["f_safe"], "f_diff": row["f_diff"],
                "f_num_diff": row["f_num_diff"], "outcome": row["outcome"], "open": place == 0 and not explained,
                "changes": changes_in_words(material.case.characteristics, setting)}
-        told.append(one if material.system is None else {**one, "replay": material.replay(setting)})
+        told.append(one if material.system is None else {
+            **one, "replay": material.replay(setting), "where": material.where(setting),
+            "differences": differences(material.again([setting])[0].evaluation, row)})
     return sorted(told, key=lambda one: (one["f_safe"], one["handle"]))
 
 

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from safevar_sumo.analysis import Case, load_cases
+from safevar_sumo.analysis.case import collided
+from safevar_sumo.answers import Unsafe, points_in_words, points_of
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import Handle, handles
 from safevar_sumo.results.manifest import read_manifest
 from safevar_sumo.showing import Comparison, compare
 from safevar_sumo.showing.page import player_data
 from safevar_sumo.showing.scene import scene_of
-from safevar_sumo.simulation import System, assemble
+from safevar_sumo.simulation import System, aggregated, assemble, at_every_point
+
+
+class Again(NamedTuple):
+    """A setting simulated once more: what it is worth now, and at which points of a matrix it is unsafe."""
+
+    evaluation: Evaluations
+    points: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +45,7 @@ class Material:
     system: System | None
     lacking: str = ""
     _compared: dict[bytes, Comparison] = field(default_factory=dict)
+    _again: dict[bytes, Again] = field(default_factory=dict)
 
     @cached_property
     def solutions(self) -> dict[str, dict[str, Any]]:
@@ -62,6 +72,29 @@ class Material:
         if key not in self._compared:
             self._compared[key] = compare(self.case.study, self.system, setting)
         return self._compared[key]
+
+    def again(self, settings: Sequence[FloatArray]) -> list[Again]:
+        """Settings simulated once more, all in one go, each once; nothing is to come out otherwise than it is recorded."""
+        assert self.system is not None
+        new = {setting.tobytes(): setting for setting in settings if setting.tobytes() not in self._again}
+        if new:
+            found = at_every_point(self.system, np.stack(list(new.values())))
+            evaluations, points = aggregated(self.system, found), points_of(self.system, found, self.unsafe)
+            for row, key in enumerate(new):
+                self._again[key] = Again(evaluations.take([row]), points[row])
+        return [self._again[setting.tobytes()] for setting in settings]
+
+    @property
+    def unsafe(self) -> Unsafe:
+        """What counts as unsafe: a collision if a solution is one, else half of the original's safety degree."""
+        return Unsafe() if collided(self.case.solutions).any() else Unsafe.half_of(self.case.original["safety_degree"])
+
+    def where(self, setting: FloatArray) -> str:
+        """At which points of a matrix a setting fails, in words; nothing of a study without one."""
+        if self.system is None or not self.system.matrix:
+            return ""
+        points = self.again([setting])[0].points
+        return points_in_words(points, len(self.system.matrix), most=len(points))
 
     def replay(self, setting: FloatArray) -> dict[str, Any]:
         """A setting's animation, as the template `player` takes it."""

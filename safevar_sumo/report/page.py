@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,11 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     progress
         Is told what is being made, how much of it is done, and of how much.
 
+    Warns
+    -----
+    UserWarning
+        Of solutions that, simulated again, are not what the results say.
+
     Raises
     ------
     InputError
@@ -89,7 +95,12 @@ def _study(material: Material, wanted: Sequence[str], jobs: int | None, progress
         "causes": lambda: causes(explained or [], material),
         "necessity": lambda: necessity(explained or [], material),
         "trust": lambda: trust(material, explained)}
+    otherwise = [one["handle"] for one in shown if one.get("differences")]
+    if otherwise:
+        warnings.warn(f"{material.place}: {', '.join(otherwise)}: simulated again not what the results say; other versions or code than "
+                      "those of the study?", stacklevel=2)
     return {"name": material.case.name, "title": material.case.study.title, "anchor": material.anchor(), "replays": shown,
+            "otherwise": otherwise,
             "has_system": material.system is not None, "front": front(material, [one["handle"] for one in shown]) if shown else None,
             **limits, **{name: make() for name, make in made.items() if name in wanted or (name == "necessity" and "causes" in wanted)}}
 

@@ -62,7 +62,7 @@ def _finding(material: Material, title: str, handle: Handle) -> dict[str, Any]:
     changes = _changes(material, setting)
     share = float(material.case.characteristics.largest_change(setting[np.newaxis])[0])
     return {"title": title, "handle": str(handle), "anchor": material.anchor("replay", handle), "changes": changes,
-            "end": _end(material, handle, setting),
+            "end": _end(material, handle, setting), "where": material.where(setting),
             "size": f"{len(changes)} of {len(setting)} characteristics changed, by {share:.0%} at the most"}
 
 

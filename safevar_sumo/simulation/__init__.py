@@ -2,11 +2,22 @@
 
 from safevar_sumo.simulation.batch import score
 from safevar_sumo.simulation.kinematic import simulate_alone
-from safevar_sumo.simulation.matrix import AtPoint, at_every_point, at_worst, evaluate, named_point, point_record, remarks_of, simulate
+from safevar_sumo.simulation.matrix import (
+    AtPoint,
+    aggregated,
+    at_every_point,
+    at_worst,
+    evaluate,
+    named_point,
+    point_record,
+    remarks_of,
+    simulate,
+    worst_points,
+)
 from safevar_sumo.simulation.network import network_files, network_fingerprint
 from safevar_sumo.simulation.sumo import Engine
 from safevar_sumo.simulation.system import System, assemble, models_of
 
 __all__ = [
-    "AtPoint", "Engine", "System", "assemble", "at_every_point", "at_worst", "evaluate", "models_of", "named_point", "network_files",
-    "network_fingerprint", "point_record", "remarks_of", "score", "simulate", "simulate_alone"]
+    "AtPoint", "Engine", "System", "aggregated", "assemble", "at_every_point", "at_worst", "evaluate", "models_of", "named_point",
+    "network_files", "network_fingerprint", "point_record", "remarks_of", "score", "simulate", "simulate_alone", "worst_points"]

@@ -53,8 +53,13 @@ def evaluate(system: System, settings: FloatArray) -> Evaluations:
     """
     if not system.matrix:
         return score(system, settings, simulate(system, settings))
-    found = at_every_point(system, settings)
-    row_of, columns = _worst(found), np.arange(len(settings))
+    return aggregated(system, at_every_point(system, settings))
+
+
+def aggregated(system: System, found: Sequence[AtPoint]) -> Evaluations:
+    """What settings that were simulated at every point are worth."""
+    settings = found[0].evaluations.settings
+    row_of, columns = worst_points(found), np.arange(len(settings))
     every = Evaluations.concatenate([one.evaluations for one in found])
     result = every.take(row_of * len(settings) + columns)
     if system.aggregate == "mean":
@@ -85,7 +90,7 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSU
     if watch is not None or engine is Engine.GUI:
         return drive_all(at_worst(system, settings), settings, engine, options, watch)
     found = at_every_point(system, settings, engine, options)
-    return _picked([one.drives for one in found], _worst(found))
+    return _picked([one.drives for one in found], worst_points(found))
 
 
 def at_every_point(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = ()) -> list[AtPoint]:
@@ -104,7 +109,7 @@ def at_worst(system: System, settings: FloatArray) -> System:
     """The system at the one point in which the last of the settings comes off worst."""
     if not system.matrix:
         return system
-    return system.at(system.points[_worst(at_every_point(system, settings[-1:]))[0]])
+    return system.at(system.points[worst_points(at_every_point(system, settings[-1:]))[0]])
 
 
 def named_point(system: System, name: str, source: object) -> System:
@@ -133,7 +138,7 @@ def _together(points: Sequence[Point], most: int) -> Iterator[tuple[Point, ...]]
             yield tuple(group[start:start + most])
 
 
-def _worst(found: Sequence[AtPoint]) -> npt.NDArray[np.intp]:
+def worst_points(found: Sequence[AtPoint]) -> npt.NDArray[np.intp]:
     """For every setting the number of the point with the least safety degree; among equals the first by name."""
     order = sorted(range(len(found)), key=lambda k: found[k].point.name)
     degrees = np.stack([found[k].evaluations.f_safe for k in order])

@@ -8,7 +8,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from safevar_sumo.answers import Because, Cause, Explained, Explanation, changes, command, number_of, sentence
+from safevar_sumo.answers import Because, Cause, Explained, Explanation, changes, command, number_of, points_in_words, sentence
+from safevar_sumo.simulation import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
 CAUSES_SHOWN = 3
@@ -45,6 +46,9 @@ def _print_one(console: Console, place: str, one: Explanation, members: Characte
     if len(one.causes) > 1:
         _say(console, f"Needed by all of them: {', '.join(one.necessary) or 'nothing'}.")
     _say(console, f"Because: {sentence(one.because)}")
+    if one.because.place:
+        number = len(assemble(told.study).matrix)
+        _say(console, points_in_words(one.points, number, most=len(one.points)))
     if one.whose:
         _say(console, f"In the same vehicle: {one.whose}.")
     console.print(_side_by_side(one.because))

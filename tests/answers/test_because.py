@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safevar_sumo.answers.because import Because, because, courses
+from safevar_sumo.answers.because import Because, because, course
 from safevar_sumo.answers.words import sentence
 from safevar_sumo.records import Drives, Encounter, Outcome, Trace
 
@@ -37,7 +37,7 @@ def drive_of(*vehicles: tuple[float, float, float, float]) -> Drives:
 
 def compared(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> Because:
     drives = drive_of(one, other)
-    return because(*courses(drives, np.array([1.0, 1.0])))
+    return because(*(course(drives, column, 1.0) for column in (0, 1)))
 
 
 SAME = (10.0, 15.0, 0.2, 6.0)

@@ -60,7 +60,7 @@ def test_the_records_are_those_of_the_solutions(case: Case, told: Explained) -> 
     known = [str(handle) for handle in handles(case.solutions)]
     for one in records:
         assert list(one) == ["algorithm", "run", "index", "setting", "outcome", "safety_degree", "changed", "minimal_causes", "robustness",
-                             "because", "whose"]
+                             "because"]
         row = case.solutions.iloc[known.index(f"{one['algorithm']}:{one['run']}:{one['index']}")]
         assert one["setting"] == row[list(case.characteristics.names)].to_dict()
         assert (one["outcome"], one["safety_degree"]) == (row["outcome"], row["safety_degree"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
@@ -13,13 +14,15 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
+from safevar_sumo.ads.full_braking import FullBraking
 from safevar_sumo.analysis import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.report import SECTIONS, findings, limits, make_report
+from safevar_sumo.report import SECTIONS, findings, limits, make_report, material
 from safevar_sumo.report.limits import LIMITS
 from safevar_sumo.report.page import gather
 from safevar_sumo.report.svg import Dot, scatter
+from safevar_sumo.simulation import assemble
 
 
 class Outline(HTMLParser):
@@ -175,6 +178,16 @@ def test_what_was_explained_of_other_results_is_not_taken(
     monkeypatch.setattr(findings, "explain", lambda case, **_: asked.append(case) or Explained(case))
     make_report([tmp_path / "copy"], only=["causes"], jobs=1)
     assert len(asked) == 1
+
+
+def test_what_is_not_as_the_results_say_any_more_is_told(page: str, slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Somebody's driving system was edited since: here another one drives."""
+    assert "not what the results say" not in page
+    monkeypatch.setattr(material, "assemble", lambda *study: replace(assemble(*study), ads=FullBraking()))
+    with pytest.warns(UserWarning, match="simulated again not what the results say"):
+        other = make_report([slippery], only=["verdict", "causes"], jobs=1)
+    assert re.search(r"the outcome is collision there and \w+ here", other)
+    assert Outline(other).open == []
 
 
 @pytest.mark.slow

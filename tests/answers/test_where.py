@@ -1,0 +1,53 @@
+"""In which points of a matrix a failure fails, and how it differs there from the original at the same point."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from safevar_sumo.answers import Unsafe, points_in_words, sentence
+from safevar_sumo.answers.where import Where, where
+from safevar_sumo.simulation import System, assemble, evaluate
+from safevar_sumo.study import load_study
+
+TESTS = [{"name": "CPLA", "model": "along", "over": {"speed": [20, 40]}, "weathers": ["clear", "night"]},
+         {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [30]}}]
+
+
+@pytest.fixture(scope="module")
+def system() -> System:
+    return assemble(load_study("euro_ncap_pedestrian", matrix={"tests": TESTS}))
+
+
+@pytest.fixture(scope="module")
+def weak(system: System) -> np.ndarray:
+    """Half the brakes."""
+    setting = system.characteristics.original.copy()
+    setting[system.characteristics.names.index("maxBrakeTorque")] /= 2
+    return setting[np.newaxis]
+
+
+@pytest.fixture(scope="module")
+def told(system: System, weak: np.ndarray) -> Where:
+    (one,), step = where(system, system.characteristics.original[np.newaxis], weak, Unsafe())
+    assert step == 0.05
+    return one
+
+
+def test_it_fails_where_it_collides_when_simulated_there_alone(system: System, weak: np.ndarray, told: Where) -> None:
+    alone = [point.name for point in system.points if evaluate(system.at(point), weak).collided[0]]
+    assert list(told.points) == alone == ["CPLA, speed 40, clear", "CPLA, speed 40, night", "CPFA, speed 30, clear"]
+
+
+def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(system: System, weak: np.ndarray, told: Where) -> None:
+    assert told.because.changed.safety_degree == evaluate(system, weak).f_safe[0]
+    at = next(point for point in system.points if point.name == told.because.place)
+    original = evaluate(system.at(at), system.characteristics.original[np.newaxis])
+    assert told.because.original.safety_degree == original.f_safe[0]
+    assert sentence(told.because).startswith(f"At {at.name}: the original ")
+
+
+def test_points_in_words() -> None:
+    assert points_in_words(("A, 1", "B"), 9) == "Fails at 2 of 9 points: A, 1; B."
+    assert points_in_words(("A", "B", "C"), 9, most=1) == "Fails at 3 of 9 points: A and 2 more."
+    assert points_in_words((), 9) == "Fails at 0 of 9 points."
