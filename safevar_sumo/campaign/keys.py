@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, one_of
-from safevar_sumo.plugins import Lookup, Member, made
+from safevar_sumo.plugins import Lookup, Member, made, undisturbed
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm
 from safevar_sumo.study import SearchTable, Study
 
@@ -45,7 +45,8 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
             legal = f"{one_of([*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels])}"
             raise InputError(source, f"search.{stray}: there is no such key and no such algorithm", legal)
     member = algorithm_member(name, study)
-    algorithm = made(member, search.parameters.get(label, {}), f"search.algorithms: {name!r}", key, source)
+    with undisturbed(source, [name] if member.guard else []):
+        algorithm = made(member, search.parameters.get(label, {}), f"search.algorithms: {name!r}", key, source)
     return algorithm if member.guard is None else GuardedAlgorithm(algorithm, member.guard)
 
 

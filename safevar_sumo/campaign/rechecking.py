@@ -5,10 +5,10 @@ from __future__ import annotations
 from concurrent.futures import Future
 
 from safevar_sumo.campaign.run import Run
-from safevar_sumo.computing import PersistentPool, foreign_names, packed, refuse_difference, reproducing
+from safevar_sumo.computing import PersistentPool, packed, refuse_difference, reproducing
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, foreign_names
 
 
 class Rechecking:

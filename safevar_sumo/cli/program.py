@@ -9,8 +9,9 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures.thread import _threads_queues
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
@@ -89,18 +90,18 @@ def main() -> None:
         _fail("interrupted", INTERRUPTED)
     except click.ClickException as error:
         error.show()
-        sys.exit(error.exit_code)
+        _leave(error.exit_code)
     except SafevarError as error:
         _fail(str(error), error.exit_code)
     except KeyboardInterrupt:
         _fail("interrupted", INTERRUPTED)
     except BrokenPipeError:
         _drop_output()
-        sys.exit(1)
+        _leave(1)
     except OSError as error:
         _drop_output()
         _fail(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}", 1)
-    sys.exit(code if isinstance(code, int) else 0)
+    _leave(code if isinstance(code, int) else 0)
 
 
 @contextmanager
@@ -136,6 +137,18 @@ def _drop_output() -> None:
 def _fail(message: str, code: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is over: another Ctrl-C changes neither code nor message
     click.echo(f"safevar-sumo: {message}", err=True)
+    _leave(code)
+
+
+def _leave(code: int) -> NoReturn:
+    """End the program, whatever threads other people's code has left running: the interpreter would wait for them, for ever."""
+    left = [one.name for one in threading.enumerate()
+            if one is not threading.current_thread() and not one.daemon and one not in _threads_queues]
+    if left:
+        click.echo(f"note: still running and ended now: {', '.join(left)}", err=True)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     sys.exit(code)
 
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from safevar_sumo.computing.interrupts import result_of
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, foreign_names
 from safevar_sumo.vehicles import CharacteristicSet
 
 LEGAL = ("what happens to vehicle i depends on vehicle i alone: nothing kept in a class, a module or the model itself from one call or "
@@ -23,13 +23,6 @@ class Submit(Protocol):
     """Has a batch of settings computed."""
 
     def __call__(self, settings: FloatArray) -> Future[Evaluations]: ...
-
-
-def foreign_names(study: Study) -> list[str]:
-    """What of a study is computed by code from outside, as the study names it."""
-    named = {"vehicle.model": [study.vehicle.model], "ads.model": [study.ads.model], "scenario.model": [study.scenario.model],
-             "metrics.also": study.metrics.also, "search.objectives": study.search.objectives}
-    return [f"{key} = {name!r}" for key, names in named.items() for name in names if ":" in name]
 
 
 def check_isolation(study: Study, characteristics: CharacteristicSet, submit: Submit) -> None:

@@ -16,11 +16,10 @@ from functools import partial
 import numpy as np
 
 from safevar_sumo.computing.base import Pool, PoolLostError, WorkerLostError
-from safevar_sumo.computing.isolation import foreign_names
 from safevar_sumo.errors import EnvironmentFault, ForeignError, SafevarError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, foreign_names
 from safevar_sumo.vehicles import CharacteristicSet
 
 Then = Callable[[Evaluations | None, BaseException | None], None]

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.plugins import undisturbed
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Drives, Evaluations, FloatArray, Outcome, Trace
 from safevar_sumo.scenarios import VUT, Lane, Point
 from safevar_sumo.scenarios.frame import Frame
@@ -67,6 +68,12 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
 
     With several points the k-th part of the settings is in the k-th of them.
     """
+    guards = [member.guard for member in system.members if member.guard is not None]
+    with undisturbed(guards[0].source if guards else "", [guard.name for guard in guards]):
+        return _driven(system, settings, world, watch)
+
+
+def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher | None) -> Drives:
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_slope(system.points, n))

@@ -15,7 +15,7 @@ import msgspec
 
 from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.errors import InputError, one_of
-from safevar_sumo.plugins import Guard, Lookup, Member, made
+from safevar_sumo.plugins import Guard, Lookup, Member, made, undisturbed
 from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, weather_of
 from safevar_sumo.shipped import NETWORKS
@@ -23,7 +23,7 @@ from safevar_sumo.simulation.checking import check_network
 from safevar_sumo.simulation.measuring import TAKEN, Measuring, measuring_of
 from safevar_sumo.simulation.sources import is_network
 from safevar_sumo.simulation.traci_controller import TraciController
-from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather
+from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, foreign_names
 from safevar_sumo.vehicles import VEHICLE_CONTRACT, VEHICLES, CharacteristicSet, GuardedVehicle, Vehicle, calibration_drive
 
 
@@ -77,6 +77,11 @@ def assemble(study: Study, source: str = "") -> System:
         Naming the study, the key, the value and what is legal.
     """
     source = source or f"study {study.name!r}"
+    with undisturbed(source, foreign_names(study)):
+        return _assembled(study, source)
+
+
+def _assembled(study: Study, source: str) -> System:
     models = models_of(study, source)
     _check_units(study, models.vehicle, models.members[0].guard is None, source)
     measuring = measuring_of(study, Lookup(source, study.origin.places))

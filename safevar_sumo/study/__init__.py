@@ -17,6 +17,7 @@ from safevar_sumo.study.schema import (
     StudyLike,
     VehicleTable,
     Weather,
+    foreign_names,
     label_of,
     study_names,
     study_path,
@@ -26,5 +27,5 @@ from safevar_sumo.study.writing import check_writable, write_study
 
 __all__ = [
     "CharacteristicTable", "FitTable", "FreeParameter", "MatrixTable", "MatrixTest", "MetricsTable", "ModelTable", "Origin", "SearchTable",
-    "Study", "StudyLike", "VehicleTable", "Weather", "check_writable", "converted", "invalid", "label_of", "load_study",
+    "Study", "StudyLike", "VehicleTable", "Weather", "check_writable", "converted", "foreign_names", "invalid", "label_of", "load_study",
     "refuse_other_than_file", "study_names", "study_path", "tables_of", "write_study"]

@@ -242,6 +242,14 @@ def study_path(study: str) -> Path:
     raise InputError("study", f"there is no study or file {study!r}", legal)
 
 
+def foreign_names(study: Study) -> list[str]:
+    """What of a study is computed by code from outside, as the study names it."""
+    tests = [] if study.matrix is None else [test.model for test in study.matrix.tests]
+    named = {"vehicle.model": [study.vehicle.model], "ads.model": [study.ads.model], "scenario.model": [study.scenario.model, *tests],
+             "metrics.also": study.metrics.also, "search.objectives": study.search.objectives}
+    return [f"{key} = {name!r}" for key, names in named.items() for name in dict.fromkeys(names) if ":" in name]
+
+
 def is_file(path: Path) -> bool:
     try:
         return path.is_file()

@@ -8,6 +8,7 @@ import pkgutil
 import re
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import click
@@ -16,7 +17,7 @@ from click.testing import CliRunner
 
 import safevar_sumo
 from safevar_sumo import cli
-from safevar_sumo.cli.program import COMMANDS, commands
+from safevar_sumo.cli.program import COMMANDS, commands, main
 from safevar_sumo.errors import InputError
 
 HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
@@ -90,3 +91,16 @@ def test_a_range_of_numbers_does_not_hold_what_is_no_number(typed: str) -> None:
     told = CliRunner().invoke(commands, typed.split())
     assert told.exit_code == 2
     assert "nan is not in the range" in told.stderr
+
+
+def test_a_thread_that_somebody_has_left_running_does_not_keep_the_program(monkeypatch: pytest.MonkeyPatch,
+                                                                           capsys: pytest.CaptureFixture[str]) -> None:
+    ended = threading.Event()
+    left = threading.Thread(target=ended.wait, name="left")
+    left.start()
+    monkeypatch.setattr(sys, "argv", ["safevar-sumo", "list"])
+    monkeypatch.setattr(os, "_exit", sys.exit)
+    with pytest.raises(SystemExit, match="^0$"):
+        main()
+    ended.set()
+    assert capsys.readouterr().err == "note: still running and ended now: left\n"
