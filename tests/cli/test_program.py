@@ -100,7 +100,7 @@ def test_a_thread_that_somebody_has_left_running_does_not_keep_the_program(monke
     left.start()
     monkeypatch.setattr(sys, "argv", ["safevar-sumo", "list"])
     monkeypatch.setattr(os, "_exit", sys.exit)
-    with pytest.raises(SystemExit, match="^0$"):
+    with pytest.raises(SystemExit, match=r"^0$"):
         main()
     ended.set()
     assert capsys.readouterr().err == "note: still running and ended now: left\n"
