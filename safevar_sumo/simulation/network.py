@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import subprocess
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
@@ -24,6 +25,7 @@ from safevar_sumo.simulation.sources import OPTIONS, Sources, sources_of
 
 ROADS = "network.net.xml"
 NOBODY = "nobody.rou.xml"
+TRIED = "tried.txt"
 RECIPE = ("--xml-validation", "never")
 """Options of netconvert in every network."""
 
@@ -53,7 +55,7 @@ def copied_network(folder: str, n: int, *others: str) -> CopiedNetwork:
     size = round_up(n * len(places))
     roads = cached(_name(sources, size, sources.roads), ROADS, partial(_copy_roads, sources, size))
     contents = tuple((place / TRAFFIC).read_bytes() for place in places)
-    traffic = cached(f"{sources.place.name}-{n}-{_digest(contents, str(n))}", TRAFFIC, partial(_copy_demand, places, n))
+    traffic = cached(_folder(sources, n, _digest(contents, str(n))), TRAFFIC, partial(_copy_demand, places, n))
     return CopiedNetwork(roads, traffic, sources.place / OPTIONS)
 
 
@@ -107,8 +109,12 @@ def round_up(n: int) -> int:
 
 def _name(sources: Sources, n: int, files: Sequence[str]) -> str:
     """Where in the cache `n` copies are that are made from these files."""
-    digest = _digest(sources.contents(*files), f"{n} {sources.plain} {sources.options}")
-    return f"{sources.place.name}-{n}-{digest}"
+    return _folder(sources, n, _digest(sources.contents(*files), f"{n} {sources.plain} {sources.options}"))
+
+
+def _folder(sources: Sources, n: int, digest: str) -> str:
+    """SUMO takes a comma for the beginning of another file."""
+    return f"{re.sub(r'[^a-zA-Z0-9_.-]', '_', sources.place.name)}-{n}-{digest}"
 
 
 @cache
@@ -140,6 +146,7 @@ def _is_nobody(child: ElementTree.Element) -> bool:
 
 def _built(sources: Sources) -> Path:
     if sources.built:
+        cached(_name(sources, 0, sources.roads), TRIED, partial(_try, sources))
         return sources.place / sources.built
     return cached(_name(sources, 0, sources.roads), ROADS, partial(_build, sources))
 
@@ -150,21 +157,36 @@ def _checked(file: Path) -> ElementTree.Element:
     return root
 
 
-def _build(sources: Sources, into: Path) -> None:
+def _run(sources: Sources, program: str, *arguments: str) -> tuple[int, str]:
+    """Run a program of SUMO's in a network's folder: how it ended, and the errors that it told."""
     import sumo
 
-    command = [str(Path(sumo.SUMO_HOME) / "bin" / "netconvert")]
+    done = subprocess.run([str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments, *RECIPE], capture_output=True, text=True,
+                          errors="replace", check=False, cwd=sources.place, env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME})
+    lines = [line.strip() for line in done.stderr.splitlines() if line.strip() and not line.startswith(("Warning:", "Quitting"))]
+    return done.returncode, " ".join(lines).removeprefix("Error: ")[:500]
+
+
+def _try(sources: Sources, into: Path) -> None:
+    """Have SUMO load a network that somebody else built, in a process of its own: it dies of some that are broken."""
+    _checked(sources.place / sources.built)
+    code, told = _run(sources, "sumo", "-n", sources.built, "--no-step-log", "true", "--end", "0")
+    if code != 0:
+        raise InputError(sources.place / sources.built, f"SUMO cannot load it: {told or f'it dies with exit code {code}'}",
+                         "a network of SUMO")
+    (into / TRIED).write_text("SUMO loads it.\n", encoding="ascii")
+
+
+def _build(sources: Sources, into: Path) -> None:
+    command = list[str]()
     for option, names in sources.plain:
-        command += [f"--{option}", ",".join(str(sources.place / name) for name in names)]
+        command += [f"--{option}", ",".join(names)]
     for option, value in sources.options:
         command += [f"--{option}", value]
-    done = subprocess.run([*command, "-o", str(into / ROADS), *RECIPE], capture_output=True, text=True, errors="replace", check=False,
-                          env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME})
-    if done.returncode != 0:
-        lines = [line.strip() for line in done.stderr.splitlines() if line.strip() and not line.startswith(("Warning:", "Quitting"))]
-        told = " ".join(lines).removeprefix("Error: ")[:500]
-        if done.returncode < 0 or not told or ("Could not" in told and "output" in told) or "bad_alloc" in told:
-            raise EnvironmentFault(f"{sources.place}: netconvert fails: {told or f'exit code {done.returncode}'}")
+    code, told = _run(sources, "netconvert", *command, "-o", str(into / ROADS))
+    if code != 0:
+        if code < 0 or not told or ("Could not" in told and "output" in told) or "bad_alloc" in told:
+            raise EnvironmentFault(f"{sources.place}: netconvert fails: {told or f'exit code {code}'}")
         raise InputError(sources.place, f"netconvert refuses the network: {told}", "sources that netconvert builds a network from")
     _keep_the_net_alone(into / ROADS)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -57,16 +59,23 @@ def sources_of(network: str) -> Sources:
     InputError
         If there is no such network, a file is missing, or it is not clear which files count.
     """
-    for place in (NETWORKS / network, Path(network)):
-        if is_network(place):
-            sources = _in_folder(place) if place.is_dir() else Sources(place.parent, built=place.name)
-            for name in (TRAFFIC, OPTIONS):
-                if not (sources.place / name).is_file():
-                    raise InputError(sources.place, f"{name} is missing", LEGAL)
-            return sources
+    place = NETWORKS / network if is_shipped(network) else Path(network)
+    if is_network(place):
+        sources = _in_folder(place, _listing(place)) if place.is_dir() else Sources(place.parent, built=place.name)
+        if "," in str(sources.place.absolute()):
+            raise InputError(sources.place, "has a comma in its path, where SUMO takes the next file to begin", "a folder without")
+        for name in (TRAFFIC, OPTIONS):
+            if not (sources.place / name).is_file():
+                raise InputError(sources.place, f"{name} is missing", LEGAL)
+        return sources
     names = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
     raise InputError("scenario.parameters.network", f"there is no network {network!r}",
                      f"one of {', '.join(names)}, a folder, or a {BUILT} beside {TRAFFIC} and {OPTIONS}")
+
+
+def is_shipped(network: str) -> bool:
+    """Whether it is the name of one of `sumo_nets/`."""
+    return network not in ("", ".", "..") and Path(network).name == network and is_network(NETWORKS / network)
 
 
 def is_network(place: Path) -> bool:
@@ -77,7 +86,15 @@ def is_network(place: Path) -> bool:
         return False
 
 
-def _in_folder(place: Path) -> Sources:
+def _listing(place: Path) -> tuple[tuple[str, int, int], ...]:
+    """Names, times of change and sizes of what lies in a folder."""
+    with os.scandir(place) as entries:
+        return tuple(sorted((entry.name, entry.stat().st_mtime_ns, entry.stat().st_size) for entry in entries if entry.is_file()))
+
+
+@lru_cache(maxsize=256)
+def _in_folder(place: Path, listing: tuple[tuple[str, int, int], ...]) -> Sources:
+    """The sources in a folder; looked at again when its `listing` changes."""
     plain, named = _plain(place), _named(place)
     if plain is not None and (not plain.builds or named in ("", plain.builds) or not (place / named).is_file()):
         sources = plain

@@ -18,10 +18,9 @@ from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.plugins import Guard, Lookup, Member, made, undisturbed
 from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, weather_of
-from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.simulation.checking import check_network
 from safevar_sumo.simulation.measuring import TAKEN, Measuring, measuring_of
-from safevar_sumo.simulation.sources import is_network
+from safevar_sumo.simulation.sources import is_network, is_shipped
 from safevar_sumo.simulation.traci_controller import TraciController
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, foreign_names
 from safevar_sumo.vehicles import VEHICLE_CONTRACT, VEHICLES, CharacteristicSet, GuardedVehicle, Vehicle, calibration_drive
@@ -147,7 +146,7 @@ def _with_network(scenario: Any, places: Sequence[str]) -> Any:
     """The scenario on the folder beside the study, if it names one that lies there and is none of ours."""
     folder = scenario.network
     found = next((str(Path(place, folder)) for place in places if is_network(Path(place, folder))), folder)
-    if found == folder or is_network(NETWORKS / folder):
+    if found == folder or is_shipped(folder):
         return scenario
     if isinstance(scenario, msgspec.Struct):
         return msgspec.structs.replace(scenario, network=found)

@@ -160,6 +160,14 @@ def test_what_cannot_be_copied_of_a_built_network_is_refused(mine: Path, old: st
     assert told in str(caught.value)
 
 
+def test_a_built_network_that_sumo_dies_of_is_refused(mine: Path) -> None:
+    for name in ("network.nod.xml", "network.edg.xml", "network.con.xml", "network.netccfg"):
+        (mine / name).unlink()
+    rewritten(mine / "network.net.xml", ' via=":crossing_0_0"', "")
+    with pytest.raises(InputError, match=r"network\.net\.xml: SUMO cannot load it: it dies"):
+        check_network(str(mine))
+
+
 def test_every_id_of_a_built_network_is_its_copys_alone(tmp_path: Path) -> None:
     """Roundabouts, opposite lanes, rails, traffic lights, walking areas: no id of the original is left, no copy shares one."""
     netgenerate = str(Path(sumo.SUMO_HOME) / "bin" / "netgenerate")
