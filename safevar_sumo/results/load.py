@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from safevar_sumo.errors import InputError
 from safevar_sumo.results.frames import NOTHING
 from safevar_sumo.results.imported import read_imported
@@ -93,8 +95,7 @@ def load(directory: str | Path) -> Results:
         evaluations = content.evaluations.take([row for _, row in asked])
         everything.append(((algorithm, run), evaluations))
         positions += [position for position, _ in asked]
-        failures += [Failure(algorithm, run, position, evaluations.reason(row))
-                     for row, (position, _) in enumerate(asked) if not evaluations.valid[row]]
+        failures += [Failure(algorithm, run, asked[row][0], evaluations.reason(row)) for row in np.flatnonzero(~evaluations.valid)]
         result = content.result(budget)
         if result is not None:
             solved.append(((algorithm, run), content.by_position(result.positions)))
