@@ -20,6 +20,15 @@ def test_a_forecast_counts_and_measures(study: Study) -> None:
     assert told.size >= 600 * 8 * (12 + len(METRICS))
 
 
+@pytest.mark.parametrize("workers", [1, 4])
+def test_a_forecast_tells_what_all_workers_do_together(workers: int, study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = iter(range(100))
+    monkeypatch.setattr("time.perf_counter", lambda: float(next(seconds)))
+    pool = FormulaPool(workers)
+    rate = forecast(study, 6, pool).rate
+    assert rate == 4 / 5 * (len(pool.simulated) - 1), "settings of the second probe, in a second; the first one warms up"
+
+
 def test_a_forecast_of_a_study_at_fault_tells_the_fault(study: Study) -> None:
     with pytest.raises(PoolLostError):
         forecast(study, 6, FormulaPool(lasts=0))

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from safevar_sumo.computing import evaluate_batch, identity_of, packed
-from safevar_sumo.computing.identity import inputs_of, powers_digest
+from safevar_sumo.computing.identity import changed, inputs_of, powers_digest
 from safevar_sumo.errors import InputError
 from safevar_sumo.results.manifest import LAYERS
 from safevar_sumo.shipped import NETWORKS
@@ -47,6 +47,17 @@ def test_a_worker_with_another_file_computes_nothing(layer: str) -> None:
     inputs[layer] = {**inputs[layer], "a_file.py": "0123456789abcdef"}
     with pytest.raises(InputError, match=r"a_file\.py: is not the file that this study began with"):
         evaluate_batch(packed(study, inputs), original)
+
+
+@pytest.mark.parametrize("file", ["scenario.sumocfg", "network.nod.xml", "network.netccfg"])
+def test_every_file_of_a_network_that_results_hang_on_counts(file: str, tmp_path: Path) -> None:
+    shutil.copytree(NETWORKS / "lead_vehicle_stopped", tmp_path / "mine")
+    study = load_study("native", scenario={"parameters": {"network": str(tmp_path / "mine")}})
+    before = inputs_of(study, assemble(study))["network"]
+    text = (tmp_path / "mine" / file).read_text()
+    (tmp_path / "mine" / file).write_text(text + "<!-- -->")
+    after = inputs_of(study, assemble(study))["network"]
+    assert changed({"network": before}, {"network": after}) == [file]
 
 
 def test_a_network_that_changes_between_two_batches_is_noticed(tmp_path: Path) -> None:

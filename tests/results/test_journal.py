@@ -172,6 +172,23 @@ def test_a_run_has_one_owner_and_a_dead_ones_lock_is_gone(tmp_path: Path) -> Non
     Journal(path, "study", "nsga2-00").close()
 
 
+def test_a_full_disk_after_a_torn_tail_leaves_what_was_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.journal"
+    end = write(path, batches=2, finished=False)[-1]
+    path.write_bytes(path.read_bytes() + b"torn" * 50)
+    journal = Journal(path, "study", "nsga2-00")
+    assert journal.cut > 0
+
+    def full(handle: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(SafevarError, match="No space left"):
+        journal.append(places(2), batch(2))
+    assert path.stat().st_size == end
+    journal.close()
+
+
 @pytest.mark.parametrize("written", [0, 7, 40])
 def test_a_full_disk_leaves_what_was_there_and_can_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int) -> None:
     path = tmp_path / "a.journal"

@@ -62,6 +62,14 @@ def test_carlas_engine_pulls_nothing_beyond_its_limit_and_its_curve_has_its_poin
     assert torque(5801) == 0
 
 
+def test_carlas_engine_turns_no_faster_than_its_limit_even_if_the_wheels_drive_it() -> None:
+    """In first gear at 30 m/s, through a clutch that hardly slips, they would turn it half as fast again."""
+    vehicle, p, one = SYSTEMS["carla"].vehicle, prepared("carla", clutchStrength=200.0, dampRateZeroT_CE=0.1), np.ones(1)
+    limit = 5800 * 2 * np.pi / 60
+    state = vehicle.at_rest(p)._replace(speed=30 * one, wheel_speed=30 / 0.355 * one, engine_speed=limit * one, gear=one, target_gear=one)
+    assert vehicle.advance(p, state, Command(np.zeros(1), np.zeros(1))).engine_speed[0] <= limit
+
+
 def test_carlas_pedals_rise_and_fall_at_their_own_rates() -> None:
     vehicle = SYSTEMS["carla"].vehicle
     one = np.ones(1)
