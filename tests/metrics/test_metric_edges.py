@@ -38,6 +38,13 @@ def test_exposed_time_up_to_an_end_is_that_of_the_samples_before_it() -> None:
     assert value("tet", ended(braking_run(10, 5, 12), 0.3)) == pytest.approx(0.3)
 
 
+def test_a_distance_below_zero_is_no_time_to_collision() -> None:
+    run = braking_run(10, 5, 12)
+    behind = dataclasses.replace(run, encounter=run.encounter._replace(distance=run.encounter.distance - 20))
+    assert np.isinf(time_to_collision(behind)).all()
+    assert value("tit", behind) == 0
+
+
 def test_a_sampling_interval_of_one_step_is_every_step() -> None:
     run = braking_run(10, 5, 12)
     for name in ("tet", "tit", "ave_dece"):

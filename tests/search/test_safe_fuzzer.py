@@ -56,6 +56,18 @@ def test_it_ends_after_five_generations_without_improvement() -> None:
     assert sum(len(settings) for settings in asked) == 500 + 5 * 50
 
 
+def test_an_improvement_begins_the_count_of_generations_without_one_anew() -> None:
+    single = CharacteristicSet((Characteristic(name="c", unit="-", original=5.0, lower=4.0, upper=6.0),))
+    generations = iter(range(1, 100))
+
+    def better_in_the_thirteenth(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
+        safety = 0.5 if next(generations) == 13 else 1.0
+        return evaluated(characteristics, np.full_like(settings, 6.0), np.full(len(settings), safety))
+
+    _, asked = searched("safe_fuzzer", 4, 5000, single, better_in_the_thirteenth)
+    assert len(asked) == 13 + 5
+
+
 def test_a_range_inside_the_filters_band_does_not_hang_it() -> None:
     """The mean of the unsafe values lies so near the original that nothing outside the band is left."""
     narrow = CharacteristicSet((Characteristic(name="c", unit="-", original=5.0, lower=4.95, upper=7.0),))
