@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     )
     from safevar_sumo.errors import InputError, SafevarError, SimulationError
     from safevar_sumo.report import make_report
+    from safevar_sumo.results import Status, status
     from safevar_sumo.showing import Comparison, animate, compare, draw_comparison, show_in_gui
     from safevar_sumo.study import Study, Weather, load_study, study_names
 
@@ -43,14 +44,15 @@ _ROOM_OF = {
     "explain": "api", "tolerance": "api", "risk": "api", "rules": "api",
     "Comparison": "showing", "compare": "showing", "draw_comparison": "showing", "animate": "showing", "show_in_gui": "showing",
     "make_report": "report",
+    "status": "results", "Status": "results",
     "SafevarError": "errors", "InputError": "errors", "SimulationError": "errors",
 }
 """Every public name and the room that it comes from."""
 
 __all__ = [
-    "Comparison", "Figures", "InputError", "Results", "SafevarError", "Simulation", "SimulationError", "Study", "Tables", "Weather",
-    "__version__", "animate", "compare", "draw_comparison", "evaluate", "explain", "figures", "load", "load_study", "make_report", "risk",
-    "rules", "run", "show_in_gui", "simulate", "study_names", "tables", "tolerance",
+    "Comparison", "Figures", "InputError", "Results", "SafevarError", "Simulation", "SimulationError", "Status", "Study", "Tables",
+    "Weather", "__version__", "animate", "compare", "draw_comparison", "evaluate", "explain", "figures", "load", "load_study",
+    "make_report", "risk", "rules", "run", "show_in_gui", "simulate", "status", "study_names", "tables", "tolerance",
 ]
 
 if not TYPE_CHECKING:  # a type checker is to know the names above, and no others

@@ -52,6 +52,11 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Half the width of its way [m].
     reach
         Its sensors' range in clear weather [m].
+
+    Notes
+    -----
+    The defaults are chosen, not measured: so that the original vehicle of `carla` avoids the standard points of Euro NCAP's
+    pedestrian and car-to-car tests with little to spare. docs/scenarios.md tells where it cannot.
     """
 
     cruise_speed: Positive | None = None

@@ -7,9 +7,10 @@ from safevar_sumo.results.imported import UNKNOWN, write_imported
 from safevar_sumo.results.journal import Journal, JournalBusy
 from safevar_sumo.results.load import Failure, Results, failure_lines, load
 from safevar_sumo.results.manifest import fixed, read_manifest
+from safevar_sumo.results.status import RunStatus, Status, status
 from safevar_sumo.results.store import ORIGINAL, ResultsDirectory, evaluations_frame, record, solutions_frame
 
 __all__ = [
     "CHOICES", "HALF", "ORIGINAL", "SPARE", "UNKNOWN", "Failure", "Handle", "Journal", "JournalBusy", "Results", "ResultsDirectory",
-    "chosen_handle", "evaluations_frame", "failure_lines", "fixed", "handles", "load", "make_directory", "position_of",
-    "read_manifest", "record", "solutions_frame", "unsafe_rows", "write_imported", "write_whole"]
+    "RunStatus", "Status", "chosen_handle", "evaluations_frame", "failure_lines", "fixed", "handles", "load", "make_directory",
+    "position_of", "read_manifest", "record", "solutions_frame", "status", "unsafe_rows", "write_imported", "write_whole"]

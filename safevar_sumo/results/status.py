@@ -62,6 +62,16 @@ class Status(NamedTuple):
 def status(directory: str | Path) -> Status:
     """Look at a results directory, whether anybody works on it or not.
 
+    Parameters
+    ----------
+    directory
+        What the command `study` or `run` writes to.
+
+    Returns
+    -------
+    Status
+        How far every run is, and what was found so far.
+
     Raises
     ------
     InputError

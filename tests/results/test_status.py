@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import safevar_sumo as sv
 from safevar_sumo.analysis import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.results.status import status
+from safevar_sumo.results import status
 
 
 def contents(place: Path) -> dict[str, tuple[bytes, int]]:
@@ -21,6 +22,7 @@ def contents(place: Path) -> dict[str, tuple[bytes, int]]:
 
 
 def test_a_finished_study_is_told_as_its_journals_hold_it(slippery: Path) -> None:
+    assert sv.status is status
     before = contents(slippery)
     told, (case,) = status(slippery), load_cases([slippery])
     assert contents(slippery) == before

@@ -1,0 +1,64 @@
+"""Every point of the matrices that ship: where and when it hits who does not brake, that the originals avoid it, and what fails."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from holding import Hold, at_contact
+
+from safevar_sumo.records import Drives
+from safevar_sumo.scenarios import Crossing
+from safevar_sumo.scenarios.along import Along
+from safevar_sumo.simulation import System, assemble, at_every_point
+from safevar_sumo.study import load_study
+
+BRAKE = {"euro_ncap_pedestrian": "maxBrakeTorque", "euro_ncap_car_to_car": "maxBrakeTorque", "wear": "brakeTorque"}
+
+
+def clear(study: str) -> System:
+    """The matrix by day: the dark changes nothing of who walks where."""
+    system = assemble(load_study(study))
+    return replace(system, matrix=tuple(point for point in system.points if point.weather.name != "night"))
+
+
+def original_and_half_its_brakes(study: str, system: System) -> np.ndarray:
+    half = system.characteristics.original.copy()
+    half[system.characteristics.names.index(BRAKE[study])] /= 2
+    return np.stack([system.characteristics.original, half])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("study", BRAKE)
+def test_who_does_not_brake_is_where_the_protocol_says_at_every_point(study: str) -> None:
+    """The impact location within 2 % of the width; a pedestrian's arrival within 5 cm of his way or of the vehicle's."""
+    system = replace(clear(study), ads=Hold())
+    for found in at_every_point(system, system.characteristics.original[np.newaxis]):
+        scenario, run = found.point.scenario, found.drives
+        assert found.evaluations.collided[0], found.point.name
+        assert struck(run, scenario.vut_width) == pytest.approx(scenario.impact_location / 100, abs=0.02), found.point.name
+        if isinstance(scenario, Crossing | Along):
+            late = abs(at_contact(run, run.trace.time) - 6.0)
+            assert late * scenario.speed / 3.6 < 0.05, found.point.name
+
+
+def struck(run: Drives, width: float) -> float:
+    return at_contact(run, run.trace.lateral[:, 0]) / width + 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("study", BRAKE)
+def test_the_originals_avoid_every_shipped_point_and_with_half_their_brakes_some_fail(study: str) -> None:
+    system = assemble(load_study(study))
+    collided = np.stack([one.evaluations.collided for one in at_every_point(system, original_and_half_its_brakes(study, system))])
+    assert not collided[:, 0].any()
+    assert collided[:, 1].any()
+
+
+def test_the_worn_cars_matrix_at_its_edges() -> None:
+    system = assemble(load_study("wear"))
+    edges = tuple(point for point in system.points if point.name in ("CPNCO, speed 40, wet", "CPLA, speed 60, wet"))
+    system = replace(system, matrix=edges)
+    collided = [one.evaluations.collided.tolist() for one in at_every_point(system, original_and_half_its_brakes("wear", system))]
+    assert collided == [[False, False], [False, True]]
