@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import platformdirs
@@ -41,11 +41,14 @@ class _BuiltRoads:
         self._network = network
 
     def lane(self, lane: str) -> Lane:
-        network = built_network(self._network)
-        shapes = _shapes(network, network.read_bytes())
-        if lane not in shapes:
+        if lane not in self._lanes:
             raise InputError(sources_of(self._network).place, f"there is no lane {lane!r}")
-        return shapes[lane]
+        return self._lanes[lane]
+
+    @cached_property
+    def _lanes(self) -> dict[str, Lane]:
+        network = built_network(self._network)
+        return _shapes(network, network.read_bytes())
 
 
 @lru_cache(maxsize=100)
