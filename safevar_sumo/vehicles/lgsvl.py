@@ -278,8 +278,10 @@ def _tyre_stiffness(p: _Prepared, speed: FloatArray, rim: FloatArray, slipping: 
     """Force per speed of slipping [N s/m] of Unity's WheelCollider: a parabola to the extremum, then down to the asymptote."""
     denominator = np.maximum(np.maximum(speed, rim), SLIP_FLOOR)
     slip = np.abs(slipping) / denominator
-    rising = (TWO - slip / PEAK_SLIP) / PEAK_SLIP
-    beyond = np.minimum((slip - PEAK_SLIP) / SLIPS_BEYOND, ONE)
-    falling = (ONE - FRICTION_LOST * beyond) / np.maximum(slip, PEAK_SLIP)
+    friction = (TWO - slip / PEAK_SLIP) / PEAK_SLIP
+    slides = slip >= PEAK_SLIP
+    if np.count_nonzero(slides):
+        beyond = np.minimum((slip - PEAK_SLIP) / SLIPS_BEYOND, ONE)
+        friction = np.where(slides, (ONE - FRICTION_LOST * beyond) / np.maximum(slip, PEAK_SLIP), friction)
     load = p.weight + DOWNFORCE * speed * speed
-    return np.asarray(p.friction * load * np.where(slip < PEAK_SLIP, rising, falling) / denominator)
+    return np.asarray(p.friction * load * friction / denominator)
