@@ -123,10 +123,11 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """The vehicle `time_to_impact` before the pedestrian's path, the pedestrian beside it, and the parked cars or none."""
         frame, walks_on = Frame.of(roads.lane(APPROACH)), WAYS[self._of("side")]
         path, _ = frame.place_of(roads.lane(CROSSING).start)
-        leaves, _ = frame.place_of(roads.lane(CROSSING).end)
-        if abs(leaves - path) > SKEW:
-            raise InputError("scenario.parameters.network", f"the crossing {CROSSING!r} leads {leaves - path:.2f} m along the road",
-                             "a crossing at right angles")
+        for lane in (CROSSING, *(f"{edge}_0" for edge in walks_on)):
+            enters, leaves = (frame.place_of(point)[0] for point in roads.lane(lane))
+            if abs(leaves - enters) > SKEW:
+                raise InputError("scenario.parameters.network", f"lane {lane!r} leads {abs(leaves - enters):.2f} m along the road",
+                                 "a way across at right angles")
         body = BODIES[self._of("target")]
         front = path - body.width / 2 - self.speed * KMH * self.time_to_impact
         if front - self.vut_length < 0:

@@ -58,8 +58,8 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
         frame, crossing = Frame.through_origin(world.lane_of(VUT)), world.lane(CROSSING_LANE)
         (path, _), (leaves, _) = frame.place_of(crossing.start), frame.place_of(crossing.end)
         if abs(leaves - path) > SKEW:
-            raise InputError("scenario.parameters.network", f"the crossing {CROSSING_LANE!r} leads {leaves - path:.2f} m along the road",
-                             "a crossing at right angles")
+            raise InputError("scenario.parameters.network", f"lane {CROSSING_LANE!r} leads {abs(leaves - path):.2f} m along the road",
+                             "a way across at right angles")
         lateral = frame.left(world.person_positions(PEDESTRIAN)) - frame.left(world.vehicle_positions(VUT))
         if self.turns_after is not None and lateral[0] > self.turns_after:
             raise InputError("scenario.parameters.network", f"the pedestrian begins {lateral[0]:.2f} m to the left of the vehicle",

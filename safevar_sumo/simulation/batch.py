@@ -85,7 +85,11 @@ def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watch
 
     state = at_start(vehicle, prepared, world.speeds())
     driver = system.ads.start(n, system.nominal, step)
-    parts = Parts(system.points, world, n)
+    try:
+        parts = Parts(system.points, world, n)
+    except world.api.TraCIException as error:
+        raise InputError("scenario.parameters.network", f"the scenario does not find what it looks for: {str(error).strip()}",
+                         "a network and traffic with the ids that the scenario names") from None
     log = _Log(n, int(parts.last.max()) + 1)
     verdict = _Verdict(n)
     for sample in range(log.length):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -128,7 +129,7 @@ def seconds(text: str) -> float | None:
             total += factor * float(part)
     except ValueError:
         return None
-    return total
+    return total if math.isfinite(total) else None
 
 
 def _text(element: ElementTree.Element, ids: Ids) -> str:

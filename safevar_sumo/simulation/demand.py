@@ -10,6 +10,7 @@ from pathlib import Path
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.simulation.copies import DEMAND, seconds
+from safevar_sumo.simulation.places import check_places, is_number
 
 _ACTORS = ("vehicle", "trip", "flow", "person", "personFlow")
 _RIDING, _WALKING = ("route", "stop", "param"), ("walk", "personTrip", "stop", "param")
@@ -50,6 +51,7 @@ def check_demand(root: ElementTree.Element, file: Path, roads: ElementTree.Eleme
     _check_ids(root, file, roads)
     _check_vut(root, file)
     _check_chance(root, file, options)
+    check_places(root, file, roads)
 
 
 def _called(element: ElementTree.Element) -> str:
@@ -60,12 +62,15 @@ def _check_element(element: ElementTree.Element, file: Path) -> None:
     for name, value in element.attrib.items():
         if name in ELSEWHERE:
             raise InputError(file, f"{_called(element)}: {name} = {value!r}", "edges and lanes of the network; no other file is read")
-        if "random" in value or (name == "period" and value.startswith("exp")) or (name in RANDOM and not _zero(value)):
+        chosen = name.startswith(("depart", "arrival")) and value.startswith("random")
+        if chosen or (name == "period" and value.startswith("exp")) or (name in RANDOM and not _zero(value)):
             raise InputError(file, f"{_called(element)}: {name} = {value!r} draws at random", "the same in every copy of the network")
     if element.tag == "param" and DEVICES.fullmatch(element.get("key", "")):
         raise InputError(file, f"param {element.get('key')!r} gives a device", "no devices: they write files, or draw at random")
     if element.tag in _ACTORS and seconds(element.get("depart", element.get("begin", "0"))) is None:
-        raise InputError(file, f"{_called(element)}: depart = {element.get('depart')!r}", "a time [s]")
+        raise InputError(file, f"{_called(element)}: depart = {element.get('depart', element.get('begin'))!r}", "a time [s]")
+    if element.tag in _ACTORS and not is_number(element.get("speedFactor", "1")):
+        raise InputError(file, f"{_called(element)}: speedFactor = {element.get('speedFactor')!r}", "a number")
 
 
 def _check_ids(root: ElementTree.Element, file: Path, roads: ElementTree.Element) -> None:
@@ -107,7 +112,8 @@ def _check_vut(root: ElementTree.Element, file: Path) -> None:
         raise InputError(file, f"vehicle {VUT!r}: type = {vut.get('type')!r}", f"{VUT!r}, a vType that becomes what a setting says")
     if seconds(vut.get("depart", "")) != 0:
         raise InputError(file, f"vehicle {VUT!r}: depart = {vut.get('depart')!r}", "0")
-    if any(stop.tag == "stop" for stop in vut.iter()):
+    routes = [route for route in root if route.tag == "route" and route.get("id") == vut.get("route")]
+    if any(part.find(".//stop") is not None for part in (vut, *routes)):
         raise InputError(file, f"vehicle {VUT!r} has a stop", "none: its ADS drives it")
     for element in root:
         if element is not vut and element.get("type") == VUT:
@@ -132,9 +138,9 @@ def _check_chance(root: ElementTree.Element, file: Path, options: Mapping[str, s
 
 def _chances(kind: ElementTree.Element, actor: ElementTree.Element, options: Mapping[str, str]) -> Iterator[tuple[str, str]]:
     deviation = kind.get("speedDev", options.get("default.speeddev"))
-    if not _number(kind.get("speedFactor", "1")):
+    if not is_number(kind.get("speedFactor", "1")):
         yield f"speedFactor = {kind.get('speedFactor')!r}", "a number"
-    if not _number(actor.get("speedFactor", "")) and not _zero(deviation or "0.1"):
+    if not is_number(actor.get("speedFactor", "")) and not _zero(deviation or "0.1"):
         yield f"speedDev = {deviation or 'SUMO default 0.1'}", 'speedDev="0"'
     if actor.tag in ("person", "personFlow"):
         return
@@ -145,13 +151,5 @@ def _chances(kind: ElementTree.Element, actor: ElementTree.Element, options: Map
         yield f"carFollowModel = {model!r}", one_of(SIGMA | STEADY)
 
 
-def _number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 def _zero(text: str) -> bool:
-    return _number(text) and float(text) == 0
+    return is_number(text) and float(text) == 0

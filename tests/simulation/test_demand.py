@@ -83,6 +83,10 @@ BAD = {
     "an id twice": ('<trip id="vut" type="car" from="oncoming" depart="0"/>', "trip has the id 'vut'"),
     "the tested type for others": (
         '<trip id="t" type="vut" from="oncoming" depart="0"/>', "type = 'vut', which changes with every setting"),
+    "a place beyond the road": (
+        '<trip id="t" type="car" from="oncoming" depart="0" departPos="900"/>', "departPos = 900 is not on 'oncoming'"),
+    "a stop beyond the road": (
+        '<trip id="t" type="car" from="oncoming" depart="0"><stop lane="oncoming_0" endPos="99"/></trip>', "endPos = 99 is not on"),
     "a ride": ('<person id="w" type="walker" depart="0"><ride from="approach" to="departure" lines="vut"/></person>', "has a 'ride'"),
     "a departure by chance": ('<trip id="t" type="car" from="oncoming" depart="triggered"/>', "depart = 'triggered'"),
     "junction to junction": ('<trip id="t" type="car" depart="0" fromJunction="east" toJunction="west"/>', "fromJunction = 'east'"),

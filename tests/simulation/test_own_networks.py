@@ -160,6 +160,28 @@ def test_what_cannot_be_copied_of_a_built_network_is_refused(mine: Path, old: st
     assert told in str(caught.value)
 
 
+@pytest.mark.parametrize(("file", "old", "new", "told"), [
+    ("network.nod.xml", 'x="80" y="0"', 'x="80" y="0" z="4"', "lane 'departure_0', which climbs"),
+    ("network.edg.xml", 'id="approach"', 'id="approach" friction="0.3"', "lane 'approach_0' of friction 0.3")])
+def test_a_road_that_the_vehicle_would_not_feel_is_refused(mine: Path, file: str, old: str, new: str, told: str) -> None:
+    rewritten(mine / file, old, new)
+    with pytest.raises(InputError, match=r"traffic\.rou\.xml: vehicle 'vut' is to drive on ") as caught:
+        check_network(str(mine))
+    assert told in str(caught.value)
+
+
+@pytest.mark.parametrize(("file", "old", "new", "told"), [
+    ("traffic.rou.xml", 'person id="pedestrian"', 'person id="walker"', "Person '0.pedestrian' is not known"),
+    ("network.con.xml", "<crossing node", "<!--", "Lane ':0.crossing_c0_0' is not known")])
+def test_what_a_scenario_does_not_find_is_told(mine: Path, file: str, old: str, new: str, told: str) -> None:
+    rewritten(mine / file, old, new)
+    if file == "network.con.xml":
+        rewritten(mine / file, 'width="0.65"/>', "-->")
+    with pytest.raises(InputError, match="the scenario does not find what it looks for") as caught:
+        simulate(on("smoke", mine), load_original("smoke"))
+    assert told in str(caught.value)
+
+
 def test_a_built_network_that_sumo_dies_of_is_refused(mine: Path) -> None:
     for name in ("network.nod.xml", "network.edg.xml", "network.con.xml", "network.netccfg"):
         (mine / name).unlink()
