@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 
-from safevar_sumo.ads.idm import Memory
-from safevar_sumo.ads.pedals import pedals, trim
-from safevar_sumo.ads.way import FARTHEST, in_the_way
-from safevar_sumo.records import Command, FloatArray, Nominal, Observation
+from safevar_sumo.ads.following import Following
+from safevar_sumo.records import FloatArray
 
 Positive = Annotated[float, Meta(gt=0, le=1e3)]
 # Gains of the modes [1/s for speeds, 1/s^2 for gaps] and thresholds: defaults of MSCFModel_ACC.
@@ -22,7 +20,7 @@ FOLLOWS_BELOW = 100.0  # m
 KEEPS_GAP, KEEPS_SPEED = 0.2, 0.1  # m, m/s: errors below which the gap is kept
 
 
-class Acc(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Acc(Following, frozen=True, kw_only=True):
     """Holds a speed, or a time headway to the one ahead.
 
     Parameters
@@ -39,15 +37,6 @@ class Acc(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     headway: Positive = 1.0
     standing_gap: Annotated[float, Meta(ge=0, le=100)] = 2.5
     corridor: Positive = 1.4
-
-    def start(self, n: int, nominal: Nominal, step: float) -> Memory:
-        return Memory(nominal, step, None)
-
-    def drive(self, seen: Observation, memory: Memory) -> tuple[Command, Memory]:
-        trimmed = trim(memory.nominal, seen) if memory.trimmed is None else memory.trimmed
-        gap = np.where(in_the_way(seen, self.corridor), seen.gap, FARTHEST)
-        wanted = self.acceleration_at(gap, seen.speed, seen.obstacle_speed)
-        return pedals(memory.nominal, seen.speed, wanted, trimmed), memory._replace(trimmed=trimmed)
 
     def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """Acceleration asked for [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""

@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 
-from safevar_sumo.ads.pedals import Trim, pedals, trim
-from safevar_sumo.ads.way import FARTHEST, in_the_way
-from safevar_sumo.records import Command, FloatArray, Nominal, Observation
+from safevar_sumo.ads.following import Following
+from safevar_sumo.records import FloatArray
 
 Positive = Annotated[float, Meta(gt=0, le=1e3)]
 LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
 
 
-class Memory(NamedTuple):
-    """The original vehicle; time between calls [s]; trim of the pedals, of the first look."""
-
-    nominal: Nominal
-    step: float
-    trimmed: Trim | None
-
-
-class Idm(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Idm(Following, frozen=True, kw_only=True):
     """dv/dt = a (1 - (v / v0)^4 - (s* / s)^2), s* = s0 + max(0, v T + v (v - u) / (2 sqrt(a b))).
 
     Parameters
@@ -45,15 +36,6 @@ class Idm(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     acceleration: Positive = 2.6
     deceleration: Positive = 4.5
     corridor: Positive = 1.4
-
-    def start(self, n: int, nominal: Nominal, step: float) -> Memory:
-        return Memory(nominal, step, None)
-
-    def drive(self, seen: Observation, memory: Memory) -> tuple[Command, Memory]:
-        trimmed = trim(memory.nominal, seen) if memory.trimmed is None else memory.trimmed
-        gap = np.where(in_the_way(seen, self.corridor), seen.gap, FARTHEST)
-        wanted = self.acceleration_at(gap, seen.speed, seen.obstacle_speed)
-        return pedals(memory.nominal, seen.speed, wanted, trimmed), memory._replace(trimmed=trimmed)
 
     def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """dv/dt [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""

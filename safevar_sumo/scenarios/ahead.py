@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import VUT, Actors, Scene, World
-from safevar_sumo.scenarios.euro_ncap import Body, lateral_of
+from safevar_sumo.scenarios.base import VUT, Actors, Grade, Scene, World
+from safevar_sumo.scenarios.euro_ncap import VUT_LENGTH, VUT_WIDTH, Body, lateral_of
 from safevar_sumo.scenarios.frame import Frame
 
 TARGET, ROAD = "target", "road_0"
@@ -72,6 +73,32 @@ def right_of(location: float, width: float) -> float:
     return lateral_of(location, width)
 
 
-def encounter(trace: Trace) -> Encounter:
-    """From bumper to body; TTC is that gap over by how much the vehicle is faster."""
-    return Encounter(separation=trace.gap, distance=trace.gap, closing_speed=trace.speed - trace.obstacle_speed, in_conflict=trace.gap > 0)
+class BehindSomebody(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of a scenario with somebody ahead.
+
+    Parameters
+    ----------
+    vut_length, vut_width
+        The vehicle under test [m].
+    grade
+        By how much the road rises over the way, negative where it falls [%].
+    """
+
+    vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
+    vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
+    grade: Grade = 0.0
+
+    def begin(self, world: World) -> Memory:
+        return self._ahead.begin(world)
+
+    def observe(self, world: World, step: float, memory: Memory) -> tuple[Scene, Memory]:
+        return self._ahead.observe(world, step, memory, world.speeds())
+
+    def encounter(self, trace: Trace) -> Encounter:
+        """From bumper to body; TTC is that gap over by how much the vehicle is faster."""
+        return Encounter(separation=trace.gap, distance=trace.gap, closing_speed=trace.speed - trace.obstacle_speed,
+                         in_conflict=trace.gap > 0)
+
+    @property
+    def _ahead(self) -> Ahead:
+        raise NotImplementedError

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from msgspec import Meta, Struct
+from msgspec import Meta
 
-from safevar_sumo.records import Encounter, Trace
-from safevar_sumo.scenarios.ahead import Ahead, Memory, encounter, right_of
-from safevar_sumo.scenarios.base import Actors, Grade, Roads, Scene, World
-from safevar_sumo.scenarios.euro_ncap import BODIES, KMH, VUT_LENGTH, VUT_WIDTH, Body, Range, Walk
+from safevar_sumo.scenarios.ahead import Ahead, BehindSomebody, right_of
+from safevar_sumo.scenarios.base import Actors, Roads
+from safevar_sumo.scenarios.euro_ncap import BODIES, KMH, Body, Range, Walk
 from safevar_sumo.scenarios.pre_crash import PreCrash
 
 PROTOCOL = Range(10, 60, (50, 10, 25, 75, 90))
 
 
-class Along(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Along(BehindSomebody, frozen=True, kw_only=True):
     """A pedestrian walks ahead in the vehicle's lane, away from it, and does not look round.
 
     Parameters
@@ -41,9 +40,6 @@ class Along(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     acceleration_distance: Annotated[float, Meta(ge=0, le=100)] = 1.0
     time_to_impact: Annotated[float, Meta(gt=0, le=60)] = 6.0
     time_after: Annotated[float, Meta(gt=0, le=60)] = 4.0
-    vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
-    vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
-    grade: Grade = 0.0
     network: str = "along"
     pre_crash = PreCrash.PEDESTRIAN
 
@@ -58,15 +54,6 @@ class Along(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def actors(self, roads: Roads) -> Actors:
         return self._ahead.actors(self.target, Body(self.vut_length, self.vut_width), self.speed * KMH)
-
-    def begin(self, world: World) -> Memory:
-        return self._ahead.begin(world)
-
-    def observe(self, world: World, step: float, memory: Memory) -> tuple[Scene, Memory]:
-        return self._ahead.observe(world, step, memory, world.speeds())
-
-    def encounter(self, trace: Trace) -> Encounter:
-        return encounter(trace)
 
     @property
     def _ahead(self) -> Ahead:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Encounter, Trace
-from safevar_sumo.scenarios.ahead import Ahead, Memory, encounter, right_of
-from safevar_sumo.scenarios.base import Actors, Grade, Roads, Scene, World
-from safevar_sumo.scenarios.euro_ncap import KMH, VUT_LENGTH, VUT_WIDTH, Body, Range
+from safevar_sumo.scenarios.ahead import Ahead, BehindSomebody, right_of
+from safevar_sumo.scenarios.base import Actors, Roads
+from safevar_sumo.scenarios.euro_ncap import KMH, Body, Range
 from safevar_sumo.scenarios.pre_crash import PreCrash
 
 CAR = Body(4.023, 1.712)
@@ -27,7 +26,7 @@ STEADY_UP_TO = 80.0
 """Speed up to which the slower target goes 20 km/h; above that 10 km/h faster for each 10 km/h."""
 
 
-class CarToCar(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class CarToCar(BehindSomebody, frozen=True, kw_only=True):
     """A car ahead in the lane stands, drives more slowly, or brakes.
 
     Parameters
@@ -58,9 +57,6 @@ class CarToCar(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     brakes_at: Annotated[float, Meta(ge=0, le=60)] = 3.0
     target_deceleration: Annotated[float, Meta(gt=0, le=12)] = 4.0
     time_after: Annotated[float, Meta(gt=0, le=60)] = 5.0
-    vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
-    vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
-    grade: Grade = 0.0
     network: str = "car_to_car"
 
     @property
@@ -79,15 +75,6 @@ class CarToCar(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def actors(self, roads: Roads) -> Actors:
         return self._ahead.actors("car", Body(self.vut_length, self.vut_width), self.speed * KMH)
-
-    def begin(self, world: World) -> Memory:
-        return self._ahead.begin(world)
-
-    def observe(self, world: World, step: float, memory: Memory) -> tuple[Scene, Memory]:
-        return self._ahead.observe(world, step, memory, world.speeds())
-
-    def encounter(self, trace: Trace) -> Encounter:
-        return encounter(trace)
 
     @property
     def _ahead(self) -> Ahead:

@@ -10,6 +10,7 @@ from msgspec import Meta, Struct
 from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
 from safevar_sumo.vehicles.delay import delayed, history, remembered
+from safevar_sumo.vehicles.sensors import late_and_near
 from safevar_sumo.vehicles.slope import LEVEL, Slope
 
 
@@ -89,14 +90,7 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     def sense(self, prepared: _Prepared, state: SumoState, seen: Observation) -> tuple[Observation, SumoState]:
         """Sensors report what was `reactionTime` ago, and nothing beyond `sensorRange` times the visibility."""
-        p = prepared
-        obstacle_speed = np.broadcast_to(seen.obstacle_speed, seen.gap.shape)
-        now = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed, obstacle_speed])
-        past = history(float(np.max(p.reaction_time)), p.step, now) if state.seen is None else remembered(state.seen, now)
-        gap, closing_speed, lateral, lateral_speed, obstacle_speed = delayed(past, p.reaction_time, p.step)
-        detected = gap <= p.sensor_range * seen.visibility
-        late = seen._replace(gap=np.where(detected, gap, np.inf), closing_speed=closing_speed, lateral=lateral,
-                             lateral_speed=lateral_speed, obstacle_speed=obstacle_speed)
+        late, past = late_and_near(seen, state.seen, prepared.reaction_time, prepared.sensor_range, prepared.step)
         return late, state._replace(seen=past)
 
     def advance(self, prepared: _Prepared, state: SumoState, command: Command) -> SumoState:

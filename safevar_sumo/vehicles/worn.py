@@ -10,6 +10,7 @@ from msgspec import Meta, Struct
 from safevar_sumo.records import Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
 from safevar_sumo.vehicles.delay import delayed, history, remembered
+from safevar_sumo.vehicles.sensors import late_and_near
 from safevar_sumo.vehicles.slope import LEVEL, Slope
 
 NEW_TREAD, LEGAL_TREAD = 8.0, 1.6
@@ -114,13 +115,7 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     def sense(self, prepared: _Prepared, state: WornState, seen: Observation) -> tuple[Observation, WornState]:
         """Dirty sensors report what was `sensorLatency` ago, and nothing beyond `sensorRange` times the visibility."""
-        p, obstacle_speed = prepared, np.broadcast_to(seen.obstacle_speed, seen.gap.shape)
-        now = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed, obstacle_speed])
-        past = history(float(np.max(p.latency)), p.step, now) if state.seen is None else remembered(state.seen, now)
-        gap, closing_speed, lateral, lateral_speed, obstacle_speed = delayed(past, p.latency, p.step)
-        detected = gap <= p.sensor_range * seen.visibility
-        late = seen._replace(gap=np.where(detected, gap, np.inf), closing_speed=closing_speed, lateral=lateral,
-                             lateral_speed=lateral_speed, obstacle_speed=obstacle_speed)
+        late, past = late_and_near(seen, state.seen, prepared.latency, prepared.sensor_range, prepared.step)
         return late, state._replace(seen=past)
 
     def advance(self, prepared: _Prepared, state: WornState, command: Command) -> WornState:
