@@ -18,6 +18,7 @@ from safevar_sumo.vehicles.base import Characteristics, SumoType
 from safevar_sumo.vehicles.slope import GRAVITY, LEVEL, Slope
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
+Share = Annotated[float, Meta(gt=0, le=1)]
 # Numbers that meet arrays in every step are arrays themselves: numpy would convert a float each time, which takes as long again.
 ONE, NEUTRAL, FIRST = map(np.array, (1.0, 0.0, 1.0))
 RPM = 2 * math.pi / 60  # rad/s per r/min
@@ -31,8 +32,6 @@ GEAR_RATIOS = np.array([0.0, 2.85, 2.02, 1.35, 1.0])  # neutral first; blueprint
 FINAL_RATIO = 4.0
 OVERALL_RATIOS = GEAR_RATIOS * FINAL_RATIO
 TOP = np.array(len(GEAR_RATIOS) - 1.0)
-SHIFT_UP, SHIFT_DOWN = map(np.array, (0.65, 0.5))  # of max_rpm
-AUTOBOX_LATENCY = np.array(2.0)  # s, least time between two switches of the automatic gearbox; PxVehicleAutoBoxData
 WHEELS = 4
 WHEEL_MASS = 20.0  # kg each; PxVehicleWheelData.mMass
 AIR_DENSITY = 1.2  # kg/m^3
@@ -73,6 +72,9 @@ class _Prepared(NamedTuple):
     damping_neutral: FloatArray
     shift_time: FloatArray
     shift_ends: FloatArray
+    shift_latency: FloatArray
+    shift_up: FloatArray
+    shift_down: FloatArray
     air_drag: FloatArray
     speed_by_force: FloatArray
     speed_by_air: FloatArray
@@ -112,6 +114,10 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Engine torque over that of CARLA's default car [-].
     throttle_rise, throttle_fall, brake_rise, brake_fall
         Rates of the pedals [1/s] (PxVehiclePadSmoothingData: 6 up, 10 down).
+    shift_up, shift_down
+        Engine speeds over max_rpm above and below which the automatic gearbox shifts [-] (PxVehicleAutoBoxData: 0.65 and 0.5).
+    shift_latency
+        Least time from the beginning of a shift to that of the next [s] (PxVehicleAutoBoxData: 2).
     camera_height, camera_design_radius
         Height of the camera above the road on wheels of the radius that its model was made for [m, m]: on another
         radius a gap that is measured down to the road comes out in proportion to the height that is assumed.
@@ -131,6 +137,9 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     throttle_fall: Positive = 10.0
     brake_rise: Positive = 6.0
     brake_fall: Positive = 10.0
+    shift_up: Share = 0.65
+    shift_down: Share = 0.5
+    shift_latency: Positive = 2.0
     camera_height: Annotated[float, Meta(ge=0.1, le=10)]
     camera_design_radius: Annotated[float, Meta(ge=0.1, le=1)] = 0.355
 
@@ -154,7 +163,8 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             grip=grip, slip_stiffness=WHEELS * GRAVITY * self.longitudinal_stiffness / (3 * grip),
             clutch=c["clutchStrength"], engine_limit=c["max_rpm"] * RPM, damping_full=c["dampRateFullT"],
             damping_engaged=c["dampRateZeroT_CE"], damping_neutral=c["dampRateZeroT_CD"], shift_time=c["gearSwitchTime"],
-            shift_ends=c["gearSwitchTime"] - TIME_ROUNDING,
+            shift_ends=c["gearSwitchTime"] - TIME_ROUNDING, shift_latency=np.array(self.shift_latency),
+            shift_up=np.array(self.shift_up), shift_down=np.array(self.shift_down),
             air_drag=air_drag, speed_by_force=speed_by_force, speed_by_air=speed_by_force * air_drag,
             pull=c["mass"] * slope.back, speed_by_slope=np.zeros_like(radius) + slope.back * tyre_step,
             assumed_height=self.camera_height / (self.camera_height + (radius - self.camera_design_radius)),
@@ -186,7 +196,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         wheel_speed = rim / p.radius
         gear = nothing + 1
         for ratio in OVERALL_RATIOS[1:-1]:
-            gear += wheel_speed * ratio > SHIFT_UP * p.engine_limit
+            gear += wheel_speed * ratio > p.shift_up * p.engine_limit
         ratio = OVERALL_RATIOS[gear.astype(np.intp)]
         through_clutch = (p.wheel_damping * wheel_speed + p.radius * force) / ratio
         # Downhill the engine brakes, and the brake takes what is left; then w_e = G w_w + m / k_c with m = -c_e w_e.
@@ -198,8 +208,8 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         pull = self._torque(p, engine_speed) - (p.damping_full - p.damping_engaged) * engine_speed
         throttle = (p.damping_engaged * engine_speed + through_clutch) / np.maximum(pull, 1.0)
         throttle = np.where(brake > 0, 0.0, np.minimum(throttle, 1.0))
-        lugs = (gear > 1) & (engine_speed < SHIFT_DOWN * p.engine_limit)
-        return state._replace(throttle=throttle, brake=brake, since_shift=np.where(lugs, p.shift_time, AUTOBOX_LATENCY))
+        lugs = (gear > 1) & (engine_speed < p.shift_down * p.engine_limit)
+        return state._replace(throttle=throttle, brake=brake, since_shift=np.where(lugs, p.shift_time, p.shift_latency))
 
     def _rim_at(self, p: _Prepared, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Speed of the wheels' rim at which the tyres push as hard as air and slope resist [m/s], and that force [N]."""
@@ -294,11 +304,11 @@ def _follows(commanded: FloatArray, pedal: FloatArray, rates: tuple[FloatArray, 
 def _shift(p: _Prepared, s: CarlaState, throttle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Automatic gearbox: gear, target gear, time since a shift. A switch, the first one out of neutral included, is spent in neutral."""
     settled = s.gear == s.target_gear
-    automatic = settled & (s.since_shift >= AUTOBOX_LATENCY)
+    automatic = settled & (s.since_shift >= p.shift_latency)
     relative = s.engine_speed / p.engine_limit
     sets_off = settled & (s.gear <= NEUTRAL) & (throttle > p.nothing)
-    up = sets_off | automatic & (relative > SHIFT_UP) & (s.gear > NEUTRAL) & (s.gear < TOP)
-    down = automatic & (relative < SHIFT_DOWN) & (s.gear > FIRST)
+    up = sets_off | automatic & (relative > p.shift_up) & (s.gear > NEUTRAL) & (s.gear < TOP)
+    down = automatic & (relative < p.shift_down) & (s.gear > FIRST)
     switches = up | down
     target, since_shift = s.target_gear, s.since_shift + p.step
     if np.count_nonzero(switches):
