@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 from drives import STEP, SYSTEMS, braking_after, drawn, drive, ends, full_throttle, original
 from scipy.integrate import solve_ivp
 
-from safevar_sumo.records import Observation
+from safevar_sumo.records import Command, Observation
 from safevar_sumo.vehicles.carla import AIR_DENSITY, ENGINE_INERTIA, FINAL_RATIO, FRONTAL_AREA, GEAR_RATIOS, GRAVITY, RPM, Carla
 
 
@@ -90,6 +91,21 @@ def test_carla_waits_in_neutral_for_its_first_gear() -> None:
     assert np.argmax(gears[:, 1] > 0) == 12
     speeds = drive("carla", settings_, full_throttle, 0.6).speed[-1]
     assert speeds[0] > speeds[1]
+
+
+def test_carla_shifts_up_above_its_engine_speed_and_not_before_its_latency() -> None:
+    """The first switch begins with the first substep of 1/60 s and takes 0.5 s; so does the next, spent in neutral too."""
+    values = dict(zip(SYSTEMS["carla"].characteristics.names, np.ascontiguousarray(original("carla").T), strict=True))
+    gears = {}
+    for up in (0.3, 0.6):
+        vehicle = msgspec.structs.replace(carla(), shift_up=up, shift_latency=1.0)
+        prepared = vehicle.prepare(values, 1.0, STEP)
+        states = [vehicle.at_rest(prepared)]
+        while len(states) <= 32:
+            states.append(vehicle.advance(prepared, states[-1], Command(np.ones(1), np.zeros(1))))
+        gears[up] = [int(state.gear[0]) for state in states]
+    assert gears[0.3] == [0] * 11 + [1] * 10 + [0] * 10 + [2] * 2
+    assert gears[0.6][:23] == [0] * 11 + [1] * 12
 
 
 def test_carlas_braked_deceleration_is_torque_over_radius_and_mass_where_tyres_hold() -> None:
