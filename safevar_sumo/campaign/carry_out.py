@@ -16,7 +16,7 @@ from safevar_sumo.computing import PersistentPool, Pool, check_isolation, first_
 from safevar_sumo.metrics import SAFEVAR, Scoring
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ORIGINAL, Failure, JournalBusy, ResultsDirectory
-from safevar_sumo.search import Problem
+from safevar_sumo.search import Problem, Search
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -65,7 +65,11 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
                       population=study.search.population, scoring=results.scoring)
     campaign = Campaign(original, {}, [], [], results.scoring)
     waiting, runs = deque(keys), set[Run]()
-    gathering, rechecking = Gathering(persistent, work, batch or BATCH), Rechecking(study, results, persistent)
+
+    def begun(key: RunKey) -> Search:
+        return algorithm_of(key.algorithm, study).search(problem, run_generator(study, key))
+
+    gathering, rechecking = Gathering(persistent, work, batch or BATCH), Rechecking(study, results, persistent, begun)
 
     def go_on(run: Run) -> None:
         """Let a run go as far as it can, then ask for what it misses."""
@@ -90,8 +94,7 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
                 except JournalBusy:
                     campaign.busy.append(key)
                     continue
-                search = algorithm_of(key.algorithm, study).search(problem, run_generator(study, key))
-                runs.add(run := Run(key, search, journal, observer, study.search.evaluations, retry=retry_failed))
+                runs.add(run := Run(key, begun(key), journal, observer, study.search.evaluations, retry=retry_failed))
                 go_on(run)
             gathering.send()
             for future in first_of([*gathering.under_way, *rechecking.under_way]):

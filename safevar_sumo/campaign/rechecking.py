@@ -1,14 +1,21 @@
-"""Settings that a run ends with, simulated once more as if there were no others: what leaks in rare states alone shows there."""
+"""What a run ends with, done once more as if there were no others: what leaks in rare states alone, or from run to run, shows there."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Future
 
+from safevar_sumo.campaign.keys import RunKey
 from safevar_sumo.campaign.run import Run
 from safevar_sumo.computing import PersistentPool, packed, refuse_difference, reproducing
+from safevar_sumo.errors import ForeignError
+from safevar_sumo.plugins import forget_foreign
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
+from safevar_sumo.search import Search
 from safevar_sumo.study import Study, foreign_names
+
+LEGAL = "what a run asks for depends on its problem, its evaluations and `rng` alone: nothing kept in a class or a module between runs"
 
 
 class Rechecking:
@@ -20,19 +27,34 @@ class Rechecking:
         By what computes it, a run and what it holds of a setting.
     """
 
-    def __init__(self, study: Study, results: ResultsDirectory, pool: PersistentPool) -> None:
-        self._study, self._pool = study, pool
+    def __init__(self, study: Study, results: ResultsDirectory, pool: PersistentPool, begun: Callable[[RunKey], Search]) -> None:
+        self._study, self._pool, self._begun = study, pool, begun
         self._work = packed(study, results.manifest, afresh=True) if foreign_names(study) else None
         self.under_way: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}
 
     def ask(self, run: Run) -> bool:
-        """Have settings of a run simulated once more; whether there are any, and models that are not ours."""
+        """Have settings of a run simulated once more; whether there are any, and models that are not ours.
+
+        Raises
+        ------
+        ForeignError
+            If it is the last run of an algorithm from outside, and alone and loaded afresh that asks for other settings.
+        """
+        self._refuse_shared_search(run)
         if self._work is None:
             return False
         samples = run.samples()
         for known in samples:
             self.under_way[self._pool.submit(self._work, known.settings)] = run, known
         return bool(samples)
+
+    def _refuse_shared_search(self, run: Run) -> None:
+        name, last = self._study.search.labels.get(run.key.algorithm, ""), self._study.search.runs - 1
+        if ":" in name and run.key.run == last > 0:
+            forget_foreign()
+            if not run.is_repeated_by(self._begun(run.key)):
+                problem = f"search.algorithms: {name!r} asks for other settings in run {last} when there are no other runs"
+                raise ForeignError(f"study {self._study.name!r}", problem, LEGAL)
 
     def take(self, done: Future[Evaluations]) -> Run | None:
         """The run of a setting, if that was its last one.

@@ -105,6 +105,20 @@ class Run:
         last = max(scored, key=lambda known: known[0])
         return [evaluations.take([i]) for _, evaluations, i in ([severe] if severe is last else [severe, last])]
 
+    def is_repeated_by(self, search: Search) -> bool:
+        """Whether a search, told what this run knows, asks for the same in the same places and returns the same."""
+        settings, asked, places = next(search), 0, dict[bytes, int]()
+        while all(row.tobytes() in self._known for row in settings):
+            for i, row in enumerate(settings):
+                places.setdefault(row.tobytes(), asked + i)
+            asked += len(settings)
+            try:
+                settings = search.send(self._recalled(settings))
+            except StopIteration as end:
+                expected = {row: place for row, (place, _, _) in self._known.items() if 0 <= place < self._budget}
+                return places == expected and np.array_equal(end.value.settings, self.result.settings)
+        return False
+
     def finish(self) -> None:
         """Journal the result of a search that has ended."""
         if not self.finished:

@@ -23,6 +23,7 @@ from drives import (
 from safevar_sumo.records import Command, Observation
 from safevar_sumo.vehicles import VEHICLES
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, FINAL_RATIO, GEAR_RATIOS, Carla
+from safevar_sumo.vehicles.delay import delayed
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 
 MODELS = sorted(VEHICLES)
@@ -204,6 +205,12 @@ def sensed_gaps(name: str) -> np.ndarray:
         seen, state = vehicle.sense(prepared, state, Observation(k * STEP, nothing, gap, nothing, nothing, nothing, 1.0))
         gaps.append(seen.gap)
     return np.stack(gaps)
+
+
+def test_what_comes_into_sight_is_where_it_is_whatever_was_before() -> None:
+    past = np.array([[5.0], [np.inf], [np.inf]])  # newest first
+    assert delayed(past, np.array([0.0]), 0.1).tolist() == [5.0]
+    assert delayed(past, np.array([0.1]), 0.1).tolist() == [np.inf]
 
 
 def test_a_sensor_sees_nothing_beyond_its_range() -> None:
