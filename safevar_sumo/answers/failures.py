@@ -12,7 +12,7 @@ from safevar_sumo.answers.bench import Bench
 from safevar_sumo.answers.unsafe import Unsafe, spread
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import CHOICES, Handle, handles, position_of
+from safevar_sumo.results import CHOICES, UNKNOWN, Handle, handles, position_of
 from safevar_sumo.study import Study
 
 LOOKED_AT = 4096
@@ -75,7 +75,7 @@ def failures_of(source: Study | Case, bench: Bench, original: Evaluations, named
     means = unsafe or Unsafe.usual(evaluations, original)
     if rows is None:
         rows = np.flatnonzero(means.of(evaluations)).tolist()
-    otherwise = 0 if recorded is None else int(np.count_nonzero(evaluations.outcome != recorded))
+    otherwise = 0 if recorded is None else int(np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN)))
     return Failures(evaluations, called, means, rows, otherwise)
 
 

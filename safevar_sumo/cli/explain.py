@@ -9,7 +9,7 @@ import click
 from rich.console import Console
 
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.simulating import jobs_option, json_option, results_or_study, unsafe_option
+from safevar_sumo.cli.simulating import jobs_option, json_option, point_option, results_or_study, unsafe_option
 from safevar_sumo.results import make_directory, write_whole
 
 
@@ -21,17 +21,18 @@ from safevar_sumo.results import make_directory, write_whole
 @click.option("--top", type=click.IntRange(1, 1000), default=8, show_default=True, help="How many failures are explained in full.")
 @click.option("--limit", type=click.IntRange(min=1), default=40_000, show_default=True, metavar="N",
               help="Simulations, about, for the minimal causes of all failures; of more failures a random sample is looked into.")
+@point_option
 @jobs_option
 @json_option
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write causes.json, causes.csv and a picture there.")
-def explain(place: str, solutions: tuple[str, ...], unsafe: str | None, top: int, limit: int, jobs: int | None, as_json: bool,
-            out: Path | None) -> None:
+def explain(place: str, solutions: tuple[str, ...], unsafe: str | None, top: int, limit: int, point: str | None,
+            jobs: int | None, as_json: bool, out: Path | None) -> None:
     """Explain failures of results in DIR, or all over the domain of STUDY: which changes did it, how little is enough, why."""
     from safevar_sumo import answers
     from safevar_sumo.terminal.explanation import print_explained
     from safevar_sumo.terminal.stages import stages
 
-    source = results_or_study(place)
+    source = results_or_study(place, point)
     if out is not None:
         make_directory(out)
     with stages(Console(stderr=True)) as progress:

@@ -11,7 +11,7 @@ from rich.console import Console
 from safevar_sumo.cli.outputs import PICTURES, check_output
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.ranges import Within
-from safevar_sumo.cli.simulating import jobs_option, json_option, study_of, unsafe_option
+from safevar_sumo.cli.simulating import jobs_option, json_option, point_option, study_of, unsafe_option
 from safevar_sumo.errors import InputError
 
 
@@ -23,17 +23,18 @@ from safevar_sumo.errors import InputError
               help="Confidence of the intervals.")
 @click.option("--width", type=Within(0, 1, min_open=True), help="Stop as soon as the interval of the probability is no wider.")
 @unsafe_option
+@point_option
 @jobs_option
 @json_option
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help="Draw what decides here: png, pdf or svg.")
-def risk(place: str, samples: int, confidence: float, width: float | None, unsafe: str | None, jobs: int | None, as_json: bool,
-         plot: Path | None) -> None:
+def risk(place: str, samples: int, confidence: float, width: float | None, unsafe: str | None, point: str | None,
+         jobs: int | None, as_json: bool, plot: Path | None) -> None:
     """Estimate how likely an unsafe outcome is when vehicles vary as STUDY says under [variation], and what decides."""
     from safevar_sumo import answers
     from safevar_sumo.terminal.risk import print_risk
     from safevar_sumo.terminal.stages import stages
 
-    chosen = study_of(place)
+    chosen = study_of(place, point)
     if plot is not None:
         check_output(plot, "--plot", PICTURES)
         if chosen.correlations:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from safevar_sumo.results.imported import UNKNOWN
 from safevar_sumo.study import Study, load_study, study_names
 
 if TYPE_CHECKING:
@@ -17,25 +19,36 @@ unsafe_option = click.option(
     help="What is unsafe: a collision, or a safety degree below X.  [default: a collision if anything that is looked at collides, else "
          "half of the original's safety degree]")
 jobs_option = click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes.  [default: the cores of this machine]")
+point_option = click.option("--point", metavar="NAME", help="Of a study with a matrix: ask about this point of it alone.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 
-def results_or_study(place: str) -> Study | Case:
-    """The case in a results directory, or a study by name or path.
+def results_or_study(place: str, point: str | None = None) -> Study | Case:
+    """The case in a results directory, or a study by name or path; at one point of its matrix if one is named.
 
     Raises
     ------
     InputError
-        If it is neither.
+        If it is neither, or has no such point.
     """
     if place in study_names() or not Path(place).is_dir():
-        return load_study(place)
+        study = load_study(place)
+        return study if point is None else _at(study, point)
     from safevar_sumo.analysis import load_cases
 
-    return load_cases([place])[0]
+    (case,) = load_cases([place])
+    if point is None:
+        return case
+    return replace(case, study=_at(case.study, point), solutions=case.solutions.assign(outcome=UNKNOWN))
 
 
-def study_of(place: str) -> Study:
+def _at(study: Study, point: str) -> Study:
+    from safevar_sumo.simulation import study_at
+
+    return study_at(study, point, "--point")
+
+
+def study_of(place: str, point: str | None = None) -> Study:
     """The study that is named, or the one that a results directory records; raises as `results_or_study`."""
-    source = results_or_study(place)
+    source = results_or_study(place, point)
     return source if isinstance(source, Study) else source.study

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from safevar_sumo.cli.outputs import PICTURES, check_output
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.simulating import jobs_option, json_option, study_of, unsafe_option
+from safevar_sumo.cli.simulating import jobs_option, json_option, point_option, study_of, unsafe_option
 
 
 @commands.command()
@@ -18,18 +18,19 @@ from safevar_sumo.cli.simulating import jobs_option, json_option, study_of, unsa
 @unsafe_option
 @click.option("--characteristics", metavar="A,B", help="These characteristics alone, separated by commas.  [default: all]")
 @click.option("--pairs", is_flag=True, help="Look at every pair too.")
+@point_option
 @jobs_option
 @json_option
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FILE",
               help="Draw the profiles here: png, pdf or svg; with --pairs, the worst pairs in a second file beside it.")
-def tolerance(place: str, unsafe: str | None, characteristics: str | None, pairs: bool, jobs: int | None, as_json: bool,
-              plot: Path | None) -> None:
+def tolerance(place: str, unsafe: str | None, characteristics: str | None, pairs: bool, point: str | None,
+              jobs: int | None, as_json: bool, plot: Path | None) -> None:
     """Find how far each characteristic of STUDY may go: alone, in pairs, and all together."""
     from safevar_sumo import answers
     from safevar_sumo.terminal.stages import stages
     from safevar_sumo.terminal.tolerance import print_tolerance
 
-    chosen = study_of(place)
+    chosen = study_of(place, point)
     second = None if plot is None else plot.with_stem(f"{plot.stem}-pairs")
     for path in (plot, second if pairs else None):
         if path is not None:

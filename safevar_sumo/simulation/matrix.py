@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Drives, Encounter, Evaluations, FloatArray, Trace
@@ -16,7 +17,8 @@ from safevar_sumo.simulation.batch import Watcher, drive_all, score
 from safevar_sumo.simulation.network import empty_fingerprint
 from safevar_sumo.simulation.staging import staged
 from safevar_sumo.simulation.sumo import Engine, standing_network
-from safevar_sumo.simulation.system import System
+from safevar_sumo.simulation.system import System, assemble
+from safevar_sumo.study import Study
 
 LARGEST_WORLD = 600
 """Copies of a network in one simulation; more are not faster."""
@@ -124,6 +126,19 @@ def named_point(system: System, name: str, source: object) -> System:
         if point.name == name:
             return system.at(point)
     raise InputError(source, repr(name), "; ".join(point.name for point in system.matrix) or "a study with a matrix")
+
+
+def study_at(study: Study, name: str, source: object) -> Study:
+    """A study with the one point of its matrix that is named; raises as `named_point`."""
+    system = assemble(study)
+    named_point(system, name, source)
+    assert study.matrix is not None
+    place = dict(next(point for point in system.matrix if point.name == name).place)
+    title, weather = place.pop("test"), place.pop("weather")
+    test = next(one for one in study.matrix.tests
+                if one.name == title and one.over.keys() == place.keys() and all(value in one.over[key] for key, value in place.items()))
+    only = replace_in(test, over={key: [value] for key, value in place.items()}, weathers=[weather] if test.weathers else [])
+    return replace_in(study, matrix=replace_in(study.matrix, tests=[only]))
 
 
 def _together(points: Sequence[Point], most: int) -> Iterator[tuple[Point, ...]]:

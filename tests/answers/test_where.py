@@ -7,7 +7,8 @@ import pytest
 
 from safevar_sumo.answers import Unsafe, points_in_words, sentence
 from safevar_sumo.answers.where import Where, where
-from safevar_sumo.simulation import System, assemble, evaluate
+from safevar_sumo.errors import InputError
+from safevar_sumo.simulation import System, assemble, evaluate, study_at
 from safevar_sumo.study import load_study
 
 TESTS = [{"name": "CPLA", "model": "along", "over": {"speed": [20, 40]}, "weathers": ["clear", "night"]},
@@ -51,3 +52,13 @@ def test_points_in_words() -> None:
     assert points_in_words(("A, 1", "B"), 9) == "Fails at 2 of 9 points: A, 1; B."
     assert points_in_words(("A", "B", "C"), 9, most=1) == "Fails at 3 of 9 points: A and 2 more."
     assert points_in_words((), 9) == "Fails at 0 of 9 points."
+
+
+def test_a_question_may_be_about_one_point_alone(system: System, weak: np.ndarray) -> None:
+    study = load_study("euro_ncap_pedestrian", matrix={"tests": TESTS})
+    for point in system.points:
+        alone = assemble(study_at(study, point.name, "--point"))
+        assert [one.name for one in alone.points] == [point.name]
+        assert evaluate(alone, weak).f_safe[0] == evaluate(system.at(point), weak).f_safe[0]
+    with pytest.raises(InputError, match=r"--point: 'CPLA'"):
+        study_at(study, "CPLA", "--point")
