@@ -34,6 +34,14 @@ def test_the_footer_of_collisions_alone_has_their_speed_and_deceleration_only() 
     assert overall == {"avgSD_mD": (None, 0), "avgSD_cS": (3.0, 2), "TET": (None, 0), "TIT": (None, 0), "aveDece": (1.5, 2)}
 
 
+def test_what_a_table_tells_of_exposure_in_collisions_does_not_count() -> None:
+    """Published rows have a TET and a TIT for collisions too."""
+    crash = {**row(values=HEAVY, sd=-2.0), "tet": 9.0, "tit": 9.0}
+    told = rq33_safety(made_up(row(values=HEAVY, tet=1.5, tit=0.75), crash))
+    overall = {one["quantity"]: (one["value"], one["n"]) for one in told[told["j"] == "any"].to_dict("records")}
+    assert (overall["TET"], overall["TIT"]) == ((0.5, 1), (0.25, 1))
+
+
 def test_a_case_that_is_refused_first_does_not_take_the_others_answers() -> None:
     """Whatever the order, the case that has what a question asks for is answered."""
     alone, whole = made_up(row(), study=made_up_study(name="alone")), made_up(row(), row("rs"))
