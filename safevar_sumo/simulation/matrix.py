@@ -20,8 +20,8 @@ from safevar_sumo.simulation.sumo import Engine, standing_network
 from safevar_sumo.simulation.system import System, assemble
 from safevar_sumo.study import Study
 
-LARGEST_WORLD = 600
-"""Copies of a network in one simulation; more are not faster."""
+LARGEST_WORLD = 200
+"""Copies of a network in one simulation; more cost more each, as SUMO then works beyond the processor's caches."""
 
 
 class AtPoint(NamedTuple):
