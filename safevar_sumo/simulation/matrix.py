@@ -14,7 +14,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Drives, Encounter, Evaluations, FloatArray, Trace
 from safevar_sumo.scenarios import Point
 from safevar_sumo.simulation.batch import Watcher, drive_all, score
-from safevar_sumo.simulation.network import empty_fingerprint
+from safevar_sumo.simulation.network import empty_fingerprint, lanes_of
 from safevar_sumo.simulation.staging import staged
 from safevar_sumo.simulation.sumo import Engine, standing_network
 from safevar_sumo.simulation.system import System, assemble
@@ -22,6 +22,8 @@ from safevar_sumo.study import Study
 
 LARGEST_WORLD = 200
 """Copies of a network in one simulation; more cost more each, as SUMO then works beyond the processor's caches."""
+LARGEST_ROADS = 100_000
+"""Lanes of all copies in one simulation: beyond, loading takes minutes and gigabytes."""
 
 
 class AtPoint(NamedTuple):
@@ -53,9 +55,17 @@ def evaluate(system: System, settings: FloatArray) -> Evaluations:
     A pure function: row i of the result depends on row i of `settings` alone, to the bit. In a matrix a setting's row is that
     of the point in which it comes off worst; with the aggregate `mean` its safety degree is the mean over the points.
     """
-    if not system.matrix:
-        return score(system, settings, simulate(system, settings))
-    return aggregated(system, at_every_point(system, settings))
+    most = _most_copies(system)
+    parts = [settings[first:first + most] for first in range(0, len(settings), most)] or [settings]
+    found = [aggregated(system, at_every_point(system, part)) if system.matrix else score(system, part, simulate(system, part))
+             for part in parts]
+    return found[0] if len(found) == 1 else Evaluations.concatenate(found)
+
+
+def _most_copies(system: System) -> int:
+    """How many copies of the largest of the networks one simulation may have."""
+    lanes = max(lanes_of(network) for network in {point.scenario.network for point in system.points})
+    return max(LARGEST_ROADS // max(lanes, 1), 1)
 
 
 def aggregated(system: System, found: Sequence[AtPoint]) -> Evaluations:
@@ -98,7 +108,7 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSU
 def at_every_point(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = ()) -> list[AtPoint]:
     """Settings, shape (N, n), at every point, in the points' order; raises as `simulate`."""
     n, found = len(settings), dict[str, AtPoint]()
-    for points in _together(system.points, max(LARGEST_WORLD // max(n, 1), 1)):
+    for points in _together(system.points, max(min(LARGEST_WORLD, _most_copies(system)) // max(n, 1), 1)):
         drives = drive_all(replace(system, matrix=points), settings, engine, options)
         evaluations = score(system, np.tile(settings, (len(points), 1)), drives)
         for k, point in enumerate(points):

@@ -70,6 +70,17 @@ def built_network(folder: str) -> Path:
     return _built(sources_of(folder))
 
 
+def lanes_of(folder: str) -> int:
+    """How many lanes a network has, those of junctions included; raises as `copied_network`."""
+    file = built_network(folder)
+    return _lanes(file, file.stat().st_mtime_ns)
+
+
+@cache
+def _lanes(file: Path, changed: int) -> int:
+    return file.read_bytes().count(b"<lane ")
+
+
 def network_fingerprint(folder: str) -> str:
     """Tells networks of different content apart: sources, traffic and options."""
     return ":".join(network_files(folder).values())

@@ -14,9 +14,9 @@ import sumo
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.shipped import NETWORKS
-from safevar_sumo.simulation import System, assemble, network_fingerprint, simulate
+from safevar_sumo.simulation import System, assemble, evaluate, matrix, network_fingerprint, simulate
 from safevar_sumo.simulation.checking import check_network
-from safevar_sumo.simulation.network import built_network, copied_network
+from safevar_sumo.simulation.network import built_network, copied_network, lanes_of
 from safevar_sumo.simulation.traffic import repeatable_traffic
 from safevar_sumo.study import load_study
 
@@ -207,3 +207,13 @@ def test_every_id_of_a_built_network_is_its_copys_alone(tmp_path: Path) -> None:
     assert originals
     assert not originals & kept
     assert len(root.findall("edge")) == 2 * len(plain.findall("edge"))
+
+
+def test_a_network_of_many_lanes_is_simulated_in_parts(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    system = on("smoke", mine)
+    settings = np.vstack([system.characteristics.original * (1 + 0.01 * i) for i in range(5)])
+    whole = evaluate(system, settings)
+    monkeypatch.setattr(matrix, "LARGEST_ROADS", 2 * lanes_of(str(mine)))
+    parts = evaluate(system, settings)
+    assert parts.outcome.tolist() == whole.outcome.tolist()
+    assert all(np.array_equal(values, parts.metrics[name], equal_nan=True) for name, values in whole.metrics.items())
