@@ -10,14 +10,17 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pytest
-from formulas import FormulaPool, Told, carried_out, solutions, with_search
+from formulas import SUN, FormulaPool, Told, carried_out, evaluated, solutions, with_search
 
-from safevar_sumo.campaign import all_runs, carry_out
+from safevar_sumo.campaign import RunKey, all_runs, carry_out
+from safevar_sumo.campaign.run import Run
 from safevar_sumo.computing import PoolLostError, WorkerLostError
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import Journal, ResultsDirectory, load
 from safevar_sumo.results.frames import encoded, read_frames
+from safevar_sumo.results.journal import read_journal
+from safevar_sumo.search import Search
 from safevar_sumo.study import Study
 
 
@@ -32,6 +35,20 @@ def test_a_torn_tail_is_told_and_simulated_again(study: Study, tmp_path: Path) -
     assert len(told.warnings) == 1
     assert str(torn) in told.warnings[0]
     assert 0 < len(pool.simulated) <= 2 * study.search.population
+
+
+def test_a_setting_that_is_asked_for_twice_stands_where_it_was_asked_for_first(tmp_path: Path) -> None:
+    settings = np.stack([SUN.original, SUN.lower, SUN.original])
+
+    def twice() -> Search:
+        return (yield settings).take([0])
+
+    run = Run(RunKey("nsga2", 0), twice(), Journal(tmp_path / "a.journal", "study", "nsga2-00"), Told(), budget=3)
+    assert not run.advance()
+    assert run.take(evaluated(run.missing))
+    run.advance()
+    run.close()
+    assert read_journal(tmp_path / "a.journal", "study", "nsga2-00").positions == [0, 1]
 
 
 def test_failures_are_counted_kept_out_and_not_met_again(study: Study, tmp_path: Path) -> None:

@@ -89,8 +89,10 @@ def test_a_worker_that_was_killed_while_it_started_costs_nothing(pool: LocalPool
 
 
 def test_what_takes_too_long_is_stopped() -> None:
-    with local_pool(1, 0.2) as pool, pytest.raises(WorkerLostError, match=r"longer than 0\.2 s"):
-        pool.submit(SMOKE, np.repeat(ORIGINAL, 2000, axis=0)).result(timeout=30)
+    with local_pool(1, 0.2) as pool:
+        with pytest.raises(WorkerLostError, match=r"longer than 0\.2 s"):
+            pool.submit(SMOKE, np.repeat(ORIGINAL, 2000, axis=0)).result(timeout=30)
+        assert not processes(), "it would keep a core busy beside its successor"
 
 
 def test_an_error_of_the_study_arrives_as_it_is_and_a_bug_with_its_traceback(pool: LocalPool) -> None:
