@@ -173,7 +173,7 @@ class PersistentPool:
     def _blamed(self, error: WorkerLostError) -> ForeignError:
         """A process that ends or hangs with a user's code in it is that code's fault, as far as anybody can tell."""
         problem = f"{error}, again and again, with {' and '.join(self._foreign)} in it; a process that is gone cannot tell file and line"
-        return ForeignError(f"study {self._study.name!r}", problem, "code that neither ends nor blocks its process")
+        return ForeignError(f"study {self._study.name!r}", problem)
 
     def _told(self, error: ForeignError, setting: FloatArray) -> ForeignError:
         """The error with a command that reproduces it."""

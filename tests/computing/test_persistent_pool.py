@@ -135,6 +135,13 @@ def test_a_process_that_ends_with_a_users_code_in_it_is_an_error() -> None:
         PersistentPool(ToldPool(deadly(4302)), FOREIGN).submit(b"", settings(8)).result(timeout=5)
 
 
+def test_settings_that_fail_one_after_the_other_without_end_are_a_fault_of_the_study() -> None:
+    pool = PersistentPool(ToldPool(deadly(*4300 + np.arange(40))), STUDY)
+    assert not pool.submit(b"", settings(19)).result(timeout=5).valid.any()
+    with pytest.raises(WorkerLostError, match="exit code -9"):
+        pool.submit(b"", settings(40)).result(timeout=5)
+
+
 def test_why_a_setting_could_not_be_simulated_is_kept() -> None:
     found = PersistentPool(ToldPool(deadly(4301)), STUDY).submit(b"", settings(3)).result(timeout=5)
     assert found.reason(1) == "the worker process died (exit code -9)"
