@@ -76,7 +76,7 @@ def test_latex_has_no_mistakes(cases: list[Case], layouts: Layouts) -> None:
     assert document.count(r"\toprule") == document.count(r"\bottomrule") > 5
 
 
-@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX here; the syntax is checked without")
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX here, as there is in CI")
 def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
     document = DOCUMENT % (latex(answer(cases)) + latex(answer(cases), PAPER).replace("tab:", "tab:paper-"))
     (tmp_path / "tables.tex").write_text(document, encoding="utf-8")

@@ -182,7 +182,7 @@ def test_a_csv_that_is_not_the_packages_is_refused(in_tmp: Path) -> None:
     frame.astype(object).replace({5.0: "x"}).to_csv("letters.csv", index=False)
     Path("empty.csv").write_text("")
     for name, told in (("lacking.csv", "mass"), ("tet.csv", "TET"), ("letters.csv", "letters.csv"), ("empty.csv", "empty"),
-                       ("nothing.csv", "nothing.csv"), (".", "cannot be read")):
+                       ("nothing.csv", "nothing.csv"), (".", "is no regular file")):
         refused("import", "sun", "--out", "out", "--nsga2", name, told=(told,))
     refused("import", "native", "--out", "out", "--nsga2", "a.csv", told=("--original",))
     refused("import", "lgsvl", "--out", "out", "--nsga2", "a.csv", told=("lacks the columns",))
