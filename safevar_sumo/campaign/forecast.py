@@ -30,7 +30,7 @@ class Forecast(NamedTuple):
 
 def forecast(study: Study, runs: int, pool: Pool, batch: int | None = None) -> Forecast:
     """What carrying out `runs` runs takes at the most, after a short probe of the pool that will do it."""
-    characteristics, size = CharacteristicSet.of(study.vehicle.characteristics), batch or min(BATCH, runs * study.search.population)
+    characteristics, size = CharacteristicSet.of(study.vehicle.characteristics), batch or min(BATCH, max(runs, 1) * study.search.population)
     persistent, work, rng = PersistentPool(pool, study), packed(study), np.random.default_rng(study.search.seed)
 
     def probe(number: int) -> float:

@@ -20,6 +20,10 @@ def test_a_forecast_counts_and_measures(study: Study) -> None:
     assert told.size >= 600 * 8 * (12 + len(METRICS))
 
 
+def test_a_share_without_a_run_takes_nothing(study: Study) -> None:
+    assert forecast(study, 0, FormulaPool())[2:] == (0, 0)
+
+
 @pytest.mark.parametrize("workers", [1, 4])
 def test_a_forecast_tells_what_all_workers_do_together(workers: int, study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
     seconds = iter(range(100))
