@@ -143,9 +143,13 @@ def _points_of(test: MatrixTest, study: Study, source: str) -> Iterator[Point]:
 
 
 def _with_network(scenario: Any, places: Sequence[str]) -> Any:
-    """The scenario on the folder beside the study, if it names one that lies there and is none of ours."""
+    """The scenario on the folder beside the study, if it names one that lies there and is none of ours.
+
+    One with sources comes first: beside a results directory a study's results have its name, as its network may.
+    """
     folder = scenario.network
-    found = next((str(Path(place, folder)) for place in places if is_network(Path(place, folder))), folder)
+    there = [path for place in places if is_network(path := Path(place, folder))]
+    found = str(next((path for path in there if path.is_file() or any(path.glob("*.xml"))), there[0] if there else folder))
     if found == folder or is_shipped(folder):
         return scenario
     if isinstance(scenario, msgspec.Struct):

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sumo
+from msgspec import structs
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.shipped import NETWORKS
@@ -42,6 +43,14 @@ def on(study: str, network: Path) -> System:
 
 def roads(network: Path, n: int = 1) -> ElementTree.Element:
     return ElementTree.parse(copied_network(str(network), n).network).getroot()
+
+
+def test_results_of_the_networks_name_do_not_hide_it(mine: Path) -> None:
+    (mine.parent / "results" / "mine").mkdir(parents=True)
+    study = load_study("sun", scenario={"parameters": {"network": "mine"}})
+    places = (str(mine.parent / "results"), str(mine.parent))
+    system = assemble(structs.replace(study, origin=structs.replace(study.origin, places=places)))
+    assert system.scenario.network == str(mine)
 
 
 def test_edge_types_of_a_file_of_their_own_count(mine: Path) -> None:
