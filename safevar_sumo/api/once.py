@@ -100,7 +100,7 @@ class Simulation:
         if self.outcome is Outcome.COLLISION:
             return f"collides at {self.collision_speed:.2f} m/s"
         least = self.metrics["safety_degree"]
-        return WORDS[self.outcome] + ("" if np.isnan(least) else f", at the nearest {least:.2f} m from a collision")
+        return WORDS[self.outcome] + ("" if np.isnan(least) else f", with a safety degree of {least:.2f} m")
 
     def record(self) -> dict[str, Any]:
         """As plain values, as `simulate --json` prints it; undefined is None."""
