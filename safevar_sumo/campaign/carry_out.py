@@ -60,6 +60,8 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     persistent, work = PersistentPool(pool, study), packed(study, results.manifest)
     original = _original(study, work, characteristics, results, persistent, observer)
+    if original.collided[0]:
+        observer.warned(f"study {study.name!r}: the original vehicle itself collides, no change is needed for that")
     results.begin(original)
     problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,
                       population=study.search.population, scoring=results.scoring)

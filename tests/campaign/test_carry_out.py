@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,21 @@ def test_runs_share_batches_and_one_run_is_shared_out(study: Study, tmp_path: Pa
     assert alone.sizes[1:3] == [20, 20]
     one, other = (load(tmp_path / name).evaluations.query("algorithm == 'rs' and run == 3") for name in ("together", "alone"))
     pd.testing.assert_frame_equal(one.reset_index(drop=True), other.reset_index(drop=True))
+
+
+class Colliding(FormulaPool):
+    """Everybody collides, the original vehicle too."""
+
+    def submit(self, study: bytes, settings: np.ndarray) -> Future[Evaluations]:
+        future = Future[Evaluations]()
+        future.set_result(replace(evaluated(settings), outcome=np.full(len(settings), "collision")))
+        return future
+
+
+def test_an_original_vehicle_that_collides_is_told(study: Study, tmp_path: Path) -> None:
+    _, told = carried_out(study, tmp_path / "unsafe", Colliding())
+    assert [line for line in told.warnings if "the original vehicle itself collides" in line] == told.warnings != []
+    assert carried_out(study, tmp_path / "safe")[1].warnings == []
 
 
 def test_another_seed_finds_other_solutions(study: Study, tmp_path: Path) -> None:
