@@ -57,7 +57,7 @@ def causes(found: Found, material: Material) -> list[dict[str, Any]]:
     """The distinct minimal causes, the one of the fewest and smallest changes first, each with its replay at the boundary."""
     distinct: dict[tuple[str, ...], dict[str, Any]] = {}
     for failure in found:
-        for cause in failure.get("minimal_causes", []):
+        for cause in _with_changes(failure):
             key = tuple(cause["changes"])
             if key not in distinct or _size(material, cause) < _size(material, distinct[key]["cause"]):
                 distinct[key] = {"cause": cause, "because": failure["because"], "robustness": failure["robustness"],
@@ -68,10 +68,15 @@ def causes(found: Found, material: Material) -> list[dict[str, Any]]:
     return [_told(material, place, one) for place, one in enumerate(ordered, 1)]
 
 
-def smallest_cause(found: Found) -> dict[str, Any] | None:
-    """The minimal cause of the fewest changes, of those the one at the smallest fraction."""
-    all_of_them = [cause for failure in found for cause in failure.get("minimal_causes", [])]
-    return min(all_of_them, key=lambda cause: (len(cause["changes"]), cause["fraction"]), default=None)
+def least_cause(found: Found, material: Material) -> dict[str, Any] | None:
+    """The minimal cause of the fewest changes, of those the one whose largest is smallest; the first of `causes`."""
+    all_of_them = [cause for failure in found for cause in _with_changes(failure)]
+    return min(all_of_them, key=lambda cause: _size(material, cause), default=None)
+
+
+def _with_changes(failure: dict[str, Any]) -> list[dict[str, Any]]:
+    """The minimal causes of a failure; none where the original vehicle itself is unsafe, which no change causes."""
+    return [cause for cause in failure.get("minimal_causes", []) if cause["changes"]]
 
 
 def handle_of(failure: dict[str, Any]) -> str:
@@ -107,7 +112,7 @@ def replays(material: Material, explained: Found | None) -> list[dict[str, Any]]
         row, setting = material.solutions[handle], material.setting_of(Handle.parse(handle))
         one = {"handle": handle, "anchor": material.anchor("replay", handle), "f_safe": row["f_safe"], "f_diff": row["f_diff"],
                "f_num_diff": row["f_num_diff"], "outcome": row["outcome"], "open": place == 0 and not explained,
-               "changes": changes_in_words(material.case.characteristics, setting)}
+               "differences": [], "where": "", "changes": changes_in_words(material.case.characteristics, setting)}
         told.append(one if material.system is None else {
             **one, "replay": material.replay(setting), "where": material.where(setting),
             "differences": differences(material.again([setting])[0].evaluation, row)})

@@ -89,6 +89,11 @@ class Material:
         """What counts as unsafe: a collision if a solution is one, else half of the original's safety degree."""
         return Unsafe() if collided(self.case.solutions).any() else Unsafe.half_of(self.case.original["safety_degree"])
 
+    @property
+    def original_fails(self) -> bool:
+        """Whether the original vehicle itself collides: then no change causes anything."""
+        return self.case.original["safety_degree"] < 0
+
     def where(self, setting: FloatArray) -> str:
         """At which points of a matrix a setting fails, in words; nothing of a study without one."""
         if self.system is None or not self.system.matrix:

@@ -77,7 +77,7 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
         studies=studies,
         tables=tables(cases) if asked else [], figures=figures(cases) if asked else [],
         commands=reproduce(materials, [PARTS[name] for name in PARTS if name in wanted]) if "reproduce" in wanted else [],
-        player=player_parts(), css=_part("report.css"), js=_part("report.js"))
+        takes_simulations=list(PARTS), player=player_parts(), css=_part("report.css"), js=_part("report.js"))
     progress("tables and figures", 1, 1)
     return page + "\n"
 
@@ -101,7 +101,8 @@ def _study(material: Material, wanted: Sequence[str], jobs: int | None, progress
                       "those of the study?", stacklevel=2)
     return {"name": material.case.name, "title": material.case.study.title, "anchor": material.anchor(), "replays": shown,
             "otherwise": otherwise,
-            "has_system": material.system is not None, "front": front(material, [one["handle"] for one in shown]) if shown else None,
+            "lacking": material.lacking, "original_fails": material.original_fails,
+            "front": front(material, [one["handle"] for one in shown]) if shown else None,
             **limits, **{name: make() for name, make in made.items() if name in wanted or (name == "necessity" and "causes" in wanted)}}
 
 

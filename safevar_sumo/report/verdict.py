@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.analysis.case import collided
-from safevar_sumo.report.findings import Found, smallest_cause
+from safevar_sumo.answers import joined
+from safevar_sumo.report.findings import Found, least_cause
 from safevar_sumo.report.material import Material
 from safevar_sumo.results import CHOICES, Handle, chosen_handle, unsafe_rows
 from safevar_sumo.showing.comparison import changes_in_words
@@ -50,11 +51,13 @@ def _headline(told: dict[str, Any], explained: Found | None, material: Material)
     what = "collide" if told["hits"] else "unsafe"
     if not told["unsafe"]:
         return f"Nothing unsafe was found among {told['solutions']} solutions; the nearest miss is told below."
-    least = smallest_cause(explained) if explained else None
-    if least is not None:
-        setting = material.setting_with(least["boundary"])
-        return f"The smallest change that makes it {what}: {_joined(_changes(material, setting))}."
-    return f"The smallest change found that makes it {what}: {_joined(told['findings'][0]['changes'])}."
+    if material.original_fails:
+        return "No change is needed: the original vehicle itself collides."
+    least = least_cause(explained, material) if explained else None
+    changes = told["findings"][0]["changes"] if least is None else _changes(material, material.setting_with(least["boundary"]))
+    if len(changes) == 1:
+        return f"One change is enough to make it {what}: {changes[0]}."
+    return f"The fewest changes found that make it {what}: {joined(changes)}."
 
 
 def _finding(material: Material, title: str, handle: Handle) -> dict[str, Any]:
@@ -76,6 +79,3 @@ def _end(material: Material, handle: Handle, setting: np.ndarray) -> str:
 def _changes(material: Material, setting: np.ndarray) -> list[str]:
     return changes_in_words(material.case.characteristics, setting)
 
-
-def _joined(parts: list[str]) -> str:
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

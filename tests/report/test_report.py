@@ -139,7 +139,7 @@ def test_the_sections_stand_in_their_order_and_tell_what_was_found(page: str, sl
     worst = case.solutions["f_safe"].min()
     assert f"hits at {-worst:.1f} m/s" in page
     assert f"stops with {case.original['safety_degree']:.2f} m to spare" in page
-    assert "The smallest change that makes it collide" in page
+    assert "The fewest changes found that make it collide" in page
     for words in ("Unsafe alone: tireFric.", "within 50 % of the way", "<strong>25.00 %</strong>", "No rule was found",
                   "NSGA-II (1 runs)", "wet leaves", "RQ1: found settings", "RQ3.2", "from seed 1"):
         assert words in page
@@ -197,7 +197,7 @@ def test_parts_are_computed_on_the_way(slippery: Path, tmp_path: Path, monkeypat
     page = make_report([tmp_path / "copy"], only=["verdict", "causes", "tolerance", "risk", "rules"])
     assert "Cause 1: " in page
     assert page.count('<svg class="chart"') >= 4
-    assert "The smallest change that makes it collide" in page
+    assert "The fewest changes found that make it collide" in page
 
 
 def test_only_some_sections(slippery: Path) -> None:

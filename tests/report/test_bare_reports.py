@@ -1,0 +1,42 @@
+"""Reports of results about which there is less to tell: the study cannot be simulated here, or its original vehicle collides."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from safevar_sumo.report import findings, make_report
+from safevar_sumo.report.limits import LIMITS
+from safevar_sumo.report.page import PARTS
+
+
+def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path: Path) -> None:
+    """Its network's folder is gone since."""
+    shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))
+    manifest = json.loads((slippery / "manifest.json").read_text())
+    manifest["study"]["scenario"]["parameters"] = {"network": "/nowhere/gone"}
+    (tmp_path / "copy/manifest.json").write_text(json.dumps(manifest))
+    page = make_report([tmp_path / "copy"], only=["tested", "verdict", *PARTS, "trust", "reproduce"], jobs=1)
+    told = re.findall(r"slippery: What this study is about cannot be simulated here: .*gone", page)
+    assert len(told) == 1 + len(LIMITS), "each section that would take simulations says so"
+    assert '<details class="replay"' in page
+
+
+def test_of_an_original_that_collides_no_change_is_called_the_cause(
+        slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))
+    manifest = json.loads((slippery / "manifest.json").read_text())
+    manifest["original"] |= {"outcome": "collision", "collision": True, "collision_speed": 3.9, "safety_degree": -3.9, "f_safe": -3.9}
+    (tmp_path / "copy/manifest.json").write_text(json.dumps(manifest))
+    empty = {"changes": {}, "boundary": {}, "fraction": 0.0, "outcome": "collision", "safety_degree": -3.9}
+    failure = {"algorithm": "nsga2", "run": 0, "index": 0, "minimal_causes": [empty], "robustness": 1.0, "because": "it collides anyhow"}
+    monkeypatch.setattr(findings, "explain", lambda *_, **__: SimpleNamespace(records=lambda: [failure]))
+    page = make_report([tmp_path / "copy"], only=["verdict", "causes"], jobs=1)
+    assert "No change is needed: the original vehicle itself collides." in page
+    assert "No change is a cause" in page
+    assert "Cause 1" not in page
