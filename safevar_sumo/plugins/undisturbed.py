@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -20,7 +21,8 @@ LEGAL = "code that leaves what others import as it is: a function of its own, or
 def undisturbed(source: str, names: Sequence[str]) -> Iterator[None]:
     """Within, plug-ins of such names may run, as the study `source` calls them; without any, nothing is done.
 
-    Working directory, environment, numpy's error state and the recursion limit are put back at the end.
+    Working directory, environment, numpy's error state and the recursion limit are put back at the end. `os._exit`, which
+    nobody could tell from a program that is over, is an exception like `sys.exit`.
 
     Raises
     ------
@@ -31,9 +33,12 @@ def undisturbed(source: str, names: Sequence[str]) -> Iterator[None]:
         yield
         return
     before, folder, environment, limit, state = _callables(), os.getcwd(), dict(os.environ), sys.getrecursionlimit(), np.geterr()
+    leave = os._exit
+    os._exit = _exception_instead(leave)  # type: ignore[assignment]
     try:
         yield
     finally:
+        os._exit = leave
         sys.setrecursionlimit(limit)
         np.seterr(**state)
         os.chdir(folder)
@@ -41,6 +46,18 @@ def undisturbed(source: str, names: Sequence[str]) -> Iterator[None]:
             os.environ.clear()
             os.environ.update(environment)
         _refuse_replaced(before, source, names)
+
+
+def _exception_instead(leave: Callable[[int], NoReturn]) -> Callable[[int], NoReturn]:
+    """For this thread of this process: another one, a forked process say, is left as it wants."""
+    here = os.getpid(), threading.get_ident()
+
+    def end(status: int) -> NoReturn:
+        if (os.getpid(), threading.get_ident()) != here:
+            leave(status)
+        raise SystemExit(f"os._exit({status})")
+
+    return end
 
 
 def _callables() -> list[tuple[Any, str, Any]]:
