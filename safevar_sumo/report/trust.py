@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shlex
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Outcome
 from safevar_sumo.report.findings import Found
 from safevar_sumo.report.material import Material
+from safevar_sumo.study import Study, load_study, study_names
 
 RUN = "python -m safevar_sumo"
 NOT_MODELLED = (
@@ -48,12 +53,24 @@ def reproduce(materials: Sequence[Material], parts: Sequence[str]) -> list[dict[
     for material in materials:
         place, study = shlex.quote(str(material.place)), material.case.study
         if material.case.has_runs:
-            commands.append({"what": f"The study {study.name}, as its manifest.json records it whole", "command":
-                             f"{RUN} study {study.name} --seed {study.search.seed} --runs {study.search.runs} "
-                             f"--evaluations {study.search.evaluations} --out {place}"})
+            commands.append({"what": f"The study {study.name}, as its manifest.json records it whole, into another directory",
+                             "command": _again(study, f"{material.place}-again", material.place)})
         commands.append({"what": "A replay, with figure and animation",
                          "command": f"{RUN} simulate {place} --most-severe --plot it.png --animate it.html"})
         commands += [{"what": f"The part {part}", "command": f"{RUN} {part} {place}"} for part in parts]
     commands.append({"what": "The tables of RQ1 to RQ3", "command": f"{RUN} tables {places}"})
     commands.append({"what": "The figures", "command": f"{RUN} figures {places} --out figures"})
     return commands
+
+
+def _again(study: Study, out: str, place: Path) -> str:
+    """What carries a study out: the command where it is a shipped one with other options, else what the results record of it."""
+    search = study.search
+    if study.name in study_names():
+        options = {name: getattr(search, name) for name in ("seed", "runs", "evaluations", "algorithms")}
+        shipped = load_study(study.name)
+        if msgspec.structs.replace(shipped, search=msgspec.structs.replace(shipped.search, **options), origin=study.origin) == study:
+            told = {**options, "algorithms": shlex.quote(",".join(search.algorithms)), "out": shlex.quote(out)}
+            return " ".join([f"{RUN} study {study.name}", *(f"--{name} {value}" for name, value in told.items())])
+    script = f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(str(place))}).study, out={json.dumps(out)}, progress=True)"
+    return f"python -c {shlex.quote(script)}"
