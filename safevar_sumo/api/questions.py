@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from safevar_sumo.api.results import Results
-from safevar_sumo.study import Study, StudyLike, load_study
+from safevar_sumo.api.results import Results, study_of, study_or_case
+from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
     from safevar_sumo.answers import Explained, Risk, Rules, Tolerance
@@ -20,7 +20,7 @@ def explain(source: StudyLike | Results, *, solutions: Sequence[str] = (), unsaf
     Parameters
     ----------
     source
-        Results, whose solutions are explained; or a study, of which failures all over the domain are.
+        Results or their directory, whose solutions are explained; or a study, of which failures all over the domain are.
     solutions
         Handles of solutions, such as "nsga2:3:0"; by default the failures that matter.
     unsafe
@@ -37,8 +37,7 @@ def explain(source: StudyLike | Results, *, solutions: Sequence[str] = (), unsaf
     """
     from safevar_sumo import answers
 
-    asked = source.case if isinstance(source, Results) else load_study(source)
-    return answers.explain(asked, solutions=solutions, unsafe=unsafe, top=top, pool=pool, jobs=jobs)
+    return answers.explain(study_or_case(source), solutions=solutions, unsafe=unsafe, top=top, pool=pool, jobs=jobs)
 
 
 def tolerance(study: StudyLike | Results, *, unsafe: str | None = None, characteristics: Sequence[str] | None = None, pairs: bool = False,
@@ -46,7 +45,7 @@ def tolerance(study: StudyLike | Results, *, unsafe: str | None = None, characte
     """How far characteristics may go: each alone, with `pairs` two together, and all together. Otherwise as `explain`."""
     from safevar_sumo import answers
 
-    return answers.tolerance(_study(study), unsafe=unsafe, characteristics=characteristics, pairs=pairs, pool=pool, jobs=jobs)
+    return answers.tolerance(study_of(study), unsafe=unsafe, characteristics=characteristics, pairs=pairs, pool=pool, jobs=jobs)
 
 
 def risk(study: StudyLike | Results, *, samples: int = 10_000, confidence: float = 0.95, width: float | None = None,
@@ -58,7 +57,7 @@ def risk(study: StudyLike | Results, *, samples: int = 10_000, confidence: float
     """
     from safevar_sumo import answers
 
-    return answers.risk(_study(study), samples=samples, confidence=confidence, width=width, unsafe=unsafe, pool=pool, jobs=jobs)
+    return answers.risk(study_of(study), samples=samples, confidence=confidence, width=width, unsafe=unsafe, pool=pool, jobs=jobs)
 
 
 def rules(study: StudyLike | Results, *, samples: int = 16_384, unsafe: str | None = None, pool: Pool | None = None,
@@ -66,8 +65,4 @@ def rules(study: StudyLike | Results, *, samples: int = 16_384, unsafe: str | No
     """Rules that tell where it is unsafe, from `samples` settings spread over the whole domain. Otherwise as `explain`."""
     from safevar_sumo import answers
 
-    return answers.rules(_study(study), samples=samples, unsafe=unsafe, pool=pool, jobs=jobs)
-
-
-def _study(source: StudyLike | Results) -> Study:
-    return source.study if isinstance(source, Results) else load_study(source)
+    return answers.rules(study_of(study), samples=samples, unsafe=unsafe, pool=pool, jobs=jobs)

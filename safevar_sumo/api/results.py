@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.results import read_manifest
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, StudyLike, load_study, study_names
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -76,3 +78,28 @@ def load(directory: str | Path) -> Results:
     from safevar_sumo.analysis import load_cases
 
     return Results(Path(directory), load_cases([directory])[0])
+
+
+def study_or_case(source: StudyLike | Results) -> Study | Case:
+    """What a question is about: a study, or the case that results or their directory hold.
+
+    Raises
+    ------
+    InputError
+        If it is neither.
+    """
+    if isinstance(source, Results):
+        return source.case
+    if isinstance(source, str | Path) and str(source) not in study_names():
+        if os.path.isdir(source):  # whatever the text is, as no method of a path
+            return load(source).case
+        if not os.path.exists(source):
+            legal = f"a directory that the command study has written, {one_of(study_names())}, or the path of a study file (TOML)"
+            raise InputError(source, "is no results directory, no study and no file", legal)
+    return load_study(source)
+
+
+def study_of(source: StudyLike | Results) -> Study:
+    """The study itself, or the one of the results; raises as `study_or_case`."""
+    found = study_or_case(source)
+    return found if isinstance(found, Study) else found.study

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import evaluations_frame
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.vehicles import CharacteristicSet
+
+LEGAL = "a pandas.DataFrame with a column of numbers for each characteristic that is changed, or an array of numbers, shape (M, n)"
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,6 +82,8 @@ def _table(settings: pd.DataFrame | npt.ArrayLike, characteristics: Characterist
     import pandas as pd
 
     names = list(characteristics.names)
+    if isinstance(settings, Mapping):
+        raise InputError("settings", f"is a {type(settings).__name__}", LEGAL)
     if isinstance(settings, pd.DataFrame):
         for name in settings.columns:
             if name not in names:
@@ -97,7 +102,7 @@ def _numbers(settings: Any) -> FloatArray:
     try:
         return np.array(settings, dtype=float)
     except (TypeError, ValueError) as error:
-        raise InputError("settings", str(error), "numbers") from None
+        raise InputError("settings", str(error), LEGAL) from None
 
 
 def _check(asked: FloatArray, characteristics: CharacteristicSet, beyond: bool) -> None:

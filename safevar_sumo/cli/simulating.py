@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from safevar_sumo.results.imported import UNKNOWN
-from safevar_sumo.study import Study, load_study, study_names
+from safevar_sumo.study import Study
 
 if TYPE_CHECKING:
     from safevar_sumo.analysis import Case
@@ -31,15 +30,14 @@ def results_or_study(place: str, point: str | None = None) -> Study | Case:
     InputError
         If it is neither, or has no such point.
     """
-    if place in study_names() or not Path(place).is_dir():
-        study = load_study(place)
-        return study if point is None else _at(study, point)
-    from safevar_sumo.analysis import load_cases
+    from safevar_sumo.api.results import study_or_case
 
-    (case,) = load_cases([place])
+    found = study_or_case(place)
     if point is None:
-        return case
-    return replace(case, study=_at(case.study, point), solutions=case.solutions.assign(outcome=UNKNOWN))
+        return found
+    if isinstance(found, Study):
+        return _at(found, point)
+    return replace(found, study=_at(found.study, point), solutions=found.solutions.assign(outcome=UNKNOWN))
 
 
 def _at(study: Study, point: str) -> Study:

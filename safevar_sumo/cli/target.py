@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import click
 
+from safevar_sumo.api.results import study_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import Handle, chosen_handle, position_of
-from safevar_sumo.study import Study, load_study, study_names
+from safevar_sumo.study import Study, study_names
 
 Command = Callable[..., Any]
 
@@ -48,20 +49,17 @@ def target_of(place: str, solution: str | None, choice: str | None) -> Target:
     if solution is not None and choice is not None:
         raise InputError("--solution", f"{solution!r} and --{choice.replace('_', '-')} both choose a solution", "one of them")
     asked = solution is not None or choice is not None
-    if not asked and (place in study_names() or not Path(place).is_dir()):
-        return Target(load_study(place), place)
+    if not asked:
+        return Target(study_of(place), place)
     if place in study_names() and not Path(place).is_dir():
         raise InputError(place, "is a study and has no solutions", "a directory that the command study has written")
     from safevar_sumo.analysis import load_cases  # takes longer to load than the simulation
 
     (case,) = load_cases([place])
-    target = Target(case.study, place)
-    if not asked:
-        return target
     if solution is not None:
         handle = Handle.parse(solution)
     else:
         handle = chosen_handle(case.solutions, case.original["safety_degree"], str(choice), place)
     row = case.solutions.iloc[position_of(case.solutions, handle)]
     setting = row[list(case.characteristics.names)].to_numpy(dtype=float)
-    return target._replace(handle=handle, setting=setting, recorded={str(name): value for name, value in row.items()})
+    return Target(case.study, place, handle, setting, {str(name): value for name, value in row.items()})

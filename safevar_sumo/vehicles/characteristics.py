@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -42,14 +43,14 @@ class Characteristic:
         return FARTHEST * max(abs(self.lower), abs(self.upper))
 
     def check(self, value: float, source: object, *, beyond: bool = False) -> None:
-        """Refuse a value outside the domain, or with `beyond` only what means nothing (`is_legal`).
+        """Refuse what is no number or outside the domain, or with `beyond` only what means nothing (`is_legal`).
 
         Raises
         ------
         InputError
             Naming the value and what is legal.
         """
-        if not self.is_legal(value, beyond=beyond):
+        if not isinstance(value, Real) or not self.is_legal(value, beyond=beyond):
             above = " above 0" if self.lower > 0 else ""
             farther, within = f"a finite number{above}, up to {self.farthest:g}", f"a number in [{self.lower:g}, {self.upper:g}]"
             raise InputError(source, f"{self.name} = {value}", f"{farther if beyond else within} {self.unit}")
@@ -131,6 +132,8 @@ class CharacteristicSet:
         InputError
             If a name is unknown or a value is outside its domain.
         """
+        if not isinstance(values, Mapping):
+            raise InputError(source, f"is a {type(values).__name__}", "values by characteristic, such as {'mass': 2500}")
         setting = self.original.copy()
         for name, value in values.items():
             if name not in self.names:

@@ -14,6 +14,8 @@ import pandas as pd
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.analysis import Case
+from safevar_sumo.api.results import study_of, study_or_case
 from safevar_sumo.simulation import assemble, simulate
 from safevar_sumo.study import load_study, tables_of
 from safevar_sumo.vehicles import CharacteristicSet
@@ -95,6 +97,30 @@ def test_values_beyond_the_domain_need_to_be_asked_for() -> None:
         sv.simulate("sun", {"tireFric": np.inf}, beyond=True)
 
 
+@pytest.mark.parametrize("value", ["+8%", "heavy", None, [2500.0]])
+def test_what_is_no_number_is_refused(value: object) -> None:
+    with pytest.raises(sv.InputError, match=r"^changes: mass = .*\nlegal: a number in \[2040, 2700\] kg"):
+        sv.simulate("rain", {"mass": value})  # type: ignore[dict-item]
+
+
+def test_changes_stand_in_a_mapping() -> None:
+    with pytest.raises(sv.InputError, match=r"changes: is a list\nlegal: values by characteristic"):
+        sv.simulate("rain", ["mass"])  # type: ignore[arg-type]
+
+
+def test_what_is_neither_study_nor_results_is_told_as_both() -> None:
+    for ask in (sv.explain, sv.tolerance, sv.risk, sv.rules):
+        with pytest.raises(sv.InputError, match=r"^nowhere: is no results directory, no study and no file\nlegal: a directory .* rain,"):
+            ask("nowhere")
+
+
+def test_questions_take_a_directory_as_they_take_results(results: sv.Results) -> None:
+    case = study_or_case(str(results.directory))
+    assert isinstance(case, Case)
+    pd.testing.assert_frame_equal(case.solutions, results.solutions)
+    assert tables_of(study_of(results.directory)) == tables_of(study_of(results)) == tables_of(study_of("smoke"))
+
+
 @pytest.mark.parametrize("value", [0.0, -5.0, 1e300])
 def test_what_no_vehicle_can_have_is_not_beyond_the_domain_but_refused(value: float) -> None:
     with pytest.raises(sv.InputError, match=r"mass = .*\nlegal: a finite number above 0, up to 2.7e\+06 kg"):
@@ -138,6 +164,7 @@ def test_evaluate_is_simulate_row_by_row() -> None:
 
 @pytest.mark.parametrize(("settings", "told"), [
     (pd.DataFrame({"weight": [1.0]}), "weight"), (pd.DataFrame({"mass": ["heavy"]}), "heavy"), ([[1.0, 2.0]], r"shape \(1, 2\)"),
+    ({"mass": [2500.0]}, "a dict\nlegal: a pandas.DataFrame"),
     (pd.DataFrame({"mass": [2404.0, 9999.0]}), "row 1: mass = 9999"), (pd.DataFrame({"mass": [float("nan")]}), "mass = nan"),
 ])
 def test_settings_that_cannot_be_used_are_told_before_any_is_simulated(settings: object, told: str) -> None:
