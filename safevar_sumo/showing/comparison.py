@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.records import Drives, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.showing.moments import moments
 from safevar_sumo.simulation import System, at_worst, score
@@ -94,7 +94,18 @@ def compare(study: Study, system: System, setting: FloatArray) -> Comparison:
     taken = film(there, settings)
     return Comparison(title=study.title + "".join(where[:1]), characteristics=system.characteristics,
                       ttc_threshold=system.metrics.ttc_threshold, evaluations=score(there, settings, taken.drives),
-                      film=taken)
+                      film=replace(taken, drives=_up_to_impacts(taken.drives)))
+
+
+def _up_to_impacts(drives: Drives) -> Drives:
+    """Drives with the pedals that were in force at an impact: those of the sample before, a command after it moves nothing any more."""
+    trace = drives.trace
+    throttle, brake = trace.throttle.copy(), trace.brake.copy()
+    for row in np.flatnonzero(~np.isnan(drives.collision_speed)).tolist():
+        end = moments(drives, row).end
+        for pedal in (throttle, brake):
+            pedal[end, row] = pedal[max(end - 1, 0), row]
+    return replace(drives, trace=replace(trace, throttle=throttle, brake=brake))
 
 
 def differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:

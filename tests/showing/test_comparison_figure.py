@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from safevar_sumo.analysis import load_cases
 from safevar_sumo.showing import Comparison, compare, draw_comparison, write_figure
-from safevar_sumo.simulation import assemble
+from safevar_sumo.simulation import assemble, simulate, study_at
+from safevar_sumo.study import load_study
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +35,21 @@ def test_it_draws_both_drives_as_far_as_they_go(comparison: Comparison) -> None:
     heading = figure.get_suptitle()
     for change in comparison.changes:
         assert change in heading
+
+
+def test_at_an_impact_the_pedals_are_those_that_were_in_force() -> None:
+    """AEB lets go of the brake once the gap is gone, which is after the collision."""
+    study = study_at(load_study("euro_ncap_pedestrian"), "CPLA, speed 60, clear", "point")
+    system = assemble(study)
+    setting = system.characteristics.original.copy()
+    for name, value in (("tireFric", 1.0), ("mass", 2600.0)):
+        setting[system.characteristics.names.index(name)] = value
+    shown, drives = compare(study, system, setting), simulate(system, setting[np.newaxis])
+    trace, end = shown.film.drives.trace, shown.film.last[-1]
+    assert shown.verdict(1).startswith("hits")
+    assert drives.trace.brake[end, 0] == 0
+    assert trace.brake[end, 1] == trace.brake[end - 1, 1] == drives.trace.brake[end - 1, 0] == 1
+    assert shown.evaluations.metrics["safety_degree"][1] == -drives.collision_speed[0]
 
 
 def test_a_title_of_dollars_is_no_formula(comparison: Comparison, tmp_path: Path) -> None:
