@@ -60,8 +60,8 @@ def _described(name: str, what: Callable[..., Any]) -> dict[str, str]:
 
 def _print_catalogue(console: Console, studies: list[Study]) -> None:
     catalogue = _catalogue(studies)
-    print_names(console, "Studies", [tuple(row.values()) for row in catalogue["studies"]],
-                         ("name", "title", "vehicle", "ADS", "scenario", "weather"))
+    studied = [(name, title, ", ".join(parts)) for name, title, *parts in map(dict.values, catalogue["studies"])]
+    print_names(console, "Studies", studied, ("name", "title", "vehicle, ADS, scenario, weather"))
     for vehicle in catalogue["vehicles"]:
         rows = [(row["name"], row["unit"], *(f"{row[key]:g}" for key in ("original", "lower", "upper", "threshold")))
                 for row in vehicle["characteristics"]]

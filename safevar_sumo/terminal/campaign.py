@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from safevar_sumo.campaign import Campaign, Forecast
 from safevar_sumo.computing import Pool
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import failure_lines, record, solutions_frame
 from safevar_sumo.study import Study
+from safevar_sumo.terminal.plain import WholeTable
 from safevar_sumo.vehicles import CharacteristicSet
 
 SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\nTET, TIT: over solutions without collision."
@@ -23,7 +23,7 @@ SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\n
 def print_forecast(console: Console, study: Study, runs: int, told: Forecast) -> None:
     """What a campaign would take."""
     console.print(study.title, soft_wrap=True, highlight=False, markup=False)
-    table = Table(show_header=False)
+    table = WholeTable(show_header=False)
     table.add_row("algorithms", ", ".join(study.search.labels))
     table.add_row("runs", str(runs))
     table.add_row("evaluations, at the most", str(told.evaluations))
@@ -53,7 +53,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
         of_it = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]
         if of_it:
             found[algorithm] = Evaluations.concatenate(of_it)
-    table = Table("", title=escape(study.title), title_justify="left")
+    table = WholeTable("", title=escape(study.title), title_justify="left")
     for head in found:
         table.add_column(head, justify="right")
     table.add_row("solutions", "-", *(str(len(one)) for one in list(found.values())[1:]))

@@ -6,10 +6,10 @@ import math
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from safevar_sumo.answers import Because, Cause, Explained, Explanation, changes, command, number_of, points_in_words, sentence
 from safevar_sumo.simulation import assemble
+from safevar_sumo.terminal.plain import WholeTable
 from safevar_sumo.vehicles import CharacteristicSet
 
 CAUSES_SHOWN = 3
@@ -63,7 +63,7 @@ def _print_cause(console: Console, place: str, cause: Cause, members: Characteri
         _say(console, "No change is needed: the original vehicle itself is unsafe.")
         return
     _say(console, f"Minimal cause: {changes(members, cause.changes)}: {cause.outcome}, SD {_decimal(cause.safety_degree)}")
-    table = Table("characteristic", "unit")
+    table = WholeTable("characteristic", "unit")
     for head in ("original", "here", "all shrunk", "alone back to"):
         table.add_column(head, justify="right")
     for member in members:
@@ -74,9 +74,9 @@ def _print_cause(console: Console, place: str, cause: Cause, members: Characteri
     _say(console, f"Still unsafe at {cause.fraction:.1%} of these changes, safe just below. {command(place, cause.changes)}")
 
 
-def _side_by_side(told: Because) -> Table:
+def _side_by_side(told: Because) -> WholeTable:
     """Original and changed vehicle, and what each line explains of the lost distance."""
-    table = Table("", "unit")
+    table = WholeTable("", "unit")
     for head in ("original", "changed", "explains, m"):
         table.add_column(head, justify="right")
     one, other = told.original.braking, told.changed.braking
@@ -95,14 +95,14 @@ def _side_by_side(told: Because) -> Table:
 
 def _print_common(console: Console, told: Explained) -> None:
     looked = "all of them" if told.analysed == told.failures else f"a random sample of {told.analysed} of the {told.failures}"
-    table = Table("characteristic", title=f"Changed is not needed: {looked}", title_justify="left")
+    table = WholeTable("characteristic", title=f"Changed is not needed: {looked}", title_justify="left")
     for head in ("changed", "necessary", "in some cause"):
         table.add_column(head, justify="right")
     for row in told.necessity.to_dict("records"):
         table.add_row(escape(row["characteristic"]), *(f"{row[name]:.0%}" for name in ("changed", "necessary", "involved")))
     console.print(table)
     console.print("necessary: in every minimal cause of a failure; shares of the failures.")
-    causes = Table("minimal cause", title=f"Distinct minimal causes: {len(told.distinct)}", title_justify="left")
+    causes = WholeTable("minimal cause", title=f"Distinct minimal causes: {len(told.distinct)}", title_justify="left")
     for head in ("failures", "share"):
         causes.add_column(head, justify="right")
     for row in told.distinct.head(DISTINCT_SHOWN).to_dict("records"):

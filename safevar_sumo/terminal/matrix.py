@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from safevar_sumo.simulation import AtPoint, point_record
-from safevar_sumo.terminal.plain import plain
+from safevar_sumo.terminal.plain import WholeTable, plain
 
 KMH = 3.6
 BANDS = ((5.0, "green"), (15.0, "yellow"), (25.0, "dark_orange"), (35.0, "orange4"))
@@ -38,7 +37,7 @@ def print_matrix(console: Console, found: Sequence[AtPoint], row: int = 0) -> No
 
 def _print_table(console: Console, title: str, points: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> None:
     columns = list(dict.fromkeys(place.get(COLUMN) for place, _ in points))
-    table = Table(title=plain(title), title_justify="left")
+    table = WholeTable(title=plain(title), title_justify="left")
     table.add_column("speed")
     for column in columns:
         table.add_column("" if column is None else f"{column:g} %", justify="right")

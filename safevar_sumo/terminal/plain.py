@@ -1,8 +1,27 @@
-"""Text of a user's as it is: no markup, no control characters."""
+"""Text of a user's as it is: no markup, no control characters; and tables in which nothing is cut off."""
 
 from __future__ import annotations
 
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.measure import Measurement
+from rich.table import Table
 from rich.text import Text
+
+
+class WholeTable(Table):
+    """A table whose first column keeps its words, the names; what else does not fit goes on in the next line."""
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for column in self.columns:
+            column.overflow = "fold"
+        wide = options.update(width=1_000_000)
+        excess = Measurement.get(console, wide, self).maximum - options.max_width
+        if excess > 0:
+            first = self.columns[0]
+            cells = [Measurement.get(console, wide, cell) for cell in (first.header, *first.cells)]
+            words, natural = (max(sizes) for sizes in zip(*cells, strict=True))
+            first.width = max(words, natural - excess)
+        yield from super().__rich_console__(console, options)
 
 
 def plain(text: object, style: str = "") -> Text:

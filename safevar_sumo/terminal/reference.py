@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.reference import Agreement, Calibration, on_a_bound
 from safevar_sumo.study import Study
+from safevar_sumo.terminal.plain import WholeTable
 
 
 def print_agreement(console: Console, study: Study, told: Agreement) -> None:
     """Comparison with reference data, metric by metric."""
-    table = Table("", title=escape(f"{study.title}: {told.rows} rows"), title_justify="left")
+    table = WholeTable("", title=escape(f"{study.title}: {told.rows} rows"), title_justify="left")
     for head in ("Spearman's rho", "mean abs. error", "in repeats", "bias", "original there", "original here"):
         table.add_column(head, justify="right")
     for name in told.spearman:
@@ -39,7 +39,7 @@ def _number(value: float | None) -> str:
 
 def print_calibration(console: Console, study: Study, found: Calibration) -> None:
     """Found values, and how well they do on both halves of the data."""
-    table = Table("parameter", "unit", title=escape(study.title), title_justify="left")
+    table = WholeTable("parameter", "unit", title=escape(study.title), title_justify="left")
     for head in ("found", "lower", "upper"):
         table.add_column(head, justify="right")
     for name, value in found.values.items():
@@ -47,7 +47,7 @@ def print_calibration(console: Console, study: Study, found: Calibration) -> Non
         table.add_row(name, row.unit, *(f"{number:.5g}" for number in (value, row.lower, row.upper)))
     console.print(table)
     for name in found.used:
-        both = Table(title=escape(f"{name}: rows used / held back"), title_justify="left")
+        both = WholeTable(title=escape(f"{name}: rows used / held back"), title_justify="left")
         both.add_column("")
         for head in ("Spearman's rho", "mean abs. error", "bias"):
             both.add_column(head, justify="right")

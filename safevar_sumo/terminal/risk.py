@@ -6,9 +6,9 @@ import math
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from safevar_sumo.answers import Risk
+from safevar_sumo.terminal.plain import WholeTable
 from safevar_sumo.variation import Uniform
 
 
@@ -23,7 +23,7 @@ def print_risk(console: Console, told: Risk) -> None:
     _say(console, f"They vary as the study says: {varied}; the others uniformly." if laws else "They vary uniformly over the whole domain.")
     if told.sensitivity is None or told.sensitivity_of_unsafe is None:
         return
-    table = Table("characteristic", title="What decides: share of the variance", title_justify="left")
+    table = WholeTable("characteristic", title="What decides: share of the variance", title_justify="left")
     for what in ("SD", "unsafe"):
         table.add_column(f"{what}: alone", justify="right")
         table.add_column("in all", justify="right")

@@ -6,13 +6,12 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from safevar_sumo.api import Simulation
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study
-from safevar_sumo.terminal.plain import plain
+from safevar_sumo.terminal.plain import WholeTable, plain
 from safevar_sumo.vehicles import CharacteristicSet
 
 
@@ -20,9 +19,9 @@ def print_simulation(console: Console, found: Simulation) -> None:
     """A setting beside the original vehicle: what was simulated, how it ended, metrics and objectives, a verdict."""
     _print_setting(console, found)
     records = (found.original.record(), found.record())
-    table = Table()
-    table.add_column("result", overflow="fold")
-    table.add_column("unit", overflow="fold")
+    table = WholeTable()
+    table.add_column("result")
+    table.add_column("unit")
     for head in ("original", "simulated"):
         table.add_column(head, justify="right")
     table.add_row("outcome", "", *(record["outcome"] for record in records))
@@ -35,9 +34,9 @@ def print_simulation(console: Console, found: Simulation) -> None:
 
 
 def _print_setting(console: Console, found: Simulation) -> None:
-    table = Table(title=plain(found.study.title))
-    table.add_column("characteristic", overflow="fold")
-    table.add_column("unit", overflow="fold")
+    table = WholeTable(title=plain(found.study.title))
+    table.add_column("characteristic")
+    table.add_column("unit")
     for head in ("original", "simulated"):
         table.add_column(head, justify="right")
     for member in CharacteristicSet.of(found.study.vehicle.characteristics):
@@ -61,7 +60,7 @@ def print_sweep(console: Console, study: Study, names: Sequence[str], original: 
     """Many settings, a row each under the original vehicle's, by the values of the named characteristics."""
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     columns = [characteristics.names.index(name) for name in names]
-    table = Table(title=plain(study.title))
+    table = WholeTable(title=plain(study.title))
     for column in columns:
         unit = characteristics.members[column].unit
         table.add_column(plain(f"{names[columns.index(column)]}{'' if unit == '-' else f', {unit}'}"), justify="right")
@@ -78,7 +77,7 @@ def print_sweep(console: Console, study: Study, names: Sequence[str], original: 
 
 def print_names(console: Console, title: str, rows: Iterable[tuple[str, ...]], heads: tuple[str, ...]) -> None:
     """A plain table of what there is."""
-    table = Table(*heads, title=plain(title), title_justify="left")
+    table = WholeTable(*heads, title=plain(title), title_justify="left")
     for row in rows:
         table.add_row(*(plain(cell) for cell in row))
     console.print(table)

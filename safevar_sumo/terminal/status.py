@@ -5,11 +5,11 @@ from __future__ import annotations
 from datetime import timedelta
 
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from safevar_sumo.analysis.quality import nondominated
 from safevar_sumo.results.status import RunStatus, Status
+from safevar_sumo.terminal.plain import WholeTable
 
 FRONT = 5
 """Points of the front that are shown."""
@@ -17,7 +17,7 @@ FRONT = 5
 
 def status_view(told: Status, rate: float | None) -> RenderableType:
     """A study's runs by algorithm and the front so far; `rate` is the share of the work done per second, if it is known."""
-    table = Table("algorithm", title=Text(told.title), title_justify="left")
+    table = WholeTable("algorithm", title=Text(told.title), title_justify="left")
     for head in ("runs", "under way", "simulated", "collisions", "failures", "best SD"):
         table.add_column(head, justify="right")
     for algorithm in dict.fromkeys(run.algorithm for run in told.runs):
@@ -52,7 +52,7 @@ def _front(told: Status) -> RenderableType:
         return Text("Nothing simulated yet.")
     front = nondominated(told.points)
     front = front[front[:, 0].argsort(kind="stable")]
-    table = Table(title=f"Front so far: {len(front)} points, the most severe ones", title_justify="left")
+    table = WholeTable(title=f"Front so far: {len(front)} points, the most severe ones", title_justify="left")
     for head in ("safety degree [m, -m/s]", "largest change [%]", "changed"):
         table.add_column(head, justify="right")
     for f_safe, f_diff, number in front[:FRONT].tolist():

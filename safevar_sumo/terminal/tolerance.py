@@ -6,10 +6,10 @@ import math
 
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from safevar_sumo.answers import Tolerance
 from safevar_sumo.answers.alone import Alone
+from safevar_sumo.terminal.plain import WholeTable
 from safevar_sumo.vehicles import Characteristic
 
 PAIRS_SHOWN = 12
@@ -30,8 +30,8 @@ def print_tolerance(console: Console, told: Tolerance) -> None:
                   f"with {box.confidence:.0%} confidence at most {box.unsafe_at_most:.2%} of those in there are.")
 
 
-def _alone(told: Tolerance) -> Table:
-    table = Table("characteristic", title="Each alone", title_justify="left")
+def _alone(told: Tolerance) -> WholeTable:
+    table = WholeTable("characteristic", title="Each alone", title_justify="left")
     for head in ("original", "safe from", "to", "SD at the ends", "unsafe"):
         table.add_column(head, justify="right")
     for one in told.alone:
@@ -58,7 +58,7 @@ def _print_pairs(console: Console, told: Tolerance) -> None:
     found = sorted((pair for pair in told.pairs or [] if pair.nearest is not None), key=lambda pair: -pair.unsafe_share)
     if not found:
         return
-    table = Table("pair", title=f"Pairs with unsafe settings: {len(found)} of {len(told.pairs or [])}", title_justify="left")
+    table = WholeTable("pair", title=f"Pairs with unsafe settings: {len(found)} of {len(told.pairs or [])}", title_justify="left")
     for head in ("unsafe share", "nearest unsafe setting"):
         table.add_column(head, justify="right")
     for pair in found[:PAIRS_SHOWN]:
