@@ -11,7 +11,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import time_to_collision
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import STANDSTILL, Drives, FloatArray
 from safevar_sumo.showing.comparison import CHANGED, ORIGINAL, Comparison
 from safevar_sumo.showing.moments import divergence, moments
 
@@ -41,7 +41,6 @@ def draw_comparison(comparison: Comparison) -> Figure:
         figure = Figure(figsize=(9.6, 6.2), layout=ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.08))
         axes = figure.subplots(2, 2, sharex=True).ravel()
     ttc = time_to_collision(comparison.film.drives)
-    trace_end = max(comparison.film.drives.trace.time[comparison.film.last])
     for row in comparison.rows:
         _speed(axes[0], comparison, row)
         _gap(axes[1], comparison, row)
@@ -52,10 +51,12 @@ def draw_comparison(comparison: Comparison) -> Figure:
     axes[2].set_ylabel("brake     |     throttle")
     axes[3].set_ylabel("time to collision [s]")
     axes[1].axhline(0, color="black", linewidth=0.8)
+    axes[0].margins(y=0.1)
+    axes[1].set_ylim(-0.22 * axes[1].get_ylim()[1], None)
     axes[2].set_ylim(-1.08, 1.08)
     axes[2].set_yticks([-1, -0.5, 0, 0.5, 1], ["1", "0.5", "0", "0.5", "1"])
     axes[3].set_ylim(0, None)
-    axes[3].set_xlim(right=trace_end * 1.12)
+    axes[3].set_xlim(right=_over(comparison) * 1.25)
     axes[3].axhline(comparison.ttc_threshold, color="0.4", linewidth=0.9, linestyle=":")
     for axis in axes[2:]:
         axis.set_xlabel("time [s]")
@@ -64,6 +65,18 @@ def draw_comparison(comparison: Comparison) -> Figure:
     _heading(figure, comparison)
     _legend(figure, comparison)
     return figure
+
+
+def _over(comparison: Comparison) -> float:
+    """When the last vehicle has come to its end or to rest, and its story with it [s]."""
+    drives = comparison.film.drives
+    ends = [when for row in comparison.rows for when in (moments(drives, row).nearest, _comes_to_rest(drives, row)) if when is not None]
+    return float(drives.trace.time[min(max(ends) + 1, len(drives.trace.time) - 1)])
+
+
+def _comes_to_rest(drives: Drives, row: int) -> int:
+    """The last sample of a drive at which its vehicle moves, its first one if it never does."""
+    return int(np.flatnonzero(drives.trace.active[:, row] & (drives.trace.speed[:, row] > STANDSTILL)).max(initial=0))
 
 
 def write_figure(figure: Figure, path: Path) -> None:
@@ -106,11 +119,11 @@ def _line(axis: Axes, comparison: Comparison, row: int, values: FloatArray) -> N
     axis.plot(time, values[:end], color=COLOURS[row], linestyle=DASHES[row], linewidth=1.6, zorder=3 + row)
 
 
-def _mark(axis: Axes, row: int, place: tuple[float, float], mark: str, text: str = "") -> None:
-    """A mark on a line, its text beside an impact, else above the original's and below the changed vehicle's."""
-    axis.plot(*place, marker=mark, color=COLOURS[row], markersize=11 if mark == IMPACT else 8, linestyle="", zorder=6,
+def _mark(axis: Axes, row: int, place: tuple[float, float], mark: str, text: str = "", *, is_speed: bool = False) -> None:
+    """A mark on a line, the original's larger, so that it is seen below the other's, its text below the other's."""
+    axis.plot(*place, marker=mark, color=COLOURS[row], markersize=12 - 4 * row + 2 * (mark == IMPACT), linestyle="", zorder=6 + row,
               markeredgecolor="white")
-    offset, side = ((9, 2), "left") if mark == IMPACT else ((0, 9), "center") if row == ORIGINAL else ((-6, -14), "right")
+    offset, side = ((3, 7), "left") if is_speed else ((0, 9 if row == ORIGINAL else -17), "center")
     axis.annotate(text, place, xytext=offset, textcoords="offset points", color=COLOURS[row], fontweight="bold", ha=side)
 
 
@@ -121,7 +134,7 @@ def _speed(axis: Axes, comparison: Comparison, row: int) -> None:
         _mark(axis, row, (trace.time[when.brake], trace.speed[when.brake, row]), BRAKING)
     hit = float(comparison.film.drives.collision_speed[row])
     if not np.isnan(hit):
-        _mark(axis, row, (trace.time[when.end], hit), IMPACT, f"{hit:.1f} m/s")
+        _mark(axis, row, (trace.time[when.end], hit), IMPACT, f"{hit:.1f} m/s", is_speed=True)
 
 
 def _gap(axis: Axes, comparison: Comparison, row: int) -> None:
