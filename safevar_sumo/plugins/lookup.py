@@ -82,7 +82,7 @@ class Lookup(NamedTuple):
         """
         if name in members:
             return Member(members[name])
-        legal = f"{one_of(members)}, or package.module:Name"
+        legal = f"{one_of(members)}, or package.module:Name" if members else "package.module:Name"
         module_name, colon, attribute = name.partition(":")
         if not (colon and attribute.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):
             raise InputError(self.source, f"{key} = {name!r}", legal)
@@ -94,16 +94,16 @@ class Lookup(NamedTuple):
             raise InputError(self.source, problem, legal)
         return Member(what, Guard(self.source, f"{key} = {name!r}", folder), module_name, folder)
 
-    def class_of(self, members: Mapping[str, Any], name: str, key: str, *contracts: Contract) -> Member:
+    def class_of(self, members: Mapping[str, Any], name: str, key: str, *contracts: Contract, otherwise: str = "") -> Member:
         """A class by name; one from outside meets a contract, which is looked at before anything of it is called.
 
-        Of several contracts the first that concerns the class counts.
+        Of several contracts the first that concerns the class counts. `otherwise` tells what else there is than a class.
         """
         found = self.find(members, name, key)
         contract = next(contract for contract in contracts if contract.concerns(found.what))
         reason = contract.lacking(found.what) if found.guard else ""
         if reason:
-            raise InputError(self.source, f"{key} = {name!r} {reason}", "; or ".join(map(str, contracts)))
+            raise InputError(self.source, f"{key} = {name!r} {reason}", "; or ".join([*map(str, contracts), *filter(None, [otherwise])]))
         return found
 
     def _imported(self, name: str, guard: Guard, places: list[str]) -> tuple[ModuleType, str]:

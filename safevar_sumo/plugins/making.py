@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -33,8 +33,16 @@ def made(member: Member, parameters: Mapping[str, Any], name: str, key: str, sou
     cls = member.what
     if issubclass(cls, msgspec.Struct):
         return converted(source, parameters, cls, key)
+    check_parameters(cls, (), parameters, name, key, source)
+    return (member.guard or Guard(source, name)).call("__init__", partial(cls, **parameters))
+
+
+def check_parameters(function: Callable[..., Any], arguments: tuple[Any, ...], parameters: Mapping[str, Any], name: str, key: str,
+                     source: str) -> None:
+    """Refuse parameters that a class or function does not take beside its arguments; otherwise as `made`."""
     try:
-        inspect.signature(cls).bind(**parameters)
+        inspect.signature(function).bind(*arguments, **parameters)
     except TypeError as error:
         raise InputError(source, f"{name} does not take {key} = {dict(parameters)}: {error}") from None
-    return (member.guard or Guard(source, name)).call("__init__", partial(cls, **parameters))
+    except ValueError:  # compiled, without a signature: it tells itself when it is called
+        pass

@@ -15,7 +15,7 @@ import msgspec
 
 from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.errors import InputError, one_of
-from safevar_sumo.plugins import Guard, Lookup, Member, made, undisturbed
+from safevar_sumo.plugins import Guard, Lookup, Member, check_parameters, made, undisturbed
 from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, weather_of
 from safevar_sumo.simulation.checking import check_network
@@ -24,6 +24,9 @@ from safevar_sumo.simulation.sources import is_network, is_shipped
 from safevar_sumo.simulation.traci_controller import TraciController
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, foreign_names
 from safevar_sumo.vehicles import VEHICLE_CONTRACT, VEHICLES, CharacteristicSet, GuardedVehicle, Vehicle, calibration_drive
+
+STEP = "a function step(traci, vehicle_id), or a class with that method"
+"""What a controller written for TraCI is."""
 
 
 class Models(NamedTuple):
@@ -110,8 +113,11 @@ def _traci(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
     member, name = lookup.find({}, choice.model, "ads.model"), f"ads.model = {choice.model!r}"
     what, make = member.what, partial(made, member, choice.parameters, name, "ads.parameters", lookup.source)
     if not callable(getattr(what, "step", None) if inspect.isclass(what) else what):
-        raise InputError(lookup.source, f"{name} has no step", "a function step(traci, vehicle_id), or a class with that method")
-    if not inspect.isclass(what):
+        raise InputError(lookup.source, f"{name} has no step", STEP)
+    if inspect.isclass(what):
+        make()
+    else:
+        check_parameters(what, (None, None), choice.parameters, name, "ads.parameters", lookup.source)
         function = partial(what, **choice.parameters)
         make = partial(lambda: function)
     return TraciController(make, member.guard or Guard(lookup.source, name)), member
@@ -189,7 +195,8 @@ def _scenario(choice: ModelTable, lookup: Lookup) -> tuple[Scenario, Member]:
 def _ads(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
     if choice.kind == "traci":
         return _traci(choice, lookup)
-    member = lookup.class_of(ADS, choice.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT)
+    member = lookup.class_of(ADS, choice.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT,
+                             otherwise=f'with ads.kind = "traci" {STEP}')
     name = f"ads.model = {choice.model!r}"
     make = partial(made, member, choice.parameters, name, "ads.parameters", lookup.source)
     driver = make()

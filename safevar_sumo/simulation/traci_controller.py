@@ -41,7 +41,7 @@ class TraciController:
         world.set_types(SumoType(*(np.full(n, getattr(nominal, name)) for name in SumoType._fields)))
         names = world.names()
         views = [_Traci(world, copy, names, nominal, step) for copy in range(n)]
-        controllers = [self._guard.call("__init__", self._make) for _ in range(n)]
+        controllers = [self._make() for _ in range(n)]
         for controller, view in zip(controllers, views, strict=True):
             if hasattr(controller, "start"):
                 self._guard.call("start", controller.start, view, VUT)

@@ -94,3 +94,17 @@ def test_what_it_may_not_do_is_told(name: str, told: str, tmp_path: Path, monkey
 
     with pytest.raises(InputError, match=told):
         drive()
+
+
+@pytest.mark.parametrize(("table", "told"), [
+    ({"model": "my_controller:Hrash", "kind": "traci"}, r"has no 'Hrash'\nlegal: package.module:Name$"),
+    ({"model": "my_controller:Harsh", "kind": "traci", "parameters": {"margin": 2}}, r"^mine: ads.model = .* does not take ads.parameters"),
+    ({"model": "my_controller:step", "kind": "traci", "parameters": {"margin": 2}}, r"^mine: ads.model = .* does not take ads.parameters"),
+    ({"model": "my_controller:step"}, r'not a class\nlegal: .*; or with ads.kind = "traci" a function step\('),
+])
+def test_a_table_that_cannot_be_used_is_told_before_anything_is_simulated(
+        table: dict[str, object], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_controller.py").write_text(SCRIPT)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=told):
+        assemble(msgspec.structs.replace(load_study("native"), ads=msgspec.convert(table, ModelTable)), "mine")
