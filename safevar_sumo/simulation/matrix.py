@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
+from difflib import SequenceMatcher
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,8 @@ LARGEST_WORLD = 200
 """Copies of a network in one simulation; more cost more each, as SUMO then works beyond the processor's caches."""
 LARGEST_ROADS = 100_000
 """Lanes of all copies in one simulation: beyond, loading takes minutes and gigabytes."""
+NEAREST = 4
+"""Points that are told to who names one that there is not."""
 
 
 class AtPoint(NamedTuple):
@@ -135,7 +138,17 @@ def named_point(system: System, name: str, source: object) -> System:
     for point in system.matrix:
         if point.name == name:
             return system.at(point)
-    raise InputError(source, repr(name), "; ".join(point.name for point in system.matrix) or "a study with a matrix")
+    raise InputError(source, repr(name), _nearest(name, [point.name for point in system.matrix]))
+
+
+def _nearest(name: str, names: Sequence[str]) -> str:
+    """What is legal in the place of a name: those that have most of its parts, the most alike first."""
+    if not names:
+        return "a study with a matrix"
+    asked = {part.strip() for part in name.split(",")}
+    order = sorted(names, key=lambda one: (-len(asked & set(one.split(", "))), -SequenceMatcher(None, one, name).ratio()))
+    told = "; ".join(order[:NEAREST])
+    return told if len(names) <= NEAREST else f"one of {len(names)} points, the nearest of them: {told}"
 
 
 def study_at(study: Study, name: str, source: object) -> Study:

@@ -74,6 +74,17 @@ def test_a_point_is_named() -> None:
         named_point(SYSTEM, "CPNCO", "--point")
 
 
+def test_who_names_no_point_is_told_the_nearest_ones_and_how_many_there_are() -> None:
+    with pytest.raises(InputError) as told:
+        named_point(assemble(load_study("euro_ncap_pedestrian")), "CPNA, speed 50", "--point")
+    ahead, _, names = told.value.legal.partition(": ")
+    assert ahead == "one of 72 points, the nearest of them"
+    assert all(name.startswith("CPNA, speed 50, ") for name in names.split("; "))
+    assert len(names.split("; ")) == matrix.NEAREST
+    with pytest.raises(InputError, match="a study with a matrix"):
+        named_point(assemble(load_study("sun")), "CPNA", "--point")
+
+
 @pytest.mark.parametrize(("tests", "told"), [
     ([TESTS[2], TESTS[2]], "2 points are 'CPLA"),
     ([MatrixTest(name="x", over={"spede": [1]})], "spede"),
