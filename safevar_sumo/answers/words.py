@@ -23,7 +23,7 @@ PARTS = {"place": ("it begins to brake nearer", "it begins to brake farther away
 
 def change(member: Characteristic, value: float) -> str:
     """One change, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
-    return f"{member.name} {member.original:g} -> {value:.6g}{unit(member)} ({(value - member.original) / abs(member.original):+.1%})"
+    return f"{member.name} {member.original:g} -> {value:.6g}{member.suffix} ({(value - member.original) / abs(member.original):+.1%})"
 
 
 def changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
@@ -31,10 +31,6 @@ def changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> 
     told = [change(member, values[member.name]) for member in characteristics
             if values.get(member.name, member.original) != member.original]
     return ", ".join(told) or "no change at all"
-
-
-def unit(member: Characteristic) -> str:
-    return "" if member.unit == "-" else f" {member.unit}"
 
 
 def direction(member: Characteristic, value: float) -> str:
@@ -111,5 +107,5 @@ def rule_in_words(rule: Rule, characteristics: CharacteristicSet, unsafe: Unsafe
 
 def _condition(member: Characteristic, low: float | None, high: float | None) -> str:
     if low is not None and high is not None:
-        return f"{member.name} from {low:g} to {high:g}{unit(member)}"
-    return f"{member.name} {f'below {high:g}' if low is None else f'above {low:g}'}{unit(member)}"
+        return f"{member.name} from {low:g} to {high:g}{member.suffix}"
+    return f"{member.name} {f'below {high:g}' if low is None else f'above {low:g}'}{member.suffix}"

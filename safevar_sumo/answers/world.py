@@ -83,7 +83,7 @@ class World:
         low, high = member.lower if low is None else low, member.upper if high is None else high
         chosen = otherwise if value is None else value
         if not low <= chosen <= high:
-            raise InputError(self._source, f"variation.{member.name}.{key} = {chosen:g}", f"a number in [{low:g}, {high:g}] {member.unit}")
+            raise InputError(self._source, f"variation.{member.name}.{key} = {chosen:g}", f"a number in [{low:g}, {high:g}]{member.suffix}")
         return chosen
 
     def _cholesky(self, correlations: Sequence[Correlation]) -> FloatArray | None:

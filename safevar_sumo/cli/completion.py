@@ -26,5 +26,5 @@ def complete_changes(ctx: click.Context, param: click.Parameter, incomplete: str
         characteristics = load_study(study).vehicle.characteristics
     except SafevarError:
         return []
-    return [CompletionItem(f"{name}=", help=f"{row.lower:g} to {row.upper:g} {row.unit}")
+    return [CompletionItem(f"{name}=", help=f"{row.lower:g} to {row.upper:g}" + (f" {row.unit}" if row.unit != "-" else ""))
             for name, row in characteristics.items() if name.startswith(incomplete)]

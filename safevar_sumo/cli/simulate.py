@@ -101,7 +101,7 @@ def _tell(target: Target, system: System, found: Simulation, as_json: bool) -> N
     else:
         print_simulation(Console(), found)
         print_matrix(Console(), points)
-        Console().print(f"NHTSA's pre-crash types: {tags(system.points)}.", soft_wrap=True, markup=False, highlight=False)
+        Console().print(tags(system.points), soft_wrap=True, markup=False, highlight=False)
     for remark in dict.fromkeys(remark for one in system.points for remark in remarks_of(one.scenario)):
         click.echo(f"note: {remark}", err=True)
     for name, value in found.put_back.items():

@@ -91,6 +91,11 @@ def _part(name: str, share: float, look: str, how: str) -> Bar:
     return Bar(0, min(max(share, 0.0), 1.0), look, f"{name}: {share:.0%} {how}")
 
 
+def _percent(share: float) -> str:
+    """A share as it is told: an estimate just below 0 is 0."""
+    return f"{round(share, 2) + 0.0:.0%}"
+
+
 def _share(member: Characteristic, value: float) -> float:
     return (value - member.lower) / (member.upper - member.lower)
 
@@ -104,4 +109,4 @@ def _sensitivity(material: Material, sensitivity: list[Found]) -> Markup | None:
                _part(one["characteristic"], one["first_order"] or 0.0, "safe", "alone")] for one in ordered]
     return rows(f"{material.case.name}: share of the safety degree's variance that each characteristic decides",
                 [one["characteristic"] for one in ordered], pieces, [None] * len(ordered),
-                [("", f"alone {one['first_order'] or 0:.0%}, with others {one['total']:.0%}") for one in ordered])
+                [("", f"alone {_percent(one['first_order'] or 0)}, with others {_percent(one['total'])}") for one in ordered])

@@ -8,6 +8,7 @@ from typing import Any
 
 from safevar_sumo.ads import ADS
 from safevar_sumo.analysis.case import ALGORITHM_TITLES
+from safevar_sumo.answers import number_of
 from safevar_sumo.report.material import Material
 from safevar_sumo.scenarios import SCENARIOS, Point, tags
 from safevar_sumo.showing.comparison import number
@@ -17,12 +18,12 @@ from safevar_sumo.vehicles import VEHICLES
 def tested(material: Material) -> dict[str, Any]:
     """Two sentences, and the characteristics that were varied."""
     case, study = material.case, material.case.study
-    number_of = len(case.characteristics)
     return {
-        "who": f"A vehicle ({_described(VEHICLES, study.vehicle.model)}) of which {number_of} characteristics may vary is driven by "
-               f"{study.ads.model} ({_described(ADS, study.ads.model)}) in the scenario {study.scenario.model} "
-               f"({_described(SCENARIOS, study.scenario.model)}), {_where(material)}.",
-        "tags": "" if material.system is None else f"NHTSA's pre-crash types: {tags(material.system.points)}.",
+        "who": f"A vehicle ({_described(VEHICLES, study.vehicle.model) or study.vehicle.model}) of which "
+               f"{number_of(len(case.characteristics), 'characteristic')} may vary is driven by "
+               f"{_named(ADS, study.ads.model)} in the scenario {_named(SCENARIOS, study.scenario.model)}, "
+               f"{_where(material)}.",
+        "tags": "" if material.system is None else tags(material.system.points),
         "how": _how(material),
         "characteristics": [
             {"name": one.name, "unit": "" if one.unit == "-" else one.unit, "original": number(one.original), "lower": number(one.lower),
@@ -52,12 +53,18 @@ def _how(material: Material) -> str:
     if not case.has_runs:
         return f"Its {len(case.solutions)} solutions were found elsewhere and imported ({versions})."
     runs = Counter(algorithm for algorithm, _ in case.finished)
-    who = ", ".join(f"{ALGORITHM_TITLES.get(name, name)} ({count} runs)" for name, count in runs.items()) or "no finished run"
+    who = ", ".join(f"{ALGORITHM_TITLES.get(name, name)} ({number_of(count, 'run')})" for name, count in runs.items()) or "no finished run"
     return (f"Searched by {who} of at most {search.evaluations} simulations each, {len(case.evaluations)} different vehicles in all, "
             f"from seed {search.seed}, with {versions}.")
 
 
+def _named(models: Mapping[str, Any], name: str) -> str:
+    return f"{name} ({told})" if (told := _described(models, name)) else name
+
+
 def _described(models: Mapping[str, Any], name: str) -> str:
-    """The first sentence of a model's description, the name alone for one that comes from outside."""
-    sentence = (models[name].__doc__ or "").strip().partition("\n")[0].rstrip(".") if name in models else name
+    """The first sentence of a model's description, nothing for one that comes from outside."""
+    if name not in models:
+        return ""
+    sentence = (models[name].__doc__ or "").strip().partition("\n")[0].rstrip(".")
     return sentence[:1].lower() + sentence[1:] if not sentence[1:2].isupper() else sentence

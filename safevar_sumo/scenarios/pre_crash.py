@@ -25,8 +25,8 @@ def pre_crash_of(scenario: Any) -> str:
 
 
 def tags(points: Iterable[Point]) -> str:
-    """What types the scenarios of some points are of, and whether it is day or night, in words."""
+    """What types the scenarios of some points are of, and whether it is day or night, in a sentence."""
     points = tuple(points)
     types = dict.fromkeys(filter(None, (pre_crash_of(point.scenario) for point in points)))
-    light = dict.fromkeys(f"by {point.weather.light}" for point in points)
-    return f"{'; '.join(types) or 'of no pre-crash type that is told'}; {' and '.join(light)}"
+    light = " and ".join(dict.fromkeys(f"by {point.weather.light}" for point in points))
+    return f"NHTSA's pre-crash types: {'; '.join(types)}; {light}." if types else f"It is {light}; the scenario tells no pre-crash type."

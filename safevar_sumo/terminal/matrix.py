@@ -30,7 +30,7 @@ def print_matrix(console: Console, found: Sequence[AtPoint], row: int = 0) -> No
         _print_table(console, f"{test}, {weather}", points)
     if records:
         hit = [told["point"] for told in records if told["impact_speed"] is not None]
-        first = "; ".join(hit[:NAMED]) + ("; ..." if len(hit) > NAMED else "")
+        first = "; ".join(hit[:NAMED]) + (f" and {len(hit) - NAMED} more" if len(hit) > NAMED else "")
         summary = f"{len(hit)} of {len(records)} points fail{': ' + first if hit else ''}."
         console.print(summary, soft_wrap=True, markup=False, highlight=False)
 

@@ -42,6 +42,11 @@ class Characteristic:
         """Largest magnitude that is taken when values beyond the domain are asked for."""
         return FARTHEST * max(abs(self.lower), abs(self.upper))
 
+    @property
+    def suffix(self) -> str:
+        """The unit as it follows a number; nothing for a pure number."""
+        return "" if self.unit == "-" else f" {self.unit}"
+
     def check(self, value: float, source: object, *, beyond: bool = False) -> None:
         """Refuse what is no number or outside the domain, or with `beyond` only what means nothing (`is_legal`).
 
@@ -53,7 +58,7 @@ class Characteristic:
         if not isinstance(value, Real) or not self.is_legal(value, beyond=beyond):
             above = " above 0" if self.lower > 0 else ""
             farther, within = f"a finite number{above}, up to {self.farthest:g}", f"a number in [{self.lower:g}, {self.upper:g}]"
-            raise InputError(source, f"{self.name} = {value}", f"{farther if beyond else within} {self.unit}")
+            raise InputError(source, f"{self.name} = {value}", f"{farther if beyond else within}{self.suffix}")
 
     def is_legal(self, values: Any, *, beyond: bool = False) -> Any:
         """Whether values, a number or an array, are in the domain; with `beyond`, whether they mean anything.

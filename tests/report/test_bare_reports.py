@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from safevar_sumo.report import findings, make_report
-from safevar_sumo.report.limits import LIMITS
-from safevar_sumo.report.page import PARTS
+from safevar_sumo.report import tested as what
+from safevar_sumo.report.limits import LIMITS, _percent
+from safevar_sumo.report.page import PARTS, gather
+from safevar_sumo.scenarios import Point
 
 
 def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path: Path) -> None:
@@ -40,3 +45,20 @@ def test_of_an_original_that_collides_no_change_is_called_the_cause(
     assert "No change is needed: the original vehicle itself collides." in page
     assert "No change is a cause" in page
     assert "Cause 1" not in page
+
+
+def test_what_comes_from_outside_is_called_by_its_name_once(slippery: Path) -> None:
+    (material,) = gather([slippery])
+    scenario = SimpleNamespace()
+    study = replace(material.case.study, ads=replace(material.case.study.ads, model="my_controller:Pilot"))
+    points = [Point(scenario, material.case.weather)]  # type: ignore[arg-type]
+    others: Any = SimpleNamespace(case=dataclasses.replace(material.case, study=study), manifest=material.manifest, lacking="",
+                                  system=SimpleNamespace(points=points, matrix=()))
+    told = what.tested(others)
+    assert "is driven by my_controller:Pilot in the scenario pedestrian_crossing (" in told["who"]
+    assert "NSGA-II (1 run)" in told["how"]
+    assert told["tags"] == "It is by day; the scenario tells no pre-crash type."
+
+
+def test_an_estimate_just_below_nothing_is_nothing() -> None:
+    assert [_percent(share) for share in (-0.002, 0.0, 0.126)] == ["0%", "0%", "13%"]

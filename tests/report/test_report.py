@@ -142,7 +142,7 @@ def test_the_sections_stand_in_their_order_and_tell_what_was_found(page: str, sl
     assert "The fewest changes found that make it collide" in page
     for words in ("Unsafe alone: tireFric.", "within 50 % of the way", "<strong>25.00 %</strong>", "No rule was found",
                   "Of that whole failure's neighbours, 50 % are unsafe too", "stays unsafe down to 99.7 % of these changes",
-                  "NSGA-II (1 runs)", "wet leaves", "RQ1: found settings", "RQ3.2", "from seed 1"):
+                  "NSGA-II (1 run)", "wet leaves", "RQ1: found settings", "RQ3.2", "from seed 1"):
         assert words in page
 
 

@@ -21,7 +21,7 @@ PEDESTRIAN = "pedestrian crash without prior vehicle manoeuvre"
     ("euro_ncap_car_to_car", "lead vehicle stopped; lead vehicle moving at lower constant speed; lead vehicle decelerating; by day"),
 ])
 def test_the_tags_of_the_shipped_studies(study: str, told: str) -> None:
-    assert tags(assemble(load_study(study)).points) == told
+    assert tags(assemble(load_study(study)).points) == f"NHTSA's pre-crash types: {told}."
 
 
 def test_every_shipped_scenario_has_a_type_of_nhtsas_list() -> None:
@@ -31,4 +31,5 @@ def test_every_shipped_scenario_has_a_type_of_nhtsas_list() -> None:
 
 def test_it_is_night_where_the_weather_says_so_and_a_scenario_may_tell_no_type() -> None:
     assert {name for name, weather in WEATHERS.items() if weather.light == "night"} == {"night"}
-    assert tags([Point(SimpleNamespace(), WEATHERS["night"])]) == "of no pre-crash type that is told; by night"  # type: ignore[arg-type]
+    night = Point(SimpleNamespace(), WEATHERS["night"])  # type: ignore[arg-type]
+    assert tags([night]) == "It is by night; the scenario tells no pre-crash type."

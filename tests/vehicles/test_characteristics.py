@@ -62,6 +62,8 @@ def test_the_original_changes_nothing() -> None:
 def test_a_value_outside_the_domain_is_refused(value: float) -> None:
     with pytest.raises(InputError, match=r"mass = .*\nlegal: a number in \[2040, 2700\] kg"):
         SUN.setting({"mass": value}, "--set")
+    with pytest.raises(InputError, match=r"\nlegal: a number in \[[\d.]+, [\d.]+\]$"):
+        SUN.setting({"tireFric": -abs(value)}, "--set")
 
 
 def test_an_unknown_characteristic_is_refused() -> None:
@@ -84,3 +86,5 @@ def test_the_ends_of_a_domain_belong_to_it(value: float) -> None:
 def test_just_beyond_an_end_is_refused(value: float) -> None:
     with pytest.raises(InputError):
         SUN.setting({"mass": value}, "--set")
+    with pytest.raises(InputError, match=r"\nlegal: a number in \[[\d.]+, [\d.]+\]$"):
+        SUN.setting({"tireFric": -abs(value)}, "--set")
