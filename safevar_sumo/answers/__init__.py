@@ -12,10 +12,10 @@ from safevar_sumo.answers.tolerance import Tolerance, tolerance
 from safevar_sumo.answers.unsafe import Unsafe
 from safevar_sumo.answers.where import points_in_words, points_of
 from safevar_sumo.answers.whose import Whose, summary, whose_failures
-from safevar_sumo.answers.words import changes, command, joined, number_of, rule_in_words, sentence
+from safevar_sumo.answers.words import ask, changes, command, joined, number_of, rule_in_words, sentence
 
 __all__ = [
     "Because", "Braking", "Cause", "Course", "Explained", "Explanation", "Risk", "Robustness", "Rule", "Rules", "Tolerance", "Unsafe",
-    "Whose", "changes", "command", "explain", "joined", "lead", "necessity_figure", "number_of", "pairs_figure", "points_in_words",
-    "points_of", "profiles_figure", "risk", "rule_in_words", "rules", "save", "sensitivity_figure", "sentence", "summary", "tolerance",
-    "whose_failures"]
+    "Whose", "ask", "changes", "command", "explain", "joined", "lead", "necessity_figure", "number_of", "pairs_figure",
+    "points_in_words", "points_of", "profiles_figure", "risk", "rule_in_words", "rules", "save", "sensitivity_figure", "sentence",
+    "summary", "tolerance", "whose_failures"]

@@ -44,6 +44,11 @@ def command(study: str, values: Mapping[str, float]) -> str:
     return " ".join(["python -m safevar_sumo simulate", quote(study), *told])
 
 
+def ask(question: str, place: str, point: str = "") -> str:
+    """The command that asks a question about results or a study, at one point of its matrix if one is named."""
+    return " ".join(["python -m safevar_sumo", question, quote(place), *(["--point", quote(point)] if point else [])])
+
+
 def joined(parts: Iterable[str]) -> str:
     """Parts of a sentence as one speaks them."""
     *first, last = parts

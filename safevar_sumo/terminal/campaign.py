@@ -41,13 +41,11 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     names = tuple(study.vehicle.characteristics)
     solutions = solutions_frame(names, campaign.solutions.items())
     if len(solutions):
-        for line in lead(study, solutions, campaign.original, pool):
+        for line in lead(study, solutions, campaign.original, pool, str(directory)):
             console.print(line, soft_wrap=True, markup=False, highlight=False)
         collided = solutions.loc[solutions["outcome"] == str(Outcome.COLLISION), list(names)].to_numpy(dtype=float)
         if len(collided):
             console.print(summary(study, collided), soft_wrap=True, markup=False, highlight=False)
-        more = f"Why, and how far: python -m safevar_sumo explain {shlex.quote(str(directory))}"
-        console.print(more, soft_wrap=True, markup=False, highlight=False)
     found = {"original vehicle": campaign.original}
     for algorithm in study.search.labels:
         of_it = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]

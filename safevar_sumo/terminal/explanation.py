@@ -7,7 +7,7 @@ import math
 from rich.console import Console
 from rich.markup import escape
 
-from safevar_sumo.answers import Because, Cause, Explained, Explanation, changes, command, number_of, points_in_words, sentence
+from safevar_sumo.answers import Because, Cause, Explained, Explanation, ask, changes, command, number_of, points_in_words, sentence
 from safevar_sumo.simulation import assemble
 from safevar_sumo.terminal.plain import WholeTable
 from safevar_sumo.vehicles import CharacteristicSet
@@ -25,7 +25,7 @@ def print_explained(console: Console, place: str, told: Explained) -> None:
     if told.otherwise:
         _say(console, f"note: {number_of(told.otherwise, 'setting')} not as the results say when simulated again: another version or code?")
     if not told.explanations:
-        _say(console, "Nothing unsafe found.")
+        _say(console, f"Nothing unsafe found. How far each characteristic may go: {ask('tolerance', place)}")
         return
     for one in told.explanations:
         _print_one(console, place, one, members, told)

@@ -115,10 +115,13 @@ def test_what_cannot_be_read_is_refused(slippery: Path, arguments: list[str], sa
 
 def test_the_summary_of_a_study_leads_with_the_answer(case: Case) -> None:
     original = Bench(case.study, Here()).original()
-    first, *others = lead(case.study, case.solutions, original, Here())
+    first, *others, more = lead(case.study, case.solutions, original, Here(), "my results")
     crashes = int((case.solutions["outcome"] == "collision").sum())
     assert first == f"Unsafe (collision): {crashes} of {len(case.solutions)} solutions."
     assert [line.partition(":")[0] for line in others] == ["Fewest changes", "Smallest changes", "Most severe"]
     assert all(" It takes " in line for line in others)
     safe = case.solutions[case.solutions["f_safe"] > 2]
-    assert lead(case.study, safe, original, Here())[0].startswith(f"Nothing unsafe found in {len(safe)} solutions")
+    assert more == "Why, and how far: python -m safevar_sumo explain 'my results'"
+    nothing, more = lead(case.study, safe, original, Here(), "out")
+    assert nothing.startswith(f"Nothing unsafe found in {len(safe)} solutions")
+    assert more == "How far each characteristic may go: python -m safevar_sumo tolerance out"

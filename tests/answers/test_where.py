@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from slippery import Here
 
-from safevar_sumo.answers import Unsafe, points_in_words, sentence
+from safevar_sumo.answers import Unsafe, lead, points_in_words, sentence
 from safevar_sumo.answers.where import Where, where
 from safevar_sumo.errors import InputError
+from safevar_sumo.results import solutions_frame
 from safevar_sumo.simulation import System, assemble, evaluate, study_at
 from safevar_sumo.study import load_study
 
@@ -52,6 +54,14 @@ def test_points_in_words() -> None:
     assert points_in_words(("A, 1", "B"), 9) == "Fails at 2 of 9 points: A, 1; B."
     assert points_in_words(("A", "B", "C"), 9, most=1) == "Fails at 3 of 9 points: A and 2 more."
     assert points_in_words((), 9) == "Fails at 0 of 9 points."
+
+
+def test_the_summary_of_a_matrix_asks_why_at_the_worst_point_alone(system: System, weak: np.ndarray, told: Where) -> None:
+    study = load_study("euro_ncap_pedestrian", matrix={"tests": TESTS})
+    solutions = solutions_frame(system.characteristics.names, [(("nsga2", 0), evaluate(system, weak))])
+    original = evaluate(system, system.characteristics.original[np.newaxis])
+    more = lead(study, solutions, original, Here(), "out")[-1]
+    assert more.endswith(f": python -m safevar_sumo explain out --point '{told.because.place}'")
 
 
 def test_a_question_may_be_about_one_point_alone(system: System, weak: np.ndarray) -> None:
