@@ -71,6 +71,10 @@ class Rule:
     def coverage_interval(self) -> tuple[float, float] | None:
         return interval_of(self.unsafe_inside, self.unsafe_everywhere, self.confidence) if self.unsafe_everywhere else None
 
+    def tells_more_than(self, share: float) -> bool:
+        """Whether what lies inside is surely unsafe more often than that share of all; what has no limits tells of all."""
+        return not self.limits or (self.density_interval is not None and self.density_interval[0] > share)
+
     def record(self) -> dict[str, Any]:
         """As `rules --json` prints it."""
         return {

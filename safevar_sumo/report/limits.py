@@ -46,8 +46,12 @@ def rules(material: Material, jobs: int | None, progress: Progress) -> Found:
     """Rules in words, with what they are worth on vehicles that they were not made from."""
     def compute() -> Found:
         told = answers.rules(material.case.study, samples=SAMPLES, unsafe=_unsafe(material), jobs=jobs, progress=progress)
-        words = [answers.rule_in_words(rule, material.case.characteristics, told.unsafe) for rule in told.rules]
-        return {"words": words, "samples": told.samples, "share": told.unsafe_share, "remark": told.remark, "unsafe": str(told.unsafe)}
+        sure = [rule for rule in told.rules if rule.tells_more_than(told.unsafe_share)]
+        words = [answers.rule_in_words(rule, material.case.characteristics, told.unsafe) for rule in sure]
+        dropped = answers.number_of(len(told.rules) - len(sure), "rule")
+        remark = told.remark if len(sure) == len(told.rules) else (
+            f"Left out: {dropped} that so few vehicles do not tell from chance; the command rules looks at more.")
+        return {"words": words, "samples": told.samples, "share": told.unsafe_share, "remark": remark, "unsafe": str(told.unsafe)}
 
     found: Found = stored(material, "rules", compute)
     return found

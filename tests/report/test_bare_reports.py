@@ -13,6 +13,9 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from safevar_sumo import answers
+from safevar_sumo.answers import Rule, Unsafe
+from safevar_sumo.answers.bench import silent
 from safevar_sumo.report import findings, make_report
 from safevar_sumo.report import tested as what
 from safevar_sumo.report.limits import LIMITS, _percent
@@ -62,3 +65,16 @@ def test_what_comes_from_outside_is_called_by_its_name_once(slippery: Path) -> N
 
 def test_an_estimate_just_below_nothing_is_nothing() -> None:
     assert [_percent(share) for share in (-0.002, 0.0, 0.126)] == ["0%", "0%", "13%"]
+
+
+def test_a_rule_that_may_be_chance_is_no_finding(slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 6 vehicles inside 1 is unsafe, as of all; of 300 inside 290."""
+    (material,) = gather([shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))])
+    chance = Rule({"tireFric": (None, 1.01)}, 6, 1, 290, 0.95)
+    sure = Rule({"tireFric": (None, 1.2)}, 300, 290, 290, 0.95)
+    everywhere = Rule({}, 300, 300, 300, 0.95)
+    told = SimpleNamespace(rules=[sure, chance, everywhere], samples=4000, unsafe_share=0.15, remark="", unsafe=Unsafe())
+    monkeypatch.setattr(answers, "rules", lambda *_, **__: told)
+    found = LIMITS["rules"](material, 1, silent)
+    assert [words.partition(":")[0] for words in found["words"]] == ["tireFric below 1.2", "everywhere"]
+    assert found["remark"].startswith("Left out: 1 rule that so few vehicles do not tell from chance")
