@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -58,6 +59,11 @@ def compare(x: ArrayLike, y: ArrayLike) -> Comparison:
     test = scipy.stats.mannwhitneyu(one, other, alternative="two-sided", method="exact" if exact else "asymptotic")
     a12 = float(test.statistic) / (one.size * other.size)
     return Comparison(float(test.pvalue), a12, magnitude(a12), one.size, other.size, EXACT if exact else ASYMPTOTIC)
+
+
+def too_few(n1: int, n2: int) -> bool:
+    """Whether samples are so small that not even two which do not overlap differ significantly."""
+    return 2 / math.comb(n1 + n2, n1) >= ALPHA
 
 
 def magnitude(effect_size: float) -> str:

@@ -15,7 +15,8 @@ from safevar_sumo.study import label_of
 
 
 class RunStatus(NamedTuple):
-    """How far one run is: different settings simulated, how many of them collided or failed, its least safety degree.
+    """How far one run is: different settings simulated, how many of them collided or could not be simulated, its least
+    safety degree.
 
     `best` is in m, or -m/s, None before the first simulation; `state` is waiting, begun or finished.
     """
@@ -25,7 +26,7 @@ class RunStatus(NamedTuple):
     state: str
     simulated: int
     collisions: int
-    failures: int
+    simulator_errors: int
     best: float | None
 
 

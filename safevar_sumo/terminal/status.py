@@ -18,7 +18,7 @@ FRONT = 5
 def status_view(told: Status, rate: float | None) -> RenderableType:
     """A study's runs by algorithm and the front so far; `rate` is the share of the work done per second, if it is known."""
     table = WholeTable("algorithm", title=Text(told.title), title_justify="left")
-    for head in ("runs", "under way", "simulated", "collisions", "failures", "best SD"):
+    for head in ("runs", "under way", "simulated", "collisions", "simulator errors", "best SD"):
         table.add_column(head, justify="right")
     for algorithm in dict.fromkeys(run.algorithm for run in told.runs):
         of_it = [run for run in told.runs if run.algorithm == algorithm]
@@ -29,8 +29,8 @@ def status_view(told: Status, rate: float | None) -> RenderableType:
 def _cells(runs: list[RunStatus]) -> list[str]:
     best = [run.best for run in runs if run.best is not None]
     return [f"{sum(run.state == 'finished' for run in runs)}/{len(runs)}", str(sum(run.state == "begun" for run in runs)),
-            str(sum(run.simulated for run in runs)), str(sum(run.collisions for run in runs)), str(sum(run.failures for run in runs)),
-            f"{min(best):.2f}" if best else "-"]
+            str(sum(run.simulated for run in runs)), str(sum(run.collisions for run in runs)),
+            str(sum(run.simulator_errors for run in runs)), f"{min(best):.2f}" if best else "-"]
 
 
 def _under_way(told: Status) -> str:

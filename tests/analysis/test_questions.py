@@ -258,5 +258,7 @@ def test_unfinished_campaigns_say_so() -> None:
 def test_the_brief_lines_say_what_the_data_allows() -> None:
     lines = brief(made_up(*(row(sd=1 - i / 100) for i in range(20)), *(row("rs", sd=1.5 + i / 100) for i in range(20))))
     assert any("NSGA-II: SD 0.00*" in line for line in lines)
-    assert any("RS: IGD" in line and "SD 1.00*" in line for line in lines)
+    assert any("RS: SD 1.00*" in line and "; IGD, IGD+, HV: too few runs" in line for line in lines)
+    five = made_up(*(row(name, run=run, sd=sd + run / 10) for name, sd in (("nsga2", 1.0), ("rs", 2.0)) for run in range(5)))
+    assert any("RS: IGD " in line and "too few" not in line for line in brief(five))
     assert any("RQ2: has finished runs of nsga2 alone" in line for line in brief(made_up(row())))

@@ -48,6 +48,8 @@ def test_a_study_under_way(slippery: Path, tmp_path: Path) -> None:
     done = CliRunner().invoke(commands, ["status", str(tmp_path / "it")])
     assert "nsga2:0 " in done.output
     assert "Front so far" in done.output
+    assert "simulator" in done.output, "a collision is a failure too, but counted on its own"
+    assert "failures" not in done.output
     assert "% done" in done.output
 
 
