@@ -59,7 +59,9 @@ def profiles_figure(told: Tolerance) -> Figure:
     for axis in list(axes.flat)[len(told.alone):]:
         axis.set_axis_off()
     figure.supylabel(DEGREE, fontsize=FONT)
-    figure.supxlabel("dot: the original vehicle; hatched: unsafe;\nbelow the dashed line: collisions", fontsize=FONT)
+    told_of = {"dot: the original vehicle": True, "hatched: unsafe": any(one.unsafe for one in told.alone),
+               "below the dashed line: collisions": bool(degrees.size) and degrees.min() <= 0}
+    figure.supxlabel(";\n".join(words for words, is_drawn in told_of.items() if is_drawn), fontsize=FONT)
     return figure
 
 

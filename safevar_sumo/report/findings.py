@@ -14,7 +14,7 @@ from safevar_sumo.report.material import Material
 from safevar_sumo.report.stored import stored
 from safevar_sumo.report.svg import Bar, rows
 from safevar_sumo.results import Handle, chosen_handle, unsafe_rows
-from safevar_sumo.showing.comparison import changes_in_words, differences
+from safevar_sumo.showing.comparison import changes_in_words, differences, raised
 
 Found = list[dict[str, Any]]
 """What `explain --json` prints."""
@@ -60,7 +60,7 @@ def causes(found: Found, material: Material) -> list[dict[str, Any]]:
         for cause in _with_changes(failure):
             key = tuple(cause["changes"])
             if key not in distinct or _size(material, cause) < _size(material, distinct[key]["cause"]):
-                distinct[key] = {"cause": cause, "because": failure["because"], "robustness": failure["robustness"],
+                distinct[key] = {"cause": cause, "because": raised(failure["because"]), "robustness": failure["robustness"],
                                  "handle": handle_of(failure)}
     ordered = sorted(distinct.values(), key=lambda one: _size(material, one["cause"]))[:CAUSES]
     if ordered:

@@ -14,7 +14,7 @@ from safevar_sumo.report.material import Material
 from safevar_sumo.report.stored import stored
 from safevar_sumo.report.svg import Bar, rows
 from safevar_sumo.results import unsafe_rows
-from safevar_sumo.showing.comparison import number, spaced
+from safevar_sumo.showing.comparison import number, raised, spaced
 from safevar_sumo.vehicles import Characteristic
 
 SAMPLES = 4000
@@ -47,7 +47,7 @@ def rules(material: Material, jobs: int | None, progress: Progress) -> Found:
     def compute() -> Found:
         told = answers.rules(material.case.study, samples=SAMPLES, unsafe=_unsafe(material), jobs=jobs, progress=progress)
         sure = [rule for rule in told.rules if rule.tells_more_than(told.unsafe_share)]
-        words = [answers.rule_in_words(rule, material.case.characteristics, told.unsafe) for rule in sure]
+        words = [raised(answers.rule_in_words(rule, material.case.characteristics, told.unsafe)) for rule in sure]
         dropped = answers.number_of(len(told.rules) - len(sure), "rule")
         remark = told.remark if len(sure) == len(told.rules) else (
             f"Left out: {dropped} that so few vehicles do not tell from chance; the command rules looks at more.")

@@ -17,6 +17,7 @@ from safevar_sumo.analysis.layout import Bold, Table, lay_out
 from safevar_sumo.report.findings import best_of, spread
 from safevar_sumo.report.material import Material
 from safevar_sumo.report.svg import Dot, scatter
+from safevar_sumo.showing.comparison import raised
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,9 +39,10 @@ def tables(cases: Sequence[Case]) -> list[dict[str, Any]]:
 
 
 def _plain(table: Table) -> dict[str, Any]:
-    rows = [[{"text": str(cell), "bold": isinstance(cell, Bold)} for cell in row] for row in table.rows]
-    spans = [("", table.labels), *table.spans] if table.spans else []
-    return {"title": table.title, "heads": table.heads, "spans": spans, "rows": rows, "labels": table.labels, "notes": table.notes}
+    rows = [[{"text": raised(str(cell)), "bold": isinstance(cell, Bold)} for cell in row] for row in table.rows]
+    spans = [("", table.labels), *((raised(name), width) for name, width in table.spans)] if table.spans else []
+    heads, notes = ([raised(text) for text in texts] for texts in (table.heads, table.notes))
+    return {"title": raised(table.title), "heads": heads, "spans": spans, "rows": rows, "labels": table.labels, "notes": notes}
 
 
 def figures(cases: Sequence[Case]) -> list[dict[str, str]]:

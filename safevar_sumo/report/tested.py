@@ -11,7 +11,7 @@ from safevar_sumo.analysis.case import ALGORITHM_TITLES
 from safevar_sumo.answers import number_of
 from safevar_sumo.report.material import Material
 from safevar_sumo.scenarios import SCENARIOS, Point, tags
-from safevar_sumo.showing.comparison import number
+from safevar_sumo.showing.comparison import number, raised
 from safevar_sumo.vehicles import VEHICLES
 
 
@@ -26,8 +26,8 @@ def tested(material: Material) -> dict[str, Any]:
         "tags": "" if material.system is None else tags(material.system.points),
         "how": _how(material),
         "characteristics": [
-            {"name": one.name, "unit": "" if one.unit == "-" else one.unit, "original": number(one.original), "lower": number(one.lower),
-             "upper": number(one.upper), "threshold": number(one.threshold)} for one in case.characteristics],
+            {"name": one.name, "unit": "" if one.unit == "-" else raised(one.unit), "original": number(one.original),
+             "lower": number(one.lower), "upper": number(one.upper), "threshold": number(one.threshold)} for one in case.characteristics],
         "remarks": [*case.remarks, *([material.lacking] if material.lacking else [])]}
 
 

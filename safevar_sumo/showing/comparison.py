@@ -76,7 +76,12 @@ def number(value: float) -> str:
 
 def spaced(unit: str) -> str:
     """A unit as it follows a number, its powers raised; nothing for a pure number."""
-    return "" if unit == "-" else " " + unit.replace("^2", "²").replace("^3", "³")
+    return "" if unit == "-" else " " + raised(unit)
+
+
+def raised(text: str) -> str:
+    """A text with units such as m/s^2 as they are printed: m/s²."""
+    return text.replace("^2", "²").replace("^3", "³")
 
 
 def compare(study: Study, system: System, setting: FloatArray) -> Comparison:

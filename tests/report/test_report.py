@@ -140,6 +140,7 @@ def test_the_sections_stand_in_their_order_and_tell_what_was_found(page: str, sl
     assert f"hits at {-worst:.1f} m/s" in page
     assert f"stops with {case.original['safety_degree']:.2f} m to spare" in page
     assert "The fewest changes found that make it collide" in page
+    assert "^2" not in re.sub("<(style|script).*?</(style|script)>", "", page, flags=re.DOTALL)
     for words in ("Unsafe alone: tireFric.", "within 50 % of the way", "<strong>25.00 %</strong>", "No rule was found",
                   "Of that whole failure's neighbours, 50 % are unsafe too", "stays unsafe down to 99.7 % of these changes",
                   "NSGA-II (1 run)", "wet leaves", "RQ1: found settings", "RQ3.2", "from seed 1"):
