@@ -19,7 +19,7 @@ from safevar_sumo.study.schema import NAME, Origin, SearchTable, Study, StudyLik
 REPLACED = ("calibration", "published", "repeatability")
 """Tables that a study does not inherit in part from the one that it extends."""
 OF_ONE_SYSTEM = ("title", "published", "repeatability")
-"""What holds for one vehicle, ADS, scenario and weather alone: with another one it is not inherited."""
+"""What holds for one vehicle, ADS, scenario (its network too), weather and matrix alone: with another one it is not inherited."""
 LARGEST_FILE = 10_000_000
 """Bytes."""
 
@@ -122,7 +122,7 @@ def _extended(raw: _Raw, path: Path, seen: tuple[Path, ...]) -> _Raw:
 def _overridden(base: _Raw, over: Mapping[str, Any], source: object) -> _Raw:
     """Override a study's tables by others; with another system what holds for the old one alone is left out."""
     tables = _merged(base.tables, over)
-    other = [key for key in ("weather", "vehicle", "ads", "scenario") if _kind(tables.get(key)) != _kind(base.tables.get(key))]
+    other = [key for key in ("weather", "vehicle", "ads", "scenario", "matrix") if _kind(tables.get(key)) != _kind(base.tables.get(key))]
     remarks = base.origin.remarks
     if other:
         lost = [key for key in OF_ONE_SYSTEM[:2] if key in base.tables and key not in over]
@@ -135,8 +135,11 @@ def _overridden(base: _Raw, over: Mapping[str, Any], source: object) -> _Raw:
 
 
 def _kind(table: object) -> object:
-    """Which model or weather a table stands for."""
-    return table.get("model", table) if isinstance(table, dict) else table
+    """Which model on which network, or which weather or matrix, a table stands for."""
+    if not isinstance(table, dict):
+        return table
+    parameters = table.get("parameters")
+    return table.get("model", table), parameters.get("network") if isinstance(parameters, dict) else None
 
 
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

@@ -113,6 +113,7 @@ def test_all_mistakes_of_a_file_are_told_at_once(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("text", "inherits"), [
     ('weather = "fog"', False), ('[ads]\nmodel = "krauss"', False), ("[ads.parameters]\nlatency = 0.1", True),
+    ('[scenario.parameters]\nnetwork = "my_town"', False), ('[[matrix.tests]]\nname = "late"\n', False),
     ("[scenario.parameters]\nduration = 5.0", True), ("[search]\nruns = 3", True), ('[ads]\nmodel = "world_on_rails"', True),
 ])
 def test_another_system_inherits_neither_title_nor_published_values(text: str, inherits: bool, tmp_path: Path) -> None:
