@@ -112,7 +112,7 @@ def replays(material: Material, explained: Found | None) -> list[dict[str, Any]]
         row, setting = material.solutions[handle], material.setting_of(Handle.parse(handle))
         one = {"handle": handle, "anchor": material.anchor("replay", handle), "f_safe": row["f_safe"], "f_diff": row["f_diff"],
                "f_num_diff": row["f_num_diff"], "outcome": row["outcome"], "open": place == 0 and not explained,
-               "differences": [], "where": "", "changes": changes_in_words(material.case.characteristics, setting)}
+               "differences": [], "where": None, "changes": changes_in_words(material.case.characteristics, setting)}
         told.append(one if material.system is None else {
             **one, "replay": material.replay(setting), "where": material.where(setting),
             "differences": differences(material.again([setting])[0].evaluation, row)})

@@ -12,9 +12,10 @@ import numpy as np
 
 from safevar_sumo.analysis import Case, load_cases
 from safevar_sumo.analysis.case import collided
-from safevar_sumo.answers import Unsafe, points_in_words, points_of
+from safevar_sumo.answers import Unsafe, points_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.report.places import failing_places
 from safevar_sumo.results import Handle, handles
 from safevar_sumo.results.manifest import read_manifest
 from safevar_sumo.showing import Comparison, compare
@@ -94,12 +95,11 @@ class Material:
         """Whether the original vehicle itself collides: then no change causes anything."""
         return self.case.original["safety_degree"] < 0
 
-    def where(self, setting: FloatArray) -> str:
-        """At which points of a matrix a setting fails, in words; nothing of a study without one."""
+    def where(self, setting: FloatArray) -> dict[str, Any] | None:
+        """At which points of a matrix a setting fails; None of a study without one."""
         if self.system is None or not self.system.matrix:
-            return ""
-        points = self.again([setting])[0].points
-        return points_in_words(points, len(self.system.matrix), most=len(points))
+            return None
+        return failing_places(self.system.matrix, self.again([setting])[0].points)
 
     def replay(self, setting: FloatArray) -> dict[str, Any]:
         """A setting's animation, as the template `player` takes it."""
