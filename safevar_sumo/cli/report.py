@@ -10,7 +10,7 @@ from rich.console import Console
 
 from safevar_sumo.cli.outputs import check_output
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.simulating import jobs_option
+from safevar_sumo.cli.simulating import jobs_option, point_option
 from safevar_sumo.results import write_whole
 
 
@@ -19,8 +19,9 @@ from safevar_sumo.results import write_whole
 @click.option("--out", type=click.Path(path_type=Path), default=Path("report.html"), show_default=True, metavar="FILE.html",
               help="The page.")
 @click.option("--only", metavar="SECTION,...", help="These sections alone, separated by commas: tested, verdict, causes, ...")
+@point_option
 @jobs_option
-def report(directories: tuple[str, ...], out: Path, only: str | None, jobs: int | None) -> None:
+def report(directories: tuple[str, ...], out: Path, only: str | None, point: str | None, jobs: int | None) -> None:
     """Write one self-contained page about the results directories DIR...: verdict, causes, replays, tables, figures."""
     from safevar_sumo.report import make_report
     from safevar_sumo.terminal.stages import stages
@@ -29,7 +30,7 @@ def report(directories: tuple[str, ...], out: Path, only: str | None, jobs: int 
     sections = [name.strip() for name in only.split(",")] if only is not None else []
     with stages(Console(stderr=True)) as progress, warnings.catch_warnings(record=True) as otherwise:
         warnings.simplefilter("always", UserWarning)
-        page = make_report(directories, sections, jobs, progress)
+        page = make_report(directories, sections, jobs, progress, point=point or "")
     for one in otherwise:
         click.echo(f"warning: {one.message}", err=True)
     write_whole(out, page)

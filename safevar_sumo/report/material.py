@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ from safevar_sumo.results.manifest import read_manifest
 from safevar_sumo.showing import Comparison, compare
 from safevar_sumo.showing.page import player_data
 from safevar_sumo.showing.scene import scene_of
-from safevar_sumo.simulation import System, aggregated, assemble, at_every_point
+from safevar_sumo.simulation import System, aggregated, assemble, at_every_point, evaluate, study_at
 
 
 class Again(NamedTuple):
@@ -36,7 +36,8 @@ class Material:
     """One study of a report.
 
     `place` is its results directory as it was given, `number` its place among the studies, from 1; `system` is None where
-    what the study names cannot be simulated here, and `lacking` says why.
+    what the study names cannot be simulated here, and `lacking` says why. `point` is the one of its matrix that is asked
+    about, to which all of the case belongs then; nothing where it is the whole study.
     """
 
     number: int
@@ -45,6 +46,7 @@ class Material:
     manifest: Mapping[str, Any]
     system: System | None
     lacking: str = ""
+    point: str = ""
     _compared: dict[bytes, Comparison] = field(default_factory=dict)
     _again: dict[bytes, Again] = field(default_factory=dict)
 
@@ -96,8 +98,8 @@ class Material:
         return self.case.original["safety_degree"] < 0
 
     def where(self, setting: FloatArray) -> dict[str, Any] | None:
-        """At which points of a matrix a setting fails; None of a study without one."""
-        if self.system is None or not self.system.matrix:
+        """At which points of a matrix a setting fails; None of a study without one, and where one point is asked about."""
+        if self.system is None or not self.system.matrix or self.point:
             return None
         return failing_places(self.system.matrix, self.again([setting])[0].points)
 
@@ -111,21 +113,35 @@ class Material:
         return "".join(sign if sign.isascii() and sign.isalnum() else "-" for sign in words)
 
 
-def gather(directories: Iterable[str | Path]) -> list[Material]:
-    """Read results directories.
+def gather(directories: Iterable[str | Path], point: str = "") -> list[Material]:
+    """Read results directories, or what their solutions are at one point of a matrix, where they are simulated once more.
 
     Raises
     ------
     InputError
-        If one is no results directory, is damaged or is given twice.
+        If one is no results directory, is damaged or is given twice, or a study has no such point.
     """
     places = [Path(directory) for directory in directories]
     found = []
     for number, (place, case) in enumerate(zip(places, load_cases(places), strict=True), 1):
         system, lacking = None, ""
+        if point:
+            case = _at_point(case, point)
         try:
             system = assemble(case.study, str(place))
         except InputError as error:
             lacking = f"What this study is about cannot be simulated here: {error.source}: {error.problem}."
-        found.append(Material(number=number, place=place, case=case, manifest=read_manifest(place), system=system, lacking=lacking))
+        found.append(Material(number=number, place=place, case=case, manifest=read_manifest(place), system=system, lacking=lacking,
+                              point=point))
     return found
+
+
+def _at_point(case: Case, point: str) -> Case:
+    """A case with its solutions and its original as they are at one point of the study's matrix."""
+    study = study_at(case.study, point, "--point")
+    system = assemble(study)
+    settings = np.concatenate([case.characteristics.original[np.newaxis], case.solutions[list(case.characteristics.names)].to_numpy(float)])
+    found = evaluate(system, settings)
+    measured = {"f_safe": found.f_safe, **found.metrics, "outcome": found.outcome}
+    return replace(case, study=study, original={name: float(found.metrics[name][0]) for name in case.original if name in found.metrics},
+                   solutions=case.solutions.assign(**{name: values[1:] for name, values in measured.items() if name in case.solutions}))

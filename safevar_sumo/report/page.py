@@ -39,7 +39,8 @@ PARTS = {"causes": "explain", **{name: name for name in LIMITS}}
 """Sections that take simulations, and the commands that make them alone."""
 
 
-def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), jobs: int | None = None, progress: Progress = silent) -> str:
+def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), jobs: int | None = None, progress: Progress = silent,
+                *, point: str = "") -> str:
     """One self-contained page about the results of one or several studies; the same results give the same page.
 
     Parameters
@@ -52,6 +53,8 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
         Worker processes for what is to be simulated, one for each core by default.
     progress
         Is told what is being made, how much of it is done, and of how much.
+    point
+        Name of a point of a matrix, to be asked about alone; the research questions are about whole studies and left out.
 
     Warns
     -----
@@ -67,7 +70,11 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     if unknown:
         raise InputError("only", f"there is no section {unknown[0]!r}", f"some of {','.join(SECTIONS)}")
     wanted = [name for name in SECTIONS if not only or name in only]
-    materials = gather(directories)
+    if point:
+        if "questions" in only:
+            raise InputError("only", "the research questions are about whole studies", "sections other than questions with --point")
+        wanted = [name for name in wanted if name != "questions"]
+    materials = gather(directories, point)
     studies = [_study(material, wanted, jobs, progress) for material in materials]
     progress("tables and figures", 0, 1)
     cases = [material.case for material in materials]

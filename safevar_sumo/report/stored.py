@@ -24,7 +24,8 @@ def stored(material: Material, name: str, compute: Callable[[], Any]) -> Any:
 
     Where the directory cannot be written, nothing is kept.
     """
-    file, identity = material.place / FOLDER / f"{name}.json", _identity(material)
+    at = f"-{material.anchor(material.point)}" if material.point else ""
+    file, identity = material.place / FOLDER / f"{name}{at}.json", _identity(material)
     try:
         refuse_other_than_file(file)
         kept = json.loads(file.read_text(encoding="utf-8"))
@@ -48,5 +49,5 @@ def _identity(material: Material) -> str:
         file = material.place / name
         content = file.read_bytes() if file.is_file() else b""
         digest.update(len(content).to_bytes(8, "big") + content)
-    digest.update(repr(material.case.finished).encode())
+    digest.update(repr(material.case.finished).encode() + material.point.encode())
     return digest.hexdigest()

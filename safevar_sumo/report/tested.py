@@ -34,6 +34,8 @@ def tested(material: Material) -> dict[str, Any]:
 def _where(material: Material) -> str:
     """The weather, or how many points a matrix has, and in which weathers."""
     points = () if material.system is None else material.system.matrix
+    if material.point:
+        return f"at the point {material.point} of its matrix alone, at which all that was found is simulated again"
     if not points:
         return f"weather: {material.case.weather.name}"
     return f"every vehicle at all {len(points)} points of a matrix: {', '.join(_tests(points))}"

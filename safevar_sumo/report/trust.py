@@ -55,9 +55,14 @@ def reproduce(materials: Sequence[Material], parts: Sequence[str]) -> list[dict[
         if material.case.has_runs:
             commands.append({"what": f"The study {study.name}, as its manifest.json records it whole, into another directory",
                              "command": _again(study, f"{material.place}-again", material.place)})
+        at = f" --point {shlex.quote(material.point)}" if material.point else ""
+        commands += [{"what": f"The part {part}", "command": f"{RUN} {part} {place}{at}"} for part in parts]
+        if material.point:
+            continue
         commands.append({"what": "A replay, with figure and animation",
                          "command": f"{RUN} simulate {place} --most-severe --plot it.png --animate it.html"})
-        commands += [{"what": f"The part {part}", "command": f"{RUN} {part} {place}"} for part in parts]
+    if any(material.point for material in materials):
+        return commands
     commands.append({"what": "The tables of RQ1 to RQ3", "command": f"{RUN} tables {places}"})
     commands.append({"what": "The figures", "command": f"{RUN} figures {places} --out figures"})
     return commands

@@ -55,7 +55,7 @@ def test_what_comes_from_outside_is_called_by_its_name_once(slippery: Path) -> N
     scenario = SimpleNamespace()
     study = replace(material.case.study, ads=replace(material.case.study.ads, model="my_controller:Pilot"))
     points = [Point(scenario, material.case.weather)]  # type: ignore[arg-type]
-    others: Any = SimpleNamespace(case=dataclasses.replace(material.case, study=study), manifest=material.manifest, lacking="",
+    others: Any = SimpleNamespace(case=dataclasses.replace(material.case, study=study), manifest=material.manifest, lacking="", point="",
                                   system=SimpleNamespace(points=points, matrix=()))
     told = what.tested(others)
     assert "is driven by my_controller:Pilot in the scenario pedestrian_crossing (" in told["who"]
