@@ -106,6 +106,9 @@ class Explained:
         shares = {name: dict(zip(of_it.index, of_it[name].tolist(), strict=True)) for name in ("necessary", "changed")}
         return [*(one.record() for one in self.explanations), {"summary": shares}]
 
+    def __repr__(self) -> str:
+        return f"<Explained {self.study.name}, unsafe {self.unsafe}: {self.failures} of {self.looked_at}, {len(self.explanations)} in full>"
+
     def frame(self) -> pd.DataFrame:
         """One row for each change of each minimal cause of each explanation.
 

@@ -64,6 +64,10 @@ class Risk:
                 **{f"{name}_interval": [number(row[f"{name}_lower"]), number(row[f"{name}_upper"])] for name in ("first_order", "total")}}
                 for row in rows]}
 
+    def __repr__(self) -> str:
+        low, high = self.interval
+        return f"<Risk of {self.study.name}, unsafe {self.unsafe}: {self.probability:.4g} ({low:.4g} to {high:.4g})>"
+
 
 def interval_of(count: int, number: int, confidence: float) -> tuple[float, float]:
     """Clopper and Pearson's exact interval of a share."""

@@ -99,6 +99,10 @@ class Rules:
         """As `rules --json` prints them."""
         return [rule.record() for rule in self.rules]
 
+    def __repr__(self) -> str:
+        share = f"{self.unsafe_share:.2%} of {self.samples}"
+        return f"<Rules of {self.study.name}, unsafe {self.unsafe}: {share} settings, {len(self.rules)} rules>"
+
 
 def rules(study: Study, *, samples: int = SAMPLES, unsafe: str | None = None, pool: Pool | None = None, jobs: int | None = None,
           progress: Progress = silent) -> Rules:

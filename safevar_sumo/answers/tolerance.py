@@ -63,6 +63,9 @@ class Tolerance:
         return {"study": self.study.name, "unsafe": str(self.unsafe), "alone": [one.record() for one in self.alone],
                 "pairs": [pair.record() for pair in self.pairs or []], "joint": self.joint._asdict()}
 
+    def __repr__(self) -> str:
+        return f"<Tolerance of {self.study.name}, unsafe {self.unsafe}: {self.verdict}>"
+
 
 def tolerance(study: Study, *, unsafe: str | None = None, characteristics: Sequence[str] | None = None, pairs: bool = False,
               pool: Pool | None = None, jobs: int | None = None, progress: Progress = silent) -> Tolerance:

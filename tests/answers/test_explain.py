@@ -56,6 +56,7 @@ def test_every_boundary_is_unsafe_and_just_below_it_is_safe(case: Case, told: Ex
 
 
 def test_the_records_are_those_of_the_solutions(case: Case, told: Explained) -> None:
+    assert repr(told).startswith(f"<Explained {case.study.name}, unsafe collision: {told.failures} of ")
     *records, last = json.loads(json.dumps(told.records(), allow_nan=False))
     known = [str(handle) for handle in handles(case.solutions)]
     for one in records:

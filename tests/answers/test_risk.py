@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from typing import Any
 
 import msgspec
@@ -57,6 +58,7 @@ def test_sobol_indices_of_ishigamis_function() -> None:
 
 
 def test_the_promised_record_and_the_same_again() -> None:
+    assert re.fullmatch(r"<Risk of [\w-]+, unsafe collision: 0\.\d+ \(0\.\d+ to 0\.\d+\)>", repr(of(box, samples=500)))
     first, again = (json.dumps(of(box, samples=500).record(), allow_nan=False) for _ in range(2))
     assert first == again
     record = json.loads(first)

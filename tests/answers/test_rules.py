@@ -67,6 +67,7 @@ def test_nothing_everything_and_too_little() -> None:
 def test_the_promised_record_the_same_again_and_in_words() -> None:
     first, again = (of(box), of(box))
     assert json.dumps(first.records(), allow_nan=False) == json.dumps(again.records(), allow_nan=False)
+    assert repr(first).endswith("settings, 1 rules>")
     (record,) = first.records()
     assert list(record) == ["conditions", "density", "coverage", "density_interval", "coverage_interval"]
     assert [list(condition) for condition in record["conditions"]] == [["characteristic", "at_least", "at_most"]] * 2

@@ -88,6 +88,11 @@ def test_where_nothing_collides_half_of_the_original_is_the_limit() -> None:
     assert told.alone[0].safe == (pytest.approx(1.0, abs=1e-4), pytest.approx(9.0, abs=1e-4))
 
 
+def test_it_is_shown_in_a_line() -> None:
+    told = of(2, two_islands)
+    assert repr(told) == f"<Tolerance of {told.study.name}, unsafe collision: Unsafe alone: a.>"
+
+
 def test_the_promised_record() -> None:
     record = json.loads(json.dumps(of(2, two_islands, pairs=True).record(), allow_nan=False))
     assert list(record) == ["study", "unsafe", "alone", "pairs", "joint"]
