@@ -38,10 +38,9 @@ def direction(member: Characteristic, value: float) -> str:
     return f"{member.name} {'up' if value > member.original else 'down'}"
 
 
-def command(study: str, values: Mapping[str, float]) -> str:
-    """The command that simulates these changes of a study."""
-    told = (f"--set {quote(f'{name}={value!r}')}" for name, value in values.items())
-    return " ".join(["python -m safevar_sumo simulate", quote(study), *told])
+def command(study: str, values: Mapping[str, float], point: str = "") -> str:
+    """The command that simulates these changes of a study, at one point of its matrix if one is named."""
+    return " ".join([ask("simulate", study, point), *(f"--set {quote(f'{name}={value!r}')}" for name, value in values.items())])
 
 
 def ask(question: str, place: str, point: str = "") -> str:

@@ -41,7 +41,7 @@ def explain(place: str, solutions: tuple[str, ...], unsafe: str | None, top: int
     if as_json:
         click.echo(records)
     else:
-        print_explained(Console(), place, told)
+        print_explained(Console(), place, told, point or "")
     if out is not None:
         write_whole(out / "causes.json", records + "\n")
         write_whole(out / "causes.csv", told.frame().to_csv(index=False, lineterminator="\n"))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
+from functools import partial
 
 from rich.console import Console
 from rich.markup import escape
@@ -15,24 +17,26 @@ from safevar_sumo.vehicles import CharacteristicSet
 CAUSES_SHOWN = 3
 """Minimal causes of a failure, and distinct ones of all failures, that a table has room for."""
 DISTINCT_SHOWN = 10
+Again = Callable[[Mapping[str, float]], str]
+"""The command that simulates these changes."""
 
 
-def print_explained(console: Console, place: str, told: Explained) -> None:
-    """Every explanation, then what all failures have in common."""
+def print_explained(console: Console, place: str, told: Explained, point: str = "") -> None:
+    """Every explanation, then what all failures have in common; commands that are told are about `place`, and its `point`."""
     members = CharacteristicSet.of(told.study.vehicle.characteristics)
     _say(console, told.study.title)
     _say(console, f"Unsafe: {told.unsafe}. {number_of(told.failures, 'failure')} among {told.looked_at} different settings.")
     if told.otherwise:
         _say(console, f"note: {number_of(told.otherwise, 'setting')} not as the results say when simulated again: another version or code?")
     if not told.explanations:
-        _say(console, f"Nothing unsafe found. How far each characteristic may go: {ask('tolerance', place)}")
+        _say(console, f"Nothing unsafe found. How far each characteristic may go: {ask('tolerance', place, point)}")
         return
     for one in told.explanations:
-        _print_one(console, place, one, members, told)
+        _print_one(console, partial(command, place, point=point), one, members, told)
     _print_common(console, told)
 
 
-def _print_one(console: Console, place: str, one: Explanation, members: CharacteristicSet, told: Explained) -> None:
+def _print_one(console: Console, again: Again, one: Explanation, members: CharacteristicSet, told: Explained) -> None:
     title = f"{', '.join(one.reasons)}: {one.handle or 'a setting of its own'}"
     console.rule(escape(title), align="left")
     ends = f"{one.outcome}, SD {_decimal(one.safety_degree)} with {number_of(len(one.changed), 'change')}"
@@ -40,7 +44,7 @@ def _print_one(console: Console, place: str, one: Explanation, members: Characte
     if not one.causes:
         _say(console, "It is not unsafe.")
     for cause in one.causes[:CAUSES_SHOWN]:
-        _print_cause(console, place, cause, members)
+        _print_cause(console, again, cause, members)
     if len(one.causes) > CAUSES_SHOWN:
         _say(console, f"... and {len(one.causes) - CAUSES_SHOWN} more of the same number of changes (--json has all).")
     if len(one.causes) > 1:
@@ -58,7 +62,7 @@ def _print_one(console: Console, place: str, one: Explanation, members: Characte
         _say(console, f"Neighbours within the filter's thresholds that are unsafe too: {shares}; {word} ({one.robustness.share:.0%}).")
 
 
-def _print_cause(console: Console, place: str, cause: Cause, members: CharacteristicSet) -> None:
+def _print_cause(console: Console, again: Again, cause: Cause, members: CharacteristicSet) -> None:
     if not cause.changes:
         _say(console, "No change is needed: the original vehicle itself is unsafe.")
         return
@@ -71,7 +75,7 @@ def _print_cause(console: Console, place: str, cause: Cause, members: Characteri
             values = (member.original, cause.changes[member.name], cause.boundary[member.name], cause.alone[member.name])
             table.add_row(escape(member.name), escape(member.unit), *(f"{value:.6g}" for value in values))
     console.print(table)
-    _say(console, f"Still unsafe at {cause.fraction:.1%} of these changes, safe just below. {command(place, cause.changes)}")
+    _say(console, f"Still unsafe at {cause.fraction:.1%} of these changes, safe just below. {again(cause.changes)}")
 
 
 def _side_by_side(told: Because) -> WholeTable:

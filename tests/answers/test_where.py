@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from slippery import Here
 
-from safevar_sumo.answers import Unsafe, lead, points_in_words, sentence
+from safevar_sumo.answers import Unsafe, command, lead, points_in_words, sentence
 from safevar_sumo.answers.where import Where, where
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import solutions_frame
@@ -54,6 +54,12 @@ def test_points_in_words() -> None:
     assert points_in_words(("A, 1", "B"), 9) == "Fails at 2 of 9 points: A, 1; B."
     assert points_in_words(("A", "B", "C"), 9, most=1) == "Fails at 3 of 9 points: A and 2 more."
     assert points_in_words((), 9) == "Fails at 0 of 9 points."
+
+
+def test_what_was_asked_at_a_point_is_simulated_again_there() -> None:
+    again = command("results/a b", {"mass": 2600.5}, "CPNA, speed 40")
+    assert again == "python -m safevar_sumo simulate 'results/a b' --point 'CPNA, speed 40' --set mass=2600.5"
+    assert command("rain", {}) == "python -m safevar_sumo simulate rain"
 
 
 def test_the_summary_of_a_matrix_asks_why_at_the_worst_point_alone(system: System, weak: np.ndarray, told: Where) -> None:
