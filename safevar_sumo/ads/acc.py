@@ -7,10 +7,10 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
+from safevar_sumo.ads.base import Positive
 from safevar_sumo.ads.following import Following
 from safevar_sumo.records import FloatArray
 
-Positive = Annotated[float, Meta(gt=0, le=1e3)]
 # Gains of the modes [1/s for speeds, 1/s^2 for gaps] and thresholds: defaults of MSCFModel_ACC.
 SPEED_GAIN = -0.4
 CLOSING = 0.8, 0.04

@@ -7,12 +7,11 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
+from safevar_sumo.ads.base import NotNegative, Positive
 from safevar_sumo.ads.pedals import Trim, pedals, trim
 from safevar_sumo.ads.way import in_the_way
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
-Positive = Annotated[float, Meta(gt=0, le=1e3)]
-NotNegative = Annotated[float, Meta(ge=0, le=1e3)]
 LEAST_DECELERATION = 0.5
 """Of somebody ahead who counts as braking [m/s^2]."""
 

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
+
+from msgspec import Meta
 
 from safevar_sumo.records import Command, Nominal, Observation
+
+Positive = Annotated[float, Meta(gt=0, le=1e3)]
+"""A driver's parameter above 0, in SI units."""
+NotNegative = Annotated[float, Meta(ge=0, le=1e3)]
+"""One that may be 0."""
 
 
 class Ads(Protocol):

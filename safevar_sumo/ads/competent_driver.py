@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Struct
 
+from safevar_sumo.ads.base import NotNegative, Positive
 from safevar_sumo.ads.reacting import HARDEST, JERK, TIME_ROUNDING, Reaction, react, unaware
 from safevar_sumo.ads.way import in_the_way, time_to_reach
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
-
-Positive = Annotated[float, Meta(gt=0, le=1e3)]
-NotNegative = Annotated[float, Meta(ge=0, le=1e3)]
 
 
 class _Memory(NamedTuple):

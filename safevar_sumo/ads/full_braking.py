@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Struct
 
+from safevar_sumo.ads.base import Positive
 from safevar_sumo.ads.reacting import Reaction, react, unaware
 from safevar_sumo.ads.way import in_the_way
 from safevar_sumo.records import Command, Nominal, Observation
 
-Positive = Annotated[float, Meta(gt=0, le=1e3)]
 AS_HARD_AS_CAN_BE = 1e6
 """More than any brake does [m/s^2]: the pedal is on the floor."""
 

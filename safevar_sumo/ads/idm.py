@@ -8,10 +8,10 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
+from safevar_sumo.ads.base import Positive
 from safevar_sumo.ads.following import Following
 from safevar_sumo.records import FloatArray
 
-Positive = Annotated[float, Meta(gt=0, le=1e3)]
 LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
 
 

@@ -7,11 +7,10 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta, Struct
 
+from safevar_sumo.ads.base import Positive
 from safevar_sumo.ads.reacting import Reaction, react, unaware
 from safevar_sumo.ads.way import in_the_way, time_to_reach
 from safevar_sumo.records import Command, Nominal, Observation
-
-Positive = Annotated[float, Meta(gt=0, le=1e3)]
 
 
 class R157(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Struct
 
+from safevar_sumo.ads.base import NotNegative, Positive
 from safevar_sumo.ads.reacting import HARDEST, Reaction, react, unaware
 from safevar_sumo.ads.way import in_the_way
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
-
-Positive = Annotated[float, Meta(gt=0, le=1e3)]
-NotNegative = Annotated[float, Meta(ge=0, le=1e3)]
 
 
 class Rss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
