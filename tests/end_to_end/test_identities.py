@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 import time
 from pathlib import Path
 
@@ -73,11 +74,17 @@ def test_results_go_with_the_files_that_they_were_computed_with() -> None:
     assert Path("out/solutions.csv").read_bytes() == before
 
 
-@pytest.mark.slow
-def test_files_that_are_edited_meanwhile_mix_nothing() -> None:
+def under_way() -> subprocess.Popen[str]:
+    """A long study that has journalled something."""
     Path("mine.toml").write_text(STUDY.replace("evaluations = 30", "evaluations = 400"))
     process = started("study", "mine.toml", "--out", "out", "--jobs", "1", "--batch", "1")
     until(lambda: written(Path("out")) > 0, process)
+    return process
+
+
+@pytest.mark.slow
+def test_files_that_are_edited_meanwhile_mix_nothing() -> None:
+    process = under_way()
     edited("my_ads.py", "0.5", "0.65")
     before = written(Path("out"))
     until(lambda: written(Path("out")) > before + 500, process)
@@ -95,9 +102,7 @@ def test_files_that_are_edited_meanwhile_mix_nothing() -> None:
 
 @pytest.mark.slow
 def test_a_network_that_is_edited_meanwhile_mixes_nothing() -> None:
-    Path("mine.toml").write_text(STUDY.replace("evaluations = 30", "evaluations = 400"))
-    process = started("study", "mine.toml", "--out", "out", "--jobs", "1", "--batch", "1")
-    until(lambda: written(Path("out")) > 0, process)
+    process = under_way()
     edited("my_net/traffic.rou.xml", "<route", "<!-- --><route")
     assert "traffic.rou.xml: is not the file that this study began with" in ended(process, 2)
 
