@@ -50,7 +50,8 @@ class Run:
         self._known: dict[bytes, tuple[int, Evaluations, int]] = {}
         self._taken: set[int] = set()
         self._asked = 0
-        self._settings: FloatArray | None = None
+        self._settings: FloatArray = np.empty((0, 0))
+        self._places: dict[bytes, int] = {}
         self._fresh = 0
         self.result: Evaluations
         self.finished = False
@@ -64,8 +65,7 @@ class Run:
     @property
     def missing(self) -> FloatArray:
         """What the search asks for and nobody knows yet, each once; shape (k, n)."""
-        assert self._settings is not None
-        return np.array(list({row.tobytes(): row for row in self._settings if row.tobytes() not in self._known}.values()))
+        return self._settings[[place - self._asked for row, place in self._places.items() if row not in self._known]]
 
     @property
     def failures(self) -> list[Failure]:
@@ -81,15 +81,15 @@ class Run:
             self.result = self._journal.content.by_position(done.positions)
             self._asked, self.finished = done.asked, True
             return True
-        if self._settings is None:
-            self._settings = next(self._search)
-        while not len(self.missing):
+        if not self._places:
+            self._ask(next(self._search))
+        while self._places.keys() <= self._known.keys():
             self._place_spares()
             evaluations = self._recalled(self._settings)
             self._observer.evaluated(self.key, evaluations, self._fresh)
             self._asked, self._fresh = self._asked + len(evaluations), 0
             try:
-                self._settings = self._search.send(evaluations)
+                self._ask(self._search.send(evaluations))
             except StopIteration as end:
                 self.result = end.value
                 return True
@@ -130,24 +130,27 @@ class Run:
         """Journal and learn a computed batch; whether that was all that was missing."""
         self._place(evaluations)
         self._fresh += len(evaluations)
-        return not len(self.missing)
+        return self._places.keys() <= self._known.keys()
 
     def close(self) -> None:
         """Give the journal back."""
         self._journal.close()
 
+    def _ask(self, settings: FloatArray) -> None:
+        """Take note of what the search asks for next, and where in the run each setting stands first."""
+        self._settings, self._places = settings, {}
+        for i, row in enumerate(settings):
+            self._places.setdefault(row.tobytes(), self._asked + i)
+
     def _place_spares(self) -> None:
         """Journal where in the run evaluations stand that were known before it asked for them."""
-        assert self._settings is not None
-        spares = {row.tobytes(): row for row in self._settings if self._known[row.tobytes()][0] == SPARE}
+        spares = [place - self._asked for row, place in self._places.items() if self._known[row][0] == SPARE]
         if spares:
-            self._place(self._recalled(np.array(list(spares.values()))))
+            self._place(self._recalled(self._settings[spares]))
 
     def _place(self, evaluations: Evaluations) -> None:
         """Journal and learn evaluations that the search asks for now."""
-        assert self._settings is not None
-        places = {row.tobytes(): self._asked + i for i, row in reversed(list(enumerate(self._settings)))}
-        positions = [places[row.tobytes()] for row in evaluations.settings]
+        positions = [self._places[row.tobytes()] for row in evaluations.settings]
         if not self._taken.isdisjoint(positions):
             raise InputError(self._journal.path, "holds other settings than this search asks for", "another --out")
         self._journal.append(positions, evaluations)

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from functools import cache
 from typing import Annotated, Any
 
+import moocore
 import numpy as np
 from deap import base, tools
 from msgspec import Meta, Struct
@@ -27,11 +28,14 @@ def _fitness(objectives: int) -> type[Any]:
 
 
 class _Individual(list[float]):
-    """Unfiltered values of a setting; once evaluated, its fitness, the evaluations that it is a row of, and its rank."""
+    """Unfiltered values of a setting; once evaluated, its fitness and the evaluations that it is a row of.
+
+    Of a survivor `standing` is its rank, from 0, and its crowding distance below 0: who has less is better.
+    """
 
     fitness: base.Fitness
     found: tuple[Evaluations, int]
-    rank: int
+    standing: tuple[int, float]
 
 
 class Nsga2(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -63,7 +67,7 @@ class Nsga2(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             good = [one for one, valid in zip(brood, problem.scoring.valid(evaluated), strict=True) if valid]
             population = _survivors(population + good, problem.population)
             brood = variation.offspring(population, min(problem.population, problem.evaluations - asked))
-        front = [evaluations.take([row]) for evaluations, row in (one.found for one in population if one.rank == 0)]
+        front = [evaluations.take([row]) for evaluations, row in (one.found for one in population if one.standing[0] == 0)]
         return Evaluations.concatenate(front) if front else evaluated.take([])
 
 
@@ -92,7 +96,7 @@ class _Variation:
         children: list[_Individual] = []
         with self.randomness():
             while population and len(children) < number:
-                first, second = (_Individual(list(_tournament(population, self._settings.tournament_size))) for _ in range(2))
+                first, second = (_Individual(_tournament(population, self._settings.tournament_size)) for _ in range(2))
                 if random.random() <= self._settings.crossover_probability:
                     tools.cxSimulatedBinaryBounded(first, second, self._settings.crossover_index, self._lower, self._upper)
                 for child in (first, second):
@@ -102,14 +106,28 @@ class _Variation:
 
 
 def _survivors(individuals: list[_Individual], number: int) -> list[_Individual]:
-    """The best `number` by rank, then by crowding distance: DEAP's `selNSGA2`, which forgets the ranks that it finds."""
+    """The best `number` by rank, then by crowding distance; DEAP's `selNSGA2`, sorted by compiled code."""
+    ordered = sorted(individuals, key=lambda one: one.fitness.wvalues, reverse=True)
     survivors: list[_Individual] = []
-    for rank, front in enumerate(tools.sortLogNondominated(individuals, number) if individuals else []):
+    for rank, front in enumerate(_fronts(ordered)):
         tools.emo.assignCrowdingDist(front)
         for one in front:
-            one.rank = rank
-        survivors += sorted(front, key=lambda one: -one.fitness.crowding_dist)
+            one.standing = rank, -one.fitness.crowding_dist
+        survivors += sorted(front, key=lambda one: one.standing)
+        if len(survivors) >= number:
+            break
     return survivors[:number]
+
+
+def _fronts(individuals: list[_Individual]) -> list[list[_Individual]]:
+    """The non-dominated ones, then those that only they dominate, and so on; each in the order in which they are given."""
+    if not individuals:
+        return []
+    ranks = moocore.pareto_rank([one.fitness.wvalues for one in individuals], maximise=True).tolist()
+    fronts: list[list[_Individual]] = [[] for _ in range(max(ranks) + 1)]
+    for one, rank in zip(individuals, ranks, strict=True):
+        fronts[rank].append(one)
+    return fronts
 
 
 def _tournament(population: list[_Individual], size: int = 2) -> _Individual:
@@ -118,7 +136,6 @@ def _tournament(population: list[_Individual], size: int = 2) -> _Individual:
         return population[0]
     best, *others = random.sample(population, min(size, len(population)))
     for other in others:
-        mine, its = ((one.rank, -one.fitness.crowding_dist) for one in (best, other))
-        if its < mine or (its == mine and random.random() >= 0.5):
+        if other.standing < best.standing or (other.standing == best.standing and random.random() >= 0.5):
             best = other
     return best

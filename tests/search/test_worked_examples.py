@@ -5,6 +5,9 @@ from __future__ import annotations
 import moocore
 import numpy as np
 import pytest
+from deap import tools
+from hypothesis import given
+from hypothesis import strategies as st
 from problems import POPULATION, SUN, evaluated, searched, sphere
 
 from safevar_sumo.records import Evaluations, Outcome
@@ -33,17 +36,30 @@ def test_survivors_are_the_better_ranks_and_of_the_last_rank_those_with_most_roo
     kept = _survivors([*behind, *front], 4)
     # (1, 3) has (1.5 - 0) / 4 + (4 - 2.5) / 4 = 0.75, (1.5, 2.5) has 1, (3, 1) has 1.25.
     assert {tuple(one.fitness.values[:2]) for one in kept} == {(0, 4), (4, 0), (3, 1), (1.5, 2.5)}
-    assert {one.rank for one in kept} == {0}
+    assert {one.standing[0] for one in kept} == {0}
     everybody = _survivors([*behind, *front], 7)
-    assert [one.rank for one in everybody] == [0] * 5 + [1, 2]
+    assert [one.standing[0] for one in everybody] == [0] * 5 + [1, 2]
+
+
+@given(st.lists(st.tuples(*[st.integers(-2, 2)] * 3), max_size=40), st.integers(1, 40))
+def test_survivors_are_those_of_deap(objectives: list[tuple[float, float, float]], number: int) -> None:
+    """The very same ones, in the same order: with ties of all kinds."""
+    ours, deaps = individuals(*objectives), individuals(*objectives)
+    fronts = tools.sortLogNondominated(deaps, number) if deaps else []
+    expected = []
+    for front in fronts:
+        tools.emo.assignCrowdingDist(front)
+        expected += sorted(front, key=lambda one: one.fitness.crowding_dist, reverse=True)
+    found = [next(i for i, one in enumerate(ours) if one is survivor) for survivor in _survivors(ours, number)]
+    assert found == [next(i for i, one in enumerate(deaps) if one is survivor) for survivor in expected[:number]]
 
 
 def test_a_tournament_is_won_by_rank_then_by_room() -> None:
     better, worse = individuals((0, 0, 0), (1, 1, 1))
     for one, rank, room in ((better, 0, 0.1), (worse, 1, 9.0)):
-        one.rank, one.fitness.crowding_dist = rank, room
+        one.standing = rank, -room
     assert all(_tournament([better, worse]) is better for _ in range(20))
-    worse.rank = 0
+    worse.standing = 0, -9.0
     assert all(_tournament([better, worse]) is worse for _ in range(20))
 
 
