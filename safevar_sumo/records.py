@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from typing import NamedTuple
@@ -67,12 +67,24 @@ class Command(NamedTuple):
     brake: FloatArray
 
 
+class Tables(NamedTuple):
+    """What the original vehicle's pedals do on a dry road, at `speeds` [m/s].
+
+    What it gains at `full_throttle` and what it loses `coasting` [m/s^2]; `braking` is what the brake adds per unit of pedal,
+    far from the limit of the tyres [m/s^2].
+    """
+
+    speeds: FloatArray
+    full_throttle: FloatArray
+    coasting: FloatArray
+    braking: float
+
+
 class Nominal(NamedTuple):
     """The original vehicle on a dry road: all that an ADS knows of the vehicle.
 
-    `mass` [kg], `accel`, `decel` [m/s^2], `max_speed` [m/s] and `tau` [s] are those of its SUMO type. The tables hold
-    at `speeds` [m/s]: what it gains at `full_throttle` and what it loses `coasting` [m/s^2]; `braking` is what the
-    brake adds per unit of pedal, far from the limit of the tyres [m/s^2].
+    `mass` [kg], `accel`, `decel` [m/s^2], `max_speed` [m/s] and `tau` [s] are those of its SUMO type; `tables` drives it, once
+    somebody asks, and returns what `speeds`, `full_throttle`, `coasting` and `braking` are of.
     """
 
     mass: float
@@ -80,10 +92,23 @@ class Nominal(NamedTuple):
     decel: float
     max_speed: float
     tau: float
-    speeds: FloatArray
-    full_throttle: FloatArray
-    coasting: FloatArray
-    braking: float
+    tables: Callable[[], Tables]
+
+    @property
+    def speeds(self) -> FloatArray:
+        return self.tables().speeds
+
+    @property
+    def full_throttle(self) -> FloatArray:
+        return self.tables().full_throttle
+
+    @property
+    def coasting(self) -> FloatArray:
+        return self.tables().coasting
+
+    @property
+    def braking(self) -> float:
+        return self.tables().braking
 
 
 class Encounter(NamedTuple):

@@ -19,7 +19,7 @@ from safevar_sumo.ads.guarded import GuardedAds, PerVehicle
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import ForeignError, InputError, SafevarError
 from safevar_sumo.plugins import Guard
-from safevar_sumo.records import Nominal, Observation
+from safevar_sumo.records import Nominal, Observation, Tables
 from safevar_sumo.reference.rows import read_reference
 from safevar_sumo.simulation import assemble
 from safevar_sumo.study import Study, load_study, tables_of
@@ -121,7 +121,7 @@ def test_a_csv_of_a_hundred_thousand_columns_is_refused_soon(tmp_path: Path) -> 
 
 NOTHING = np.zeros(2)
 SEEN = Observation(0.0, NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, 1.0)
-KNOWN = Nominal(1.0, 1.0, 1.0, 1.0, 1.0, NOTHING, NOTHING, NOTHING, 1.0)
+KNOWN = Nominal(1.0, 1.0, 1.0, 1.0, 1.0, lambda: Tables(NOTHING, NOTHING, NOTHING, 1.0))
 COMMANDS = st.one_of(ANYTHING, st.none(), st.tuples(ANYTHING, ANYTHING), st.tuples(st.floats(), st.floats()),
                      st.tuples(st.floats(0, 1), st.sampled_from([0, True, np.float32(0.5), np.array(0.5), np.array([0.5])])))
 

@@ -94,11 +94,13 @@ def _assembled(study: Study, source: str) -> System:
     for network in dict.fromkeys(scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))):
         check_network(network)
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    nominal = calibration_drive(models.vehicle, characteristics)
+    if models.members[0].guard is not None:
+        nominal.tables()  # what is wrong with a vehicle from outside shows here, whoever drives it
     return System(
         characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
-        metrics=study.metrics, nominal=calibration_drive(models.vehicle, characteristics),  # type: ignore[arg-type]
-        members=(*models.members, *measuring.members), measuring=measuring, step_length=study.step_length, matrix=matrix,
-        aggregate="worst" if study.matrix is None else study.matrix.aggregate)
+        metrics=study.metrics, nominal=nominal, members=(*models.members, *measuring.members), measuring=measuring,
+        step_length=study.step_length, matrix=matrix, aggregate="worst" if study.matrix is None else study.matrix.aggregate)
 
 
 def models_of(study: Study, source: str) -> Models:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache, lru_cache, partial
 
 import numpy as np
 
-from safevar_sumo.records import Command, FloatArray, Nominal
+from safevar_sumo.records import Command, FloatArray, Nominal, Tables
 from safevar_sumo.vehicles.base import Vehicle
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
@@ -16,12 +16,21 @@ LONGEST = 60.0  # s that a drive may take
 LIGHT_BRAKE = 0.1  # pedal at which the brake is tried: far from the limit of the tyres
 
 
-@lru_cache(maxsize=4)
 def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> Nominal:
-    """Drive the original vehicle on a dry road: full throttle up, coasting down, braking lightly down."""
-    original = {member.name: np.full(1, float(member.original)) for member in characteristics}
-    prepared = vehicle.prepare(original, 1.0, STEP)
-    types = vehicle.sumo_type(prepared)
+    """The original vehicle, driven on a dry road as soon as somebody asks for what it does there."""
+    types = vehicle.sumo_type(vehicle.prepare(_original(characteristics), 1.0, STEP))
+    tables = cache(partial(_driven, vehicle, characteristics))  # type: ignore[arg-type]
+    return Nominal(**{name: float(values[0]) for name, values in types._asdict().items()}, tables=tables)
+
+
+def _original(characteristics: CharacteristicSet) -> dict[str, FloatArray]:
+    return {member.name: np.full(1, float(member.original)) for member in characteristics}
+
+
+@lru_cache(maxsize=4)
+def _driven(vehicle: Vehicle, characteristics: CharacteristicSet) -> Tables:
+    """Full throttle up, coasting down, braking lightly down."""
+    prepared = vehicle.prepare(_original(characteristics), 1.0, STEP)
     rest = vehicle.at_rest(prepared)
 
     def drive(state: object, throttle: float, brake: float) -> tuple[list[float], object]:
@@ -38,9 +47,11 @@ def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> N
     up, fast = drive(rest, 1.0, 0.0)
     coasting = _changes(drive(fast, 0.0, 0.0)[0][::-1])
     braking = _changes(drive(fast, 0.0, LIGHT_BRAKE)[0][::-1])
-    return Nominal(
-        **{name: float(values[0]) for name, values in types._asdict().items()}, speeds=SPEEDS, full_throttle=_changes(up),
-        coasting=coasting, braking=float(np.median(braking - coasting)) / LIGHT_BRAKE)
+    tables = Tables(speeds=SPEEDS, full_throttle=_changes(up), coasting=coasting,
+                    braking=float(np.median(braking - coasting)) / LIGHT_BRAKE)
+    for table in tables[:3]:
+        table.flags.writeable = False  # many ADSs read them
+    return tables
 
 
 def _changes(speeds: list[float]) -> FloatArray:
