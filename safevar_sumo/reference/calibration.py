@@ -24,6 +24,7 @@ from safevar_sumo.reference.agreement import Agreement, agreement
 from safevar_sumo.reference.loss import LARGEST, original_cost, reference_cost
 from safevar_sumo.reference.parameters import check_bound, value_of, with_values
 from safevar_sumo.reference.rows import ReferenceData
+from safevar_sumo.reference.searching import Search
 from safevar_sumo.simulation import assemble
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -77,20 +78,17 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
         rows = np.arange(len(data.settings)) % fit.hold_out == fit.hold_out - 1
         used[name], held_back[name] = data.take(~rows), data.take(rows)
     trial = _Trial(study, used, pool)
-    search = _Search(trial, fit.population, done)
-    if not from_scratch:
-        search.best, search.cost = study, trial.costs([study])[0]
-        if search.cost >= LARGEST:
-            raise SimulationError(f"study {study.name!r} cannot be simulated with its own values")
-        done(search.cost, study)
-    rng, reached = np.random.default_rng(fit.seed), []
-    far = fit.trials // (2 * fit.starts) if fit.starts else 0
-    for _ in range(fit.starts):
-        reached.append(search.run(rng.random(len(first)), WIDE, far, int(rng.integers(1, 2**31))))
-    reached.append(search.run(trial.shares(search.best), NEAR, fit.trials - fit.starts * far - (not from_scratch), fit.seed + 1))
-    values = {name: value_of(search.best, name) for name in study.calibration}
+    search = Search(trial, fit.population, fit.trials, done)
+    if not from_scratch and search.tried([study])[0] >= LARGEST:
+        raise SimulationError(f"study {study.name!r} cannot be simulated with its own values")
+    rng = np.random.default_rng(fit.seed)
+    searches = [search.begun(rng.random(len(first)), WIDE, int(rng.integers(1, 2**31))) for _ in range(fit.starts)]
+    search.race(searches)
+    searches.append(search.begun(trial.shares(search.best or study), NEAR, fit.seed + 1))
+    searches[-1].go_on(search.left)
+    values = {name: value_of(search.best or study, name) for name in study.calibration}
     best = with_values(study, values)
-    return Calibration(values, best, search.cost, reached, trial.alone,
+    return Calibration(values, best, search.cost, [one.lowest for one in searches], trial.alone,
                        _told(best, used, pool), _told(best, held_back, pool))
 
 
@@ -114,34 +112,6 @@ def _checked(study: Study, references: Mapping[str, ReferenceData], from_scratch
         for side in ("lower", "upper"):
             check_bound(study, name, side, getattr(row, side))
     return first
-
-
-class _Search:
-    """CMA-ES from one place after the other; keeps the best study of all."""
-
-    def __init__(self, trial: _Trial, population: int, done: Callable[[float, Study], None]) -> None:
-        self.best, self.cost = trial.study, np.inf
-        self._trial, self._population, self._done = trial, population, done
-
-    def run(self, place: FloatArray, spread: float, trials: int, seed: int) -> float:
-        """Search from a place in the unit cube of the bounds; returns the lowest cost of this search."""
-        import cma  # only here: it takes longer to load than all the rest
-
-        strategy = cma.CMAEvolutionStrategy(place, spread, {
-            "bounds": [0, 1], "seed": seed, "verbose": -9, "popsize": self._population, "maxstd": np.inf})
-        lowest = np.inf
-        for start in range(0, trials, self._population):
-            shares = strategy.ask()
-            candidates = [self._trial.at(share) for share in shares[:trials - start]]
-            costs = self._trial.costs(candidates)
-            for candidate, cost in zip(candidates, costs, strict=True):
-                lowest = min(lowest, cost)
-                if cost < self.cost:
-                    self.best, self.cost = candidate, cost
-                self._done(self.cost, self.best)
-            if len(costs) == len(shares):
-                strategy.tell(shares, costs)
-        return lowest
 
 
 class _Trial:
