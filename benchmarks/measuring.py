@@ -13,6 +13,7 @@ REPETITIONS = 7
 MEANINGS = {
     "bare_libsumo": "an evaluation takes so many times what bare libsumo takes to load and step the same network",
     "stepping_alone": "an evaluation takes so many times what bare libsumo takes to step it",
+    "replayed": "the same with a vehicle and an ADS that compute nothing: what no model can go below",
     "batches_of_1": "so many times as fast as one setting after the other",
     "traci_socket": "so many times as fast as one setting after the other through a TraCI socket, the network reloaded for each",
     "scalar_ads": "an evaluation with a ScalarAds that does next to nothing takes so many times one with the study's own ADS",
