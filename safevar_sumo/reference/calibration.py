@@ -40,7 +40,8 @@ SAME = 1e-6
 class Calibration(NamedTuple):
     """Found values by parameter, the study with them, its cost, and both parts of every reference by its name.
 
-    `reached` is the lowest cost that each search came to; `alone` whether vehicles were tried beside one copy of the network.
+    `reached` is the lowest cost that each search came to, the last one beginning at the best of the others; `alone` whether
+    vehicles were tried beside one copy of the network.
     """
 
     values: dict[str, float]
@@ -88,7 +89,7 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
     searches[-1].go_on(search.left)
     values = {name: value_of(search.best or study, name) for name in study.calibration}
     best = with_values(study, values)
-    return Calibration(values, best, search.cost, [one.lowest for one in searches], trial.alone,
+    return Calibration(values, best, search.cost, [one.lowest for one in searches if one.lowest < np.inf], trial.alone,
                        _told(best, used, pool), _told(best, held_back, pool))
 
 
