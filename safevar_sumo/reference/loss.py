@@ -15,16 +15,24 @@ from safevar_sumo.study import FitTable
 LARGEST = 1e3
 """Of what a reference can cost; that of a study which cannot be simulated at all."""
 FARTHEST = 10.0
-"""Tolerances beyond which the original vehicle's miss costs no more."""
+"""Tolerances beyond which the original vehicle's miss costs no more: a value that there is not is so far away."""
 
 
 def original_cost(original: Evaluations, published: Mapping[str, float], fit: FitTable) -> float:
-    """Squared misses of the original vehicle's values, in tolerances, weighted by metric; mean."""
-    misses = [
-        fit.weights.get(name, 0.0) * (min(abs(original.metrics[name][0] / value - 1) / fit.tolerance, FARTHEST) ** 2
-                                      if np.isfinite(original.metrics[name][0]) else FARTHEST ** 2)
-        for name, value in published.items() if name in METRICS]
+    """Misses of the original vehicle's values, weighted by metric; mean.
+
+    Squared up to the tolerance and in proportion beyond it (Huber 1964): squares would have a search fit one vehicle first, and
+    the rows only as far as that leaves it room.
+    """
+    misses = [fit.weights.get(name, 0.0) * _huber(original.metrics[name][0] / value - 1, fit.tolerance)
+              for name, value in published.items() if name in METRICS]
     return fit.original * float(np.mean(misses)) if misses else 0.0
+
+
+def _huber(miss: float, tolerance: float) -> float:
+    """A relative miss in tolerances, squared up to one; twice as much, less one, beyond."""
+    distance = min(abs(miss) / tolerance, FARTHEST) if np.isfinite(miss) else FARTHEST
+    return distance * distance if distance <= 1 else 2 * distance - 1
 
 
 def reference_cost(told: Agreement, data: ReferenceData, fit: FitTable) -> float:

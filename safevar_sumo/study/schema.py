@@ -156,7 +156,7 @@ class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How free parameters are found: what counts for how much, which rows are used, and from where the search starts.
 
-    The loss is `original` * mean_m(w_m (miss / (`tolerance` * published))^2) of the original vehicle
+    The loss is `original` * mean_m(w_m h(miss / (`tolerance` * published))) of the original vehicle, h being x^2 to 1 and 2 x - 1 beyond,
     + mean over the files of sum_m(w_m (`rank` (1 - rho) + mean |error| / standard deviation)) + `collisions` * share of rows that
     collide on one side alone, w_m being `weights` by metric. Of every `hold_out` rows one is used for nothing but to be reported.
     `trials` sets of parameters are tried, in generations of `population`: first in a race of searches from `starts` random places in
