@@ -24,8 +24,14 @@ def calibration_comment(found: Calibration, study: Study, references: Mapping[st
     return "\n".join([
         f"Study {study.name!r}, calibrated by CMA-ES ({fit.trials} trials, seed {fit.seed}, from {start})",
         f"to the original vehicle's published values{others}", *(_data_line(name, data) for name, data in references.items()),
-        f"Cost {found.cost:.4f}; each search came to {', '.join(f'{cost:.4f}' for cost in found.reached)}.", *parts,
+        f"{cost_line(found)}.", *parts,
         *(f"{name} stands on its bound." for name in on_a_bound(found.values, study.calibration))])
+
+
+def cost_line(found: Calibration) -> str:
+    """The cost of what was found, and what each search came to if there was any."""
+    reached = ", ".join(f"{cost:.4f}" for cost in found.reached)
+    return f"Cost {found.cost:.4f}" + (f"; each search came to {reached}" if reached else "")
 
 
 def on_a_bound(values: Mapping[str, float], free: Mapping[str, FreeParameter]) -> list[str]:

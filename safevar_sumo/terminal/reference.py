@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.reference import Agreement, Calibration, on_a_bound
+from safevar_sumo.reference import Agreement, Calibration, cost_line, on_a_bound
 from safevar_sumo.study import Study
 from safevar_sumo.terminal.plain import WholeTable
 
@@ -62,4 +62,4 @@ def print_calibration(console: Console, study: Study, found: Calibration) -> Non
         console.print(f"{name} stands on its bound: a wider one may fit better.", markup=False)
     if not found.alone:
         console.print("SUMO simulated every trial in copies of the network: beside one copy, vehicles do something else in this scenario.")
-    console.print(f"Cost {found.cost:.4f}; each search came to {', '.join(f'{cost:.4f}' for cost in found.reached)}")
+    console.print(cost_line(found))
