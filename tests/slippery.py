@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future
 from pathlib import Path
 
+from in_process import Here, Silent
+
 from safevar_sumo.campaign import all_runs, carry_out
-from safevar_sumo.computing import evaluate_batch, identity_of
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.computing import identity_of
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.simulation import assemble
 from safevar_sumo.study import load_study
@@ -27,25 +27,6 @@ population = 10
 evaluations = 60
 runs = 1
 """
-
-
-class Here:
-    """A pool that computes in this process, at once."""
-
-    workers = 1
-
-    def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
-        future: Future[Evaluations] = Future()
-        future.set_result(evaluate_batch(study, settings))
-        return future
-
-
-class Silent:
-    """An observer that nobody hears."""
-
-    def evaluated(self, *_: object) -> None: ...
-    def finished(self, *_: object) -> None: ...
-    def warned(self, message: str) -> None: ...
 
 
 def make_results(out: Path, title: str = "Crossing on wet leaves") -> Path:

@@ -85,9 +85,11 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
     rng = np.random.default_rng(fit.seed)
     searches = [search.begun(rng.random(len(first)), WIDE, int(rng.integers(1, 2**31))) for _ in range(fit.starts)]
     search.race(searches)
-    searches.append(search.begun(trial.shares(search.best or study), NEAR, fit.seed + 1))
+    place = rng.random(len(first)) if search.best is None else trial.shares(search.best)
+    searches.append(search.begun(place, NEAR, fit.seed + 1))
     searches[-1].go_on(search.left)
-    values = {name: value_of(search.best or study, name) for name in study.calibration}
+    assert search.best is not None, "there is a trial at least"
+    values = {name: value_of(search.best, name) for name in study.calibration}
     best = with_values(study, values)
     return Calibration(values, best, search.cost, [one.lowest for one in searches if one.lowest < np.inf], trial.alone,
                        _told(best, used, pool), _told(best, held_back, pool))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from slippery import Here
+from in_process import Here
 
 from safevar_sumo.analysis import Case, load_cases
 from safevar_sumo.answers import Explained, explain, lead

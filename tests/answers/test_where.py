@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from slippery import Here
+from in_process import Here
 
 from safevar_sumo.answers import Unsafe, command, lead, points_in_words, sentence
 from safevar_sumo.answers.where import Where, where

@@ -4,41 +4,21 @@ from __future__ import annotations
 
 import json
 import tempfile
-from concurrent.futures import Future
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import msgspec
+from in_process import Here, Silent
 
 from safevar_sumo.campaign import all_runs, carry_out
-from safevar_sumo.computing import evaluate_batch, identity_of
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.computing import identity_of
 from safevar_sumo.results import ResultsDirectory, load
 from safevar_sumo.simulation import assemble
 from safevar_sumo.study import Study, load_study
 
 STUDIES = ("sun", "rain", "lgsvl", "native", "smoke")
 FILE = Path(__file__).with_name("golden.json")
-
-
-class Here:
-    """A pool that computes in this process, at once."""
-
-    workers = 1
-
-    def submit(self, work: bytes, settings: FloatArray) -> Future[Evaluations]:
-        future: Future[Evaluations] = Future()
-        future.set_result(evaluate_batch(work, settings))
-        return future
-
-
-class Silent:
-    """An observer that nobody hears."""
-
-    def evaluated(self, *_: object) -> None: ...
-    def finished(self, *_: object) -> None: ...
-    def warned(self, message: str) -> None: ...
 
 
 def small(name: str) -> Study:

@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future
-
 import msgspec
 import numpy as np
 import pytest
+from in_process import Here
 
-from safevar_sumo.computing import evaluate_batch
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference import ReferenceData, calibrate, fitted_as, with_values
 from safevar_sumo.simulation import assemble, evaluate
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
 
 GAP = "ads.parameters.brake_gap"
-
-
-class Here:
-    """A pool that computes when it is asked to."""
-
-    workers = 1
-
-    def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
-        done: Future[Evaluations] = Future()
-        done.set_result(evaluate_batch(study, settings))
-        return done
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +39,11 @@ def test_a_fit_from_scratch_finds_the_truth_and_forgets_what_the_study_says(data
     assert len(found[0].reached) == 2
     assert min(found[0].reached) == found[0].cost
     assert (found[0].used["mine"].rows, found[0].held_back["mine"].rows) == (12, 12)
+
+
+def test_a_fit_from_scratch_with_too_few_trials_for_its_starts_knows_nothing_of_the_study_either(data: ReferenceData) -> None:
+    found = [calibrate(mine(gap, starts=8, trials=2), {"mine": data}, Here(), from_scratch=True) for gap in (0.4, 1.5)]
+    assert found[0].values == found[1].values
 
 
 def test_what_counts_for_nothing_in_the_study_costs_nothing(data: ReferenceData) -> None:

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from slippery import Here, Silent
+from in_process import Here, Silent
 
 from safevar_sumo.campaign import all_runs, carry_out
 from safevar_sumo.computing import identity_of
