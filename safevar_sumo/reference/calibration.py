@@ -40,8 +40,8 @@ SAME = 1e-6
 class Calibration(NamedTuple):
     """Found values by parameter, the study with them, its cost, and both parts of every reference by its name.
 
-    `reached` is the lowest cost that each search came to, the last one beginning at the best of the others; `alone` whether
-    vehicles were tried beside one copy of the network.
+    `reached` is the lowest cost that each search came to, the last one from the study's own values unless these were forgotten;
+    `alone` whether vehicles were tried beside one copy of the network.
     """
 
     values: dict[str, float]
@@ -84,10 +84,9 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
         raise SimulationError(f"study {study.name!r} cannot be simulated with its own values")
     rng = np.random.default_rng(fit.seed)
     searches = [search.begun(rng.random(len(first)), WIDE, int(rng.integers(1, 2**31))) for _ in range(fit.starts)]
+    if not from_scratch:
+        searches.append(search.begun(trial.shares(study), NEAR, fit.seed + 1))
     search.race(searches)
-    place = rng.random(len(first)) if search.best is None else trial.shares(search.best)
-    searches.append(search.begun(place, NEAR, fit.seed + 1))
-    searches[-1].go_on(search.left)
     assert search.best is not None, "there is a trial at least"
     values = {name: value_of(search.best, name) for name in study.calibration}
     best = with_values(study, values)

@@ -50,17 +50,20 @@ class Search:
         return OneSearch(self, place, spread, seed)
 
     def race(self, searches: Sequence[OneSearch]) -> None:
-        """Successive halving (Jamieson and Talwalkar 2016): rounds of as many trials each, shared by half as many searches each time.
+        """Successive halving (Jamieson and Talwalkar 2016) of all trials that are left.
 
-        As many trials as a round has are left in the end.
+        Rounds have as many trials each, shared by half as many searches each time; the last has two. One that has had both the last
+        rounds hardly improves any more, so a wider race is worth more than a longer one.
         """
-        rounds = (len(searches) - 1).bit_length() + 1
-        share, racing = self.left // (rounds + 1), list(searches)
-        while racing:
+        racing = list(searches)
+        rounds = max(1, (len(racing) - 1).bit_length())
+        share = self.left // rounds
+        for _ in range(rounds):
             each = share // len(racing)
             for one in racing:
                 one.go_on(each - each % self.population if each > self.population else each)
-            racing = sorted(racing, key=lambda one: one.lowest)[:(len(racing) + 1) // 2] if len(racing) > 1 else []
+            racing = sorted(racing, key=lambda one: one.lowest)[:(len(racing) + 1) // 2]
+        racing[0].go_on(self.left)
 
 
 class OneSearch:

@@ -159,9 +159,8 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     The loss is `original` * mean_m(w_m h(miss / (`tolerance` * published))) of the original vehicle, h being x^2 to 1 and 2 x - 1 beyond,
     + mean over the files of sum_m(w_m (`rank` (1 - rho) + mean |error| / standard deviation)) + `collisions` * share of rows that
     collide on one side alone, w_m being `weights` by metric. Of every `hold_out` rows one is used for nothing but to be reported.
-    `trials` sets of parameters are tried, in generations of `population`: first in a race of searches from `starts` random places in
-    the bounds, of which the worse half gives up after every round; then, as many as a round has, from the better of what these
-    found and the study's own values. `seed` is the seed of all that.
+    `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own values and from
+    `starts` random places in the bounds, of which the worse half gives up after every round. `seed` is the seed of all that.
     """
 
     trials: PositiveInt = 1200
