@@ -80,7 +80,7 @@ def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watch
     types = vehicle.sumo_type(prepared)
     world.set_types(types._replace(decel=np.maximum(types.decel, SURE_BRAKES)))
     world.depart()
-    world.set_types(types)
+    world.set_decelerations(types.decel)
     length, way = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
 
     state = at_start(vehicle, prepared, world.speeds())
@@ -90,7 +90,7 @@ def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watch
     except world.api.TraCIException as error:
         raise InputError("scenario.parameters.network", f"the scenario does not find what it looks for: {str(error).strip()}",
                          "a network and traffic with the ids that the scenario names") from None
-    log = _Log(n, int(parts.last.max()) + 1)
+    log = _Log(n, int(parts.last.max()) + 1, way)
     verdict = _Verdict(n)
     for sample in range(log.length):
         if watch is not None:
@@ -101,7 +101,7 @@ def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watch
         seen = parts.seen(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
         seen, state = vehicle.sense(prepared, state, seen)
         command, driver = system.ads.drive(seen, driver)
-        log.write(sample, position=way.along(world.vehicle_positions(VUT)), speed=speed, gap=scene.gap, lateral=scene.lateral,
+        log.write(sample, place=world.vehicle_positions(VUT), speed=speed, gap=scene.gap, lateral=scene.lateral,
                   lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active,
                   obstacle_speed=scene.obstacle_speed)
         if not verdict.open.any():
@@ -140,20 +140,23 @@ def _slope(points: Sequence[Point], n: int) -> list[Slope]:
 
 
 class _Log:
-    """Samples of a run in arrays of shape (T, N)."""
+    """Samples of a run in arrays of shape (T, N), and where the vehicles were on SUMO's plane, shape (T, N, 2)."""
 
-    _COLUMNS = ("position", "speed", "gap", "lateral", "lateral_speed", "throttle", "brake", "gear", "active", "obstacle_speed")
+    _COLUMNS = ("speed", "gap", "lateral", "lateral_speed", "throttle", "brake", "gear", "active", "obstacle_speed")
 
-    def __init__(self, n: int, length: int) -> None:
-        self.length = length
+    def __init__(self, n: int, length: int, way: Frame) -> None:
+        self.length, self._way = length, way
         self._rows = {name: np.zeros((length, n), dtype=bool if name == "active" else float) for name in self._COLUMNS}
+        self._places = np.zeros((length, n, 2))
 
-    def write(self, sample: int, **columns: FloatArray | BoolArray) -> None:
+    def write(self, sample: int, place: FloatArray, **columns: FloatArray | BoolArray) -> None:
+        self._places[sample] = place
         for name, values in columns.items():
             self._rows[name][sample] = values
 
     def trace(self, length: int, step: float, vehicle_length: float) -> Trace:
         rows = {name: values[:length] for name, values in self._rows.items()}
+        rows["position"] = self._way.along(self._places[:length].reshape(-1, 2)).reshape(length, -1)
         return Trace(step=step, vehicle_length=vehicle_length, time=np.round(np.arange(length) * step, TIME_DECIMALS), **rows)
 
 

@@ -45,6 +45,9 @@ class KinematicWorld(SumoWorld):
     def set_types(self, types: SumoType) -> None:
         """The vehicles' SUMO types have no part in how they move."""
 
+    def set_decelerations(self, decel: FloatArray) -> None:
+        """Nor have these."""
+
     def depart(self) -> None:
         super().depart()
         vehicle, vut = self._api.vehicle, self.ids(VUT)[0]

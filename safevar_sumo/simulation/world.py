@@ -29,6 +29,8 @@ class SumoWorld:
     def __init__(self, api: Any, n: int, *, first: int = 0, watched: bool = False, standing: StandingSumo | None = None,
                  whole: SumoWorld | None = None) -> None:
         self._api, self.n, self._first, self._standing = api, n, first, standing
+        self._set_speed, self._get_speed = _direct(api, "vehicle", "setSpeed"), _direct(api, "vehicle", "getSpeed")
+        self._vehicle_position, self._person_position = _direct(api, "vehicle", "getPosition"), _direct(api, "person", "getPosition")
         self._parts, self._whole = list[SumoWorld](), whole
         self._last_speeds, self._last_positions = np.zeros(n), np.zeros((n, 2))
         """Speeds and positions of vehicles under test that have left the road."""
@@ -52,13 +54,19 @@ class SumoWorld:
     def set_types(self, types: SumoType) -> None:
         """Make the vehicles under test the SUMO vehicle types that their settings say."""
         vehicletype = self._api.vehicletype
-        for name, mass, accel, decel, max_speed, tau in zip(self.ids(VUT), *(values.tolist() for values in types), strict=True):
+        columns = (values.tolist() for values in (types.mass, types.accel, types.max_speed, types.tau))
+        for name, mass, accel, max_speed, tau in zip(self.ids(VUT), *columns, strict=True):
             vehicletype.setMass(name, mass)
             vehicletype.setAccel(name, accel)
-            vehicletype.setDecel(name, decel)
-            vehicletype.setEmergencyDecel(name, decel)
             vehicletype.setMaxSpeed(name, max_speed)
             vehicletype.setTau(name, tau)
+        self.set_decelerations(types.decel)
+
+    def set_decelerations(self, decel: FloatArray) -> None:
+        """What their brakes can do at the most, in an emergency too [m/s^2]."""
+        for name, value in zip(self.ids(VUT), decel.tolist(), strict=True):
+            self._api.vehicletype.setDecel(name, value)
+            self._api.vehicletype.setEmergencyDecel(name, value)
 
     def depart(self) -> None:
         """Insert everybody, and take the vehicles under test into our hands.
@@ -84,7 +92,7 @@ class SumoWorld:
 
     def advance(self, speeds: FloatArray) -> None:
         """One simulation step in which the vehicles under test reach `speeds` [m/s]."""
-        set_speed, names = _direct(self._api, "vehicle", "setSpeed"), self.ids(VUT)
+        set_speed, names = self._set_speed, self.ids(VUT)
         changed = self._rows[(speeds != self._told)[self._rows]]
         for copy, speed in zip(changed.tolist(), speeds[changed].tolist(), strict=True):
             set_speed(names[copy], speed)
@@ -118,14 +126,14 @@ class SumoWorld:
             return self._whole.speeds()[self._first:self._first + self.n]
         if self._speeds_now is None:
             self._speeds_now = self._last_speeds.copy()
-            self._speeds_now[self._rows] = [*map(_direct(self._api, "vehicle", "getSpeed"), self._driving)]
+            self._speeds_now[self._rows] = [*map(self._get_speed, self._driving)]
         return self._speeds_now
 
     def vehicle_positions(self, actor: str) -> FloatArray:
-        return self._looked_up(actor, _direct(self._api, "vehicle", "getPosition"))
+        return self._looked_up(actor, self._vehicle_position)
 
     def person_positions(self, actor: str) -> FloatArray:
-        return self._looked_up(actor, _direct(self._api, "person", "getPosition"))
+        return self._looked_up(actor, self._person_position)
 
     def _looked_up(self, actor: str, position: Callable[[str], tuple[float, float]]) -> FloatArray:
         """Positions in this step; whoever asks again gets the same array."""
