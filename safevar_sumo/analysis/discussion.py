@@ -120,7 +120,7 @@ def effects(case: Case) -> pd.DataFrame:
 
 def _clearness(case: Case) -> tuple[float, float, float]:
     weather = case.weather
-    return weather.road_friction, weather.visibility, -weather.recognition_delay
+    return weather.road_friction, weather.visibility, -weather.recognition_delay - weather.hesitation
 
 
 def _without_weather(case: Case) -> tuple[object, ...]:

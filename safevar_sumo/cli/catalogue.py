@@ -67,8 +67,8 @@ def _print_catalogue(console: Console, studies: list[Study]) -> None:
                 for row in vehicle["characteristics"]]
         heads = ("characteristic", "unit", "original", "lower", "upper", "threshold")
         print_names(console, f"Vehicle {vehicle['name']}", rows, heads)
-    weathers = [(row["name"], *(f"{row[key]:g}" for key in ("road_friction", "visibility", "recognition_delay")), row["light"])
-                for row in catalogue["weathers"]]
-    print_names(console, "Weathers", weathers, ("name", "road friction", "visibility", "recognition delay, s", "light"))
+    numbers = ("road_friction", "visibility", "recognition_delay", "hesitation")
+    weathers = [(row["name"], *(f"{row[key]:g}" for key in numbers), row["light"]) for row in catalogue["weathers"]]
+    print_names(console, "Weathers", weathers, ("name", "road friction", "visibility", "recognition delay, s", "hesitation, s", "light"))
     for title, key in (("ADSs", "ads"), ("Scenarios", "scenarios"), ("Algorithms", "algorithms"), ("Metrics", "metrics")):
         print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "what"))

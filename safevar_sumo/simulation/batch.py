@@ -101,6 +101,7 @@ def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watch
         seen = parts.seen(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
         seen, state = vehicle.sense(prepared, state, seen)
         command, driver = system.ads.drive(seen, driver)
+        command = parts.braked(command)
         log.write(sample, place=world.vehicle_positions(VUT), speed=speed, gap=scene.gap, lateral=scene.lateral,
                   lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active,
                   obstacle_speed=scene.obstacle_speed)

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from safevar_sumo.records import Encounter, FloatArray, Observation, Trace
+from safevar_sumo.records import Command, Encounter, FloatArray, Observation, Trace
 from safevar_sumo.scenarios import Point, Scene
 from safevar_sumo.simulation.perception import Perception
 from safevar_sumo.simulation.world import SumoWorld
@@ -46,6 +46,13 @@ class Parts:
                         for perception, rows in self._perceptions]
         joined = _joined(observations, [len(rows) for _, rows in self._perceptions])
         return Observation._make(np.asarray(values)[self._order] if np.ndim(values) else values for values in joined)
+
+    def braked(self, command: Command) -> Command:
+        """What becomes of all vehicles' commands."""
+        if len(self._perceptions) == 1:
+            return self._perceptions[0][0].braked(command)
+        commands = [perception.braked(Command(*(pedal[rows] for pedal in command))) for perception, rows in self._perceptions]
+        return Command(*(np.concatenate(pedals)[self._order] for pedals in zip(*commands, strict=True)))
 
     def encounter(self, trace: Trace) -> Encounter:
         """The geometry that the metrics are computed from."""

@@ -1,4 +1,4 @@
-"""What an ADS makes out of the scene: its own speed at once, everything else as late as the weather has it."""
+"""What an ADS makes out of the scene, its own speed at once, everything else as late as the weather has it; and how late it brakes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from safevar_sumo.records import EVERYWHERE, FloatArray, Observation
+from safevar_sumo.records import EVERYWHERE, Command, FloatArray, Observation
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather
 
@@ -16,12 +16,11 @@ HIDDEN = np.array([[np.inf], [np.inf], [0.0], [0.0]])
 
 
 class Perception:
-    """Observations of N vehicles, one step after the other."""
+    """Observations and commands of N vehicles in one weather, one step after the other."""
 
     def __init__(self, weather: Weather, step: float) -> None:
-        self._visibility = weather.visibility
-        self._whole, self._part = divmod(round(weather.recognition_delay / step, STEP_DECIMALS), 1)
-        self._past: deque[FloatArray] = deque()
+        self._visibility, self._hesitates = weather.visibility, weather.hesitation > 0
+        self._scenes, self._brakes = _Late(weather.recognition_delay, step), _Late(weather.hesitation, step)
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
         """What is seen at this step; every step is to be shown. Who is hidden is infinitely far away and still."""
@@ -29,10 +28,24 @@ class Perception:
         now[0], now[1], now[2], now[3], now[4] = scene.gap, scene.lateral, scene.lateral_speed, scene.obstacle_speed, speed
         if scene.visible is not EVERYWHERE:
             now[:-1] = np.where(scene.visible, now[:-1], HIDDEN)
-        gap, lateral, lateral_speed, obstacle_speed, own = self._late(now)
+        gap, lateral, lateral_speed, obstacle_speed, own = self._scenes.shown(now)
         return Observation(time, speed, gap, own - obstacle_speed, lateral, lateral_speed, self._visibility, obstacle_speed)
 
-    def _late(self, now: FloatArray) -> FloatArray:
+    def braked(self, command: Command) -> Command:
+        """What becomes of a command: who is not sure yet what he sees brakes no harder than he wanted a hesitation ago."""
+        if not self._hesitates:
+            return command
+        return Command(command.throttle, np.minimum(command.brake, self._brakes.shown(command.brake)))
+
+
+class _Late:
+    """Values that are told a delay [s] late."""
+
+    def __init__(self, delay: float, step: float) -> None:
+        self._whole, self._part = divmod(round(delay / step, STEP_DECIMALS), 1)
+        self._past: deque[FloatArray] = deque()
+
+    def shown(self, now: FloatArray) -> FloatArray:
         """What was there a delay ago, linear between two steps; before the first one nothing was different."""
         self._past = self._past or deque([now] * (int(self._whole) + 2), maxlen=int(self._whole) + 2)
         self._past.append(now)

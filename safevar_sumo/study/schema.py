@@ -58,13 +58,15 @@ class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Weather as data: what it does to the road and to the sensors.
 
     `road_friction` and `visibility` are factors on the dry, clear case [-]; `recognition_delay` is by how much later
-    than in clear weather an ADS makes somebody out [s]. `light` says when it is, and acts through these alone.
+    than in clear weather an ADS makes somebody out [s], `hesitation` by how much later than it lets go of the accelerator
+    it then brakes [s]. `light` says when it is, and acts through these alone.
     """
 
     name: str
     road_friction: Annotated[float, Meta(gt=0, le=1.5)]
     visibility: Annotated[float, Meta(gt=0, le=1.5)]
     recognition_delay: Annotated[float, Meta(ge=0, le=5)] = 0.0
+    hesitation: Annotated[float, Meta(ge=0, le=5)] = 0.0
     light: Literal["day", "night"] = "day"
 
 

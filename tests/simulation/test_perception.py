@@ -1,13 +1,17 @@
-"""What bad weather keeps from an ADS, and for how long."""
+"""What bad weather keeps from an ADS, for how long, and how it makes it hesitate."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from safevar_sumo.records import Command
 from safevar_sumo.scenarios.base import Scene
+from safevar_sumo.simulation import assemble, simulate
 from safevar_sumo.simulation.perception import Perception
-from safevar_sumo.study import Weather
+from safevar_sumo.study import Weather, load_study
 
 STEP = 0.05
 TIMES = np.arange(12) * STEP
@@ -41,3 +45,32 @@ def test_what_appears_between_two_steps_is_not_there_yet() -> None:
     gaps = [perception.observe(time, nothing, Scene(np.array([gap]), nothing, nothing, nothing > 0)).gap[0]
             for time, gap in zip(TIMES.tolist(), [np.inf, np.inf, 5.0, 4.0], strict=False)]
     assert gaps == pytest.approx([np.inf, np.inf, np.inf, 4.6])
+
+
+def pressed(hesitation: float, wanted: list[float]) -> list[float]:
+    """How hard one vehicle brakes that wants to brake so hard."""
+    perception = Perception(Weather(name="any", road_friction=1.0, visibility=1.0, hesitation=hesitation), STEP)
+    return [float(perception.braked(Command(np.ones(1), np.array([brake]))).brake[0]) for brake in wanted]
+
+
+def test_who_hesitates_brakes_later_and_lets_go_at_once() -> None:
+    wanted = [0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.2, 0.0, 0.0]
+    assert pressed(0.0, wanted) == wanted
+    assert pressed(0.1, wanted) == [0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.2, 0.0, 0.0]
+    assert pressed(0.12, wanted) == pytest.approx([0.0, 0.0, 0.0, 0.0, 0.6, 1.0, 1.0, 0.2, 0.0, 0.0])
+
+
+def test_who_brakes_from_the_start_goes_on() -> None:
+    assert pressed(0.2, [0.3, 0.3, 0.5]) == [0.3, 0.3, 0.3]
+
+
+def test_in_a_drive_the_accelerator_is_let_go_of_as_without_hesitation() -> None:
+    system = assemble(load_study("sun"))
+    hesitant = replace(system, weather=Weather(name="any", road_friction=1.0, visibility=1.0, hesitation=0.15))
+    original = system.characteristics.original[np.newaxis]
+    sure, unsure = (simulate(one, original).trace for one in (system, hesitant))
+    begins = int(np.argmax(sure.brake[:, 0] > 0))
+    assert int(np.argmax(unsure.brake[:, 0] > 0)) == begins + 3
+    assert np.array_equal(unsure.throttle[:begins + 3], sure.throttle[:begins + 3])
+    assert not unsure.throttle[begins:begins + 3].any()
+    assert unsure.gap.min() < sure.gap.min()

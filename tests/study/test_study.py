@@ -32,7 +32,7 @@ def test_rain_differs_from_sun_in_weather_alone() -> None:
     same = {"name": sun.name, "title": sun.title, "published": sun.published, "calibration": sun.calibration,
             "repeatability": sun.repeatability, "fit": sun.fit}
     assert msgspec.structs.replace(rain, weather=sun.weather, **same) == sun
-    assert set(rain.calibration) == {"weather.road_friction", "weather.recognition_delay"}
+    assert set(rain.calibration) == {"weather.recognition_delay", "weather.hesitation"}
 
 
 def variant(tmp_path: Path, old: str, new: str) -> str:
