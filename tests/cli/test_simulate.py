@@ -52,7 +52,7 @@ def test_sweeps_are_combined_over_the_base() -> None:
 def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them() -> None:
     told = simulate("rain", "--set", "tireFric=1.1", "--set", "mass=2600", "--set", "dragCoeff=0.301")
     assert "original" in told.stdout
-    assert "The original vehicle stops, with a safety degree of 1.86 m" in told.stdout
+    assert "The original vehicle stops, with a safety degree of 1.92 m" in told.stdout
     assert "less safe than the original" in told.stdout
     assert "note: dragCoeff = 0.301 is so near the original that the filter put 0.3 back" in told.stderr
     assert "changed vehicle" not in simulate("rain").stdout

@@ -18,7 +18,7 @@ NEAR = 0.05
 @pytest.mark.parametrize(("study", "within"), [
     ("sun", {"safety_degree": 0.05, "tet": 0.05, "tit": 0.05, "ave_dece": 0.05}),
     ("lgsvl", {"safety_degree": 0.05, "tet": 0.05, "tit": 0.05, "ave_dece": 0.05}),
-    ("rain", {"safety_degree": 0.40 / 2.2, "tet": 0.05, "tit": 0.16, "ave_dece": 0.06}),
+    ("rain", {"safety_degree": 0.40 / 2.2, "tet": 0.05, "tit": 0.15, "ave_dece": 0.05}),
 ])
 def test_the_original_vehicle_is_as_near_to_the_published_one_as_is_said(study: str, within: dict[str, float]) -> None:
     """Rain's published vehicle is one simulation, 0.3 to 0.4 m above its own neighbours."""
