@@ -52,8 +52,7 @@ class Search:
     def race(self, searches: Sequence[OneSearch]) -> None:
         """Successive halving (Jamieson and Talwalkar 2016) of all trials that are left.
 
-        Rounds have as many trials each, shared by half as many searches each time; the last has two. One that has had both the last
-        rounds hardly improves any more, so a wider race is worth more than a longer one.
+        Rounds have as many trials each, shared by half as many searches each time; the last has two, and the winner what is left over.
         """
         racing = list(searches)
         rounds = max(1, (len(racing) - 1).bit_length())
