@@ -7,7 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from safevar_sumo.records import Command
+from safevar_sumo.ads import ScalarAds
+from safevar_sumo.ads.guarded import GuardedAds, PerVehicle
+from safevar_sumo.plugins import Guard
+from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.simulation import assemble, simulate
 from safevar_sumo.simulation.perception import Perception
@@ -62,6 +65,36 @@ def test_who_hesitates_brakes_later_and_lets_go_at_once() -> None:
 
 def test_who_brakes_from_the_start_goes_on() -> None:
     assert pressed(0.2, [0.3, 0.3, 0.5]) == [0.3, 0.3, 0.3]
+
+
+class Careful:
+    """An ADS from outside that writes its commands into the same arrays again and again."""
+
+    def start(self, n: int, nominal: Nominal, step: float) -> Command:
+        return Command(np.zeros(n), np.zeros(n))
+
+    def drive(self, seen: Observation, memory: Command) -> tuple[Command, Command]:
+        memory.throttle[:], memory.brake[:] = np.where(seen.gap < 6, 0.0, 0.6), seen.gap < 6
+        return memory, memory
+
+
+class CarefulForOne(ScalarAds):
+    """The same for one vehicle."""
+
+    def drive(self, seen: Observation) -> tuple[float, float]:
+        return (0.0, 1.0) if seen.gap < 6 else (0.6, 0.0)
+
+
+def test_anybodys_ads_hesitates_whatever_it_does_with_its_arrays() -> None:
+    rain, guard = assemble(load_study("rain")), Guard("a test", "ads")
+    assert rain.weather.hesitation > 0
+    settings = np.tile(rain.characteristics.original, (3, 1))
+    guarded = GuardedAds(Careful(), guard), PerVehicle(CarefulForOne, guard)
+    many, each = (simulate(replace(rain, ads=ads), settings).trace for ads in guarded)
+    assert np.array_equal(many.brake, each.brake)
+    assert np.array_equal(many.speed, each.speed)
+    released, braked = (int(np.argmax(column)) for column in (many.gap[:, 0] < 6, many.brake[:, 0] == 1))
+    assert braked - released == np.ceil(rain.weather.hesitation / many.step)
 
 
 def test_in_a_drive_the_accelerator_is_let_go_of_as_without_hesitation() -> None:
