@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from safevar_sumo.cli.program import commands
+from safevar_sumo.study import load_study, study_names
 
 ROOT = Path(__file__).parents[1]
 PAGES = ["README.md", *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").rglob("*.md")))]
@@ -61,3 +62,11 @@ def test_every_command_that_a_page_names_exists() -> None:
     for page in PAGES:
         for command in re.findall(r"python -m safevar_sumo ([a-z]+)", (ROOT / page).read_text()):
             assert commands.get_command(None, command) is not None, f"{page}: {command}"  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", study_names())
+def test_every_shipped_characteristic_is_explained_in_its_study_and_in_the_glossary(name: str) -> None:
+    glossary = (ROOT / "docs" / "glossary.md").read_text()
+    for key, row in load_study(name).vehicle.characteristics.items():
+        assert row.meaning, key
+        assert f"| `{key}` | {row.meaning} | {row.counterpart} |" in glossary

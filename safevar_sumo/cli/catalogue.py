@@ -16,6 +16,7 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study, study_names
+from safevar_sumo.terminal.plain import print_meanings
 from safevar_sumo.terminal.simulation import print_names
 from safevar_sumo.vehicles import VEHICLES, CharacteristicSet
 
@@ -36,7 +37,8 @@ def _catalogue(studies: list[Study]) -> dict[str, Any]:
     for one in studies:
         vehicles.setdefault(one.vehicle.model, [
             {"name": member.name, "unit": member.unit, "original": member.original, "lower": member.lower, "upper": member.upper,
-             "threshold": member.threshold} for member in CharacteristicSet.of(one.vehicle.characteristics)])
+             "threshold": member.threshold, "meaning": member.meaning, "counterpart": member.counterpart}
+            for member in CharacteristicSet.of(one.vehicle.characteristics)])
     return {
         "studies": [{"name": one.name, "title": one.title, "vehicle": one.vehicle.model, "ads": one.ads.model,
                      "scenario": one.scenario.model, "weather": _weather_name(one)} for one in studies],
@@ -62,11 +64,15 @@ def _print_catalogue(console: Console, studies: list[Study]) -> None:
     catalogue = _catalogue(studies)
     studied = [(name, title, ", ".join(parts)) for name, title, *parts in map(dict.values, catalogue["studies"])]
     print_names(console, "Studies", studied, ("name", "title", "vehicle, ADS, scenario, weather"))
+    members: dict[str, CharacteristicSet] = {}
+    for one in studies:
+        members.setdefault(one.vehicle.model, CharacteristicSet.of(one.vehicle.characteristics))
     for vehicle in catalogue["vehicles"]:
         rows = [(row["name"], row["unit"], *(f"{row[key]:g}" for key in ("original", "lower", "upper", "threshold")))
                 for row in vehicle["characteristics"]]
         heads = ("characteristic", "unit", "original", "lower", "upper", "threshold")
         print_names(console, f"Vehicle {vehicle['name']}", rows, heads)
+        print_meanings(console, members[vehicle["name"]])
     numbers = ("road_friction", "visibility", "recognition_delay", "hesitation")
     weathers = [(row["name"], *(f"{row[key]:g}" for key in numbers), row["light"]) for row in catalogue["weathers"]]
     print_names(console, "Weathers", weathers, ("name", "friction", "visibility", "delay, s", "hesitates, s", "light"))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.study import Study, refuse_other_than_file, tables_of
+from safevar_sumo.study import WORDS, Study, refuse_other_than_file, tables_of
 
 MANIFEST = "manifest.json"
 FORMAT = 2
@@ -41,8 +41,11 @@ def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def fixed(study: Study) -> dict[str, Any]:
-    """What of a study's file every evaluation depends on."""
+    """Study keys that affect evaluations."""
     everything: dict[str, Any] = tables_of(study)
+    for characteristic in everything["vehicle"]["characteristics"].values():
+        for key in WORDS:
+            del characteristic[key]
     search = {key: value for key, value in everything["search"].items() if key not in FREE_OF_SEARCH}
     return {**{key: value for key, value in everything.items() if key not in FREE}, "search": search}
 

@@ -4,6 +4,7 @@ from safevar_sumo.study.files import refuse_other_than_file
 from safevar_sumo.study.mistakes import converted, invalid
 from safevar_sumo.study.reading import load_study
 from safevar_sumo.study.schema import (
+    WORDS,
     CharacteristicTable,
     FitTable,
     FreeParameter,
@@ -26,6 +27,6 @@ from safevar_sumo.study.schema import (
 from safevar_sumo.study.writing import check_writable, write_study
 
 __all__ = [
-    "CharacteristicTable", "FitTable", "FreeParameter", "MatrixTable", "MatrixTest", "MetricsTable", "ModelTable", "Origin", "SearchTable",
-    "Study", "StudyLike", "VehicleTable", "Weather", "check_writable", "converted", "foreign_names", "invalid", "label_of", "load_study",
-    "refuse_other_than_file", "study_names", "study_path", "tables_of", "write_study"]
+    "WORDS", "CharacteristicTable", "FitTable", "FreeParameter", "MatrixTable", "MatrixTest", "MetricsTable", "ModelTable", "Origin",
+    "SearchTable", "Study", "StudyLike", "VehicleTable", "Weather", "check_writable", "converted", "foreign_names", "invalid", "label_of",
+    "load_study", "refuse_other_than_file", "study_names", "study_path", "tables_of", "write_study"]

@@ -23,16 +23,26 @@ Parameters = dict[str, Any]
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
 OBJECTIVES = ("safety_degree", "f_diff", "f_num_diff")
 """What the published study minimises."""
+LONGEST_WORDS = 200
+"""Characters of what a characteristic is, in words."""
+WORDS = ("meaning", "counterpart")
+"""Keys of a characteristic that people read and no result depends on."""
 
 
 class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One row of the characteristics table; the quantities are in `unit`, a change counts `weight` times in f_diff."""
+    """One row of the characteristics table; the quantities are in `unit`, a change counts `weight` times in f_diff.
+
+    `meaning` is what the characteristic is, in words, which begin with a short name (up to the first comma or bracket);
+    `counterpart` is the part of a real vehicle that sets it. No result depends on either.
+    """
 
     unit: str
     original: float
     lower: float
     upper: float
     weight: Positive = 1.0
+    meaning: Annotated[str, Meta(max_length=LONGEST_WORDS)] = ""
+    counterpart: Annotated[str, Meta(max_length=LONGEST_WORDS)] = ""
 
 
 class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from safevar_sumo.answers import Because, Cause, Explained, Explanation, ask, changes, command, number_of, points_in_words, sentence
 from safevar_sumo.simulation import assemble
-from safevar_sumo.terminal.plain import WholeTable
+from safevar_sumo.terminal.plain import WholeTable, print_meanings
 from safevar_sumo.vehicles import CharacteristicSet
 
 CAUSES_SHOWN = 3
@@ -75,6 +75,7 @@ def _print_cause(console: Console, again: Again, cause: Cause, members: Characte
             values = (member.original, cause.changes[member.name], cause.boundary[member.name], cause.alone[member.name])
             table.add_row(escape(member.name), escape(member.unit), *(f"{value:.6g}" for value in values))
     console.print(table)
+    print_meanings(console, [member for member in members if member.name in cause.changes])
     _say(console, f"Still unsafe at {cause.fraction:.1%} of these changes, safe just below. {again(cause.changes)}")
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
+
+from safevar_sumo.vehicles import Characteristic
 
 
 class WholeTable(Table):
@@ -27,3 +31,13 @@ class WholeTable(Table):
 def plain(text: object, style: str = "") -> Text:
     """For a rich table or line; what cannot be printed becomes a question mark, or a space if it is one."""
     return Text("".join(sign if sign.isprintable() else " " if sign.isspace() else "?" for sign in str(text)), style)
+
+
+def print_meanings(console: Console, members: Iterable[Characteristic]) -> None:
+    """What characteristics are, a line for each that the study has words for."""
+    table = Table.grid(padding=(0, 2))
+    for member in members:
+        if member.words:
+            table.add_row(plain(member.name), plain(member.words))
+    if table.row_count:
+        console.print(table)

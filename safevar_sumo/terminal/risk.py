@@ -8,8 +8,9 @@ from rich.console import Console
 from rich.markup import escape
 
 from safevar_sumo.answers import Risk
-from safevar_sumo.terminal.plain import WholeTable
+from safevar_sumo.terminal.plain import WholeTable, print_meanings
 from safevar_sumo.variation import Uniform
+from safevar_sumo.vehicles import CharacteristicSet
 
 
 def print_risk(console: Console, told: Risk) -> None:
@@ -34,6 +35,7 @@ def print_risk(console: Console, told: Risk) -> None:
     console.print(table)
     if told.sensitivity_of_unsafe["total"].isna().all():
         _say(console, "Too few settings are unsafe, or safe, to tell what decides that; the safety degree tells more.")
+    print_meanings(console, CharacteristicSet.of(told.study.vehicle.characteristics))
     console.print(f"Sobol indices, first order and total, with half of their {told.confidence:.0%} intervals.", highlight=False)
 
 

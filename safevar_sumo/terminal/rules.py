@@ -5,6 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 
 from safevar_sumo.answers import Rules, rule_in_words
+from safevar_sumo.terminal.plain import print_meanings
 from safevar_sumo.vehicles import CharacteristicSet
 
 
@@ -20,6 +21,7 @@ def print_rules(console: Console, told: Rules) -> None:
     for rule in told.rules:
         _say(console, f"- {rule_in_words(rule, members, told.unsafe)}")
     if told.rules:
+        print_meanings(console, [member for member in members if any(member.name in rule.limits for rule in told.rules)])
         _say(console, f"Judged on settings that the rules were not made from; in brackets {told.rules[0].confidence:.0%} intervals.")
 
 

@@ -11,13 +11,15 @@ from safevar_sumo.api import Simulation
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study
-from safevar_sumo.terminal.plain import WholeTable, plain
+from safevar_sumo.terminal.plain import WholeTable, plain, print_meanings
 from safevar_sumo.vehicles import CharacteristicSet
 
 
 def print_simulation(console: Console, found: Simulation) -> None:
     """A setting beside the original vehicle: what was simulated, how it ended, metrics and objectives, a verdict."""
     _print_setting(console, found)
+    members = CharacteristicSet.of(found.study.vehicle.characteristics)
+    print_meanings(console, [member for member in members if found.setting[member.name] != member.original])
     records = (found.original.record(), found.record())
     table = WholeTable()
     table.add_column("result")

@@ -9,7 +9,7 @@ from rich.markup import escape
 
 from safevar_sumo.answers import Tolerance
 from safevar_sumo.answers.alone import Alone
-from safevar_sumo.terminal.plain import WholeTable
+from safevar_sumo.terminal.plain import WholeTable, print_meanings
 from safevar_sumo.vehicles import Characteristic
 
 PAIRS_SHOWN = 12
@@ -23,6 +23,7 @@ def print_tolerance(console: Console, told: Tolerance) -> None:
     _say(console, told.verdict)
     console.print(_alone(told))
     _say(console, "* the end of the domain: nothing beyond was looked at.")
+    print_meanings(console, [one.characteristic for one in told.alone])
     if told.pairs:
         _print_pairs(console, told)
     box = told.joint

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from safevar_sumo.errors import InputError, one_of
@@ -22,7 +24,10 @@ FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
 
 @dataclass(frozen=True, kw_only=True)
 class Characteristic:
-    """One characteristic of the vehicle under test; all quantities in `unit`. A change counts `weight` times in f_diff."""
+    """One characteristic of the vehicle under test; all quantities in `unit`. A change counts `weight` times in f_diff.
+
+    `meaning` is what it is, in words, and `counterpart` what sets it in a real vehicle; empty where the study does not say.
+    """
 
     name: str
     unit: str
@@ -30,6 +35,19 @@ class Characteristic:
     lower: float
     upper: float
     weight: float = 1.0
+    meaning: str = ""
+    counterpart: str = ""
+
+    @property
+    def short_name(self) -> str:
+        """Its meaning up to the first comma or bracket, such as `engine drag`; its name where the study gives no meaning."""
+        return re.split(r"[,;(]", self.meaning)[0].strip() or self.name
+
+    @property
+    def words(self) -> str:
+        """Meaning and counterpart in one line; empty where the study gives neither."""
+        part = f"counterpart: {self.counterpart}" if self.counterpart else ""
+        return "; ".join(text for text in (self.meaning, part) if text)
 
     @property
     def threshold(self) -> float:
@@ -80,7 +98,7 @@ class CharacteristicSet:
     def of(cls, table: Mapping[str, CharacteristicTable]) -> CharacteristicSet:
         """Take the characteristics of a study's table, in its order."""
         return cls(tuple(
-            Characteristic(name=name, unit=row.unit, original=row.original, lower=row.lower, upper=row.upper, weight=row.weight)
+            Characteristic(name=name, **msgspec.structs.asdict(row))
             for name, row in table.items()))
 
     def __len__(self) -> int:

@@ -38,6 +38,15 @@ def test_other_numbers_of_a_weather_are_another_study() -> None:
     assert identity_of(one, assemble(one)) != identity_of(other, assemble(other))
 
 
+def test_what_a_characteristic_means_is_no_part_of_a_studys_identity() -> None:
+    study = load_study("native")
+    bare = {name: msgspec.structs.replace(row, meaning="", counterpart="") for name, row in study.vehicle.characteristics.items()}
+    other = msgspec.structs.replace(study, vehicle=msgspec.structs.replace(study.vehicle, characteristics=bare))
+    assert study.vehicle.characteristics["mass"].meaning
+    assert identity_of(other, assemble(other)) == identity_of(study, assemble(study))
+    assert not {"meaning", "counterpart"} & set(identity_of(study, assemble(study))["resolved"]["vehicle"]["characteristics"]["mass"])
+
+
 @pytest.mark.parametrize("layer", ["network", "sources", "code"])
 def test_a_worker_with_another_file_computes_nothing(layer: str) -> None:
     study = load_study("native")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from io import StringIO
 
 import pytest
@@ -44,3 +45,11 @@ def test_every_name_of_the_list_can_be_read_and_typed() -> None:
         study = load_study(name)
         for text in (name, study.vehicle.model, study.ads.model, study.scenario.model, *study.vehicle.characteristics):
             assert text in told
+
+
+@pytest.mark.parametrize("command", [["list"], ["simulate", "native", "--set", "brakeGain=0.8"]])
+def test_what_a_characteristic_is_stands_with_its_name(command: list[str]) -> None:
+    done = CliRunner().invoke(commands, command, catch_exceptions=False)
+    gain = load_study("native").vehicle.characteristics["brakeGain"]
+    assert f"brakeGain {gain.meaning}; counterpart: {gain.counterpart}" in re.sub(r"\s+", " ", done.stdout)
+    assert command == ["list"] or "reactionTime age" not in re.sub(r"\s+", " ", done.stdout), "of what is changed alone"
