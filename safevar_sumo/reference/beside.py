@@ -10,6 +10,7 @@ import pandas as pd
 
 from safevar_sumo.analysis import answer
 from safevar_sumo.analysis.case import Case, Unanswerable
+from safevar_sumo.analysis.questions import Answer
 from safevar_sumo.analysis.rq3 import by_number, changes, critical
 from safevar_sumo.errors import InputError
 
@@ -77,8 +78,9 @@ def tables_beside(pairs: Pairs) -> list[Beside]:
     sides = [{one.name: one for one in answer(cases)} for cases in (pairs.here, pairs.there)]
     found = []
     for name, keys in KEYS.items():
-        frames = [_shares(cases) for cases in pairs[:2]] if name == "rq3.1" else [side[name].frame for side in sides]
-        notes = [f"{side}: {note}" for side, answers in zip((HERE, THERE), sides, strict=True) for note in answers[name].notes]
+        answers = [side.get(name, Answer(name, pd.DataFrame(), ())) for side in sides]  # a footer is missing with its table
+        frames = [_shares(cases) for cases in pairs[:2]] if name == "rq3.1" else [one.frame for one in answers]
+        notes = [f"{side}: {note}" for side, one in zip((HERE, THERE), answers, strict=True) for note in one.notes]
         frames = [_with_places(frame) for frame in frames]
         if any(frame.empty for frame in frames):
             lacking = [side for side, frame in zip((HERE, THERE), frames, strict=True) if frame.empty]

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import pandas as pd
 
+from safevar_sumo.analysis.case import NSGA2
 from safevar_sumo.reference.beside import HERE, THERE, Beside, Pairs, paired, tables_beside
 from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, RULES, Conclusion, conclusions
 from safevar_sumo.reference.nearness import NEIGHBOURS, Nearness
@@ -18,6 +19,8 @@ TITLES = {
     "rq3.2": "RQ3.2: which characteristics are changed [% of the critical solutions]", "rq3.3": "RQ3.3: how large the changes are",
     "rq3.3-safety": "RQ3.3: what they do to safety", "collisions": "Collisions", "combinations": "Four changed together",
     "weather": "One weather against another"}
+
+NOT_COMPARED = ": RQ2, RQ3 and the weathers are about them and are not compared"
 
 
 def replication(pairs: Pairs, near: Sequence[Nearness]) -> str:
@@ -40,7 +43,7 @@ def _head(pairs: Pairs, found: Sequence[Conclusion]) -> str:
     lines += [f"- {name}: results here, none published given." for name in pairs.only_here]
     lines += [f"- {name}: published results given, none here." for name in pairs.only_there]
     for here, there in zip(pairs.here, pairs.there, strict=True):
-        lines += [f"- {here.study.name}: no solutions of {name} {side}."
+        lines += [f"- {here.study.name}: no solutions of {name} {side}{NOT_COMPARED if name == NSGA2 else ''}."
                   for side, one, other in ((THERE, here, there), (HERE, there, here))
                   for name in one.algorithms if name not in other.algorithms]
     lines += [f"- {note}" for case in pairs.here for note in case.remarks]
