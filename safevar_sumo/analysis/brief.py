@@ -1,47 +1,50 @@
-"""RQ1 and RQ2 in a few lines, for the end of a study."""
+"""RQ1 and RQ2 over runs in a few lines, for the end of a study."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any
 
 import pandas as pd
 
 from safevar_sumo.analysis.case import ALGORITHM_TITLES, Case, Unanswerable
-from safevar_sumo.analysis.inference import ALPHA, too_few
-from safevar_sumo.analysis.layout import titles_of
-from safevar_sumo.analysis.quality import MORE_IS_BETTER
-from safevar_sumo.analysis.rq1 import rq1
-from safevar_sumo.analysis.rq2 import rq2
+from safevar_sumo.analysis.inference import ALPHA
+from safevar_sumo.analysis.over_runs import difference_line, fewest_runs, rq1_runs, rq2_runs
+from safevar_sumo.analysis.quality import titles_of
+
+QUESTIONS: Mapping[str, tuple[Callable[[Case], pd.DataFrame], str, str]] = {
+    "RQ1": (rq1_runs, "algorithm", "runs are more unsafe than the original if below 0.5 (A12)"),
+    "RQ2": (rq2_runs, "baseline", "NSGA-II's runs are better than the other's if above 0.5 (A12)")}
 
 
 def brief(case: Case) -> list[str]:
-    """One line for each algorithm and baseline: effect sizes, and an asterisk where p says that they are no chance.
+    """For each algorithm and baseline the effect sizes over runs, an asterisk where significant; and what differs from pooling.
 
-    Indicators are of runs: of too few to be told apart they say nothing.
+    Of too few runs no difference can be significant: then the line says so.
     """
-    lines, titles = [], titles_of(case.scoring.metrics)
-    asked = ((rq1, "algorithm", "RQ1: more unsafe than the original if below 0.5 (A12)"),
-             (rq2, "baseline", "RQ2: NSGA-II better than the other if above 0.5 (A12)"))
-    for ask, who, title in asked:
+    titles = titles_of(case.scoring.metrics)
+    lines, enough = [], False
+    for question, (ask, who, title) in QUESTIONS.items():
         try:
             frame = ask(case)
         except Unanswerable as error:
-            lines.append(f"{title.partition(':')[0]}: {error.problem}.")
+            lines.append(f"{question}: {error.problem}.")
             continue
-        lines.append(f"{title}; * p < {ALPHA:g}")
-        for name, of_it in frame.groupby(who, sort=False):
-            rows = of_it.to_dict("records")
-            few = [titles[row["metric"]] for row in rows if _says_nothing(row)]
-            told = [_effect(titles[row["metric"]], row["effect_size"], row["p_value"]) for row in rows if not _says_nothing(row)]
-            unsaid = f"; {', '.join(few)}: too few runs" if few else ""
-            lines.append(f"  {ALGORITHM_TITLES.get(str(name), name)}: {', '.join(told)}{unsaid}")
-    return lines
+        lines.append(f"{question}: {title}; * p < {ALPHA:g} after Holm's correction")
+        for name, rows_of_one in frame.groupby(who, sort=False):
+            rows = rows_of_one.to_dict("records")
+            defined = [row for row in rows if row["effect_size"] is not None]
+            few = [titles[row["metric"]] for row in defined if _runs(row) < fewest_runs(question)]
+            enough = enough or len(few) < len(defined)
+            subject = "" if len(few) == len(defined) else f"{', '.join(few)}: "
+            note = f"; {subject}too few runs for a test ({fewest_runs(question)} are needed)" if few else ""
+            effects = ", ".join(_effect(titles[row["metric"]], row["effect_size"], row["p_holm"]) for row in rows)
+            lines.append(f"  {ALGORITHM_TITLES.get(str(name), name)}: {effects}{note}")
+    return [*lines, difference_line(case)] if enough else lines
 
 
-def _says_nothing(row: dict[Hashable, Any]) -> bool:
-    """Whether these are indicators of too few runs."""
-    return row["metric"] in MORE_IS_BETTER and bool(row["n1"] and row["n2"]) and too_few(row["n1"], row["n2"])
+def _runs(row: Mapping[Hashable, Any]) -> int:
+    return int(row["runs"] if "runs" in row else min(row["n1"], row["n2"]))
 
 
 def _effect(title: str, effect: float | None, p: float | None) -> str:

@@ -10,17 +10,20 @@ import pandas as pd
 
 from safevar_sumo.analysis.case import ALGORITHM_TITLES
 from safevar_sumo.analysis.inference import ALPHA, ASYMPTOTIC, EXACT, NOTABLE
+from safevar_sumo.analysis.over_runs import ASYMPTOTIC_SIGNED, EXACT_SIGNED
+from safevar_sumo.analysis.quality import titles_of
 from safevar_sumo.analysis.questions import SAFETY, Answer
 from safevar_sumo.analysis.rq3 import ANY
 from safevar_sumo.metrics import MetricFacts
 
 UNDEFINED = "-"
-INDICATOR_TITLES = {"igd": "IGD", "igd_plus": "IGD+", "hypervolume": "HV"}
 SAFETY_UNITS = {"avgSD_mD": "avgSD_mD [m]", "avgSD_cS": "avgSD_cS [m/s]", "TET": "TET [s]", "TIT": "TIT [s^2]",
                 "aveDece": "aveDece [m/s^2]"}
 PAPER_NUMBERS = ("2", "3", "4", "5", "6")
 """The numbers of changed characteristics that the paper's table of RQ3.3 has."""
 BOLD_NOTE = f"Bold (or *): p < {ALPHA:g}; an effect size of medium or large magnitude."
+
+HOLM_NOTE = f"Bold (or *): p < {ALPHA:g} after Holm's correction for all tests of a setting's RQ1 and RQ2; A12 medium or large."
 
 
 class Bold(str):
@@ -50,11 +53,6 @@ def lay_out(answer: Answer, layouts: Layouts | None = None) -> list[Table]:
         return [Table(TITLES[answer.name], (), [], 0, (), answer.notes)]
     tables = (layouts or LAYOUTS)[answer.name](answer)
     return [*tables[:-1], tables[-1]._replace(notes=(*tables[-1].notes, *answer.notes))]
-
-
-def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
-    """What metrics and quality indicators are called in tables, by name."""
-    return {**INDICATOR_TITLES, **{metric.name: metric.title for metric in metrics}}
 
 
 def units_note(metrics: Iterable[MetricFacts]) -> str:
@@ -113,6 +111,40 @@ def _rq2(answer: Answer) -> list[Table]:
     return [_tests(answer, "baseline", (
         "A12 above 0.5: NSGA-II is better; IGD, IGD+, HV: run against run, the others: pooled solutions.",
         non_collision_note(answer.metrics), "IGD on the objectives as they are, IGD+ and hypervolume (HV) on normalised ones."))]
+
+
+def _over_runs(answer: Answer, who: str, sizes: tuple[str, ...], notes: tuple[str, ...]) -> list[Table]:
+    """Tests over runs: p as it is and corrected, effect sizes, cases side by side."""
+    frame, titles = answer.frame, titles_of(answer.metrics)
+    cases = list(dict.fromkeys(frame["setting"]))
+    cells = {(row[who], row["metric"], row["setting"]): row for row in frame.to_dict("records")}
+    parts = ("p", "p Holm", "A12", "magnitude", *sizes)
+    rows = [(algorithm_title(algorithm), titles[metric],
+             *(cell for case in cases for cell in _test_over_runs(cells.get((algorithm, metric, case)), sizes)))
+            for algorithm, metric in dict.fromkeys(zip(frame[who], frame["metric"], strict=True))]
+    methods = [f"p: {method}." for method in (EXACT_SIGNED, ASYMPTOTIC_SIGNED, EXACT, ASYMPTOTIC) if method in set(frame["method"])]
+    return [Table(TITLES[answer.name], (who, "metric", *parts * len(cases)), rows, 2, tuple((case, len(parts)) for case in cases),
+                  (*methods, *notes, HOLM_NOTE))]
+
+
+def _test_over_runs(row: Mapping[Any, Any] | None, sizes: tuple[str, ...]) -> tuple[str, ...]:
+    if row is None or pd.isna(row["p_value"]):
+        return (UNDEFINED,) * (4 + len(sizes))
+    corrected, effect = p_value(row["p_holm"]), f"{row['effect_size']:.3f}"
+    return (p_value(row["p_value"]), Bold(corrected) if row["p_holm"] < ALPHA else corrected,
+            Bold(effect) if row["magnitude"] in NOTABLE else effect, row["magnitude"], *(str(row[size]) for size in sizes))
+
+
+def _rq1_runs(answer: Answer) -> list[Table]:
+    return _over_runs(answer, "algorithm", ("runs",), (
+        "One mean for each run against the original vehicle's value; A12 below 0.5: the runs are more unsafe.",
+        non_collision_note(answer.metrics)))
+
+
+def _rq2_runs(answer: Answer) -> list[Table]:
+    return _over_runs(answer, "baseline", ("n1", "n2"), (
+        "One value for each run (SD and the like: the mean of its solutions); A12 above 0.5: NSGA-II is better.",
+        non_collision_note(answer.metrics)))
 
 
 def _rq31(frame: pd.DataFrame) -> list[Table]:
@@ -241,6 +273,8 @@ WEATHER_COLUMNS = {"percent": ".1f", "percent_other": ".1f", "difference": "+.1f
 TITLES = {
     "rq1": "RQ1: found settings against the original vehicle",
     "rq2": "RQ2: NSGA-II against the other algorithms",
+    "rq1-runs": "RQ1 over runs: run means against the original vehicle",
+    "rq2-runs": "RQ2 over runs: NSGA-II's runs against those of the other algorithms",
     "rq3.1": "RQ3.1: number of changed characteristics",
     "rq3.2": "RQ3.2: % of critical solutions in which a characteristic is changed",
     "rq3.3": "RQ3.3: size of changes",
@@ -257,7 +291,7 @@ def of_frame(layout: Callable[[pd.DataFrame], list[Table]]) -> Layout:
 
 
 LAYOUTS: Layouts = {
-    "rq1": _rq1, "rq2": _rq2,
+    "rq1": _rq1, "rq2": _rq2, "rq1-runs": _rq1_runs, "rq2-runs": _rq2_runs,
     **{name: of_frame(layout) for name, layout in {
         "rq3.1": _rq31, "rq3.2": _rq32, "rq3.3": _rq33, SAFETY: _safety, "collisions": _collisions, "combinations": _combinations,
         "weather": _weather}.items()}}

@@ -8,7 +8,8 @@ from typing import Any
 import pandas as pd
 
 from safevar_sumo.analysis.inference import ALPHA, NOTABLE
-from safevar_sumo.analysis.layout import LAYOUTS, TITLES, UNDEFINED, Bold, Layouts, Table, algorithm_title, of_frame, p_value, titles_of
+from safevar_sumo.analysis.layout import LAYOUTS, TITLES, UNDEFINED, Bold, Layouts, Table, algorithm_title, of_frame, p_value
+from safevar_sumo.analysis.quality import titles_of
 from safevar_sumo.analysis.questions import Answer
 
 MARK = "x"

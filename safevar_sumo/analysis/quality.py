@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import moocore
@@ -10,11 +11,18 @@ import pandas as pd
 
 from safevar_sumo.analysis.case import Case, Unanswerable
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import FloatArray
 
 MORE_IS_BETTER = {"igd": False, "igd_plus": False, "hypervolume": True}
+INDICATOR_TITLES = {"igd": "IGD", "igd_plus": "IGD+", "hypervolume": "HV"}
 WORST = 1.1
 """Each coordinate of hypervolume's reference point, on objectives normalised to 0..1: the nadir, a tenth further away."""
+
+
+def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
+    """What metrics and quality indicators are called in tables, by name."""
+    return {**INDICATOR_TITLES, **{metric.name: metric.title for metric in metrics}}
 
 
 def nondominated(points: FloatArray) -> FloatArray:

@@ -10,6 +10,7 @@ import pandas as pd
 from safevar_sumo.analysis import discussion
 from safevar_sumo.analysis.case import NSGA2, Case, Unanswerable, counted
 from safevar_sumo.analysis.discussion import combinations
+from safevar_sumo.analysis.over_runs import difference_line, rq1_runs, rq2_runs
 from safevar_sumo.analysis.rq1 import rq1
 from safevar_sumo.analysis.rq2 import rq2
 from safevar_sumo.analysis.rq3 import critical, rq31, rq32, rq33, rq33_safety
@@ -23,6 +24,8 @@ SAFETY = "rq3.3-safety"
 OF_A_CASE: Mapping[str, Callable[[Case], Frames]] = {
     "rq1": lambda case: {"rq1": rq1(case)},
     "rq2": lambda case: {"rq2": rq2(case)},
+    "rq1-runs": lambda case: {"rq1-runs": rq1_runs(case)},
+    "rq2-runs": lambda case: {"rq2-runs": rq2_runs(case)},
     "rq3.1": lambda case: {"rq3.1": rq31(case)},
     "rq3.2": lambda case: {"rq3.2": rq32(case)},
     "rq3.3": lambda case: {"rq3.3": rq33(case), SAFETY: rq33_safety(case)},
@@ -99,6 +102,8 @@ def _notes(question: str, case: Case) -> list[str]:
         lacking = [name for name, value in case.original.items() if pd.isna(value)]
         if lacking:
             notes.append(f"{case.name}: the original vehicle's {', '.join(lacking)} is undefined, nothing is compared with it.")
+    if question in ("rq1-runs", "rq2-runs"):
+        notes.append(f"{case.name}: {difference_line(case)}")
     if question == "rq2" and not case.has_runs:
         notes.append(f"{case.name}: igd, igd_plus and hypervolume need runs, which imported solutions do not have.")
     if question == "rq2" and case.has_runs:

@@ -9,12 +9,15 @@ from typing import Any
 import msgspec
 import pandas as pd
 import pytest
+import scipy
 from made_up import CHARACTERISTICS, ORIGINAL, UNCHANGED, made_up, made_up_study, row
 
 from safevar_sumo.analysis import answer
 from safevar_sumo.analysis.brief import brief
 from safevar_sumo.analysis.case import Unanswerable
 from safevar_sumo.analysis.discussion import collisions, combinations, effects, weather, weather_pairs
+from safevar_sumo.analysis.inference import ALPHA
+from safevar_sumo.analysis.over_runs import difference_line, holm, rq1_runs, rq2_runs
 from safevar_sumo.analysis.rq1 import rq1
 from safevar_sumo.analysis.rq2 import rq2
 from safevar_sumo.analysis.rq3 import critical, rq31, rq32, rq33, rq33_safety
@@ -256,9 +259,31 @@ def test_unfinished_campaigns_say_so() -> None:
 
 
 def test_the_brief_lines_say_what_the_data_allows() -> None:
-    lines = brief(made_up(*(row(sd=1 - i / 100) for i in range(20)), *(row("rs", sd=1.5 + i / 100) for i in range(20))))
-    assert any("NSGA-II: SD 0.00*" in line for line in lines)
-    assert any("RS: SD 1.00*" in line and "; IGD, IGD+, HV: too few runs" in line for line in lines)
-    five = made_up(*(row(name, run=run, sd=sd + run / 10) for name, sd in (("nsga2", 1.0), ("rs", 2.0)) for run in range(5)))
-    assert any("RS: IGD " in line and "too few" not in line for line in brief(five))
+    five = made_up(*(row(name, run=run, sd=sd + run / 10) for name, sd in (("nsga2", 1.0), ("rs", 2.5)) for run in range(5)))
+    lines = brief(five)
+    assert any("NSGA-II: SD 0.00, " in line and line.endswith("too few runs for a test (8 are needed)") for line in lines)
+    assert any("RS: IGD " in line and "too few" not in line for line in lines), "five runs against five can differ significantly"
     assert any("RQ2: has finished runs of nsga2 alone" in line for line in brief(made_up(row())))
+
+
+def test_holms_correction_of_a_worked_example() -> None:
+    corrected = holm([0.01, None, 0.04, 0.03, 0.005])
+    assert [p and round(p, 12) for p in corrected] == [0.03, None, 0.06, 0.06, 0.02]
+
+
+def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
+    """Runs of 40 copies each: pooled, rank tests see 320 against 320 values; over runs they see the 8 against 8 that there are."""
+    ours, theirs = [1.0, 1.1, 1.2, 1.3, 1.4, 1.6, 1.7, 2.2], [1.5, 1.8, 1.9, 2.3, 2.4, 2.5, 2.6, 2.7]
+    rows = [row(name, run=run, sd=sd, values=(1100.0 + run, 2.0, 0.1))
+            for name, degrees in (("nsga2", ours), ("rs", theirs)) for run, sd in enumerate(degrees) for _ in range(40)]
+    case = made_up(*rows)
+    (paper,), (runs,) = (frame[frame["metric"] == "safety_degree"].to_dict("records") for frame in (rq2(case), rq2_runs(case)))
+    assert paper["p_value"] < 1e-30
+    assert (runs["n1"], runs["n2"]) == (8, 8)
+    assert runs["effect_size"] == 1 - (0 + 0 + 0 + 0 + 0 + 1 + 1 + 3) / 64
+    assert runs["p_value"] == scipy.stats.mannwhitneyu(ours, theirs, method="exact").pvalue > ALPHA / 10
+    assert "RQ2 RS SD loses its star" in difference_line(case)
+    (original,) = (one for one in rq1_runs(case).to_dict("records") if (one["algorithm"], one["metric"]) == ("nsga2", "safety_degree"))
+    assert original["p_value"] == 2 * 2 / 2**8, "signed ranks of which all but the smallest are negative: the second of 2^8 orders"
+    assert original["effect_size"] == 1 / 8
+    assert original["p_holm"] >= original["p_value"] * 2

@@ -143,7 +143,8 @@ def test_json_records_have_the_promised_keys(question: str, keys: set[str]) -> N
 
 def test_several_tables_in_one_json_tell_which_they_are() -> None:
     records = json.loads(as_json(answer([rich_setting()])))
-    assert {one["table"] for one in records} == {"rq1", "rq2", "rq3.1", "rq3.2", "rq3.3", "rq3.3-safety", "collisions"}
+    assert {one["table"] for one in records} == {
+        "rq1", "rq2", "rq1-runs", "rq2-runs", "rq3.1", "rq3.2", "rq3.3", "rq3.3-safety", "collisions"}
 
 
 def test_csv_holds_the_numbers_of_the_json() -> None:
