@@ -18,22 +18,19 @@ from safevar_sumo.answers.unsafe import Unsafe
 from safevar_sumo.answers.where import where
 from safevar_sumo.answers.whose import whose_failures
 from safevar_sumo.computing import Pool
+from safevar_sumo.options import ExplainOptions
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import Handle
 from safevar_sumo.simulation import assemble
 from safevar_sumo.study import Study
 
-TOP = 8
-"""Failures that are explained in full, if nobody says how many."""
-LIMIT = 40_000
-"""Simulations, about, that the minimal causes of all failures may take; of more failures a random sample is looked into."""
 REASONS = {"fewest": "fewest changes", "smallest": "smallest changes", "most_severe": "most severe"}
 Causes = Mapping[int, list[MinimalCause]]
 Reasons = tuple[str, ...]
 
 
-def explain(source: Study | Case, *, solutions: Sequence[str] = (), unsafe: str | None = None, top: int = TOP, limit: int = LIMIT,
-            pool: Pool | None = None, jobs: int | None = None, progress: Progress = silent) -> Explained:
+def explain(source: Study | Case, *, solutions: Sequence[str] = (), unsafe: str | None = None, top: int = ExplainOptions.top,
+            limit: int = ExplainOptions.limit, pool: Pool | None = None, jobs: int | None = None, progress: Progress = silent) -> Explained:
     """Explain the failures that matter among the solutions of results, or among settings all over a study's domain.
 
     Parameters
@@ -59,6 +56,7 @@ def explain(source: Study | Case, *, solutions: Sequence[str] = (), unsafe: str 
     InputError
         If `unsafe` or a handle cannot be read, or the study cannot be assembled.
     """
+    ExplainOptions(solutions=tuple(solutions), unsafe=unsafe, top=top, limit=limit)
     study = source if isinstance(source, Study) else source.study
     means, named = Unsafe.given(unsafe), [Handle.parse(text) for text in solutions]
     limit //= len(assemble(study).points)

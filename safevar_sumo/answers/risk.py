@@ -16,9 +16,9 @@ from safevar_sumo.answers.unsafe import Unsafe, usual_in
 from safevar_sumo.answers.world import World
 from safevar_sumo.computing import Pool
 from safevar_sumo.errors import SimulationError
+from safevar_sumo.options import RiskOptions
 from safevar_sumo.study import Study
 
-SAMPLES, CONFIDENCE = 10_000, 0.95
 CHUNK = 1000
 """Samples after which the interval is looked at."""
 
@@ -75,8 +75,8 @@ def interval_of(count: int, number: int, confidence: float) -> tuple[float, floa
     return float(found.low), float(found.high)
 
 
-def risk(study: Study, *, samples: int = SAMPLES, confidence: float = CONFIDENCE, width: float | None = None, unsafe: str | None = None,
-         pool: Pool | None = None, jobs: int | None = None, progress: Progress = silent) -> Risk:
+def risk(study: Study, *, samples: int = RiskOptions.samples, confidence: float = RiskOptions.confidence, width: float | None = None,
+         unsafe: str | None = None, pool: Pool | None = None, jobs: int | None = None, progress: Progress = silent) -> Risk:
     """Estimate the probability of an unsafe outcome. Nothing is filtered: this is about vehicles, not about a search.
 
     Parameters
@@ -97,6 +97,7 @@ def risk(study: Study, *, samples: int = SAMPLES, confidence: float = CONFIDENCE
     InputError
         If a distribution of the study is impossible, or as in `tolerance`.
     """
+    RiskOptions(samples=samples, confidence=confidence, width=width, unsafe=unsafe)
     means, world = Unsafe.given(unsafe), World(study)
     rng = np.random.default_rng(study.search.seed)
     count = failures = errors = 0

@@ -15,15 +15,16 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.answers.bench import Bench, Progress, open_bench, silent
-from safevar_sumo.answers.risk import CONFIDENCE, interval_of
+from safevar_sumo.answers.risk import interval_of
 from safevar_sumo.answers.unsafe import Unsafe, spread, usual_in
 from safevar_sumo.computing import Pool
+from safevar_sumo.options import RulesOptions
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
-SAMPLES = 16_384
-"""Settings over the whole domain: half of them to make rules from, half to judge them."""
+CONFIDENCE = 0.95
+"""Of the intervals of a rule's shares."""
 FEWEST = 10
 """Unsafe and safe settings that rules can be made from."""
 FOLDS, DEEPEST, PRUNINGS = 5, 6, 24
@@ -104,8 +105,8 @@ class Rules:
         return f"<Rules of {self.study.name}, unsafe {self.unsafe}: {share} settings, {len(self.rules)} rules>"
 
 
-def rules(study: Study, *, samples: int = SAMPLES, unsafe: str | None = None, pool: Pool | None = None, jobs: int | None = None,
-          progress: Progress = silent) -> Rules:
+def rules(study: Study, *, samples: int = RulesOptions.samples, unsafe: str | None = None, pool: Pool | None = None,
+          jobs: int | None = None, progress: Progress = silent) -> Rules:
     """Find rules that tell where a study is unsafe, from settings spread evenly over the whole domain.
 
     Parameters
@@ -120,6 +121,7 @@ def rules(study: Study, *, samples: int = SAMPLES, unsafe: str | None = None, po
     InputError
         As in `safevar_sumo.answers.tolerance`.
     """
+    RulesOptions(samples=samples, unsafe=unsafe)
     means, members = Unsafe.given(unsafe), CharacteristicSet.of(study.vehicle.characteristics)
     with open_bench(study, pool, jobs, progress) as bench:
         means = means or usual_in(bench, bench.original())

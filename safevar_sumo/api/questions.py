@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from safevar_sumo.api.results import Results, study_of, study_or_case
+from safevar_sumo.options import ExplainOptions, RiskOptions, RulesOptions
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
@@ -13,8 +14,8 @@ if TYPE_CHECKING:
     from safevar_sumo.computing import Pool
 
 
-def explain(source: StudyLike | Results, *, solutions: Sequence[str] = (), unsafe: str | None = None, top: int = 8,
-            pool: Pool | None = None, jobs: int | None = None) -> Explained:
+def explain(source: StudyLike | Results, *, solutions: Sequence[str] = (), unsafe: str | None = None, top: int = ExplainOptions.top,
+            limit: int = ExplainOptions.limit, pool: Pool | None = None, jobs: int | None = None) -> Explained:
     """Explain failures: minimal causes, their boundaries, why, and whether they hang on a hair.
 
     Parameters
@@ -27,6 +28,8 @@ def explain(source: StudyLike | Results, *, solutions: Sequence[str] = (), unsaf
         "collision" or "below=X"; by default a collision if there is one, else half of the original's safety degree.
     top
         How many failures are explained in full at the most.
+    limit
+        Simulations, about, that the minimal causes of all failures may take; of more failures a random sample is looked into.
     pool, jobs
         Where to simulate: a pool, or that many worker processes, by default one for each core.
 
@@ -37,7 +40,7 @@ def explain(source: StudyLike | Results, *, solutions: Sequence[str] = (), unsaf
     """
     from safevar_sumo import answers
 
-    return answers.explain(study_or_case(source), solutions=solutions, unsafe=unsafe, top=top, pool=pool, jobs=jobs)
+    return answers.explain(study_or_case(source), solutions=solutions, unsafe=unsafe, top=top, limit=limit, pool=pool, jobs=jobs)
 
 
 def tolerance(study: StudyLike | Results, *, unsafe: str | None = None, characteristics: Sequence[str] | None = None, pairs: bool = False,
@@ -48,8 +51,8 @@ def tolerance(study: StudyLike | Results, *, unsafe: str | None = None, characte
     return answers.tolerance(study_of(study), unsafe=unsafe, characteristics=characteristics, pairs=pairs, pool=pool, jobs=jobs)
 
 
-def risk(study: StudyLike | Results, *, samples: int = 10_000, confidence: float = 0.95, width: float | None = None,
-         unsafe: str | None = None, pool: Pool | None = None, jobs: int | None = None) -> Risk:
+def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, confidence: float = RiskOptions.confidence,
+         width: float | None = None, unsafe: str | None = None, pool: Pool | None = None, jobs: int | None = None) -> Risk:
     """How likely an unsafe outcome is when vehicles vary as the study says, and what decides.
 
     At most `samples` vehicles are drawn, fewer if the interval of the probability is no wider than `width` before.
@@ -60,7 +63,7 @@ def risk(study: StudyLike | Results, *, samples: int = 10_000, confidence: float
     return answers.risk(study_of(study), samples=samples, confidence=confidence, width=width, unsafe=unsafe, pool=pool, jobs=jobs)
 
 
-def rules(study: StudyLike | Results, *, samples: int = 16_384, unsafe: str | None = None, pool: Pool | None = None,
+def rules(study: StudyLike | Results, *, samples: int = RulesOptions.samples, unsafe: str | None = None, pool: Pool | None = None,
           jobs: int | None = None) -> Rules:
     """Rules that tell where it is unsafe, from `samples` settings spread over the whole domain. Otherwise as `explain`."""
     from safevar_sumo import answers

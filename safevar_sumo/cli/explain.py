@@ -4,29 +4,25 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.console import Console
 
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.simulating import jobs_option, json_option, point_option, results_or_study, unsafe_option
+from safevar_sumo.cli.simulating import jobs_option, json_option, options_of, point_option, results_or_study
+from safevar_sumo.options import ExplainOptions
 from safevar_sumo.results import make_directory, write_whole
 
 
 @commands.command()
 @click.argument("place", metavar="DIR|STUDY")
-@click.option("--solution", "solutions", multiple=True, metavar="ALG:RUN:N",
-              help="Explain the N-th solution of a run, from 0; may be repeated.  [default: the failures that matter]")
-@unsafe_option
-@click.option("--top", type=click.IntRange(1, 1000), default=8, show_default=True, help="How many failures are explained in full.")
-@click.option("--limit", type=click.IntRange(min=1), default=40_000, show_default=True, metavar="N",
-              help="Simulations, about, for the minimal causes of all failures; of more failures a random sample is looked into.")
+@options_of(ExplainOptions)
 @point_option
 @jobs_option
 @json_option
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write causes.json, causes.csv and a picture there.")
-def explain(place: str, solutions: tuple[str, ...], unsafe: str | None, top: int, limit: int, point: str | None,
-            jobs: int | None, as_json: bool, out: Path | None) -> None:
+def explain(place: str, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **given: Any) -> None:
     """Explain failures of results in DIR, or all over the domain of STUDY: which changes did it, how little is enough, why."""
     from safevar_sumo import answers
     from safevar_sumo.terminal.explanation import print_explained
@@ -36,7 +32,7 @@ def explain(place: str, solutions: tuple[str, ...], unsafe: str | None, top: int
     if out is not None:
         make_directory(out)
     with stages(Console(stderr=True)) as progress:
-        told = answers.explain(source, solutions=solutions, unsafe=unsafe, top=top, limit=limit, jobs=jobs, progress=progress)
+        told = answers.explain(source, **ExplainOptions(**given).keywords(), jobs=jobs, progress=progress)
     records = json.dumps(told.records(), indent=2, allow_nan=False)
     if as_json:
         click.echo(records)

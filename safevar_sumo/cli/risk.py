@@ -4,31 +4,26 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.console import Console
 
 from safevar_sumo.cli.outputs import PICTURES, check_output
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.ranges import Within
-from safevar_sumo.cli.simulating import jobs_option, json_option, point_option, study_of, unsafe_option
+from safevar_sumo.cli.simulating import jobs_option, json_option, options_of, point_option, study_of
 from safevar_sumo.errors import InputError
+from safevar_sumo.options import RiskOptions
 
 
 @commands.command()
 @click.argument("place", metavar="STUDY|DIR")
-@click.option("--samples", type=click.IntRange(1, 100_000_000), default=10_000, show_default=True, metavar="N",
-              help="How many vehicles are drawn at the most.")
-@click.option("--confidence", type=Within(0, 1, min_open=True, max_open=True), default=0.95, show_default=True,
-              help="Confidence of the intervals.")
-@click.option("--width", type=Within(0, 1, min_open=True), help="Stop as soon as the interval of the probability is no wider.")
-@unsafe_option
+@options_of(RiskOptions)
 @point_option
 @jobs_option
 @json_option
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help="Draw what decides here: png, pdf or svg.")
-def risk(place: str, samples: int, confidence: float, width: float | None, unsafe: str | None, point: str | None,
-         jobs: int | None, as_json: bool, plot: Path | None) -> None:
+def risk(place: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **given: Any) -> None:
     """Estimate how likely an unsafe outcome is when vehicles vary as STUDY says under [variation], and what decides."""
     from safevar_sumo import answers
     from safevar_sumo.terminal.risk import print_risk
@@ -40,7 +35,7 @@ def risk(place: str, samples: int, confidence: float, width: float | None, unsaf
         if chosen.correlations:
             raise InputError("--plot", "sensitivity indices of correlated characteristics are not defined", "a study without correlations")
     with stages(Console(stderr=True)) as progress:
-        told = answers.risk(chosen, samples=samples, confidence=confidence, width=width, unsafe=unsafe, jobs=jobs, progress=progress)
+        told = answers.risk(chosen, **RiskOptions(**given).keywords(), jobs=jobs, progress=progress)
     if told.sensitivity is None:
         click.echo("note: characteristics are correlated, for which sensitivity indices are not defined: there are none", err=True)
     if told.errors:

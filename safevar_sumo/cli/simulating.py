@@ -2,24 +2,54 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from safevar_sumo.cli.ranges import Within
+from safevar_sumo.options import Option, Options
 from safevar_sumo.results.imported import UNKNOWN
 from safevar_sumo.study import Study
 
 if TYPE_CHECKING:
     from safevar_sumo.analysis import Case
 
-unsafe_option = click.option(
-    "--unsafe", metavar="collision|below=X",
-    help="What is unsafe: a collision, or a safety degree below X.  [default: a collision if anything that is looked at collides, else "
-         "half of the original's safety degree]")
 jobs_option = click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes.  [default: the cores of this machine]")
 point_option = click.option("--point", metavar="NAME", help="Of a study with a matrix: ask about this point of it alone.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+Command = Callable[..., Any]
+
+
+def options_of(question: type[Options]) -> Callable[[Command], Command]:
+    """The flags of a question's options; the command's keywords make the record, `question(**keywords)`."""
+    def add(command: Command) -> Command:
+        for one in reversed(fields(question)):
+            command = _flag(question.flags()[one.name], one.name, one.default, question.described()[one.name])(command)
+        return command
+
+    return add
+
+
+def _flag(flag: str, name: str, default: Any, option: Option) -> Callable[[Command], Command]:
+    if option.kind is bool:
+        return click.option(flag, name, is_flag=True, default=default, help=option.help)
+    if option.form != "one":
+        return click.option(flag, name, multiple=option.form == "repeated", metavar=option.metavar, help=option.help,
+                            callback=lambda _context, _option, value: _names(value) if option.form == "commas" else value)
+    (low_open, high_open), shows = option.is_open, default is not None
+    kind: click.ParamType[Any] = click.STRING
+    if option.kind is int:
+        kind = click.IntRange(option.low, option.high)  # type: ignore[arg-type]
+    elif option.kind is float:
+        kind = Within(option.low, option.high, min_open=low_open, max_open=high_open)
+    return click.option(flag, name, type=kind, default=default, show_default=shows, metavar=option.metavar, help=option.help)
+
+
+def _names(text: str | None) -> tuple[str, ...] | None:
+    """Names between commas."""
+    return None if text is None else tuple(name.strip() for name in text.split(","))
 
 
 def results_or_study(place: str, point: str | None = None) -> Study | Case:

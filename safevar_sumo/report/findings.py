@@ -22,8 +22,6 @@ CAUSES = 6
 """Minimal causes that a report shows, at the most."""
 REPLAYS = 10
 """Solutions that a report shows, at the most; explained ones come on top."""
-LIMIT = 12_000
-"""Simulations, about, that the minimal causes of a study may take."""
 FIRST = ("fewest", "smallest", "most_severe")
 """What is shown before anything else."""
 OBJECTIVES = ["f_safe", "f_diff", "f_num_diff"]
@@ -32,7 +30,7 @@ OBJECTIVES = ["f_safe", "f_diff", "f_num_diff"]
 def explanations(material: Material, jobs: int | None, progress: Progress) -> Found:
     """The failures that matter, explained; computed once for these results."""
     def compute() -> Found:
-        return explain(material.case, limit=LIMIT, jobs=jobs,
+        return explain(material.case, **material.options["explain"].keywords(), jobs=jobs,
                        progress=lambda what, done, total: progress(f"{material.case.name}: {what}", done, total)).records()
 
     return list(stored(material, "explain", compute))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -13,19 +12,16 @@ from safevar_sumo.answers.bench import Progress
 from safevar_sumo.report.material import Material
 from safevar_sumo.report.stored import stored
 from safevar_sumo.report.svg import Bar, rows
-from safevar_sumo.results import unsafe_rows
 from safevar_sumo.showing.comparison import number, raised, spaced
 from safevar_sumo.vehicles import Characteristic
 
-SAMPLES = 4000
-"""Vehicles that risk is estimated from, and that rules are made of and judged by."""
 Found = dict[str, Any]
 
 
 def tolerance(material: Material, jobs: int | None, progress: Progress) -> Found:
     """Every characteristic's safe interval alone, as bars over its domain, and the factor for all together."""
     def compute() -> Found:
-        told = answers.tolerance(material.case.study, unsafe=_unsafe(material), jobs=jobs, progress=progress)
+        told = answers.tolerance(material.case.study, **material.options["tolerance"].keywords(), jobs=jobs, progress=progress)
         return {**told.record(), "verdict": told.verdict}
 
     found = stored(material, "tolerance", compute)
@@ -35,7 +31,7 @@ def tolerance(material: Material, jobs: int | None, progress: Progress) -> Found
 def risk(material: Material, jobs: int | None, progress: Progress) -> Found:
     """The probability of a failure with its interval, and what decides, as bars."""
     def compute() -> Found:
-        return answers.risk(material.case.study, samples=SAMPLES, unsafe=_unsafe(material), jobs=jobs, progress=progress).record()
+        return answers.risk(material.case.study, **material.options["risk"].keywords(), jobs=jobs, progress=progress).record()
 
     found = stored(material, "risk", compute)
     varied = "[variation]" if getattr(material.case.study, "variation", None) else "uniformly over their domains"
@@ -45,7 +41,7 @@ def risk(material: Material, jobs: int | None, progress: Progress) -> Found:
 def rules(material: Material, jobs: int | None, progress: Progress) -> Found:
     """Rules in words, with what they are worth on vehicles that they were not made from."""
     def compute() -> Found:
-        told = answers.rules(material.case.study, samples=SAMPLES, unsafe=_unsafe(material), jobs=jobs, progress=progress)
+        told = answers.rules(material.case.study, **material.options["rules"].keywords(), jobs=jobs, progress=progress)
         sure = [rule for rule in told.rules if rule.tells_more_than(told.unsafe_share)]
         words = [raised(answers.rule_in_words(rule, material.case.characteristics, told.unsafe)) for rule in sure]
         dropped = answers.number_of(len(told.rules) - len(sure), "rule")
@@ -59,15 +55,6 @@ def rules(material: Material, jobs: int | None, progress: Progress) -> Found:
 
 LIMITS: Mapping[str, Callable[[Material, int | None, Progress], Found]] = {"tolerance": tolerance, "risk": risk, "rules": rules}
 """The sections that ask what the whole domain holds, by name."""
-
-
-def _unsafe(material: Material) -> str | None:
-    """What counts as unsafe all over the page: what does among the solutions."""
-    degree = material.case.original["safety_degree"]
-    unsafe = unsafe_rows(material.case.solutions, degree)
-    if (material.case.solutions["outcome"] == "collision").any() or math.isnan(degree):
-        return "collision"
-    return f"below={degree / 2!r}" if len(unsafe) else None
 
 
 def _bars(material: Material, alone: list[Found]) -> Markup:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,6 +15,7 @@ from safevar_sumo.analysis import Case, load_cases
 from safevar_sumo.analysis.case import collided
 from safevar_sumo.answers import Unsafe, points_of
 from safevar_sumo.errors import InputError
+from safevar_sumo.options import ExplainOptions, Options, RiskOptions, RulesOptions, ToleranceOptions
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.report.places import failing_places
 from safevar_sumo.results import Handle, handles
@@ -22,6 +24,9 @@ from safevar_sumo.showing import Comparison, compare
 from safevar_sumo.showing.page import player_data
 from safevar_sumo.showing.scene import scene_of
 from safevar_sumo.simulation import System, aggregated, assemble, at_every_point, evaluate, study_at
+
+SAMPLES = 4000
+"""Vehicles that risk is estimated from, and that rules are made of and judged by."""
 
 
 class Again(NamedTuple):
@@ -90,7 +95,17 @@ class Material:
     @property
     def unsafe(self) -> Unsafe:
         """What counts as unsafe: a collision if a solution is one, else half of the original's safety degree."""
-        return Unsafe() if collided(self.case.solutions).any() else Unsafe.half_of(self.case.original["safety_degree"])
+        degree = self.case.original["safety_degree"]
+        return Unsafe() if collided(self.case.solutions).any() or math.isnan(degree) else Unsafe.half_of(degree)
+
+    @cached_property
+    def options(self) -> dict[str, Options]:
+        """With which options each question is asked for the page: smaller samples than the commands' own, one criterion for all."""
+        unsafe = None if self.case.solutions.empty else str(self.unsafe)
+        asked: tuple[Options, ...] = (
+            ExplainOptions(unsafe=unsafe, limit=12_000), ToleranceOptions(unsafe=unsafe), RiskOptions(unsafe=unsafe, samples=SAMPLES),
+            RulesOptions(unsafe=unsafe, samples=SAMPLES))
+        return {one.question: one for one in asked}
 
     @property
     def original_fails(self) -> bool:

@@ -25,7 +25,7 @@ def stored(material: Material, name: str, compute: Callable[[], Any]) -> Any:
     Where the directory cannot be written, nothing is kept.
     """
     at = f"-{material.anchor(material.point)}" if material.point else ""
-    file, identity = material.place / FOLDER / f"{name}{at}.json", _identity(material)
+    file, identity = material.place / FOLDER / f"{name}{at}.json", _identity(material, name)
     try:
         refuse_other_than_file(file)
         kept = json.loads(file.read_text(encoding="utf-8"))
@@ -42,12 +42,12 @@ def stored(material: Material, name: str, compute: Callable[[], Any]) -> Any:
     return json.loads(text)["value"]
 
 
-def _identity(material: Material) -> str:
-    """Results of other content, or another version of this package, give other answers."""
+def _identity(material: Material, name: str) -> str:
+    """Results of other content, other options, or another version of this package give other answers."""
     digest = sha256(version("safevar_sumo").encode())
-    for name in (MANIFEST, SOLUTIONS):
-        file = material.place / name
+    for kept in (MANIFEST, SOLUTIONS):
+        file = material.place / kept
         content = file.read_bytes() if file.is_file() else b""
         digest.update(len(content).to_bytes(8, "big") + content)
-    digest.update(repr(material.case.finished).encode() + material.point.encode())
+    digest.update(repr(material.case.finished).encode() + material.point.encode() + repr(material.options[name]).encode())
     return digest.hexdigest()

@@ -12,12 +12,12 @@ from typing import Any
 import msgspec
 
 from safevar_sumo.metrics import METRICS
+from safevar_sumo.options import RUN
 from safevar_sumo.records import Outcome
 from safevar_sumo.report.findings import Found
 from safevar_sumo.report.material import Material
 from safevar_sumo.study import Study, load_study, study_names
 
-RUN = "python -m safevar_sumo"
 NOT_MODELLED = (
     "A search finds failures; that it finds none proves nothing about what it did not try.",
     "One vehicle in its lane: no steering beyond lane keeping, no single wheels and axles, no suspension, no wind, no sensor "
@@ -55,8 +55,8 @@ def reproduce(materials: Sequence[Material], parts: Sequence[str]) -> list[dict[
         if material.case.has_runs:
             commands.append({"what": f"The study {study.name}, as its manifest.json records it whole, into another directory",
                              "command": _again(study, f"{material.place}-again", material.place)})
-        at = f" --point {shlex.quote(material.point)}" if material.point else ""
-        commands += [{"what": f"The part {part}", "command": f"{RUN} {part} {place}{at}"} for part in parts]
+        commands += [{"what": f"The part {part}", "command": material.options[part].command_line(str(material.place), material.point)}
+                     for part in parts]
         if material.point:
             continue
         commands.append({"what": "A replay, with figure and animation",

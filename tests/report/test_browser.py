@@ -14,7 +14,7 @@ from selenium.webdriver import Chrome
 from selenium.webdriver.common.by import By
 
 from safevar_sumo.analysis import load_cases
-from safevar_sumo.report import limits, make_report
+from safevar_sumo.report import make_report, material
 from safevar_sumo.showing import animate, compare
 from safevar_sumo.simulation import assemble
 
@@ -32,7 +32,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
 def report(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("page") / "report.html"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(limits, "SAMPLES", 256)
+        patch.setattr(material, "SAMPLES", 256)
         file.write_text(make_report([slippery]), encoding="utf-8")
     return file
 

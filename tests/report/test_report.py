@@ -102,7 +102,7 @@ class Limit:
 def page(slippery: Path) -> str:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(findings, "explain", lambda case, **_: Explained(case))
-        patch.setattr(limits, "SAMPLES", 32)
+        patch.setattr(material, "SAMPLES", 32)
         for name in LIMITS:
             patch.setattr(limits.answers, name, lambda *_, name=name, **__: Limit(name))
         return make_report([slippery], jobs=1)
@@ -114,6 +114,7 @@ def never_again(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("explained twice")
 
     monkeypatch.setattr(findings, "explain", explain)
+    monkeypatch.setattr(material, "SAMPLES", 32)
     for name in LIMITS:
         monkeypatch.setattr(limits.answers, name, explain)
 
@@ -194,7 +195,7 @@ def test_what_is_not_as_the_results_say_any_more_is_told(page: str, slippery: Pa
 
 @pytest.mark.slow
 def test_parts_are_computed_on_the_way(slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "SAMPLES", 256)
+    monkeypatch.setattr(material, "SAMPLES", 256)
     shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))
     page = make_report([tmp_path / "copy"], only=["verdict", "causes", "tolerance", "risk", "rules"])
     assert "Cause 1: " in page
