@@ -16,8 +16,8 @@ DIGITS = 16
 """Of a digest that tells files apart."""
 PACKAGE = Path(__file__).resolve().parents[1]
 NOT_COUNTED = (
-    "__init__.py", "__main__.py", "analysis", "answers", "api", "cli", "computing", "errors.py", "progress.py", "reference",
-    "report", "results", "shipped.py", "showing", "terminal")
+    "__init__.py", "__main__.py", "analysis", "answers", "api", "cli", "computing", "errors.py", "options.py", "progress.py",
+    "reference", "report", "results", "shipped.py", "showing", "terminal")
 """What of the package only carries, shows, asks or compares: no evaluation is made there."""
 INSTALLED = tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib"))
 
