@@ -7,6 +7,7 @@ first, so importing the package costs next to nothing.
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -57,6 +58,8 @@ __all__ = [
 
 if not TYPE_CHECKING:  # a type checker is to know the names above, and no others
     def __getattr__(name: str) -> Any:
+        if sys.version_info < (3, 11):  # noqa: UP036 (this file and __main__ alone can be read by older versions)
+            raise ImportError("safevar_sumo needs Python 3.11 or newer")
         if name == "__version__":
             from importlib.metadata import version
 

@@ -8,13 +8,24 @@ import sys
 
 def main() -> None:
     """Run the program. It is loaded here and not above, because every worker process loads this module too."""
+    if sys.version_info < (3, 11):  # noqa: UP036
+        _fail(f"needs Python 3.11 or newer; this is {'.'.join(map(str, sys.version_info[:3]))}", 1)
     _put_installed_modules_first()
     try:
         from safevar_sumo import cli
+
+        cli.main()
     except KeyboardInterrupt:
-        print("safevar-sumo: interrupted", file=sys.stderr)
-        sys.exit(130)
-    cli.main()
+        _fail("interrupted", 130)
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("safevar_sumo."):
+            raise
+        _fail(f"{error.name} is not installed; in the checkout: pip install . (or make study, which makes a .venv)", 1)
+
+
+def _fail(message: str, code: int) -> None:
+    print(f"safevar-sumo: {message}", file=sys.stderr)
+    sys.exit(code)
 
 
 def _put_installed_modules_first() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from difflib import get_close_matches
 
 
 class SafevarError(Exception):
@@ -54,6 +55,31 @@ def told(error: BaseException) -> str:
     except Exception:
         said = []
     return f"{type(error).__name__}: {said[0]}" if said else type(error).__name__
+
+
+def unknown(source: object, problem: str, given: object, names: Iterable[str], otherwise: str = "") -> InputError:
+    """The error for a name that there is not: it asks whether the nearest one is meant, and lists all of them.
+
+    Parameters
+    ----------
+    source, problem
+        As those of `InputError`.
+    given
+        The name that the user gave.
+    names
+        The names that there are.
+    otherwise
+        What would be right beside the names.
+    """
+    known = list(names)
+    return InputError(source, f"{problem}{did_you_mean(given, known)}", f"{one_of(known)}{otherwise}")
+
+
+def did_you_mean(given: object, names: Iterable[str]) -> str:
+    """`; did you mean 'rain'?`, or nothing where no name is near what was given; upper and lower case are near."""
+    by_lower = {name.lower(): name for name in names}
+    near = get_close_matches(str(given).lower(), by_lower, n=1)
+    return f"; did you mean {by_lower[near[0]]!r}?" if near else ""
 
 
 def one_of(names: Iterable[str]) -> str:

@@ -14,7 +14,7 @@ from safevar_sumo.analysis.over_runs import difference_line, rq1_runs, rq2_runs
 from safevar_sumo.analysis.rq1 import rq1
 from safevar_sumo.analysis.rq2 import rq2
 from safevar_sumo.analysis.rq3 import critical, rq31, rq32, rq33, rq33_safety
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import unknown
 from safevar_sumo.metrics import SAFEVAR, MetricFacts
 
 Frames = dict[str, pd.DataFrame]
@@ -54,7 +54,7 @@ def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
         If there is no such question, or no case holds what the one question, or any, asks for.
     """
     if question is not None and question not in QUESTIONS:
-        raise InputError("question", f"there is no question {question!r}", one_of(QUESTIONS))
+        raise unknown("question", f"there is no question {question!r}", question, QUESTIONS)
     answers, refusals, names = [], [], [case.name for case in cases]
     metrics = tuple({metric.name: metric for case in cases for metric in case.scoring.metrics}.values())
     for name in QUESTIONS if question is None else (question,):

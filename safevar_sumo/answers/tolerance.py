@@ -15,7 +15,7 @@ from safevar_sumo.answers.joint import CONFIDENCE, SAMPLES, Joint, joint
 from safevar_sumo.answers.pairs import Pair, planes
 from safevar_sumo.answers.unsafe import Unsafe, usual_in
 from safevar_sumo.computing import Pool
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import unknown
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
 
@@ -105,7 +105,7 @@ def _columns(study: Study, characteristics: Sequence[str] | None) -> list[int]:
     names = list(study.vehicle.characteristics)
     for name in characteristics or ():
         if name not in names:
-            raise InputError("characteristics", f"there is no characteristic {name!r}", one_of(names))
+            raise unknown("characteristics", f"there is no characteristic {name!r}", name, names)
     return [column for column, name in enumerate(names) if characteristics is None or name in characteristics]
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import scipy
 
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.variation import Correlation, Distribution, Fixed, Lognormal, Normal, Triangular, Uniform
@@ -36,7 +36,7 @@ class World:
         self._source = f"study {study.name!r}"
         for name in study.variation:
             if name not in self._members.names:
-                raise InputError(self._source, f"variation.{name}: there is no such characteristic", one_of(self._members.names))
+                raise unknown(self._source, f"variation.{name}: there is no such characteristic", name, self._members.names)
         self._quantiles = [self._quantile(member, study.variation.get(member.name, Uniform())) for member in self._members]
         self._factor = self._cholesky(study.correlations)
 
@@ -95,7 +95,7 @@ class World:
         for one in correlations:
             for name in one.between:
                 if name not in names:
-                    raise InputError(self._source, f"correlations.between: there is no characteristic {name!r}", one_of(names))
+                    raise unknown(self._source, f"correlations.between: there is no characteristic {name!r}", name, names)
             first, second = (names.index(name) for name in one.between)
             if first == second:
                 raise InputError(self._source, f"correlations.between = {list(one.between)}", "two different characteristics")

@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import InputError, did_you_mean, one_of
 from safevar_sumo.results import read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
 
@@ -95,7 +95,8 @@ def study_or_case(source: StudyLike | Results) -> Study | Case:
             return load(source).case
         if not os.path.exists(source):
             legal = f"a directory that the command study has written, {one_of(study_names())}, or the path of a study file (TOML)"
-            raise InputError(source, "is no results directory, no study and no file", legal)
+            problem = f"is no results directory, no study and no file{did_you_mean(source, study_names())}"
+            raise InputError(source, problem, legal)
     return load_study(source)
 
 

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from safevar_sumo.api.once import assembled
 from safevar_sumo.computing import available_cores, evaluate_all, local_pool
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.progress import counted
 from safevar_sumo.records import Evaluations, FloatArray
@@ -87,7 +87,7 @@ def _table(settings: pd.DataFrame | npt.ArrayLike, characteristics: Characterist
     if isinstance(settings, pd.DataFrame):
         for name in settings.columns:
             if name not in names:
-                raise InputError("settings", f"column {name!r} is no characteristic", one_of(names))
+                raise unknown("settings", f"column {name!r} is no characteristic", name, names)
         if settings.columns.has_duplicates:
             raise InputError("settings", "a column is there twice", "each characteristic once")
         table = pd.DataFrame(dict(zip(names, characteristics.original, strict=True)), index=settings.index)

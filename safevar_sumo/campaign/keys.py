@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.plugins import Lookup, Member, made, undisturbed
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm
 from safevar_sumo.study import SearchTable, Study
@@ -42,8 +42,8 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
         raise InputError(source, f"search.algorithms = {search.algorithms}: two have one name", "algorithms of different names")
     for stray in search.parameters:
         if stray not in ALGORITHMS and stray not in search.labels:
-            legal = f"{one_of([*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels])}"
-            raise InputError(source, f"search.{stray}: there is no such key and no such algorithm", legal)
+            legal = [*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels]
+            raise unknown(source, f"search.{stray}: there is no such key and no such algorithm", stray, legal)
     member = algorithm_member(name, study)
     with undisturbed(source, [name] if member.guard else []):
         algorithm = made(member, search.parameters.get(label, {}), f"search.algorithms: {name!r}", key, source)

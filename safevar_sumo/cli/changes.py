@@ -7,12 +7,13 @@ from itertools import product
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
 NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-SHARE = re.compile(r"([+-](?:\d+\.?\d*|\.\d+))%")
+SIGNED = re.compile(r"[+-](?:\d+\.?\d*|\.\d+)")
+SHARE = re.compile(rf"({SIGNED.pattern})%")
 SWEEP = re.compile(rf"({NUMBER})\.\.({NUMBER})(?::(\d{{1,6}}))?")
 SWEPT = 11
 """Values of a sweep that does not say how many."""
@@ -37,11 +38,12 @@ def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, b
         if name in found:
             raise InputError("--set", f"{name} is set twice", "each characteristic once")
         if name not in characteristics.names:
-            raise InputError("--set", f"there is no characteristic {name!r}", one_of(characteristics.names))
+            raise unknown("--set", f"there is no characteristic {name!r}", name, characteristics.names)
         member = characteristics.members[characteristics.names.index(name)]
         found[name] = _values(change, text, member.original)
         for value in found[name]:
-            member.check(value, "--set", beyond=beyond)
+            share = f", or {name}={text}% of the original" if SIGNED.fullmatch(text) else ""
+            member.check(value, "--set", beyond=beyond, otherwise=share, switch="--beyond")
     if np.prod([len(values) for values in found.values()], dtype=float) > MOST:
         raise InputError("--set", f"{' '.join(changes)}: more than {MOST} settings", "shorter sweeps, FROM..TO:NUMBER")
     return found

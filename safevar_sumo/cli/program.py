@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.errors import InputError, SafevarError, did_you_mean
 
 if TYPE_CHECKING:
     from safevar_sumo.study import Study
@@ -52,6 +52,12 @@ class OnDemand(click.Group):
             with _interrupted_at_once():
                 importlib.import_module(f"safevar_sumo.cli.{COMMANDS[name][0]}")
         return super().get_command(ctx, name)
+
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
+        """Of a command that there is not, the nearest one is named."""
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            ctx.fail(f"there is no command {args[0]!r}{did_you_mean(args[0], COMMANDS)}")
+        return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Call a command; what the library says of one of its parameters is said of the flag that gives it."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from safevar_sumo.errors import ForeignError, InputError, one_of
+from safevar_sumo.errors import ForeignError, InputError, did_you_mean, one_of
 from safevar_sumo.plugins.contract import Contract
 from safevar_sumo.plugins.guard import Guard
 
@@ -85,7 +85,7 @@ class Lookup(NamedTuple):
         legal = f"{one_of(members)}, or package.module:Name" if members else "package.module:Name"
         module_name, colon, attribute = name.partition(":")
         if not (colon and attribute.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):
-            raise InputError(self.source, f"{key} = {name!r}", legal)
+            raise InputError(self.source, f"{key} = {name!r}{did_you_mean(name, members)}", legal)
         places = [*self.places, os.getcwd()]
         module, folder = self._imported(module_name, Guard(self.source, f"{key} = {name!r}"), places)
         what = Guard(self.source, f"{key} = {name!r}", folder).call("import", getattr, module, attribute, _NOTHING)

@@ -10,7 +10,7 @@ from typing import Any
 from markupsafe import Markup
 
 from safevar_sumo.answers.bench import Progress, silent
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, did_you_mean
 from safevar_sumo.report.findings import causes, explanations, necessity, replays
 from safevar_sumo.report.limits import LIMITS
 from safevar_sumo.report.material import Material, gather
@@ -68,7 +68,7 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     """
     unknown = [name for name in only if name not in SECTIONS]
     if unknown:
-        raise InputError("only", f"there is no section {unknown[0]!r}", f"some of {','.join(SECTIONS)}")
+        raise InputError("only", f"there is no section {unknown[0]!r}{did_you_mean(unknown[0], SECTIONS)}", f"some of {','.join(SECTIONS)}")
     wanted = [name for name in SECTIONS if not only or name in only]
     if point:
         if "questions" in only:

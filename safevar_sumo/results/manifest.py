@@ -90,7 +90,9 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         if isinstance(manifest["study"], dict) and isinstance(manifest["versions"], dict) and manifest.get("format", FORMAT) == FORMAT:
             return dict(manifest)
     except FileNotFoundError:
-        raise InputError(directory, f"is no results directory: there is no {MANIFEST}", legal) from None
+        meant = Path("results") / directory.name
+        hint = f"; did you mean {meant}?" if meant != directory and (meant / MANIFEST).is_file() else ""
+        raise InputError(directory, f"is no results directory: there is no {MANIFEST}{hint}", legal) from None
     except OSError as error:
         raise InputError(file, f"cannot be read: {error.strerror}") from None
     except (ValueError, KeyError, TypeError, RecursionError):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import unknown
 from safevar_sumo.study import Weather
 
 _CATALOGUE = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
@@ -26,5 +26,5 @@ def weather_of(choice: str | Weather, source: object) -> Weather:
         return choice
     if choice not in WEATHERS:
         fields = ", ".join(Weather.__struct_fields__)
-        raise InputError(source, f"weather = {choice!r}", f"{one_of(WEATHERS)}, or a table with {fields}")
+        raise unknown(source, f"weather = {choice!r}", choice, WEATHERS, f", or a table with {fields}")
     return WEATHERS[choice]

@@ -7,7 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, did_you_mean
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.simulation.options import TRAFFIC, options_of, recipe_of
 
@@ -69,7 +69,7 @@ def sources_of(network: str) -> Sources:
                 raise InputError(sources.place, f"{name} is missing", LEGAL)
         return sources
     names = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
-    raise InputError("scenario.parameters.network", f"there is no network {network!r}",
+    raise InputError("scenario.parameters.network", f"there is no network {network!r}{did_you_mean(network, names)}",
                      f"one of {', '.join(names)}, a folder, or a {BUILT} beside {TRAFFIC} and {OPTIONS}")
 
 

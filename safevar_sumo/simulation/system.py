@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.plugins import Guard, Lookup, Member, check_parameters, made, undisturbed
 from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, weather_of
@@ -89,7 +89,7 @@ def _assembled(study: Study, source: str) -> System:
     measuring = measuring_of(study, Lookup(source, study.origin.places))
     for name in study.published:
         if name not in measuring.metrics:
-            raise InputError(source, f"published.{name} is no metric", one_of(measuring.metrics))
+            raise unknown(source, f"published.{name} is no metric", name, measuring.metrics)
     matrix = _matrix(study, source)
     for network in dict.fromkeys(scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))):
         check_network(network)
@@ -172,7 +172,7 @@ def _check_units(study: Study, vehicle: Vehicle, ours: bool, source: str) -> Non
         if name in TAKEN:
             raise InputError(source, f"vehicle.characteristics.{name}: the name is a column of results", f"none of {', '.join(TAKEN)}")
         if name not in known:
-            raise InputError(source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", one_of(known))
+            raise unknown(source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", name, known)
         if given[name].unit != known[name]:
             raise InputError(source, f"vehicle.characteristics.{name}.unit = {given[name].unit!r}", repr(known[name]))
         if ours and given[name].lower <= 0:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin
 import msgspec
 from msgspec import Struct
 
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import InputError, unknown
 
 T = TypeVar("T")
 MOST_TOLD = 8
@@ -49,7 +49,7 @@ def mistakes(source: object, raw: Any, kind: Any, where: str = "") -> Iterator[I
         fields = {field.name: field for field in msgspec.structs.fields(kind)}
         for key in raw:
             if key not in fields:
-                yield InputError(source, f"{_inside(where, key)}: there is no such key", one_of(fields))
+                yield unknown(source, f"{_inside(where, key)}: there is no such key", key, fields)
         for name, field in fields.items():
             if name in raw:
                 yield from mistakes(source, raw[name], field.type, _inside(where, name))

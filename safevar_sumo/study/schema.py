@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import unknown
 from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study.files import refuse_other_than_file
 from safevar_sumo.variation import Correlation, Distribution
@@ -250,8 +250,7 @@ def study_path(study: str) -> Path:
     with suppress(OSError):
         if not path.is_dir():
             refuse_other_than_file(path)
-    legal = f"{one_of(study_names())}, or the path of a study file (TOML)"
-    raise InputError("study", f"there is no study or file {study!r}", legal)
+    raise unknown("study", f"there is no study or file {study!r}", study, study_names(), ", or the path of a study file (TOML)")
 
 
 def foreign_names(study: Study) -> list[str]:

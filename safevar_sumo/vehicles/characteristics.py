@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import CharacteristicTable
 
@@ -65,8 +65,11 @@ class Characteristic:
         """The unit as it follows a number; nothing for a pure number."""
         return "" if self.unit == "-" else f" {self.unit}"
 
-    def check(self, value: float, source: object, *, beyond: bool = False) -> None:
+    def check(self, value: float, source: object, *, beyond: bool = False, otherwise: str = "",
+              switch: str = "beyond=True") -> None:
         """Refuse what is no number or outside the domain, or with `beyond` only what means nothing (`is_legal`).
+
+        `otherwise` is what would be right beside a number in the domain, `switch` how a caller asks for values beyond it.
 
         Raises
         ------
@@ -76,7 +79,9 @@ class Characteristic:
         if not isinstance(value, Real) or not self.is_legal(value, beyond=beyond):
             above = " above 0" if self.lower > 0 else ""
             farther, within = f"a finite number{above}, up to {self.farthest:g}", f"a number in [{self.lower:g}, {self.upper:g}]"
-            raise InputError(source, f"{self.name} = {value}", f"{farther if beyond else within}{self.suffix}")
+            may_be_beyond = not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
+            raise InputError(source, f"{self.name} = {value}{' is outside its domain' if may_be_beyond else ''}",
+                             f"{farther if beyond else within}{self.suffix}{otherwise}{f', or any with {switch}' if may_be_beyond else ''}")
 
     def is_legal(self, values: Any, *, beyond: bool = False) -> Any:
         """Whether values, a number or an array, are in the domain; with `beyond`, whether they mean anything.
@@ -160,7 +165,7 @@ class CharacteristicSet:
         setting = self.original.copy()
         for name, value in values.items():
             if name not in self.names:
-                raise InputError(source, f"there is no characteristic {name!r}", one_of(self.names))
+                raise unknown(source, f"there is no characteristic {name!r}", name, self.names)
             column = self.names.index(name)
             self.members[column].check(value, source, beyond=beyond)
             setting[column] = value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import os
 import pkgutil
@@ -20,6 +21,8 @@ from safevar_sumo import cli
 from safevar_sumo.cli.program import COMMANDS, commands, main
 from safevar_sumo.errors import InputError
 
+ROOT = Path(__file__).parents[2]
+OLD_PYTHON = "import runpy, sys; sys.version_info = (3, 10, 9); runpy.run_module('safevar_sumo', run_name='__main__')"
 HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
 
 
@@ -104,3 +107,41 @@ def test_a_thread_that_somebody_has_left_running_does_not_keep_the_program(monke
         main()
     ended.set()
     assert capsys.readouterr().err == "note: still running and ended now: left\n"
+
+
+@pytest.mark.parametrize(("typed", "says"), [
+    ("simulate rian", "did you mean 'rain'?"), ("explain rian", "did you mean 'rain'?"), ("simlate rain", "did you mean 'simulate'?"),
+    ("simulate rain --set tirefric=1", "did you mean 'tireFric'?"), ("tolerance rain --characteristics mas", "did you mean 'mass'?"),
+    ("report results/rain --only verdct", "did you mean 'verdict'?"),
+    ("simulate weather.toml", "did you mean 'fog'?"), ("simulate model.toml", "did you mean 'world_on_rails'?"),
+    ("simulate key.toml", "runns: there is no such key; did you mean 'runs'?"),
+    ("simulate rain --set mass=+8", "is outside its domain\nlegal: a number in [2040, 2700] kg, or mass=+8% of the original, or any with "
+                                    "--beyond"),
+    ("simulate rain --set mass=2000", "a number in [2040, 2700] kg, or any with --beyond"),
+    ("tables smoke", "did you mean results/smoke?"), ("status smoke", "did you mean results/smoke?"),
+])
+def test_an_error_names_what_was_probably_meant(typed: str, says: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch,
+                                                capsys: pytest.CaptureFixture[str]) -> None:
+    for name, text in (("weather", 'weather = "fogg"'), ("model", '[ads]\nmodel = "world_on_rail"'), ("key", "[search]\nrunns = 3")):
+        Path(f"{name}.toml").write_text(f'extends = "sun"\n{text}\n')
+    made = in_tmp / "results" / "smoke"
+    made.mkdir(parents=True)
+    (made / "manifest.json").write_text("{}")
+    monkeypatch.setattr(sys, "argv", ["safevar-sumo", *typed.split()])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    told = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert says in told
+
+
+@pytest.mark.parametrize(("start", "says"), [
+    ("-m safevar_sumo list", "click is not installed"), (f"-c {OLD_PYTHON}", "needs Python 3.11 or newer; this is 3.10.9")])
+def test_where_it_cannot_run_it_says_so_in_one_line(start: str, says: str) -> None:
+    command, code = start.split(" ", 1)
+    arguments = [command, code] if command == "-c" else start.split()
+    done = subprocess.run([sys.executable, "-S", *arguments], capture_output=True, text=True, cwd=ROOT)  # -S: nothing is installed
+    assert done.returncode == 1
+    assert re.fullmatch(f"safevar-sumo: {re.escape(says)}.*\n", done.stderr)
+    for file in ("__init__.py", "__main__.py"):
+        ast.parse((ROOT / "safevar_sumo" / file).read_text(), feature_version=(3, 10))
