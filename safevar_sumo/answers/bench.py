@@ -70,7 +70,11 @@ class Bench:
     def with_step(self, step: float) -> Bench:
         """The same, simulated with another time step [s]."""
         metrics = msgspec.structs.replace(self.study.metrics, sampling_interval=None)  # it need not be a multiple of this step
-        return Bench(msgspec.structs.replace(self.study, step_length=step, metrics=metrics), self._pool, self._progress)
+        return self.of(msgspec.structs.replace(self.study, step_length=step, metrics=metrics))
+
+    def of(self, study: Study) -> Bench:
+        """A bench of another study, on the same pool."""
+        return Bench(study, self._pool, self._progress)
 
 
 @contextmanager

@@ -13,10 +13,10 @@ from safevar_sumo.answers.causes import MinimalCause, affordable, minimal_causes
 from safevar_sumo.answers.failures import Failures, failures_of
 from safevar_sumo.answers.findings import Cause, Explained, Explanation
 from safevar_sumo.answers.necessity import distinct_causes, key_of, necessity
+from safevar_sumo.answers.preventability import preventability, preventable_by
 from safevar_sumo.answers.robustness import robustness
 from safevar_sumo.answers.unsafe import Unsafe
 from safevar_sumo.answers.where import where
-from safevar_sumo.answers.whose import whose_failures
 from safevar_sumo.computing import Pool
 from safevar_sumo.options import ExplainOptions
 from safevar_sumo.records import Evaluations
@@ -70,12 +70,14 @@ def explain(source: Study | Case, *, solutions: Sequence[str] = (), unsafe: str 
         if not solutions:
             reasons = _with_one_of_each_cause(found, bench, {row: causes[row] for row in sample}, reasons, causes, top)
         explanations = _explained(found, bench, original, causes, reasons)
+        preventable = preventability(bench, found.evaluations.settings[found.evaluations.collided])
     changed = bench.characteristics.changed(found.evaluations.settings[sample])
     of_sample = [causes[row] for row in sample]
     return Explained(
         study=study, unsafe=found.unsafe, original=original, explanations=explanations,
         necessity=necessity(bench.characteristics, changed, of_sample), distinct=distinct_causes(bench.characteristics, of_sample),
-        looked_at=len(found.evaluations), failures=len(found.rows), analysed=len(sample), otherwise=found.otherwise)
+        looked_at=len(found.evaluations), failures=len(found.rows), analysed=len(sample), otherwise=found.otherwise,
+        preventability=preventable)
 
 
 def _that_matter(found: Failures) -> dict[int, Reasons]:
@@ -114,7 +116,7 @@ def _explained(found: Failures, bench: Bench, original: Evaluations, causes: Cau
     hair = robustness(bench, here.settings, step, found.unsafe)
     shrunk = iter(boundaries(bench, [cause for row in rows for cause in causes[row]], found.unsafe))
     collided = np.flatnonzero(here.collided)
-    whose = dict(zip(collided.tolist(), whose_failures(bench.study, here.settings[collided]), strict=True))
+    avoided = dict(zip(collided.tolist(), preventable_by(bench, here.settings[collided]), strict=True))
     explanations = []
     for i, row in enumerate(rows):
         of_it = []
@@ -131,5 +133,5 @@ def _explained(found: Failures, bench: Bench, original: Evaluations, causes: Cau
             outcome=str(here.outcome[i]), safety_degree=number(here.f_safe[i]),
             changed=tuple(name for name, is_changed in zip(names, changed, strict=True) if is_changed),
             necessary=tuple(names[column] for column in sorted(necessary(causes[row]))), causes=tuple(of_it), robustness=hair[i],
-            because=beside[i].because, whose=str(whose.get(i, "")), points=beside[i].points))
+            because=beside[i].because, preventable=str(avoided.get(i) or ""), points=beside[i].points))
     return tuple(explanations)

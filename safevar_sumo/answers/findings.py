@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 
 from safevar_sumo.answers.because import Because
+from safevar_sumo.answers.preventability import Preventability
 from safevar_sumo.answers.robustness import Robustness
 from safevar_sumo.answers.unsafe import Unsafe
 from safevar_sumo.answers.words import sentence
@@ -45,8 +46,8 @@ class Cause:
 class Explanation:
     """One failure explained; `handle` is None for what did not come from results, `reasons` tell why it was chosen.
 
-    `safety_degree` is in m, or -m/s; `changed` and `necessary` are names; `causes` are all minimal ones; `whose` tells of a
-    collision who would have avoided it in the same vehicle; `points` are those of a matrix at which it is unsafe.
+    `safety_degree` is in m, or -m/s; `changed` and `necessary` are names; `causes` are all minimal ones; `preventable` tells of
+    a collision who would have avoided it in the same vehicle; `points` are those of a matrix at which it is unsafe.
     """
 
     handle: Handle | None
@@ -59,7 +60,7 @@ class Explanation:
     causes: tuple[Cause, ...]
     robustness: Robustness
     because: Because
-    whose: str = ""
+    preventable: str = ""
     points: tuple[str, ...] = ()
 
     def record(self) -> dict[str, Any]:
@@ -87,6 +88,8 @@ class Explained:
         How many settings were looked at, how many of them are unsafe, and over how many of these the two frames are.
     otherwise
         How many solutions do not end as the results say.
+    preventability
+        Who avoids the collisions among the settings looked at.
     """
 
     study: Study
@@ -99,12 +102,13 @@ class Explained:
     failures: int
     analysed: int
     otherwise: int
+    preventability: Preventability
 
     def records(self) -> list[dict[str, Any]]:
         """As `explain --json` prints them: one for each failure, and a summary."""
         of_it = self.necessity.set_index("characteristic")
         shares = {name: dict(zip(of_it.index, of_it[name].tolist(), strict=True)) for name in ("necessary", "changed")}
-        return [*(one.record() for one in self.explanations), {"summary": shares}]
+        return [*(one.record() for one in self.explanations), {"summary": {**shares, "preventable": self.preventability.to_dict()}}]
 
     def __repr__(self) -> str:
         return f"<Explained {self.study.name}, unsafe {self.unsafe}: {self.failures} of {self.looked_at}, {len(self.explanations)} in full>"
@@ -124,6 +128,6 @@ class Explained:
                     if member.name in cause.changes:
                         rows.append((i, algorithm, run, index, j, member.name, member.unit, member.original, cause.changes[member.name],
                                      cause.boundary[member.name], cause.alone[member.name], cause.fraction, cause.outcome,
-                                     cause.safety_degree, one.robustness.share, one.whose, "; ".join(one.points)))
+                                     cause.safety_degree, one.robustness.share, one.preventable, "; ".join(one.points)))
         return pd.DataFrame(rows, columns=["failure", "algorithm", "run", "index", "cause", "characteristic", "unit", "original", "value",
                                            "boundary", "alone", "fraction", "outcome", "safety_degree", "robustness", "whose", "points"])

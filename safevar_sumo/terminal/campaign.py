@@ -36,7 +36,8 @@ def print_forecast(console: Console, study: Study, runs: int, told: Forecast) ->
 def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path, pool: Pool) -> None:
     """The answer; per algorithm what was found, beside the original vehicle; the most critical setting; what RQ1 and RQ2 say of it."""
     from safevar_sumo.analysis import brief, case_of  # takes longer to load than all the rest
-    from safevar_sumo.answers import lead, summary
+    from safevar_sumo.answers import lead, preventability
+    from safevar_sumo.answers.bench import Bench
 
     names = tuple(study.vehicle.characteristics)
     solutions = solutions_frame(names, campaign.solutions.items())
@@ -45,7 +46,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
             console.print(line, soft_wrap=True, markup=False, highlight=False)
         collided = solutions.loc[solutions["outcome"] == str(Outcome.COLLISION), list(names)].to_numpy(dtype=float)
         if len(collided):
-            console.print(summary(study, collided), soft_wrap=True, markup=False, highlight=False)
+            console.print(str(preventability(Bench(study, pool), collided)), soft_wrap=True, markup=False, highlight=False)
     found = {"original vehicle": campaign.original}
     for algorithm in study.search.labels:
         of_it = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]

@@ -33,6 +33,8 @@ def print_explained(console: Console, place: str, told: Explained, point: str = 
         return
     for one in told.explanations:
         _print_one(console, partial(command, place, point=point), one, members, told)
+    if told.preventability.looked_at:
+        _say(console, str(told.preventability))
     _print_common(console, told)
 
 
@@ -53,8 +55,8 @@ def _print_one(console: Console, again: Again, one: Explanation, members: Charac
     if one.because.place:
         number = len(assemble(told.study).matrix)
         _say(console, points_in_words(one.points, number, most=len(one.points)))
-    if one.whose:
-        _say(console, f"In the same vehicle: {one.whose}.")
+    if one.preventable:
+        _say(console, f"In the same vehicle: {one.preventable}.")
     console.print(_side_by_side(one.because))
     if one.causes:
         shares = ", ".join(f"{share:.0%} at {step:g} s a step" for step, share in one.robustness.by_step.items())

@@ -1,0 +1,147 @@
+"""Preventability of collisions (ISO 34502, UN R157): would a reference driver have avoided them in the same vehicle?
+
+A collision that a competent driver avoids is the driving system's failure. One that not even full braking at the first
+possible moment avoids is the vehicle's.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from msgspec.structs import replace
+
+from safevar_sumo.answers.bench import Bench
+from safevar_sumo.answers.risk import CONFIDENCE, interval_of
+from safevar_sumo.answers.words import number_of
+from safevar_sumo.records import FloatArray
+from safevar_sumo.simulation import System, assemble, simulate, study_at
+from safevar_sumo.study import ModelTable, Study
+
+LIMIT = 20_000
+"""Simulations, about, that a study's preventability may take; of more collisions a random sample is looked at."""
+
+
+class PreventableBy(StrEnum):
+    """The least that it takes to avoid a collision in the same vehicle."""
+
+    COMPETENT_DRIVER = "preventable by a competent driver"
+    FULL_BRAKING = "preventable by full braking at the first possible moment"
+    NOBODY = "preventable by nobody"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preventability:
+    """Who avoids the collisions of a study: all of them, or a random sample.
+
+    Attributes
+    ----------
+    numbers
+        How many of the collisions looked at each class has; the classes are disjoint.
+    collisions
+        How many different collisions there are.
+    """
+
+    numbers: Mapping[PreventableBy, int]
+    collisions: int
+
+    @property
+    def looked_at(self) -> int:
+        """How many collisions were simulated with the reference drivers."""
+        return sum(self.numbers.values())
+
+    def share(self, by: PreventableBy) -> float | None:
+        """The share of one class among the collisions looked at; None if there are none."""
+        return self.numbers.get(by, 0) / self.looked_at if self.looked_at else None
+
+    def interval(self, by: PreventableBy) -> tuple[float, float] | None:
+        """95 % interval of the share among all of the study's collisions; None if none were looked at.
+
+        Where all are looked at the share has no sampling error: the interval is the share itself. For a sample it is
+        Clopper and Pearson's, without the correction for a finite population, so it rather is too wide.
+        """
+        share = self.share(by)
+        if share is None or self.looked_at == self.collisions:
+            return None if share is None else (share, share)
+        return interval_of(self.numbers.get(by, 0), self.looked_at, CONFIDENCE)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As `explain --json` prints it; shares and interval are None without any collision."""
+        interval = self.interval(PreventableBy.COMPETENT_DRIVER)
+        return {**{by.name.lower(): self.share(by) for by in PreventableBy}, "looked_at": self.looked_at,
+                "interval_competent_driver": None if interval is None else list(interval)}
+
+    def __str__(self) -> str:
+        """One line; nothing without any collision."""
+        if not self.looked_at:
+            return ""
+        sample = "" if self.looked_at == self.collisions else f"{self.looked_at}, drawn at random, of "
+        parts = [f"{self.share(by):.0%} {by}" for by in PreventableBy if self.numbers.get(by)]
+        return f"Preventability in the same vehicle ({sample}{number_of(self.collisions, 'collision')}): {', '.join(parts)}."
+
+
+def preventability(bench: Bench, settings: FloatArray, limit: int = LIMIT) -> Preventability:
+    """Who avoids the collisions of these settings, shape (M, n); equal ones count once.
+
+    If that takes more than about `limit` simulations, a random sample is looked at, drawn with the study's seed.
+    A setting that cannot be simulated with a reference driver counts as not looked at.
+    """
+    unique = np.unique(settings, axis=0)
+    most = max(limit // (len(PreventableBy) - 1 + len(assemble(bench.study).matrix)), 1)
+    rows = np.random.default_rng(bench.study.search.seed).permutation(len(unique))[:most]
+    return Preventability(numbers=Counter(by for by in preventable_by(bench, unique[rows]) if by is not None), collisions=len(unique))
+
+
+def preventable_by(bench: Bench, settings: FloatArray) -> list[PreventableBy | None]:
+    """Who avoids each collision, settings of shape (M, n); in a matrix at the point where the setting comes off worst.
+
+    None where a setting cannot be simulated.
+    """
+    found: list[PreventableBy | None] = [None] * len(settings)
+    system = assemble(bench.study)
+    worst = _worst_points(bench, system, settings)
+    for k in np.unique(worst).tolist():
+        rows = np.flatnonzero(worst == k)
+        point = system.points[k]
+        here = bench.of(study_at(bench.study, point.name, point.name) if system.matrix else bench.study)
+        for row, by in zip(rows.tolist(), _at_one_point(here, system.at(point), settings[rows]), strict=True):
+            found[row] = by
+    return found
+
+
+def _worst_points(bench: Bench, system: System, settings: FloatArray) -> npt.NDArray[np.intp]:
+    """For every setting the number of the point with the least safety degree; among equals the first by name."""
+    if not system.matrix or not len(settings):
+        return np.zeros(len(settings), dtype=np.intp)
+    order = sorted(range(len(system.points)), key=lambda k: system.points[k].name)
+    degrees = [bench.of(study_at(bench.study, name, name)).evaluate(settings, f"collisions at {name}").f_safe
+               for name in (system.points[k].name for k in order)]
+    return np.asarray(np.array(order)[np.argmin(np.where(np.isnan(degrees), np.inf, degrees), axis=0)])
+
+
+def _at_one_point(bench: Bench, system: System, settings: FloatArray) -> list[PreventableBy | None]:
+    """Full braking is only tried where the competent driver collides: the classes are disjoint."""
+    parameters = _approach(system)
+    drivers = {name: bench.of(_driven_by(bench.study, name, parameters)) for name in ("competent_driver", "full_braking")}
+    competent = drivers["competent_driver"].evaluate(settings, "a competent driver in the same vehicle")
+    left = np.flatnonzero(competent.collided)
+    braking = drivers["full_braking"].evaluate(settings[left], "full braking in the same vehicle")
+    found: list[PreventableBy | None] = [PreventableBy.COMPETENT_DRIVER if valid else None for valid in competent.valid]
+    for row, collided, valid in zip(left.tolist(), braking.collided, braking.valid, strict=True):
+        found[row] = None if not valid else PreventableBy.NOBODY if collided else PreventableBy.FULL_BRAKING
+    return found
+
+
+def _approach(system: System) -> dict[str, float]:
+    """How a reference driver approaches: from rest it accelerates to the peak speed of the driving system with the original vehicle."""
+    speed = simulate(system, system.characteristics.original[np.newaxis]).trace.speed[:, 0]
+    return {"cruise_speed": float(speed.max())} if speed[0] == 0 < speed.max() else {}
+
+
+def _driven_by(study: Study, driver: str, parameters: Mapping[str, Any]) -> Study:
+    return replace(study, ads=ModelTable(model=driver, parameters=dict(parameters)))
