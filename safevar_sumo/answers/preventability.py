@@ -17,12 +17,14 @@ import numpy.typing as npt
 from msgspec.structs import replace
 
 from safevar_sumo.answers.bench import Bench
-from safevar_sumo.answers.risk import CONFIDENCE, interval_of
+from safevar_sumo.answers.risk import interval_of
 from safevar_sumo.answers.words import number_of
 from safevar_sumo.records import FloatArray
 from safevar_sumo.simulation import System, assemble, simulate, study_at
 from safevar_sumo.study import ModelTable, Study
 
+CONFIDENCE = 0.95
+"""Of the interval of a sample's share."""
 LIMIT = 20_000
 """Simulations, about, that a study's preventability may take; of more collisions a random sample is looked at."""
 
