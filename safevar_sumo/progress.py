@@ -9,13 +9,15 @@ from datetime import timedelta
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from safevar_sumo.campaign import RunKey
 from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study
 
 SECONDS_BETWEEN_LINES = 30.0
+SETTLED = 5.0
+"""Seconds of work after which a throughput is told: batches that end together make the first ones meaningless."""
 BAR = 10
 """Letters that a bar takes."""
 LEAST_ROOM = 26
@@ -23,23 +25,18 @@ LEAST_ROOM = 26
 
 
 class CampaignProgress:
-    """Bars on a terminal, a line now and then elsewhere: what is done, how fast, what was found, how long yet."""
+    """One bar for the whole study on a terminal, a line now and then elsewhere: how fast, how long yet, what was found."""
 
     def __init__(self, console: Console, study: Study, keys: list[RunKey], quiet: bool) -> None:
-        self._console, self._quiet = console, quiet
+        self._console, self._quiet, self._name = console, quiet, study.name
         shown = console.is_terminal and not quiet
-        self._room = console.width - max(map(len, study.search.labels)) - 1
+        self._room = console.width - len(study.name) - 1
         bar = [BarColumn(bar_width=BAR)] if self._room - BAR - 1 >= LEAST_ROOM else []
         self._room -= len(bar) * (BAR + 1)
         self._bar = Progress(TextColumn("{task.description}", markup=False), *bar, TextColumn("{task.fields[told]}", markup=False),
                              console=console, disable=not shown)
-        self._lines = {}
-        for name in study.search.labels:
-            runs = sum(key.algorithm == name for key in keys)
-            if runs:
-                task = self._bar.add_task(name, total=runs * study.search.evaluations, told="waiting")
-                self._lines[name] = _Line(name, runs, study.search.evaluations, task)
-        self._asked: dict[RunKey, int] = {}
+        self._tally = _Tally(len(keys), study.search.evaluations)
+        self._task = self._bar.add_task(study.name, total=self._tally.total, told="waiting")
         self._spoke = time.monotonic()
 
     def __enter__(self) -> CampaignProgress:
@@ -50,81 +47,85 @@ class CampaignProgress:
         self._bar.stop()
 
     def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
-        self._asked[key] = self._asked.get(key, 0) + len(evaluations)
-        self._lines[key.algorithm].take_in(evaluations, simulated)
-        self._tell(self._lines[key.algorithm])
+        self._tally.take_in(key, evaluations, simulated)
+        self._show()
 
     def finished(self, key: RunKey, asked: int) -> None:
-        self._lines[key.algorithm].close_run(asked, self._asked.pop(key, 0))
-        self._tell(self._lines[key.algorithm])
+        self._tally.close_run(key, asked)
+        self._show()
 
     def warned(self, message: str) -> None:
         self._console.print(f"warning: {message}", soft_wrap=True, markup=False, highlight=False)
 
-    def _tell(self, line: _Line) -> None:
-        self._bar.update(line.task, completed=line.done, total=line.total, told=line.told_within(self._room))
+    def _show(self) -> None:
+        tally = self._tally
+        self._bar.update(self._task, completed=tally.done, total=tally.total, told=tally.text(self._room))
         now = time.monotonic()
         if not self._console.is_terminal and not self._quiet and now - self._spoke >= SECONDS_BETWEEN_LINES:
             self._spoke = now
-            for one in self._lines.values():
-                self._console.print(f"{one.name}: {one.told()}", soft_wrap=True, highlight=False)
+            self._console.print(f"{self._name}: {tally.text()}", soft_wrap=True, highlight=False)
 
 
-class _Line:
-    """How far the runs of one algorithm are."""
+class _Tally:
+    """How far all runs of a study are together."""
 
-    def __init__(self, name: str, runs: int, evaluations: int, task: TaskID) -> None:
-        self.name, self.task = name, task
+    def __init__(self, runs: int, evaluations: int) -> None:
         self.done, self.total = 0, runs * evaluations
         self._evaluations, self._runs = evaluations, runs
-        self._finished = self._simulated = self._collisions = 0
+        self._finished = self._simulated = self._answered = self._collisions = 0
         self._best = np.inf
-        self._first = self._last = 0.0
+        self._first: float | None = None
+        self._last = 0.0
+        self._seen: dict[RunKey, tuple[int, set[bytes]]] = {}
 
-    def take_in(self, evaluations: Evaluations, simulated: int) -> None:
+    def take_in(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
+        """What a run was answered; of settings that it asks for again, a collision counts once, as in `status` and in the summary."""
         self._last = time.monotonic()
-        if self._first:
+        if simulated and self._first is None:
+            self._first = self._last  # how long the first ones took, with the start of the workers, nobody knows
+        elif simulated:
             self._simulated += simulated
-        else:
-            self._first = self._last  # what came first took nobody knows how long
+            self._answered += len(evaluations)
         self.done += len(evaluations)
-        self._collisions += int(np.count_nonzero(evaluations.collided))
+        asked, collided = self._seen.get(key, (0, set()))
+        before = len(collided)
+        collided.update(setting.tobytes() for setting in evaluations.settings[evaluations.collided])
+        self._seen[key] = asked + len(evaluations), collided
+        self._collisions += len(collided) - before
         if evaluations.valid.any():
             self._best = min(self._best, float(np.min(evaluations.f_safe[evaluations.valid])))
 
-    def close_run(self, asked: int, seen: int) -> None:
-        """A run that ends early asks for less than its budget; one from a finished journal was never seen."""
+    def close_run(self, key: RunKey, asked: int) -> None:
+        """A run that ends early asks for less than its budget."""
+        seen, _ = self._seen.pop(key, (0, set()))
         self._finished += 1
         self.done += asked - seen
         self.total -= self._evaluations - asked
 
-    def told_within(self, room: int) -> str:
-        """In no more than so many letters, without what has no place: what comes first matters most."""
+    def text(self, room: int | None = None) -> str:
+        """All of it, or what has place in so many letters: what comes first matters most."""
         found = [] if np.isinf(self._best) else [f"{self._collisions} collisions"]
         best = [] if np.isinf(self._best) else [f"best SD {self._best:.2f}"]
-        told = ""
-        for part in (f"{self._rate():.0f}/s", self._left(), *found, f"runs {self._finished}/{self._runs}", *best):
-            longer = f"{told}, {part}" if told else part
-            if len(longer) > room:
+        rate = [f"{self._simulated / self._seconds:.0f}/s"] if self._simulated and self._seconds >= SETTLED else []
+        text = ""
+        for part in (*rate, self._left(), *found, f"runs {self._finished}/{self._runs}", *best):
+            longer = f"{text}, {part}" if text else part
+            if room is not None and len(longer) > room:
                 break
-            told = longer
-        return told
+            text = longer
+        return text
 
-    def told(self) -> str:
-        """In a line of its own."""
-        found = "" if np.isinf(self._best) else f", best SD {self._best:.2f}, collisions {self._collisions}"
-        return f"runs {self._finished}/{self._runs}, {self._rate():.0f} evaluations/s, {self._left()}{found}"
+    @property
+    def _seconds(self) -> float:
+        return 0.0 if self._first is None else self._last - self._first
 
     def _left(self) -> str:
-        """Hours, minutes and seconds, as far as there is a telling."""
-        rate = self._rate()
-        if not rate and self.done < self.total:
-            return "time left not known yet" if self.done else "not begun"
-        return f"{timedelta(seconds=round((self.total - self.done) / rate) if rate else 0)} left"
-
-    def _rate(self) -> float:
-        """Evaluations per second while this algorithm's runs are under way."""
-        return self._simulated / (self._last - self._first) if self._last > self._first else 0.0
+        """Hours, minutes and seconds, from the throughput of all runs together once it has settled."""
+        if self.done >= self.total:
+            return "0:00:00 left"
+        if not self._answered or self._seconds < SETTLED:
+            return "time left not known yet"
+        return f"{timedelta(seconds=round((self.total - self.done) * self._seconds / self._answered))} left"
 
 
 @contextmanager

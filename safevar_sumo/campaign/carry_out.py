@@ -25,13 +25,14 @@ class Campaign(NamedTuple):
     """What runs of a study found: the original vehicle's evaluation and the solutions of every finished run.
 
     `failures` are settings that could not be simulated; `busy` runs are in the hands of another process; `scoring` is what
-    was measured and minimised.
+    was measured and minimised; `collisions` counts the different settings of each finished run that collided.
     """
 
     original: Evaluations
     solutions: dict[RunKey, Evaluations]
     failures: list[Failure]
     busy: list[RunKey]
+    collisions: dict[RunKey, int]
     scoring: Scoring = SAFEVAR
 
 
@@ -65,7 +66,7 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
     results.begin(original)
     problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,
                       population=study.search.population, scoring=results.scoring)
-    campaign = Campaign(original, {}, [], [], results.scoring)
+    campaign = Campaign(original, {}, [], [], {}, results.scoring)
     waiting, runs = deque(keys), set[Run]()
 
     def begun(key: RunKey) -> Search:
@@ -82,7 +83,7 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
 
     def finish(run: Run) -> None:
         run.finish()
-        campaign.solutions[run.key] = run.result
+        campaign.solutions[run.key], campaign.collisions[run.key] = run.result, run.collisions
         campaign.failures.extend(run.failures)
         runs.discard(run)
         run.close()

@@ -74,12 +74,21 @@ class Run:
                 for position, evaluations, i in sorted(self._known.values(), key=lambda known: known[0])
                 if 0 <= position < self._budget and evaluations.outcome[i] == Outcome.SIMULATOR_ERROR]
 
+    @property
+    def collisions(self) -> int:
+        """How many different settings that this run asked for collided."""
+        return sum(evaluations.outcome[i] == Outcome.COLLISION for position, evaluations, i in self._known.values()
+                   if 0 <= position < self._budget)
+
     def advance(self) -> bool:
         """Answer the search as long as everything it asks for is known; whether it has ended."""
         done = self._journal.content.result(self._budget)
         if done is not None:
             self.result = self._journal.content.by_position(done.positions)
             self._asked, self.finished = done.asked, True
+            asked = self._journal.content.within(self._budget)
+            if asked is not None:
+                self._observer.evaluated(self.key, asked, 0)
             return True
         if not self._places:
             self._ask(next(self._search))

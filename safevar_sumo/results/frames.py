@@ -82,6 +82,12 @@ class Content(NamedTuple):
         row_of = {position: row for row, position in enumerate(self.positions)}
         return self.evaluations.take([row_of[position] for position in positions])
 
+    def within(self, budget: int) -> Evaluations | None:
+        """The evaluations that a run with a budget asked for; None if there is none."""
+        if self.evaluations is None:
+            return None
+        return self.evaluations.take(np.array([0 <= position < budget for position in self.positions], dtype=bool))
+
 
 NOTHING = Content([], None, {})
 

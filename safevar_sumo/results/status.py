@@ -95,10 +95,9 @@ def status(directory: str | Path) -> Status:
 
 def _run(path: Path, of: str, algorithm: str, run: int, budget: int) -> tuple[RunStatus, np.ndarray]:
     content = read_journal(path, of, path.stem) if path.exists() else None
-    if content is None or content.evaluations is None:
+    found = content.within(budget) if content is not None else None
+    if content is None or found is None:
         return RunStatus(algorithm, run, "waiting" if content is None else "begun", 0, 0, 0, None), np.zeros((0, 3))
-    asked = np.array([0 <= position < budget for position in content.positions], dtype=bool)
-    found = content.evaluations.take(asked)
     valid = found.take(found.valid)
     state = "finished" if content.result(budget) is not None else "begun"
     best = float(np.min(valid.f_safe)) if len(valid) else None

@@ -56,7 +56,9 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     for head in found:
         table.add_column(head, justify="right")
     table.add_row("solutions", "-", *(str(len(one)) for one in list(found.values())[1:]))
-    table.add_row("collisions", *(str(int(np.count_nonzero(one.collided))) for one in found.values()))
+    table.add_row("solutions that collide", *(str(int(np.count_nonzero(one.collided))) for one in found.values()))
+    collisions = [sum(number for key, number in campaign.collisions.items() if key.algorithm == name) for name in list(found)[1:]]
+    table.add_row("collisions simulated", *map(str, [int(campaign.original.collided[0]), *collisions]))
     for metric in campaign.scoring.metrics:
         table.add_row(escape(f"mean {metric.heading}"), *(_mean(one.metrics[metric.name]) for one in found.values()))
     console.print(table)

@@ -13,12 +13,14 @@ from safevar_sumo.terminal.plain import WholeTable
 
 FRONT = 5
 """Points of the front that are shown."""
+RUNS_SHOWN = 12
+"""Runs under way that are named."""
 
 
 def status_view(told: Status, rate: float | None) -> RenderableType:
     """A study's runs by algorithm and the front so far; `rate` is the share of the work done per second, if it is known."""
     table = WholeTable("algorithm", title=Text(told.title), title_justify="left")
-    for head in ("runs", "under way", "simulated", "collisions", "simulator errors", "best SD"):
+    for head in ("runs", "under\nway", "simulated", "collisions", "simulator\nerrors", "best\nSD"):
         table.add_column(head, justify="right")
     for algorithm in dict.fromkeys(run.algorithm for run in told.runs):
         of_it = [run for run in told.runs if run.algorithm == algorithm]
@@ -35,7 +37,8 @@ def _cells(runs: list[RunStatus]) -> list[str]:
 
 def _under_way(told: Status) -> str:
     begun = [f"{run.algorithm}:{run.run} {run.simulated}/{told.budget}" for run in told.runs if run.state == "begun"]
-    return "Under way: " + ", ".join(begun) if begun else ""
+    more = f" and {len(begun) - RUNS_SHOWN} more" if len(begun) > RUNS_SHOWN else ""
+    return f"Under way: {', '.join(begun[:RUNS_SHOWN])}{more}" if begun else ""
 
 
 def _left(told: Status, rate: float | None) -> str:

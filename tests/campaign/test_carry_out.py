@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from concurrent.futures import Future
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from formulas import SUN, FormulaPool, Told, carried_out, evaluated, solutions, with_search
+from rich.console import Console
 
 from safevar_sumo.campaign import RunKey, all_runs, carry_out, run_generator
 from safevar_sumo.campaign.gathering import BATCHES_PER_WORKER
 from safevar_sumo.computing import PoolLostError
+from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import ResultsDirectory, load
+from safevar_sumo.results import ResultsDirectory, load, status
 from safevar_sumo.study import Study, tables_of
 
 
@@ -26,6 +29,20 @@ def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches(study: St
         carried_out(study, tmp_path / name, pool, batch=batch)
         assert solutions(tmp_path / name) == solutions(tmp_path / "a")
         pd.testing.assert_frame_equal(load(tmp_path / name).evaluations, load(tmp_path / "a").evaluations)
+
+
+def test_bar_status_and_campaign_count_the_same_collisions(study: Study, tmp_path: Path) -> None:
+    """Different settings of each run; the bar also when it goes on from finished journals."""
+    for _ in range(2):
+        console, results = Console(file=StringIO(), width=200, force_terminal=True, _environ={}), ResultsDirectory(tmp_path, study)
+        with CampaignProgress(console, study, all_runs(study), quiet=False) as progress:
+            campaign = carry_out(study, all_runs(study), results, FormulaPool(), progress)
+        results.finish(campaign.solutions)
+        found = load(tmp_path).evaluations
+        expected = len(found[found["outcome"] == "collision"].drop_duplicates(["algorithm", "run", *SUN.names]))
+        assert expected > 0
+        assert sum(campaign.collisions.values()) == sum(run.collisions for run in status(tmp_path).runs) == expected
+        assert f" {expected} collisions" in console.file.getvalue()  # type: ignore[attr-defined]
 
 
 class Sizes(FormulaPool):

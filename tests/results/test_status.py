@@ -51,6 +51,9 @@ def test_a_study_under_way(slippery: Path, tmp_path: Path) -> None:
     assert "simulator" in done.output, "a collision is a failure too, but counted on its own"
     assert "failures" not in done.output
     assert "% done" in done.output
+    lines = CliRunner(env={"COLUMNS": "80"}).invoke(commands, ["status", str(tmp_path / "it")]).output.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "collisions" in "".join(lines), "no word is cut in two"
 
 
 def test_a_study_of_which_nothing_is_done_yet(slippery: Path, tmp_path: Path) -> None:

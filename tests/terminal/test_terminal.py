@@ -31,44 +31,58 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-def found(number: int) -> Evaluations:
+def found(number: int, first: int = 0) -> Evaluations:
+    """Collisions of different settings, from the first on."""
     values = np.full(number, -5.63)
-    return Evaluations(settings=np.zeros((number, 12)), outcome=np.full(number, "collision"), collision_speed=-values,
+    settings = np.tile(np.arange(first, first + number, dtype=float)[:, np.newaxis], 12)
+    return Evaluations(settings=settings, outcome=np.full(number, "collision"), collision_speed=-values,
                        metrics=dict.fromkeys(METRICS, values), f_diff=values, f_num_diff=values)
 
 
 def shown(study: Study, clock: list[float], *, terminal_width: int | None, quiet: bool = False) -> str:
-    """What is printed by 400 evaluations, one hundred every ten seconds, and then a run that ends."""
+    """What is printed by 500 evaluations, one hundred every ten seconds, of two algorithms in turn, and then a run that ends."""
     out = StringIO()
     console = Console(file=out, force_terminal=terminal_width is not None, width=terminal_width or 80, _environ={})
     with CampaignProgress(console, study, all_runs(study), quiet) as progress:
-        for _ in range(5):
-            progress.evaluated(RunKey("nsga2", 0), found(100), 100)
+        for i in range(5):
+            progress.evaluated(RunKey(("nsga2", "rs")[i % 2], 0), found(100, 100 * i), 100)
             clock[0] += 10
-        progress.finished(RunKey("nsga2", 0), 500)
+        progress.finished(RunKey("nsga2", 0), 300)
     return out.getvalue()
 
 
-def test_elsewhere_a_line_for_every_algorithm_every_30_seconds(study: Study, clock: list[float]) -> None:
+def test_elsewhere_a_line_for_the_whole_study_every_30_seconds(study: Study, clock: list[float]) -> None:
+    """6 runs of 1000 evaluations, 400 done, 10 a second: 5600 more take 560 s, whichever algorithms they belong to."""
     lines = shown(study, clock, terminal_width=None).splitlines()
-    assert lines == [
-        "nsga2: runs 0/2, 10 evaluations/s, 0:02:40 left, best SD -5.63, collisions 400", "rs: runs 0/2, 0 evaluations/s, not begun",
-        "safe_fuzzer: runs 0/2, 0 evaluations/s, not begun"]
+    assert lines == ["rain: 10/s, 0:09:20 left, 400 collisions, runs 0/6, best SD -5.63"]
 
 
 @pytest.mark.parametrize(("width", "told"), [
-    (120, "10/s, 0:01:40 left, 500 collisions, runs 1/2, best SD -5.63"), (80, "10/s, 0:01:40 left, 500 collisions, runs 1/2"),
-    (50, "10/s, 0:01:40 left"), (30, "10/s, 0:01:40 left"), (20, "10/s"),
+    (120, "10/s, 0:08:00 left, 500 collisions, runs 1/6, best SD -5.63"),
+    (80, "10/s, 0:08:00 left, 500 collisions, runs 1/6, best SD -5.63"),
+    (55, "10/s, 0:08:00 left, 500 collisions"), (35, "10/s, 0:08:00 left"), (20, "10/s"),
 ])
 def test_on_a_terminal_what_matters_fits_in_its_line_and_no_word_is_cut(
         width: int, told: str, study: Study, clock: list[float]) -> None:
-    """The run that ended early leaves one run of 1000."""
+    """The run that ended early leaves 5300 evaluations in all, 500 of them done."""
     lines = [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", line).rstrip() for line in shown(study, clock, terminal_width=width).splitlines()]
-    last = [line for line in lines if "nsga2" in line][-1]
+    last = [line for line in lines if "rain" in line][-1]
     assert last.endswith(told)
     assert ("━" in last) == (width >= 50)
     assert max(map(len, lines)) <= width
     assert not [line for line in lines if "…" in line]
+
+
+def test_no_time_left_is_told_before_the_throughput_has_settled(study: Study, clock: list[float]) -> None:
+    """Two batches that end within a moment say nothing of how fast the study is."""
+    out = StringIO()
+    with CampaignProgress(Console(file=out, force_terminal=True, width=120, _environ={}), study, all_runs(study), quiet=False) as progress:
+        for i in range(2):
+            progress.evaluated(RunKey("nsga2", i), found(100), 100)
+            clock[0] += 0.01
+    last = [line for line in out.getvalue().splitlines() if "rain" in line][-1]
+    assert "time left not known yet, 200 collisions" in last
+    assert "/s," not in last
 
 
 def test_quiet_says_nothing(study: Study, clock: list[float]) -> None:
@@ -77,10 +91,13 @@ def test_quiet_says_nothing(study: Study, clock: list[float]) -> None:
 
 
 def test_what_comes_from_journals_counts_as_done_and_not_as_fast(study: Study, clock: list[float]) -> None:
+    """A run of 1000 that was finished before, of 600 different settings; 500 settings of the next one; then 100 simulated in 20 s."""
     out = StringIO()
     with CampaignProgress(Console(file=out, width=80), study, all_runs(study), quiet=False) as progress:
+        progress.evaluated(RunKey("nsga2", 0), found(600), 0)
         progress.finished(RunKey("nsga2", 0), 1000)
         progress.evaluated(RunKey("nsga2", 1), found(500), 0)
+        progress.evaluated(RunKey("nsga2", 1), found(100, 500), 100)
         clock[0] += 40
-        progress.evaluated(RunKey("nsga2", 1), found(100), 100)
-    assert "nsga2: runs 1/2, 2 evaluations/s, 0:02:40 left, best SD -5.63, collisions 600" in out.getvalue()
+        progress.evaluated(RunKey("nsga2", 1), found(100, 500), 100)  # the same once more: no other collisions
+    assert out.getvalue() == "rain: 2/s, 0:28:40 left, 1200 collisions, runs 1/6, best SD -5.63\n"
