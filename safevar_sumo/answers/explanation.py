@@ -14,7 +14,7 @@ from safevar_sumo.answers.failures import Failures, failures_of
 from safevar_sumo.answers.findings import Cause, Explained, Explanation
 from safevar_sumo.answers.necessity import distinct_causes, key_of, necessity
 from safevar_sumo.answers.preventability import preventability, preventable_by
-from safevar_sumo.answers.robustness import robustness
+from safevar_sumo.answers.robustness import robustness, smallest_robust
 from safevar_sumo.answers.unsafe import Unsafe
 from safevar_sumo.answers.where import where
 from safevar_sumo.computing import Pool
@@ -24,6 +24,7 @@ from safevar_sumo.results import Handle
 from safevar_sumo.simulation import assemble
 from safevar_sumo.study import Study
 
+ROBUST = "smallest robust"
 REASONS = {"fewest": "fewest changes", "smallest": "smallest changes", "most_severe": "most severe"}
 Causes = Mapping[int, list[MinimalCause]]
 Reasons = tuple[str, ...]
@@ -38,14 +39,15 @@ def explain(source: Study | Case, *, solutions: Sequence[str] = (), unsafe: str 
     source
         Results, or a study without any.
     solutions
-        Handles of the solutions to explain; by default those with the fewest and the smallest changes, the most severe
-        one, and one of each distinct minimal cause, the most frequent first.
+        Handles of the solutions to explain; by default the smallest robust failure, those with the fewest and the smallest
+        changes, the most severe one, and one of each distinct minimal cause, the most frequent first.
     unsafe
         `collision` or `below=X`; by default a collision if there is one, else half of the original's safety degree.
     top
         How many failures are explained in full at the most.
     limit
-        Simulations, about, that the minimal causes of all failures may take: of more, a random sample is looked into.
+        Simulations, about, that the minimal causes of all failures may take: of more, a random sample is looked into. So
+        many may the search for the smallest robust failure take again.
     pool, jobs
         Where to simulate: a pool, or that many worker processes (by default one for each core).
     progress
@@ -64,7 +66,7 @@ def explain(source: Study | Case, *, solutions: Sequence[str] = (), unsafe: str 
         original = bench.original()
         found = failures_of(source, bench, original, named, means)
         sample = found.rows if solutions else [found.rows[i] for i in affordable(found.evaluations.settings[found.rows], bench, limit)]
-        reasons = dict.fromkeys(found.rows[:len(solutions)], ("asked for",)) if solutions else _that_matter(found)
+        reasons = dict.fromkeys(found.rows[:len(solutions)], ("asked for",)) if solutions else _that_matter(found, _robust(found, bench, original, limit))
         rows = sorted({*sample, *reasons})
         causes = dict(zip(rows, minimal_causes(bench, found.evaluations.settings[rows], found.unsafe), strict=True))
         if not solutions:
@@ -80,13 +82,22 @@ def explain(source: Study | Case, *, solutions: Sequence[str] = (), unsafe: str 
         preventability=preventable)
 
 
-def _that_matter(found: Failures) -> dict[int, Reasons]:
-    """The failures of the fewest and the smallest changes and the most severe one, and which of these each is."""
-    reasons: dict[int, Reasons] = {}
-    for choice, reason in REASONS.items():
+def _robust(found: Failures, bench: Bench, original: Evaluations, limit: int) -> int | None:
+    """The smallest robust failure, if there is one among those that may be tried; none where the original vehicle is unsafe itself."""
+    if not found.rows or found.unsafe.of(original)[0]:
+        return None
+    _, step = where(assemble(bench.study), original.settings, original.settings[:0], found.unsafe)
+    row = smallest_robust(bench, found.evaluations.take(found.rows), step, found.unsafe, limit)
+    return None if row is None else found.rows[row]
+
+
+def _that_matter(found: Failures, robust: int | None) -> dict[int, Reasons]:
+    """The smallest robust failure, the one of the fewest changes, the most severe and the one of the smallest changes, by row."""
+    reasons: dict[int, Reasons] = {} if robust is None else {robust: (ROBUST,)}
+    for choice in ("fewest", "most_severe", "smallest"):
         if found.rows:
             row = found.least(choice)
-            reasons[row] = (*reasons.get(row, ()), reason)
+            reasons[row] = (*reasons.get(row, ()), REASONS[choice])
     return reasons
 
 

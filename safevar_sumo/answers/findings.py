@@ -71,7 +71,8 @@ class Explanation:
             "safety_degree": self.safety_degree, "changed": list(self.changed),
             "minimal_causes": [{name: getattr(cause, name) for name in ("changes", "boundary", "fraction", "outcome", "safety_degree")}
                                for cause in self.causes],
-            "robustness": self.robustness.share, "because": sentence(self.because)}
+            "robustness": self.robustness.share, "because": sentence(self.because),
+            "reasons": list(self.reasons)}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Whether a finding hangs on a hair: its neighbours, and other time steps."""
+"""Whether a finding is robust or borderline: its neighbours, and other time steps."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ import numpy as np
 
 from safevar_sumo.answers.bench import Bench
 from safevar_sumo.answers.unsafe import Unsafe
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import Evaluations, FloatArray
 
 NEIGHBOURS = 64
 STEP_FACTORS = (1.0, 0.5, 2.0)
 """Of the study's time step: itself, half of it, and twice."""
 BORDERLINE = 0.8
 """A share of unsafe outcomes below which a finding is called borderline."""
+TOGETHER = 8
+"""Failures, the smallest first, that are tried at a time."""
 
 
 class Robustness(NamedTuple):
@@ -28,7 +30,12 @@ class Robustness(NamedTuple):
 
     @property
     def borderline(self) -> bool:
-        return self.share < BORDERLINE
+        return is_borderline(self.share)
+
+
+def is_borderline(share: float) -> bool:
+    """Whether so few of a finding's neighbours are unsafe too that small perturbations remove it."""
+    return share < BORDERLINE
 
 
 def robustness(bench: Bench, settings: FloatArray, step: float, unsafe: Unsafe) -> list[Robustness]:
@@ -46,3 +53,18 @@ def robustness(bench: Bench, settings: FloatArray, step: float, unsafe: Unsafe) 
         outcomes = unsafe.of(on.evaluate(around, f"neighbours at {step * factor:g} s a step"))
         shares[step * factor] = outcomes.reshape(len(settings), NEIGHBOURS).mean(axis=1)
     return [Robustness({step: float(of_it[row]) for step, of_it in shares.items()}) for row in range(len(settings))]
+
+
+def smallest_robust(bench: Bench, failures: Evaluations, step: float, unsafe: Unsafe, limit: int) -> int | None:
+    """The row of the smallest failure that is not borderline: of the fewest changes, then the smallest largest change.
+
+    They are tried in that order until one is robust or about `limit` simulations are spent; None if none is robust by then.
+    """
+    order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])
+    most = max(TOGETHER, limit // (NEIGHBOURS * len(STEP_FACTORS)))
+    for first in range(0, min(len(order), most), TOGETHER):
+        rows = order[first:first + TOGETHER]
+        for row, found in zip(rows.tolist(), robustness(bench, failures.settings[rows], step, unsafe), strict=True):
+            if not found.borderline:
+                return int(row)
+    return None

@@ -13,7 +13,7 @@ from known_regions import ORIGINAL, box, diagonal_band, everywhere, made_up_benc
 from safevar_sumo.answers.boundary import RESOLUTION, boundaries
 from safevar_sumo.answers.causes import affordable, involved, minimal_causes, necessary
 from safevar_sumo.answers.necessity import distinct_causes, necessity
-from safevar_sumo.answers.robustness import robustness
+from safevar_sumo.answers.robustness import robustness, smallest_robust
 from safevar_sumo.answers.unsafe import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
 
@@ -92,6 +92,14 @@ def test_robust_is_what_its_neighbours_are_too() -> None:
     assert (deep.borderline, edge.borderline) == (False, True)
     (beyond,) = robustness(bench, np.array([[7.0 + 1.01 * threshold, 1.0]]), 0.1, COLLISION)
     assert beyond.share == 1.0
+
+
+def test_the_smallest_robust_failure_is_the_first_whose_neighbours_are_unsafe_too() -> None:
+    """Largest changes of 40, 70 and 80 %; the first lies at the edge of the box."""
+    bench = made_up_bench(2, box)
+    failures = bench.evaluate(np.array([[9.0, 1.0], [7.01, 2.99], [8.5, 2.0]]), "failures")
+    assert smallest_robust(bench, failures, 0.1, COLLISION, limit=1) == 2
+    assert smallest_robust(bench, failures.take([1]), 0.1, COLLISION, limit=1) is None
 
 
 def test_necessary_and_changed_over_failures() -> None:

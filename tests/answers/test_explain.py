@@ -15,6 +15,7 @@ from safevar_sumo.analysis import Case, load_cases
 from safevar_sumo.answers import Explained, explain, lead
 from safevar_sumo.answers.bench import Bench
 from safevar_sumo.answers.boundary import RESOLUTION
+from safevar_sumo.answers.robustness import robustness
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import handles
@@ -61,7 +62,7 @@ def test_the_records_are_those_of_the_solutions(case: Case, told: Explained) -> 
     known = [str(handle) for handle in handles(case.solutions)]
     for one in records:
         assert list(one) == ["algorithm", "run", "index", "setting", "outcome", "safety_degree", "changed", "minimal_causes", "robustness",
-                             "because"]
+                             "because", "reasons"]
         row = case.solutions.iloc[known.index(f"{one['algorithm']}:{one['run']}:{one['index']}")]
         assert one["setting"] == row[list(case.characteristics.names)].to_dict()
         assert (one["outcome"], one["safety_degree"]) == (row["outcome"], row["safety_degree"])
@@ -82,6 +83,19 @@ def test_the_failures_that_matter_come_first(case: Case, told: Explained) -> Non
     assert len(reasons["fewest changes"].changed) == crashes["f_num_diff"].min()
     assert reasons["most severe"].safety_degree == crashes["safety_degree"].min()
     assert told.failures == told.analysed == len(crashes[list(case.characteristics.names)].drop_duplicates())
+
+
+def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: Case, told: Explained) -> None:
+    """Every failure that is smaller, by number of changes and then by the largest, has less than 80 % of unsafe neighbours."""
+    (robust,) = [one for one in told.explanations if "smallest robust" in one.reasons]
+    assert told.explanations[0] == robust
+    assert robust.robustness.share >= 0.8
+    crashes = case.solutions[case.solutions["outcome"] == "collision"].sort_values(["f_num_diff", "f_diff", "f_safe"], kind="stable")
+    settings = crashes[list(case.characteristics.names)].to_numpy()
+    place = next(i for i, setting in enumerate(settings) if setting.tolist() == list(robust.setting.values()))
+    if place:
+        bench = Bench(case.study, Here())
+        assert max(one.share for one in robustness(bench, settings[:place], 0.05, told.unsafe)) < 0.8
 
 
 def test_the_lost_distance_adds_up(told: Explained) -> None:
