@@ -66,7 +66,8 @@ def explain(source: Study | Case, *, solutions: Sequence[str] = (), unsafe: str 
         original = bench.original()
         found = failures_of(source, bench, original, named, means)
         sample = found.rows if solutions else [found.rows[i] for i in affordable(found.evaluations.settings[found.rows], bench, limit)]
-        reasons = dict.fromkeys(found.rows[:len(solutions)], ("asked for",)) if solutions else _that_matter(found, _robust(found, bench, original, limit))
+        robust = None if solutions else _robust(found, bench, original, limit)
+        reasons = dict.fromkeys(found.rows[:len(solutions)], ("asked for",)) if solutions else _that_matter(found, robust)
         rows = sorted({*sample, *reasons})
         causes = dict(zip(rows, minimal_causes(bench, found.evaluations.settings[rows], found.unsafe), strict=True))
         if not solutions:
