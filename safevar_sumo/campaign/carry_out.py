@@ -97,7 +97,7 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
                 except JournalBusy:
                     campaign.busy.append(key)
                     continue
-                runs.add(run := Run(key, begun(key), journal, observer, study.search.evaluations, retry=retry_failed))
+                runs.add(run := Run(key, rechecking.search(key), journal, observer, study.search.evaluations, retry=retry_failed))
                 go_on(run)
             gathering.send()
             for future in first_of([*gathering.under_way, *rechecking.under_way]):

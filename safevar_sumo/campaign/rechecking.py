@@ -1,11 +1,13 @@
-"""What a run ends with, done once more as if there were no others: what leaks in rare states alone, or from run to run, shows there."""
+"""Parts of a run done once more as if there were nothing else: what leaks in rare states alone, or from run to run, shows there."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future
 
-from safevar_sumo.campaign.keys import RunKey
+import numpy as np
+
+from safevar_sumo.campaign.keys import RunKey, run_generator
 from safevar_sumo.campaign.run import Run
 from safevar_sumo.computing import PersistentPool, packed, refuse_difference, reproducing
 from safevar_sumo.errors import ForeignError
@@ -15,7 +17,8 @@ from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.search import Search
 from safevar_sumo.study import Study, foreign_names
 
-LEGAL = "what a run asks for depends on its problem, its evaluations and `rng` alone: nothing kept in a class or a module between runs"
+LEGAL = ("what a run asks for depends on its problem, its evaluations and `rng` alone: nothing kept in a class or a module between runs, "
+         "no clock, no random numbers of its own")
 
 
 class Rechecking:
@@ -30,7 +33,23 @@ class Rechecking:
     def __init__(self, study: Study, results: ResultsDirectory, pool: PersistentPool, begun: Callable[[RunKey], Search]) -> None:
         self._study, self._pool, self._begun = study, pool, begun
         self._work = packed(study, results.manifest, afresh=True) if foreign_names(study) else None
+        self._begun_twice: set[str] = set()
         self.under_way: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}
+
+    def search(self, key: RunKey) -> Search:
+        """The search of a run.
+
+        Raises
+        ------
+        ForeignError
+            If it is the first of an algorithm from outside, and asks for other settings at once when it is begun again.
+        """
+        name = self._from_outside(key)
+        if name and name not in self._begun_twice:
+            self._begun_twice.add(name)
+            if not np.array_equal(next(self._begun(key)), next(self._begun(key))):
+                raise self._unrepeatable(name, key)
+        return self._begun(key)
 
     def ask(self, run: Run) -> bool:
         """Have settings of a run simulated once more; whether there are any, and models that are not ours.
@@ -38,23 +57,31 @@ class Rechecking:
         Raises
         ------
         ForeignError
-            If it is the last run of an algorithm from outside, and alone and loaded afresh that asks for other settings.
+            If it is the last run of an algorithm from outside, and the same run, alone and loaded afresh, asks for other settings.
         """
-        self._refuse_shared_search(run)
+        self._refuse_unrepeatable(run)
         if self._work is None:
             return False
-        samples = run.samples()
+        samples = run.samples(run_generator(self._study, run.key._replace(algorithm=f"recheck {run.key.algorithm}")))
         for known in samples:
             self.under_way[self._pool.submit(self._work, known.settings)] = run, known
         return bool(samples)
 
-    def _refuse_shared_search(self, run: Run) -> None:
-        name, last = self._study.search.labels.get(run.key.algorithm, ""), self._study.search.runs - 1
-        if ":" in name and run.key.run == last > 0:
+    def _refuse_unrepeatable(self, run: Run) -> None:
+        name = self._from_outside(run.key)
+        if name and run.key.run == self._study.search.runs - 1:
             forget_foreign()
             if not run.is_repeated_by(self._begun(run.key)):
-                problem = f"search.algorithms: {name!r} asks for other settings in run {last} when there are no other runs"
-                raise ForeignError(f"study {self._study.name!r}", problem, LEGAL)
+                raise self._unrepeatable(name, run.key)
+
+    def _from_outside(self, key: RunKey) -> str:
+        """What the study calls the algorithm of a run; "" for one of ours."""
+        name = self._study.search.labels.get(key.algorithm, "")
+        return name if ":" in name else ""
+
+    def _unrepeatable(self, name: str, key: RunKey) -> ForeignError:
+        problem = f"search.algorithms: {name!r} asks for other settings when run {key.run} is repeated alone"
+        return ForeignError(f"study {self._study.name!r}", problem, LEGAL)
 
     def take(self, done: Future[Evaluations]) -> Run | None:
         """The run of a setting, if that was its last one.

@@ -11,13 +11,15 @@ import numpy as np
 
 
 def lent(value: Any) -> Any:
-    """A copy of a record in which every array is a read-only copy."""
+    """A copy of a record and of the records in it, in which every array is a read-only copy."""
     if isinstance(value, np.ndarray):
         copy = value.copy()
         copy.flags.writeable = False
         return copy
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return type(value)(*map(lent, value))
+    if type(value) is tuple:
+        return tuple(map(lent, value))
     if is_dataclass(value) and not isinstance(value, type):
         return replace(value, **{field.name: lent(getattr(value, field.name)) for field in fields(value)})
     if isinstance(value, Mapping):

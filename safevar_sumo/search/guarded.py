@@ -16,13 +16,13 @@ ALGORITHM_CONTRACT = Contract.of(Algorithm, "an algorithm")
 
 
 class GuardedAlgorithm:
-    """Checks what a search asks for and what it returns; it is sent copies."""
+    """Checks what a search asks for and what it returns; the problem and all evaluations that it gets are read-only copies."""
 
     def __init__(self, algorithm: Algorithm, guard: Guard) -> None:
         self._algorithm, self._guard = algorithm, guard
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        search = self._guard.call("search", self._algorithm.search, problem, rng)
+        search = self._guard.call("search", self._algorithm.search, lent(problem), rng)
         if not (hasattr(search, "send") and hasattr(search, "__next__")):
             raise self._guard.wrong("search", "the search", search, "a generator: a method that yields settings and returns its result")
         known: dict[bytes, Evaluations] = {}
@@ -70,10 +70,13 @@ class GuardedAlgorithm:
         legal = "an Evaluations of settings that it was sent, such as evaluations.take(rows)"
         if not isinstance(found, Evaluations):
             raise self._guard.wrong("search", "its result", found, legal)
+        if not known:
+            raise ForeignError(self._guard.source, f"{self._guard.name} ended in search without asking for any setting",
+                               f"a generator that yields from 1 to {problem.evaluations} settings before it returns")
         rows = self._guard.numbers("search", "its result's settings", found.settings, (len(found), len(problem.characteristics)))
         if any(row.tobytes() not in known for row in rows):
             raise self._guard.wrong("search", "its result", "settings that it never asked for", legal)
-        nothing = next(iter(known.values())).take([]) if known else found
+        nothing = next(iter(known.values())).take([])
         result = Evaluations.concatenate([nothing, *(known[row.tobytes()] for row in rows)])
         return result.take(problem.scoring.valid(result))
 

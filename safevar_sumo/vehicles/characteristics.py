@@ -118,23 +118,29 @@ class CharacteristicSet:
 
     @cached_property
     def original(self) -> FloatArray:
-        return np.array([member.original for member in self.members])
+        return self._column("original")
 
     @cached_property
     def lower(self) -> FloatArray:
-        return np.array([member.lower for member in self.members])
+        return self._column("lower")
 
     @cached_property
     def upper(self) -> FloatArray:
-        return np.array([member.upper for member in self.members])
+        return self._column("upper")
 
     @cached_property
     def threshold(self) -> FloatArray:
-        return np.array([member.threshold for member in self.members])
+        return self._column("threshold")
 
     @cached_property
     def weight(self) -> FloatArray:
-        return np.array([member.weight for member in self.members])
+        return self._column("weight")
+
+    def _column(self, attribute: str) -> FloatArray:
+        """One number of every characteristic; read-only, because all runs share it."""
+        values = np.array([getattr(member, attribute) for member in self.members], dtype=float)
+        values.flags.writeable = False
+        return values
 
     def filter(self, settings: FloatArray) -> FloatArray:
         """Put back to the original what changes by no more than its threshold (method section 2)."""

@@ -63,7 +63,106 @@ def test_an_algorithm_whose_runs_learn_from_each_other(own: str, shared: bool, m
         return carried_out(study, system, all_runs(study), tmp_path / "out", InThisProcess(), Unheard(), None)
 
     if shared:
-        with pytest.raises(ForeignError, match="'mine:Mine' asks for other settings in run 2 when there are no other runs"):
+        with pytest.raises(ForeignError, match="'mine:Mine' asks for other settings when run 2 is repeated alone"):
             searched()
     else:
         searched()
+
+
+SAFER = """
+from safevar_sumo.ads import ScalarAds
+
+
+class Mine(ScalarAds):
+    made = 0
+
+    def start(self, nominal, step):
+        super().start(nominal, step)
+        Mine.made += 1
+        self.margin = 4.0 if Mine.made > 40 and Mine.made % 12 == 0 else 2.0
+
+    def drive(self, seen):
+        stopping = seen.speed**2 / (2 * 0.6 * self.nominal.decel)
+        if seen.gap < stopping + self.margin and abs(seen.lateral) < 2.5:
+            return 0.0, 1.0
+        return (0.5, 0.0) if seen.speed < 5 else (0.0, 0.0)
+"""
+
+
+def test_a_class_that_makes_every_twelfth_vehicle_safer(mine: Mine, folder: Path, tmp_path: Path) -> None:
+    """Neither the most severe evaluation of a run nor its last one shows it."""
+    system = mine(SAFER)
+    study = load_study(str(folder / "mine.toml"), search={"algorithms": ["rs"], "evaluations": 100, "runs": 2})
+    with pytest.raises(ForeignError, match="ads.model = 'mine:Mine' a result depends on what else is simulated"):
+        carried_out(study, system, all_runs(study), tmp_path / "out", InThisProcess(), Unheard(), None)
+
+
+CLOCK = """
+import time
+
+import numpy as np
+
+
+class Mine:
+    def search(self, problem, rng):
+        start = {first}
+        for _ in range(2):
+            rng = np.random.default_rng(start + {later})
+            evaluated = yield problem.characteristics.filter(problem.uniform(10, rng))
+        return evaluated.take([0])
+"""
+
+
+@pytest.mark.parametrize(("first", "later"), [("time.time_ns()", "0"), ("1", "_ * time.time_ns()")], ids=["at once", "later"])
+def test_an_algorithm_that_draws_from_the_clock(first: str, later: str, mine: Mine, folder: Path, tmp_path: Path) -> None:
+    system = mine(CLOCK.format(first=first, later=later), '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 1\n')
+    study = load_study(str(folder / "mine.toml"))
+    with pytest.raises(ForeignError, match="'mine:Mine' asks for other settings when run 0 is repeated alone"):
+        carried_out(study, system, all_runs(study), tmp_path / "out", InThisProcess(), Unheard(), None)
+
+
+GREEDY = """
+class Mine:
+    def search(self, problem, rng):
+        problem.characteristics.{array}[:] = 0
+        yield problem.characteristics.filter(problem.uniform(10, rng))
+"""
+SETATTR = """
+class Mine:
+    def search(self, problem, rng):
+        for one in problem.characteristics:
+            object.__setattr__(one, "weight", 9.0)
+        problem.characteristics.__dict__["lower"] = problem.characteristics.original
+        evaluated = yield problem.characteristics.filter(problem.uniform(10, rng))
+        return evaluated.take([0])
+"""
+IDLE = """
+class Mine:
+    def search(self, problem, rng):
+        {body}
+        return problem.original.take([])
+"""
+
+
+@pytest.mark.parametrize(("module", "problem"), [
+    (GREEDY.format(array="lower"), "read-only"), (GREEDY.format(array="original"), "read-only"),
+    (IDLE.format(body="if problem.evaluations == 0:\n            yield"), "ended in search without asking for any setting"),
+    (IDLE.format(body="yield problem.characteristics.original[None][:0]"), "returned settings = .* from search"),
+], ids=["lower", "original", "nothing", "empty"])
+def test_an_algorithm_that_changes_its_problem_or_asks_for_nothing(module: str, problem: str, mine: Mine, folder: Path,
+                                                                  tmp_path: Path) -> None:
+    system = mine(module, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 10\nruns = 1\n')
+    study = load_study(str(folder / "mine.toml"))
+    with pytest.raises(ForeignError, match=problem):
+        carried_out(study, system, all_runs(study), tmp_path / "out", InThisProcess(), Unheard(), None)
+
+
+def test_what_an_algorithm_does_to_its_problem_reaches_nobody_else(mine: Mine, folder: Path, tmp_path: Path) -> None:
+    with_mine, alone = '[search]\nalgorithms = ["mine:Mine", "rs"]\n{}', '[search]\nalgorithms = ["rs"]\n{}'
+    found = []
+    for table in (with_mine, alone):
+        system = mine(SETATTR, table.format("evaluations = 10\nruns = 1\n"))
+        study = load_study(str(folder / "mine.toml"))
+        campaign = carried_out(study, system, all_runs(study), tmp_path / f"{len(found)}", InThisProcess(), Unheard(), None)
+        found.append(next(one for key, one in campaign.solutions.items() if key.algorithm == "rs"))
+    assert found[0].settings.tobytes() == found[1].settings.tobytes()
