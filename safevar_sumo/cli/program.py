@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures.thread import _threads_queues
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -158,7 +158,7 @@ def _leave(code: int) -> NoReturn:
     sys.exit(code)
 
 
-def tell_remarks(study: Study) -> None:
-    """What a study's reader had to leave out, on the standard error."""
-    for remark in study.origin.remarks:
+def tell_remarks(study: Study, others: Iterable[str] = ()) -> None:
+    """What of a study is left out or not used, on the standard error."""
+    for remark in (*study.origin.remarks, *others):
         click.echo(f"note: {remark}", err=True)

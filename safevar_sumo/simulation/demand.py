@@ -10,7 +10,7 @@ from pathlib import Path
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.simulation.copies import DEMAND, seconds
-from safevar_sumo.simulation.places import check_places, is_number
+from safevar_sumo.simulation.places import check_places, is_number, way_of_vut
 
 _ACTORS = ("vehicle", "trip", "flow", "person", "personFlow")
 _RIDING, _WALKING = ("route", "stop", "param"), ("walk", "personTrip", "stop", "param")
@@ -31,6 +31,12 @@ RANDOM = frozenset({"lcSigma", "jmIgnoreFoeProb", "jmIgnoreJunctionFoeProb", "jm
 SIGMA = frozenset({"Krauss", "KraussOrig1", "KraussPS"})
 STEADY = frozenset({"IDM", "IDMM", "ACC", "CACC"})
 """Models of following that draw at random as far as sigma is not 0, and never."""
+
+SET_BY_SETTINGS = ("mass", "accel", "decel", "emergencyDecel", "apparentDecel", "maxSpeed", "tau")
+"""Attributes of the type of the vehicle under test in whose place its model puts the setting's."""
+OF_SUMOS_DRIVER = re.compile("carFollowModel|speedFactor|speedDev|sigma.*|desiredMaxSpeed|impatience|laneChangeModel|lc[A-Z].*|jm[A-Z].*"
+                             "|actionStepLength|startupDelay|delta|stepping|minGapLat|maxSpeedLat|latAlignment")
+"""Attributes that say how SUMO's own driver drives."""
 
 
 def check_demand(root: ElementTree.Element, file: Path, roads: ElementTree.Element, options: Mapping[str, str]) -> None:
@@ -153,3 +159,31 @@ def _chances(kind: ElementTree.Element, actor: ElementTree.Element, options: Map
 
 def _zero(text: str) -> bool:
     return is_number(text) and float(text) == 0
+
+
+def unused(root: ElementTree.Element, roads: ElementTree.Element, fastest: float, *, sumo_drives: bool) -> list[str]:
+    """What a network says of the vehicle under test and the simulation does not use.
+
+    Parameters
+    ----------
+    fastest
+        How fast the original vehicle can drive; a higher speed limit limits nothing [m/s].
+    sumo_drives
+        Whether SUMO's own driver has a say, as beside a controller written for TraCI.
+    """
+    mentioned = []
+    for element in (one for one in root if one.get("id") == VUT):
+        for name, value in element.attrib.items():
+            if name in SET_BY_SETTINGS or (OF_SUMOS_DRIVER.fullmatch(name) and not sumo_drives and not _says_nothing(name, value)):
+                mentioned.append(f"{name} = {value}")
+    slow = [] if sumo_drives else [lane for edge in way_of_vut(root) for lane in roads.findall(f"edge[@id='{edge}']/lane")
+                                   if float(lane.get("speed", "inf")) < fastest]
+    if slow:
+        mentioned.append(f"the speed limit of lane {slow[0].get('id')!r} ({float(slow[0].get('speed', 'nan')):g} m/s)"
+                         f"{f' and of {len(slow) - 1} more' if len(slow) > 1 else ''}")
+    driver = "the study's vehicle and ADS say how it drives"
+    return [f"not used of vehicle {VUT!r}: {', '.join(dict.fromkeys(mentioned))}; {driver}"] if mentioned else []
+
+
+def _says_nothing(name: str, value: str) -> bool:
+    return (name in ("sigma", "speedDev") and _zero(value)) or (name == "speedFactor" and is_number(value) and float(value) == 1)

@@ -70,6 +70,12 @@ def built_network(folder: str) -> Path:
     return _built(sources_of(folder))
 
 
+def try_network(folder: str) -> None:
+    """Have SUMO itself load a network with its options and traffic, once for each content; raises as `copied_network`."""
+    sources = sources_of(folder)
+    cached(_name(sources, 0, sources.files), TRIED, partial(_try_all, sources, _built(sources)))
+
+
 def lanes_of(folder: str) -> int:
     """How many lanes a network has, those of junctions included; raises as `copied_network`."""
     file = built_network(folder)
@@ -185,6 +191,15 @@ def _try(sources: Sources, into: Path) -> None:
     if code != 0:
         raise InputError(sources.place / sources.built, f"SUMO cannot load it: {told or f'it dies with exit code {code}'}",
                          "a network of SUMO")
+    (into / TRIED).write_text("SUMO loads it.\n", encoding="ascii")
+
+
+def _try_all(sources: Sources, built: Path, into: Path) -> None:
+    code, told = _run(sources, "sumo", "-c", OPTIONS, "-n", str(built.absolute()), "-r", TRAFFIC, "--begin", "0", "--end", "0",
+                      "--no-step-log", "true")
+    if code != 0 or told:
+        raise InputError(sources.place, f"SUMO refuses {OPTIONS} or {TRAFFIC}: {told or f'it dies with exit code {code}'}",
+                         "options and traffic that SUMO loads without an error")
     (into / TRIED).write_text("SUMO loads it.\n", encoding="ascii")
 
 

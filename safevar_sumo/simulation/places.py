@@ -36,6 +36,12 @@ def check_places(root: ElementTree.Element, file: Path, roads: ElementTree.Eleme
         _check_on(stop, ("startPos", "endPos"), stop.get("edge") or stop.get("lane", "").rpartition("_")[0], lanes, file)
 
 
+def way_of_vut(root: ElementTree.Element) -> list[str]:
+    """The edges on which the vehicle under test drives, as far as the traffic file says so."""
+    routes = {route.get("id", ""): route for route in root.findall("route")}
+    return [edge for actor in root if actor.get("id") == VUT and actor.tag in ("vehicle", "trip") for edge in _way(actor, routes)]
+
+
 def _way(actor: ElementTree.Element, routes: dict[str, ElementTree.Element]) -> list[str]:
     """The edges on which an actor sets off and, as far as the file says so, goes on."""
     for part in (actor.find("route"), routes.get(actor.get("route", "")), actor, actor.find("walk"), actor.find("personTrip")):

@@ -18,7 +18,7 @@ from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.plugins import Guard, Lookup, Member, check_parameters, made, undisturbed
 from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, weather_of
-from safevar_sumo.simulation.checking import check_network
+from safevar_sumo.simulation.checking import check_network, network_remarks
 from safevar_sumo.simulation.measuring import TAKEN, Measuring, measuring_of
 from safevar_sumo.simulation.sources import is_network, is_shipped
 from safevar_sumo.simulation.traci_controller import TraciController
@@ -68,6 +68,13 @@ class System:
     def at(self, point: Point) -> System:
         """The same at one point alone."""
         return replace(self, scenario=point.scenario, weather=point.weather, matrix=())
+
+    @property
+    def network_remarks(self) -> list[str]:
+        """What the networks say of the vehicle under test and is not used."""
+        networks = dict.fromkeys(point.scenario.network for point in self.points)
+        return [remark for network in networks for remark in
+                network_remarks(network, self.nominal.max_speed, sumo_drives=isinstance(self.ads, TraciController))]
 
 
 def assemble(study: Study, source: str = "") -> System:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import xml.etree.ElementTree as ElementTree
@@ -177,6 +178,30 @@ def test_a_road_that_the_vehicle_would_not_feel_is_refused(mine: Path, file: str
     with pytest.raises(InputError, match=r"traffic\.rou\.xml: vehicle 'vut' is to drive on ") as caught:
         check_network(str(mine))
     assert told in str(caught.value)
+
+
+@pytest.mark.parametrize(("file", "old", "new", "problem"), [
+    ("scenario.sumocfg", r'step-length value="[^"]*"', 'step-length value="0"', "scenario.sumocfg: step-length = '0'"),
+    ("traffic.rou.xml", r'id="vut"(.*) length="[^"]*"', r'id="vut"\1 length="-4"', "traffic.rou.xml: vType 'vut': length = '-4'"),
+    ("network.edg.xml", r'id="approach"', r'id="approach" length="-20"', "network.edg.xml: edge 'approach': length = '-20'"),
+    ("scenario.sumocfg", r'collision.action value="[^"]*"', 'collision.action value="stop"', "Invalid collision.action 'stop'")])
+def test_numbers_that_nothing_can_have_are_refused(mine: Path, file: str, old: str, new: str, problem: str) -> None:
+    text, replaced = re.subn(old, new, (mine / file).read_text(), count=1)
+    assert replaced
+    (mine / file).write_text(text)
+    with pytest.raises(InputError) as caught:
+        check_network(str(mine))
+    assert problem in str(caught.value)
+
+
+def test_what_a_network_says_of_the_vehicle_and_is_not_used_is_mentioned(mine: Path) -> None:
+    assert on("sun", mine).network_remarks == []
+    rewritten(mine / "network.edg.xml", 'id="approach" from="west" to="crossing" numLanes="1" width="4" speed="70"',
+              'id="approach" from="west" to="crossing" numLanes="1" width="4" speed="8.33"')
+    rewritten(mine / "traffic.rou.xml", '<vType id="vut"', '<vType id="vut" carFollowModel="IDM" speedFactor="0.8" accel="3"')
+    (remark,) = on("sun", mine).network_remarks
+    assert remark.startswith(f"{mine / 'traffic.rou.xml'}: not used of vehicle 'vut': carFollowModel = IDM, speedFactor = 0.8, accel = 3, "
+                             "the speed limit of lane 'approach_0' (8.33 m/s)")
 
 
 @pytest.mark.parametrize(("file", "old", "new", "told"), [
