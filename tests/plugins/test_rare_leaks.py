@@ -93,7 +93,7 @@ def test_a_class_that_makes_every_twelfth_vehicle_safer(mine: Mine, folder: Path
     """Neither the most severe evaluation of a run nor its last one shows it."""
     system = mine(SAFER)
     study = load_study(str(folder / "mine.toml"), search={"algorithms": ["rs"], "evaluations": 100, "runs": 2})
-    with pytest.raises(ForeignError, match="ads.model = 'mine:Mine' a result depends on what else is simulated"):
+    with pytest.raises(ForeignError, match=r"ads.model = 'mine:Mine' a result depends on what else is simulated"):
         carried_out(study, system, all_runs(study), tmp_path / "out", InThisProcess(), Unheard(), None)
 
 
