@@ -20,6 +20,9 @@ class Ads(Protocol):
 
     It sees an `Observation` and knows the original vehicle (`Nominal`); no ADS sees the setting.
     Element i of a command depends on element i of the observations alone, to the bit.
+
+    A class with `own_reactions = True` has a reaction time of its own: a weather's `recognition_delay` and `hesitation`,
+    which were measured on another driver, do not act on it. Without the attribute they do.
     """
 
     def start(self, n: int, nominal: Nominal, step: float) -> Any:
@@ -37,6 +40,7 @@ class ScalarAds(ABC):
 
     nominal: Nominal
     step: float
+    own_reactions = False
 
     def start(self, nominal: Nominal, step: float) -> None:
         """Called once before the run; keeps what is known of the original vehicle and the time between two calls.

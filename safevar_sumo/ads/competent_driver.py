@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from msgspec import Struct
 
+from safevar_sumo.ads.acc import KEEPING
 from safevar_sumo.ads.base import NotNegative, Positive
-from safevar_sumo.ads.reacting import HARDEST, JERK, TIME_ROUNDING, Reaction, react, unaware
+from safevar_sumo.ads.reacting import HARDEST, TIME_ROUNDING, Reaction, Start, react, unaware
 from safevar_sumo.ads.way import in_the_way, time_to_reach
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
@@ -23,7 +24,10 @@ class _Memory(NamedTuple):
 
 
 class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Holds its speed; perceives who strays into its way, reacts to a TTC below 2 s, and brakes with up to 0.774 g.
+    """Holds its speed or a headway; perceives who strays into its way, reacts to a TTC below 2 s, and brakes with up to 0.774 g.
+
+    It stands until the way is clear. Behind somebody who drives it keeps its headway with the accelerator alone:
+    a = 0.07 (u - v) + 0.23 (gap - headway v), the gap control of Milanes and Shladover (2014), and not below `-lets_go`.
 
     Parameters
     ----------
@@ -34,9 +38,13 @@ class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     stray, perception_time
         Who enters the way is perceived once he has strayed so far from where he was first seen, and so long after [m, s].
     lets_go
-        Deceleration with the accelerator released, while it reacts [m/s^2].
+        Deceleration with the accelerator released, while it reacts or drops back [m/s^2].
+    headway
+        Time headway at which it follows [s].
     corridor
         Half the width of its way [m].
+    start_throttle
+        Throttle of the run's first steps, one value a step, as long as it sees no danger [-].
     """
 
     cruise_speed: Positive | None = None
@@ -45,17 +53,28 @@ class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     stray: NotNegative = 0.375
     perception_time: NotNegative = 0.4
     lets_go: NotNegative = 0.4
+    headway: Positive = 2.0
     corridor: Positive = 1.4
+    start_throttle: Start = ()
+    own_reactions = True
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         return _Memory(unaware(n, nominal, step), np.full(n, np.inf), np.zeros(n, dtype=bool), np.full(n, -1.0))
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         perceived, memory = self._perceived(seen, memory)
-        danger = perceived & in_the_way(seen, self.corridor) & (time_to_reach(seen) < self.critical_ttc)
-        command, reaction = react(seen, memory.reaction, danger, np.full_like(seen.speed, HARDEST), reaction_time=self.reaction_time,
-                                  jerk=JERK, lets_go=self.lets_go, cruise_speed=self.cruise_speed)
+        ahead = perceived & in_the_way(seen, self.corridor)
+        command, reaction = react(
+            seen, memory.reaction, ahead & (time_to_reach(seen) < self.critical_ttc), np.full_like(seen.speed, HARDEST),
+            reaction_time=self.reaction_time, corridor=self.corridor, lets_go=self.lets_go, cruise_speed=self.cruise_speed,
+            start=self.start_throttle, following=self._following(seen, ahead))
         return command, memory._replace(reaction=reaction)
+
+    def _following(self, seen: Observation, ahead: BoolArray) -> FloatArray:
+        """Acceleration that keeps the headway to somebody ahead who drives the same way [m/s^2]; infinite behind nobody."""
+        gap = np.where(ahead, seen.gap, 0.0)
+        law = KEEPING[0] * (seen.obstacle_speed - seen.speed) + KEEPING[1] * (gap - self.headway * seen.speed)
+        return np.where(ahead & (seen.obstacle_speed > 0), np.maximum(law, -self.lets_go), np.inf)
 
     def _perceived(self, seen: Observation, memory: _Memory) -> tuple[BoolArray, _Memory]:
         sighted = np.isfinite(seen.gap) & np.isfinite(seen.lateral)

@@ -6,7 +6,7 @@ import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.ads.base import Positive
-from safevar_sumo.ads.reacting import Reaction, react, unaware
+from safevar_sumo.ads.reacting import Reaction, Start, react, unaware
 from safevar_sumo.ads.way import in_the_way
 from safevar_sumo.records import Command, Nominal, Observation
 
@@ -23,10 +23,14 @@ class FullBraking(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         Speed that it holds [m/s], by default the one that it starts with.
     corridor
         Half the width of its way [m].
+    start_throttle
+        Throttle of the run's first steps, one value a step, as long as it does not brake [-].
     """
 
     cruise_speed: Positive | None = None
     corridor: Positive = 1.4
+    start_throttle: Start = ()
+    own_reactions = True
 
     def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
         return unaware(n, nominal, step)
@@ -34,4 +38,4 @@ class FullBraking(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
         hardest = np.full_like(seen.speed, AS_HARD_AS_CAN_BE)
         return react(seen, memory, in_the_way(seen, self.corridor), hardest, reaction_time=0.0, jerk=AS_HARD_AS_CAN_BE / memory.step,
-                     cruise_speed=self.cruise_speed)
+                     corridor=self.corridor, cruise_speed=self.cruise_speed, start=self.start_throttle)

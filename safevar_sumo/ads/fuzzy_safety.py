@@ -47,6 +47,7 @@ class FuzzySafety(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     leader_deceleration: Positive = 7.0
     margin: NotNegative = 2.0
     corridor: Positive = 1.4
+    own_reactions = True
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         return _Memory(unaware(n, nominal, step), None)
@@ -59,7 +60,7 @@ class FuzzySafety(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         critical = self.critical(gap, seen.speed, seen.obstacle_speed, acceleration)
         wanted = np.where(critical > 0, critical * (self.hardest - self.comfortable) + self.comfortable, proactive * self.comfortable)
         command, reaction = react(seen, memory.reaction, (proactive > 0) | (critical > 0), np.minimum(wanted, HARDEST),
-                                  reaction_time=self.reaction_time, cruise_speed=self.cruise_speed)
+                                  reaction_time=self.reaction_time, corridor=self.corridor, cruise_speed=self.cruise_speed)
         return command, _Memory(reaction, seen.speed)
 
     def proactive(self, gap: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:

@@ -21,6 +21,7 @@ class GuardedAds:
 
     def __init__(self, ads: Ads, guard: Guard) -> None:
         self._ads, self._guard = ads, guard
+        self.own_reactions = bool(getattr(ads, "own_reactions", False))
 
     def start(self, n: int, nominal: Nominal, step: float) -> Any:
         return self._guard.call("start", self._ads.start, n, lent(nominal), step)
@@ -38,8 +39,8 @@ class GuardedAds:
 class PerVehicle:
     """Drives N vehicles with N instances of a `ScalarAds`."""
 
-    def __init__(self, make: Callable[[], ScalarAds], guard: Guard) -> None:
-        self._make, self._guard = make, guard
+    def __init__(self, make: Callable[[], ScalarAds], guard: Guard, own_reactions: bool = False) -> None:
+        self._make, self._guard, self.own_reactions = make, guard, own_reactions
 
     def start(self, n: int, nominal: Nominal, step: float) -> list[ScalarAds]:
         drivers = [self._guard.call("__init__", self._make) for _ in range(n)]

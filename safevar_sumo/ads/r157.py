@@ -31,6 +31,7 @@ class R157(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     reaction_time: Annotated[float, Meta(ge=0, le=60)] = 0.35
     margin: Annotated[float, Meta(ge=0, le=60)] = 0.1
     corridor: Positive = 1.4
+    own_reactions = True
 
     def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
         return unaware(n, nominal, step)
@@ -39,4 +40,4 @@ class R157(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         critical = seen.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
         danger = in_the_way(seen, self.corridor) & (time_to_reach(seen) < critical)
         return react(seen, memory, danger, np.full_like(seen.speed, self.deceleration), reaction_time=self.reaction_time,
-                     jerk=self.deceleration / memory.step, cruise_speed=self.cruise_speed)
+                     jerk=self.deceleration / memory.step, corridor=self.corridor, cruise_speed=self.cruise_speed)

@@ -5,11 +5,13 @@ Each of them has a danger and a deceleration of its own. Until it reacts it hold
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from msgspec import Meta
 
 from safevar_sumo.ads.pedals import Trim, pedals, trim
+from safevar_sumo.ads.way import blocks_the_way
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 GRAVITY = 9.81  # m/s^2
@@ -21,6 +23,8 @@ CRUISE_GAIN = 1.0
 """Acceleration per error of the speed that is held [1/s]."""
 TIME_ROUNDING = 1e-9
 """Times that differ by less are the same [s]."""
+Start = tuple[Annotated[float, Meta(ge=0, le=1)], ...]
+"""Throttle from the run's start on, one value a simulation step [-]: another driver's start, replayed."""
 
 
 class Reaction(NamedTuple):
@@ -41,9 +45,10 @@ def unaware(n: int, nominal: Nominal, step: float) -> Reaction:
     return Reaction(nominal, step, None, np.full(n, -1.0), np.zeros(n))
 
 
-def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration: FloatArray, *, reaction_time: float, jerk: float = JERK,
-          lets_go: float = 0.0, cruise_speed: float | None = None) -> tuple[Command, Reaction]:
-    """Pedals of drivers in a danger, which passes when the obstacle is out of sight, behind or no longer nearing.
+def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration: FloatArray, *, reaction_time: float, corridor: float,
+          jerk: float = JERK, lets_go: float = 0.0, cruise_speed: float | None = None, start: Start = (),
+          following: FloatArray | float = np.inf) -> tuple[Command, Reaction]:
+    """Pedals of drivers in a danger, which passes when nobody is ahead and nearing, or stands in the way.
 
     Parameters
     ----------
@@ -53,21 +58,32 @@ def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration
         What is braked with once they react, shape (N,) [m/s^2]; it rises at `jerk` [m/s^3].
     reaction_time
         From the first sight of the danger to the brake [s].
+    corridor
+        Half the width of their way [m].
     lets_go
         Deceleration while they react [m/s^2].
     cruise_speed
         Speed that they hold [m/s], by default the one that they started with.
+    start
+        Throttle that they start with as long as they see no danger.
+    following
+        Acceleration that they do not exceed, shape (N,) [m/s^2]: of those who follow somebody.
     """
     held = reaction.held
     if held is None:
         speed = seen.speed if cruise_speed is None else np.full_like(seen.speed, cruise_speed)
         held = speed, trim(reaction.nominal, seen)
     nears = np.isfinite(seen.gap) & (seen.gap > 0) & (seen.closing_speed > 0)
+    lasts = nears | blocks_the_way(seen, corridor)
     aware = reaction.waited >= 0
-    waited = np.where(aware, np.where(nears, reaction.waited + reaction.step, -1.0), np.where(danger, 0.0, -1.0))
+    waited = np.where(aware, np.where(lasts, reaction.waited + reaction.step, -1.0), np.where(danger, 0.0, -1.0))
     brakes = waited >= reaction_time - TIME_ROUNDING
     asked = np.where(brakes, np.minimum(reaction.asked + jerk * reaction.step, deceleration), 0.0)
-    holding = CRUISE_GAIN * (held[0] - seen.speed)
+    holding = np.minimum(CRUISE_GAIN * (held[0] - seen.speed), following)
     acceleration = np.where(brakes, -asked, np.where((waited >= 0) & (lets_go > 0), -lets_go, holding))
     command = pedals(reaction.nominal, seen.speed, acceleration, held[1])
+    sample = round(seen.time / reaction.step)
+    if sample < len(start):
+        starts = waited < 0
+        command = Command(np.where(starts, start[sample], command.throttle), np.where(starts, 0.0, command.brake))
     return command, reaction._replace(held=held, waited=waited, asked=asked)

@@ -34,6 +34,7 @@ class Rss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     deceleration: Positive = HARDEST
     leader_deceleration: Positive = HARDEST
     corridor: Positive = 1.4
+    own_reactions = True
 
     def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
         return unaware(n, nominal, step)
@@ -41,7 +42,7 @@ class Rss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
         danger = in_the_way(seen, self.corridor) & (seen.gap < self.safe_distance(seen.speed, seen.obstacle_speed))
         return react(seen, memory, danger, np.full_like(seen.speed, self.deceleration), reaction_time=self.reaction_time,
-                     cruise_speed=self.cruise_speed)
+                     corridor=self.corridor, cruise_speed=self.cruise_speed)
 
     def safe_distance(self, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """The least gap that is safe [m], at speeds [m/s] of shape (N,)."""

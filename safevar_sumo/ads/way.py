@@ -27,3 +27,9 @@ def in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> Boo
     lateral = np.where(detected, seen.lateral, FARTHEST)
     then = lateral + seen.lateral_speed * time_to_reach(seen)
     return np.asarray(detected & ((np.abs(lateral) <= corridor) | (np.abs(then) <= corridor)))
+
+
+def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
+    """Whether somebody detected, not past yet, is within `corridor` of the lane's middle [m] or on the way into it, and not driving off."""
+    ahead = np.isfinite(seen.gap) & (seen.gap > 0) & (seen.closing_speed >= 0)
+    return np.asarray(ahead & ((np.abs(seen.lateral) <= corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0)))

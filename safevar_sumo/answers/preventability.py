@@ -128,7 +128,7 @@ def _worst_points(bench: Bench, system: System, settings: FloatArray) -> npt.NDA
 
 def _at_one_point(bench: Bench, system: System, settings: FloatArray) -> list[PreventableBy | None]:
     """Full braking is only tried where the competent driver collides: the classes are disjoint."""
-    parameters = _approach(system)
+    parameters = approach(system)
     drivers = {name: bench.of(_driven_by(bench.study, name, parameters)) for name in ("competent_driver", "full_braking")}
     competent = drivers["competent_driver"].evaluate(settings, "a competent driver in the same vehicle")
     left = np.flatnonzero(competent.collided)
@@ -139,10 +139,18 @@ def _at_one_point(bench: Bench, system: System, settings: FloatArray) -> list[Pr
     return found
 
 
-def _approach(system: System) -> dict[str, float]:
-    """How a reference driver approaches: from rest it accelerates to the peak speed of the driving system with the original vehicle."""
-    speed = simulate(system, system.characteristics.original[np.newaxis]).trace.speed[:, 0]
-    return {"cruise_speed": float(speed.max())} if speed[0] == 0 < speed.max() else {}
+def approach(system: System) -> dict[str, Any]:
+    """How a reference driver approaches from rest: as the driving system does with the original vehicle.
+
+    It replays the throttle until the driving system first brakes or reaches its peak speed, and holds that speed. So both are
+    at the same place when the danger begins. Where the run begins at speed, that speed is held.
+    """
+    trace = simulate(system, system.characteristics.original[np.newaxis]).trace
+    speed, braked = trace.speed[:, 0], trace.brake[:, 0] > 0
+    if speed[0] > 0 or not speed.any():
+        return {}
+    ends = min(int(np.argmax(speed)), int(np.argmax(braked)) if braked.any() else len(speed))
+    return {"cruise_speed": float(speed.max()), "start_throttle": trace.throttle[:ends, 0].tolist()}
 
 
 def _driven_by(study: Study, driver: str, parameters: Mapping[str, Any]) -> Study:

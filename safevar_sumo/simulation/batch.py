@@ -86,7 +86,7 @@ def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watch
     state = at_start(vehicle, prepared, world.speeds())
     driver = system.ads.start(n, system.nominal, step)
     try:
-        parts = Parts(system.points, world, n)
+        parts = Parts(system.points, world, n, own_reactions=getattr(system.ads, "own_reactions", False))
     except world.api.TraCIException as error:
         raise InputError("scenario.parameters.network", f"the scenario does not find what it looks for: {str(error).strip()}",
                          "a network and traffic with the ids that the scenario names") from None

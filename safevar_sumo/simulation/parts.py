@@ -16,14 +16,14 @@ R = TypeVar("R", Scene, Observation)
 
 
 class Parts:
-    """A batch whose k-th part of equally many vehicles is in the k-th point."""
+    """A batch whose k-th part of equally many vehicles is in the k-th point; of drivers with reactions of their own, or not."""
 
-    def __init__(self, points: Sequence[Point], world: SumoWorld, n: int) -> None:
+    def __init__(self, points: Sequence[Point], world: SumoWorld, n: int, own_reactions: bool = False) -> None:
         self._size = size = n // len(points)
         self._points, self._step = points, world.step_length
         self._rows = [slice(k * size, (k + 1) * size) for k in range(len(points))]
         self._worlds = [world] if len(points) == 1 else [world.part(rows.start, size) for rows in self._rows]
-        weathers = [point.weather for point in points]
+        weathers = [point.weather.without_reactions if own_reactions else point.weather for point in points]
         self._perceptions = [(Perception(weather, self._step), np.repeat([one == weather for one in weathers], size).nonzero()[0])
                              for k, weather in enumerate(weathers) if weather not in weathers[:k]]
         self._order = np.argsort(np.concatenate([rows for _, rows in self._perceptions]))

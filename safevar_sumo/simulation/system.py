@@ -211,5 +211,5 @@ def _ads(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
     driver = make()
     if issubclass(member.what, ScalarAds):
         guard = member.guard or Guard(lookup.source, name)
-        return PerVehicle(make, guard), member
+        return PerVehicle(make, guard, driver.own_reactions), member
     return (driver if member.guard is None else GuardedAds(driver, member.guard)), member

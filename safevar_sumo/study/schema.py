@@ -69,7 +69,8 @@ class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     `road_friction` and `visibility` are factors on the dry, clear case [-]; `recognition_delay` is by how much later
     than in clear weather an ADS makes somebody out [s], `hesitation` by how much later than it lets go of the accelerator
-    it then brakes [s]. `light` says when it is, and acts through these alone.
+    it then brakes [s]: both are World On Rails' and do not act on an ADS with reactions of its own.
+    `light` says when it is, and acts through these alone.
     """
 
     name: str
@@ -78,6 +79,11 @@ class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     recognition_delay: Annotated[float, Meta(ge=0, le=5)] = 0.0
     hesitation: Annotated[float, Meta(ge=0, le=5)] = 0.0
     light: Literal["day", "night"] = "day"
+
+    @property
+    def without_reactions(self) -> Weather:
+        """The same for a driver with reactions of its own."""
+        return msgspec.structs.replace(self, recognition_delay=0.0, hesitation=0.0)
 
 
 class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -10,6 +10,7 @@ import pytest
 
 from safevar_sumo.ads.acc import Acc
 from safevar_sumo.ads.competent_driver import CompetentDriver
+from safevar_sumo.ads.full_braking import FullBraking
 from safevar_sumo.ads.fuzzy_safety import FuzzySafety
 from safevar_sumo.ads.idm import Idm
 from safevar_sumo.ads.krauss import Krauss
@@ -135,3 +136,39 @@ def test_fuzzy_metrics_are_those_worked_out_by_hand() -> None:
     assert model.critical(0.4 * one, 12 * one, 10 * one, -8 * one)[0] == 1
     assert model.critical(0.6 * one, 12 * one, 10 * one, -8 * one)[0] == 0
     assert model.critical(1.0 * one, 10 * one, 10 * one, 0 * one)[0] == 0
+
+
+def driven(driver: Any, seconds: float, speed: float, gap: float, leader: float = 0.0,
+           lateral: Any = lambda time: (0.0, 0.0)) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gaps, speeds and brake pedals of a point mass that obeys its pedals, behind somebody at a constant speed [m, m/s, -]."""
+    one, memory, told = np.ones(1), driver.start(1, KNOWN, STEP), []
+    for k in range(round(seconds / STEP)):
+        aside, moves = lateral(k * STEP)
+        seen = Observation(k * STEP, speed * one, gap * one, (speed - leader) * one, aside * one, moves * one, 1.0, leader * one, 0 * one)
+        command, memory = driver.drive(seen, memory)
+        told.append((gap, speed, float(command.brake[0])))
+        faster = max(speed + (3 * float(command.throttle[0]) - 10 * told[-1][2]) * STEP, 0.0)
+        gap, speed = gap + (leader - (speed + faster) / 2) * STEP, faster
+    return tuple(np.array(told).T)  # type: ignore[return-value]
+
+
+def test_who_has_stopped_for_a_pedestrian_waits_until_the_way_is_clear() -> None:
+    """He stands in the way for 10 s, walks out at 1 m/s, 1.4 m to the edge of the way; then on."""
+    def lateral(time: float) -> tuple[float, float]:
+        return max(time - 10, 0.0), float(time >= 10)
+
+    for driver in (CompetentDriver(), R157(), FuzzySafety(), FullBraking()):
+        gaps, speeds, _ = driven(driver, 13.0, 8.0, 30.0, lateral=lateral)
+        clear = round(11.4 / STEP)
+        assert np.diff(speeds[:clear]).max() <= 1e-9, "it starts again towards somebody who stands in front of it"
+        assert speeds[clear - 1] < 0.2
+        assert speeds[-1] > 1, "it goes on once he is out of the way"
+        assert gaps[clear] > 0
+
+
+def test_the_competent_driver_follows_two_seconds_behind_without_the_brake() -> None:
+    for gap in (80.0, 34.0):
+        gaps, speeds, brakes = driven(CompetentDriver(cruise_speed=18.0), 90.0, 15.0, gap, leader=15.0)
+        assert gaps[-1] == pytest.approx(2 * 15, abs=0.3)
+        assert speeds[-1] == pytest.approx(15, abs=0.05)
+        assert brakes.max() <= 0.04 + 1e-9, "no more than the accelerator let go: 0.4 m/s^2 of the 10 m/s^2 of the whole pedal"

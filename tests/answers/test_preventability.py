@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
 import scipy
 from in_process import Here
 
+from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.answers import PreventableBy, preventability, preventable_by
 from safevar_sumo.answers.bench import Bench
+from safevar_sumo.answers.preventability import approach
 from safevar_sumo.records import FloatArray
+from safevar_sumo.simulation import assemble, simulate
 from safevar_sumo.study import ModelTable, load_study
 
 STUDY = load_study("euro_ncap_pedestrian")
@@ -54,6 +59,18 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     expected = scipy.stats.beta.ppf(0.025, hits, 31 - hits), scipy.stats.beta.ppf(0.975, hits + 1, 30 - hits)
     assert sample["interval_competent_driver"] == pytest.approx(expected)
     assert expected[0] < 1 / 3 < expected[1]
+
+
+def test_reference_drivers_approach_as_the_driving_system_does() -> None:
+    """A competent driver sees no danger before the time to collision is 2 s: until then both are at the same place."""
+    rain = assemble(load_study("rain"))
+    original = rain.characteristics.original[np.newaxis]
+    driver = msgspec.convert(approach(rain), CompetentDriver)
+    theirs, his = (simulate(one, original).trace for one in (rain, replace(rain, ads=driver)))
+    danger = int(np.argmax(theirs.gap[:, 0] < 2 * theirs.speed[:, 0]))
+    assert theirs.speed[danger, 0] > 4
+    assert np.array_equal(theirs.position[:danger + 1], his.position[:danger + 1])
+    assert approach(assemble(bench(test="CPFA", speed=40).study)) == {}
 
 
 def test_in_a_matrix_the_worst_point_counts() -> None:

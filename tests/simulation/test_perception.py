@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from safevar_sumo.ads import ScalarAds
+from safevar_sumo.ads import ADS, ScalarAds
 from safevar_sumo.ads.guarded import GuardedAds, PerVehicle
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, Nominal, Observation
@@ -95,6 +95,24 @@ def test_anybodys_ads_hesitates_whatever_it_does_with_its_arrays() -> None:
     assert np.array_equal(many.speed, each.speed)
     released, braked = (int(np.argmax(column)) for column in (many.gap[:, 0] < 6, many.brake[:, 0] == 1))
     assert braked - released == np.ceil(rain.weather.hesitation / many.step)
+
+
+@pytest.mark.parametrize("name", ["competent_driver", "full_braking", "fuzzy_safety", "r157", "rss"])
+def test_a_driver_with_reactions_of_its_own_does_not_wait_like_world_on_rails(name: str) -> None:
+    """The study rain is sun but for its weather, of which nothing but the reactions differs from clear: these drive as in sun."""
+    rain, sun = (assemble(load_study(study)) for study in ("rain", "sun"))
+    driver = ADS[name](cruise_speed=5.5)
+    wet, dry = (simulate(replace(one, ads=driver), one.characteristics.original[np.newaxis]).trace for one in (rain, sun))
+    assert dry.brake.max() > 0
+    assert np.array_equal(wet.position, dry.position)
+
+
+@pytest.mark.parametrize("of_its_own", [True, False])
+def test_an_ads_from_outside_may_have_reactions_of_its_own_too(of_its_own: bool) -> None:
+    rain, guard = assemble(load_study("rain")), Guard("a test", "ads")
+    own = type("Own", (Careful,), {"own_reactions": of_its_own})
+    trace = simulate(replace(rain, ads=GuardedAds(own(), guard)), rain.characteristics.original[np.newaxis]).trace
+    assert (int(np.argmax(trace.brake[:, 0] > 0)) == int(np.argmax(trace.gap[:, 0] < 6))) == of_its_own
 
 
 def test_in_a_drive_the_accelerator_is_let_go_of_as_without_hesitation() -> None:
