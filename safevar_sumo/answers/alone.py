@@ -8,6 +8,7 @@ from itertools import groupby
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 
 from safevar_sumo.answers.bench import Bench
@@ -21,6 +22,8 @@ VALUES = 201
 FINER, ROUNDS = 8, 4
 """Into how many parts the place of a change is divided, and how often: to a 4096th of the distance of two values."""
 
+SAFE, UNSAFE, NOT_SIMULATED = range(3)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Alone:
@@ -29,8 +32,8 @@ class Alone:
     Attributes
     ----------
     profile
-        Columns `value` [unit], `safety_degree` [m, or -m/s], `outcome`, `unsafe`, in the order of the values; closer
-        together where the outcome changes.
+        Columns `value` [unit], `safety_degree` [m, or -m/s], `outcome`, `unsafe`, `valid`, in the order of the values; closer
+        together where the state changes. What is not valid could not be simulated: it is neither safe nor unsafe.
     """
 
     characteristic: Characteristic
@@ -38,14 +41,14 @@ class Alone:
 
     @property
     def _runs(self) -> list[pd.DataFrame]:
-        """The profile cut where safe and unsafe change."""
-        places = [[place for place, _ in run] for _, run in groupby(enumerate(self.profile["unsafe"]), key=lambda one: one[1])]
+        """The profile cut where the state changes: safe, unsafe, not simulated."""
+        places = [[place for place, _ in run] for _, run in groupby(enumerate(_states(self.profile).tolist()), key=lambda one: one[1])]
         return [self.profile.iloc[run] for run in places]
 
     @property
     def _around(self) -> pd.DataFrame | None:
         """The safe values around the original."""
-        return next((run for run in self._runs if not run["unsafe"].iloc[0] and (run["value"] == self.characteristic.original).any()), None)
+        return next((run for run in self._runs if _states(run)[0] == SAFE and (run["value"] == self.characteristic.original).any()), None)
 
     @property
     def safe(self) -> tuple[float, float] | None:
@@ -62,12 +65,21 @@ class Alone:
     @property
     def unsafe(self) -> list[tuple[float, float]]:
         """All unsafe intervals, from the first to the last unsafe value of each."""
-        return [(float(run["value"].iloc[0]), float(run["value"].iloc[-1])) for run in self._runs if run["unsafe"].iloc[0]]
+        return self._intervals(UNSAFE)
+
+    @property
+    def not_simulated(self) -> list[tuple[float, float]]:
+        """All intervals that could not be simulated, as `unsafe`."""
+        return self._intervals(NOT_SIMULATED)
+
+    def _intervals(self, state: int) -> list[tuple[float, float]]:
+        return [(float(run["value"].iloc[0]), float(run["value"].iloc[-1])) for run in self._runs if _states(run)[0] == state]
 
     def record(self) -> dict[str, Any]:
         """As `tolerance --json` prints it."""
         return {"characteristic": self.characteristic.name, "unit": self.characteristic.unit, "original": self.characteristic.original,
-                "safe": None if self.safe is None else list(self.safe), "unsafe": [list(interval) for interval in self.unsafe]}
+                "safe": None if self.safe is None else list(self.safe), "unsafe": [list(interval) for interval in self.unsafe],
+                "not_simulated": [list(interval) for interval in self.not_simulated]}
 
 
 def scan(bench: Bench, columns: Sequence[int], unsafe: Unsafe) -> list[Alone]:
@@ -86,11 +98,16 @@ def scan(bench: Bench, columns: Sequence[int], unsafe: Unsafe) -> list[Alone]:
 
 
 def _where_it_changes(profile: pd.DataFrame) -> FloatArray:
-    """Values between two neighbours of which one is safe and one unsafe."""
-    values, unsafe = profile["value"].to_numpy(), profile["unsafe"].to_numpy()
-    changes = np.flatnonzero(unsafe[1:] != unsafe[:-1])
+    """Values between two neighbours of different states."""
+    values, states = profile["value"].to_numpy(), _states(profile)
+    changes = np.flatnonzero(states[1:] != states[:-1])
     inner = values[changes][:, np.newaxis] + np.diff(values)[changes][:, np.newaxis] * np.arange(1, FINER) / FINER
     return np.setdiff1d(inner, values)
+
+
+def _states(profile: pd.DataFrame) -> npt.NDArray[np.int_]:
+    """Whether each value of a profile is `SAFE`, `UNSAFE` or `NOT_SIMULATED`."""
+    return np.where(profile["valid"], np.where(profile["unsafe"], UNSAFE, SAFE), NOT_SIMULATED)
 
 
 def _evaluated(bench: Bench, columns: Sequence[int], values: Sequence[FloatArray], unsafe: Unsafe) -> list[pd.DataFrame]:
@@ -101,5 +118,5 @@ def _evaluated(bench: Bench, columns: Sequence[int], values: Sequence[FloatArray
         settings[end - len(of_it):end, column] = of_it
     evaluations = bench.evaluate(settings, "one characteristic at a time")
     frame = pd.DataFrame({"value": np.concatenate(values), "safety_degree": evaluations.f_safe, "outcome": evaluations.outcome,
-                          "unsafe": unsafe.of(evaluations)})
+                          "unsafe": unsafe.of(evaluations), "valid": evaluations.valid})
     return [frame.iloc[end - len(of_it):end].reset_index(drop=True) for of_it, end in zip(values, ends, strict=True)]

@@ -11,8 +11,8 @@ import pandas as pd
 
 from safevar_sumo.answers.alone import Alone, scan
 from safevar_sumo.answers.bench import Bench, Progress, open_bench, silent
-from safevar_sumo.answers.joint import CONFIDENCE, SAMPLES, Joint, joint
 from safevar_sumo.answers.pairs import Pair, planes
+from safevar_sumo.answers.safe_box import SafeBox, no_box, safe_box
 from safevar_sumo.answers.unsafe import Unsafe, usual_in
 from safevar_sumo.computing import Pool
 from safevar_sumo.errors import unknown
@@ -29,7 +29,7 @@ class Tolerance:
     original: Evaluations
     alone: list[Alone]
     pairs: list[Pair] | None
-    joint: Joint
+    joint: SafeBox
 
     @property
     def verdict(self) -> str:
@@ -50,18 +50,19 @@ class Tolerance:
         """One row for each characteristic alone.
 
         Columns: `characteristic`, `unit`, `original`, `lower` and `upper` of the domain, `safe_from`, `safe_to` [unit],
-        `margin_from`, `margin_to`, the safety degrees there [m], and `unsafe`, a list of intervals.
+        `margin_from`, `margin_to`, the safety degrees there [m], and `unsafe` and `not_simulated`, lists of intervals.
         """
         return pd.DataFrame([{
             "characteristic": one.characteristic.name, "unit": one.characteristic.unit, "original": one.characteristic.original,
             "lower": one.characteristic.lower, "upper": one.characteristic.upper,
             **dict(zip(("safe_from", "safe_to"), one.safe or (None, None), strict=True)),
-            **dict(zip(("margin_from", "margin_to"), one.margins, strict=True)), "unsafe": one.unsafe} for one in self.alone])
+            **dict(zip(("margin_from", "margin_to"), one.margins, strict=True)), "unsafe": one.unsafe,
+            "not_simulated": one.not_simulated} for one in self.alone])
 
     def record(self) -> dict[str, Any]:
         """As `tolerance --json` prints it."""
         return {"study": self.study.name, "unsafe": str(self.unsafe), "alone": [one.record() for one in self.alone],
-                "pairs": [pair.record() for pair in self.pairs or []], "joint": self.joint._asdict()}
+                "pairs": [pair.record() for pair in self.pairs or []], "joint": self.joint.record()}
 
     def __repr__(self) -> str:
         return f"<Tolerance of {self.study.name}, unsafe {self.unsafe}: {self.verdict}>"
@@ -77,7 +78,7 @@ def tolerance(study: Study, *, unsafe: str | None = None, characteristics: Seque
         `collision` or `below=X`; by default a collision if one of many settings all over the domain is one, else half of
         the original's safety degree.
     characteristics
-        Which ones alone and in pairs, by default all; the joint factor is always that of all.
+        Which ones vary, by default all: alone, in pairs, and together in the joint box; the others are the original's.
     pairs
         Whether pairs are looked at too.
     pool, jobs
@@ -97,7 +98,7 @@ def tolerance(study: Study, *, unsafe: str | None = None, characteristics: Seque
         alone = scan(bench, columns, means)
         both = planes(bench, columns, means) if pairs else None
         is_safe = not means.of(original)[0]
-        box = joint(bench, means, _known(bench, alone, both or [])) if is_safe else Joint(0.0, CONFIDENCE, SAMPLES)
+        box = safe_box(bench, columns, means, _known(bench, alone, both or [])) if is_safe else no_box(bench, columns)
     return Tolerance(study=study, unsafe=means, original=original, alone=alone, pairs=both, joint=box)
 
 

@@ -26,19 +26,31 @@ def print_tolerance(console: Console, told: Tolerance) -> None:
     print_meanings(console, [one.characteristic for one in told.alone])
     if told.pairs:
         _print_pairs(console, told)
+    _say(console, _together(told))
+
+
+def _together(told: Tolerance) -> str:
     box = told.joint
-    _say(console, f"All together: within {box.factor:.1%} of the domain around the original, none of {box.samples} settings is unsafe; "
-                  f"with {box.confidence:.0%} confidence at most {box.unsafe_at_most:.2%} of those in there are.")
+    subset = len(box.characteristics) < len(told.study.vehicle.characteristics)
+    who = f"{', '.join(box.characteristics)} together, the others as in the original" if subset else "All together"
+    if not box.factor:
+        return f"{who}: no box around the original is safe."
+    failed = f"; {box.failed} of them could not be simulated and count as unsafe in what follows" if box.failed else ""
+    bad = "are unsafe or cannot be simulated" if box.failed else "are unsafe"
+    return (f"{who}: within {box.factor:.1%} of the domain around the original, none of {box.samples} settings drawn at random is unsafe"
+            f"{failed}. With {box.confidence:.0%} confidence at most {box.unsafe_at_most:.2%} of all settings in there {bad}.")
 
 
 def _alone(told: Tolerance) -> WholeTable:
     table = WholeTable("characteristic", title="Each alone", title_justify="left")
-    for head in ("original", "safe from", "to", "SD at the ends", "unsafe"):
+    failing = any(one.not_simulated for one in told.alone)
+    for head in ("original", "safe from", "to", "SD at the ends", "unsafe", *(["could not be simulated"] if failing else [])):
         table.add_column(head, justify="right")
     for one in told.alone:
         member = one.characteristic
         table.add_row(escape(f"{member.name} [{member.unit}]"), f"{member.original:g}", *_ends(one),
-                      ", ".join(f"{low:.5g} to {high:.5g}" for low, high in one.unsafe) or "nowhere")
+                      *(", ".join(f"{low:.5g} to {high:.5g}" for low, high in intervals) or "nowhere"
+                        for intervals in (one.unsafe, *([one.not_simulated] if failing else []))))
     return table
 
 
@@ -65,7 +77,8 @@ def _print_pairs(console: Console, told: Tolerance) -> None:
     for pair in found[:PAIRS_SHOWN]:
         names = [member.name for member in pair.characteristics]
         nearest = ", ".join(f"{name} {value:.5g}" for name, value in zip(names, pair.nearest or (), strict=True))
-        table.add_row(escape(" with ".join(names)), f"{pair.unsafe_share:.1%}", escape(nearest))
+        failed = f" ({pair.not_simulated_share:.1%} could not be simulated)" if pair.not_simulated_share else ""
+        table.add_row(escape(" with ".join(names)), f"{pair.unsafe_share:.1%}{failed}", escape(nearest))
     console.print(table)
     if len(found) > PAIRS_SHOWN:
         _say(console, f"... and {len(found) - PAIRS_SHOWN} more (--json has all).")

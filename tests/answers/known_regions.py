@@ -25,22 +25,26 @@ def made_up_study(n: int) -> Study:
 
 
 class Plant:
-    """A pool in which settings of a region collide at 1 m/s, and all others keep the distance of `degree`."""
+    """A pool in which settings of a region collide at 1 m/s, those of `failing` fail, and all others keep the distance of `degree`."""
 
     workers = 1
 
-    def __init__(self, study: Study, region: Region, degree: Callable[[FloatArray], FloatArray] | None = None):
+    def __init__(self, study: Study, region: Region, degree: Callable[[FloatArray], FloatArray] | None = None,
+                 failing: Region | None = None):
         self._characteristics, self._region = CharacteristicSet.of(study.vehicle.characteristics), region
         self._degree = degree or (lambda settings: np.full(len(settings), 2.0))
+        self._failing = failing or nowhere
         self.seen: set[bytes] = set()
 
     def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
         collides = np.asarray(self._region(settings), dtype=bool)
-        degree = np.where(collides, -1.0, self._degree(settings))
+        fails = self._failing(settings)
+        collides &= ~fails
+        degree = np.where(fails, np.nan, np.where(collides, -1.0, self._degree(settings)))
         self.seen |= {row.tobytes() for row in settings}
         future: Future[Evaluations] = Future()
         future.set_result(Evaluations(
-            settings=settings, outcome=np.where(collides, "collision", "stopped").astype("U16"),
+            settings=settings, outcome=np.where(fails, "simulator-error", np.where(collides, "collision", "stopped")).astype("U16"),
             collision_speed=np.where(collides, 1.0, np.nan),
             metrics={name: degree if name == "safety_degree" else np.full(len(settings), np.nan) for name in METRICS},
             f_diff=self._characteristics.largest_change(settings), f_num_diff=self._characteristics.number_changed(settings)))
