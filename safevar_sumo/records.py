@@ -203,8 +203,10 @@ class Evaluations:
         return self.metrics["safety_degree"]
 
     def column(self, name: str) -> FloatArray:
-        """A metric, f_safe, f_diff or f_num_diff by name; shape (M,)."""
-        return np.asarray(getattr(self, name) if name in ("f_safe", "f_diff", "f_num_diff") else self.metrics[name])
+        """A metric, f_safe, f_diff or f_num_diff by name; shape (M,). A metric that nothing could measure is undefined everywhere."""
+        if name in ("f_safe", "f_diff", "f_num_diff"):
+            return np.asarray(getattr(self, name))
+        return np.asarray(self.metrics.get(name, np.full(len(self), np.nan)))
 
     @property
     def objectives(self) -> FloatArray:

@@ -91,8 +91,7 @@ def signed_rank(sample: FloatArray, value: float) -> Comparison:
 
 def fewest_runs(question: str) -> int:
     """The least number of runs at which a test of this question can be significant at all, before any correction."""
-    least = {"RQ1": lambda n: 2 / 2**n, "RQ2": lambda n: 2 / math.comb(2 * n, n)}[question]
-    return next(n for n in range(1, 100) if least(n) < ALPHA)
+    return next(n for n in range(1, 100) if 2 / (2**n if question == "RQ1" else math.comb(2 * n, n)) < ALPHA)
 
 
 def difference_line(case: Case) -> str:

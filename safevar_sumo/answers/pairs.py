@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -77,7 +77,7 @@ def planes(bench: Bench, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
     shape = (len(chosen), SIDE, SIDE)
     degrees, valid = evaluations.f_safe.reshape(shape), evaluations.valid.reshape(shape)
     is_unsafe = unsafe.of(evaluations).reshape(shape)
-    nearest = _nearest(bench, chosen, axes, is_unsafe, unsafe)
+    nearest = _nearest(bench, chosen, is_unsafe, unsafe)
     return [Pair(characteristics=(members[first], members[second]), values=np.stack([axes[first], axes[second]]), safety_degree=degrees[i],
                  unsafe=is_unsafe[i], valid=valid[i], nearest=nearest.get(i)) for i, (first, second) in enumerate(chosen)]
 
@@ -89,8 +89,7 @@ class _Squares(NamedTuple):
     corner: FloatArray
 
 
-def _nearest(bench: Bench, chosen: Sequence[tuple[int, int]], axes: Mapping[int, FloatArray], is_unsafe: BoolArray,
-             unsafe: Unsafe) -> dict[int, tuple[float, float]]:
+def _nearest(bench: Bench, chosen: Sequence[tuple[int, int]], is_unsafe: BoolArray, unsafe: Unsafe) -> dict[int, tuple[float, float]]:
     """Of every plane that has one, the unsafe setting nearest to the original, in widths of the domains.
 
     A branch and bound search: squares with an unsafe corner are divided into smaller ones, as long as a place in them is nearer than
@@ -109,7 +108,7 @@ def _nearest(bench: Bench, chosen: Sequence[tuple[int, int]], axes: Mapping[int,
                 best[plane[row]], place[plane[row]] = distances[row], values[row]
 
     plane, i, j = np.nonzero(is_unsafe)
-    improve(plane, np.array([(axes[chosen[k][0]][a], axes[chosen[k][1]][b]) for k, a, b in zip(plane, i, j, strict=True)]).reshape(-1, 2))
+    improve(plane, lower[plane] + np.stack([i, j], axis=1) * size[plane])
     touched = is_unsafe[:, 1:, 1:] | is_unsafe[:, :-1, 1:] | is_unsafe[:, 1:, :-1] | is_unsafe[:, :-1, :-1]
     plane, i, j = np.nonzero(touched)
     squares = _Squares(plane, lower[plane] + np.stack([i, j], axis=1) * size[plane])

@@ -65,16 +65,17 @@ def _bars(material: Material, alone: list[Found]) -> Markup:
         safe, unsafe = one["safe"], one["unsafe"]
         bars = [] if safe is None else [_bar(member, safe, "safe")]
         names.append(member.name)
-        pieces.append([*bars, *(_bar(member, interval, "unsafe") for interval in unsafe)])
+        pieces.append([*bars, *(_bar(member, interval, "unsafe") for interval in unsafe),
+                       *(_bar(member, interval, "weak", "could not be simulated") for interval in one["not_simulated"])])
         marks.append(_share(member, member.original))
         ends.append((f"{number(member.lower)}{spaced(member.unit)}", f"{number(member.upper)}{spaced(member.unit)}"))
     told = f"{material.case.name}: where each characteristic alone is safe and where it is unsafe; a mark at the original"
     return rows(told, names, pieces, marks, ends)
 
 
-def _bar(member: Characteristic, interval: Sequence[float], look: str) -> Bar:
+def _bar(member: Characteristic, interval: Sequence[float], look: str, state: str = "") -> Bar:
     low, high = interval
-    words = f"{member.name} from {number(low)} to {number(high)}{spaced(member.unit)}: {look}"
+    words = f"{member.name} from {number(low)} to {number(high)}{spaced(member.unit)}: {state or look}"
     return Bar(_share(member, low), _share(member, high), look, words)
 
 

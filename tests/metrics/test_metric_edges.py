@@ -10,7 +10,8 @@ from test_metrics import STEP, braking_run, value
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import time_to_collision
-from safevar_sumo.records import Drives, Encounter
+from safevar_sumo.metrics.scoring import F_DIFF, F_SAFE, Objective, Scoring
+from safevar_sumo.records import Drives, Encounter, Evaluations
 from safevar_sumo.study import MetricsTable
 
 
@@ -71,3 +72,13 @@ def test_a_time_to_collision_at_the_threshold_is_exposed() -> None:
     moving = np.count_nonzero(run.encounter.closing_speed[:, 0] > 0)
     assert value("tet", level) == pytest.approx(moving * STEP, abs=2 * STEP)
     assert value("tit", level) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_batch_that_failed_as_a_whole_has_no_valid_objective() -> None:
+    """Nothing measured the metric of a user's own: it is undefined, as is the safety degree."""
+    undefined = np.full(2, np.nan)
+    failed = Evaluations(settings=np.ones((2, 1)), outcome=np.full(2, "simulator-error"), collision_speed=undefined,
+                         metrics={"safety_degree": undefined}, f_diff=np.zeros(2), f_num_diff=np.zeros(2))
+    scoring = Scoring(metrics=(), objectives=(F_SAFE, F_DIFF, Objective(name="jerk", title="jerk", unit="m/s^3")))
+    assert scoring.valid(failed).tolist() == [False, False]
+    assert np.isnan(scoring.values(failed)[:, 2]).all()

@@ -94,8 +94,10 @@ class Limit:
                     "confidence": 0.95, "sensitivity": [
                         {"characteristic": "tireFric", "first_order": 0.8, "total": 0.9, "first_order_interval": [0, 1],
                          "total_interval": [0, 1]}]}
-        return {"study": "it", "unsafe": "collision", "pairs": [], "joint": {"factor": 0.5, "confidence": 0.95, "samples": 64}, "alone": [
-            {"characteristic": "tireFric", "unit": "-", "original": 3.5, "safe": [1.5, 4.0], "unsafe": [[0.5, 1.5]]}]}
+        return {"study": "it", "unsafe": "collision", "pairs": [], "joint": {
+            "factor": 0.5, "confidence": 0.95, "samples": 64, "failed": 0, "unsafe_at_most": 0.05}, "alone": [
+            {"characteristic": "tireFric", "unit": "-", "original": 3.5, "safe": [1.5, 4.0], "unsafe": [[0.5, 1.5]],
+             "not_simulated": []}]}
 
 
 @pytest.fixture(scope="module")
