@@ -74,7 +74,8 @@ def _print_catalogue(console: Console, studies: list[Study]) -> None:
         print_names(console, f"Vehicle {vehicle['name']}", rows, heads)
         print_meanings(console, members[vehicle["name"]])
     numbers = ("road_friction", "visibility", "recognition_delay", "hesitation")
-    weathers = [(row["name"], *(f"{row[key]:g}" for key in numbers), row["light"]) for row in catalogue["weathers"]]
-    print_names(console, "Weathers", weathers, ("name", "friction", "visibility", "delay, s", "hesitates, s", "light"))
+    weathers = [(row["name"], *(f"{row[key]:g}" for key in numbers), row["light"], "wet" if row["wet"] else "dry")
+                for row in catalogue["weathers"]]
+    print_names(console, "Weathers", weathers, ("name", "friction", "visibility", "delay, s", "hesitates, s", "light", "road"))
     for title, key in (("ADSs", "ads"), ("Scenarios", "scenarios"), ("Algorithms", "algorithms"), ("Metrics", "metrics")):
         print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "what"))

@@ -18,7 +18,7 @@ from safevar_sumo.simulation.staging import staged
 from safevar_sumo.simulation.sumo import Engine, world_on
 from safevar_sumo.simulation.system import System
 from safevar_sumo.simulation.world import SumoWorld
-from safevar_sumo.vehicles import CharacteristicSet, Slope, at_start, slope_of
+from safevar_sumo.vehicles import LEVEL, CharacteristicSet, at_start, slope_of
 
 SURE_BRAKES = 9.0
 """SUMO puts nobody onto the road who might not stop before what is ahead; there everybody brakes so hard at least [m/s^2]."""
@@ -76,7 +76,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
 def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher | None) -> Drives:
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_slope(system.points, n))
+    prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_surface(system.points, n))
     types = vehicle.sumo_type(prepared)
     world.set_types(types._replace(decel=np.maximum(types.decel, SURE_BRAKES)))
     world.depart()
@@ -134,10 +134,14 @@ def _road_friction(points: Sequence[Point], n: int) -> Any:
     return factors[0] if len(set(factors)) == 1 else np.repeat(factors, n // len(points))
 
 
-def _slope(points: Sequence[Point], n: int) -> list[Slope]:
-    """Of the points' roads, each for its part of the vehicles; nothing where all are level: not every vehicle takes one."""
-    grades = [getattr(point.scenario, "grade", 0.0) for point in points]
-    return [slope_of(np.repeat(grades, n // len(points)))] if any(grades) else []
+def _surface(points: Sequence[Point], n: int) -> list[Any]:
+    """Slope and wetness of the points' roads, each for its part of the vehicles.
+
+    Nothing where all are level and dry: not every vehicle takes them.
+    """
+    grades, wet = [getattr(point.scenario, "grade", 0.0) for point in points], [point.weather.wet for point in points]
+    slope = slope_of(np.repeat(grades, n // len(points))) if any(grades) else LEVEL
+    return [slope, np.repeat(wet, n // len(points))] if any(wet) else [slope] if any(grades) else []
 
 
 class _Log:

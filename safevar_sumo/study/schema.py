@@ -67,7 +67,8 @@ class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Weather as data: what it does to the road and to the sensors.
 
-    `road_friction` and `visibility` are factors on the dry, clear case [-]; `recognition_delay` is by how much later
+    `road_friction` and `visibility` are factors on the dry, clear case [-]; `wet` says whether there is water on the road, which worn
+    treads lose friction to, beyond that factor; `recognition_delay` is by how much later
     than in clear weather an ADS makes somebody out [s], `hesitation` by how much later than it lets go of the accelerator
     it then brakes [s]: both are World On Rails' and do not act on an ADS with reactions of its own.
     `light` says when it is, and acts through these alone.
@@ -79,6 +80,7 @@ class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     recognition_delay: Annotated[float, Meta(ge=0, le=5)] = 0.0
     hesitation: Annotated[float, Meta(ge=0, le=5)] = 0.0
     light: Literal["day", "night"] = "day"
+    wet: bool = False
 
     @property
     def without_reactions(self) -> Weather:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from safevar_sumo.records import Command, FloatArray, Observation
+from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.slope import LEVEL, Slope
 
 Characteristics = Mapping[str, FloatArray]
@@ -47,10 +47,12 @@ class Vehicle(Protocol):
 
     UNITS: Mapping[str, str]
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL) -> Any:
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
+                wet: bool | BoolArray = False) -> Any:
         """Everything that stays the same in a run, `step` seconds a step, once computed.
 
-        A vehicle whose method takes no `slope` drives on level roads only.
+        `road_friction` is the weather's factor on the tyres' friction, `wet` whether the road is wet, for vehicles on which water acts
+        beyond that factor. A vehicle whose method takes no `slope` drives on level roads only; one that takes no `wet` is not told.
         """
 
     def sumo_type(self, prepared: Any) -> SumoType:

@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.records import Command, FloatArray, Observation
+from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
 from safevar_sumo.vehicles.slope import GRAVITY, LEVEL, Slope
 
@@ -143,7 +143,8 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     camera_height: Annotated[float, Meta(ge=0.1, le=10)]
     camera_design_radius: Annotated[float, Meta(ge=0.1, le=1)] = 0.355
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL) -> _Prepared:
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
+                wet: bool | BoolArray = False) -> _Prepared:
         c = characteristics
         radius = c["radius"] / 100
         grip = c["tireFric"] * (self.tyre_friction * road_friction) * c["mass"] * slope.down

@@ -9,7 +9,7 @@ import numpy as np
 
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.plugins import Contract, Guard, lent, takes
-from safevar_sumo.records import Command, FloatArray, Observation
+from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType, Vehicle
 from safevar_sumo.vehicles.slope import LEVEL, Slope
 
@@ -52,12 +52,17 @@ class GuardedVehicle:
             raise guard.wrong("__init__", "UNITS", units, "a mapping from names of characteristics to their units")
         self.UNITS = dict(units)
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL) -> _Prepared:
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
+                wet: bool | BoolArray = False) -> _Prepared:
         n, method = len(next(iter(characteristics.values()))), self._vehicle.prepare
         if slope is not LEVEL and not takes(method, 4):
             problem = f"{self._guard.name} has no slope in prepare(characteristics, road_friction, step, slope), and the road has a grade"
             raise ForeignError(self._guard.source, problem, "a vehicle with it, or scenarios with grade 0")
-        given = (lent(characteristics), road_friction, step, *([] if slope is LEVEL else [lent(slope)]))
+        given: tuple[Any, ...] = (lent(characteristics), road_friction, step)
+        if np.any(wet) and takes(method, 5):
+            given = (*given, lent(slope), wet if isinstance(wet, bool) else wet.copy())
+        elif slope is not LEVEL:
+            given = (*given, lent(slope))
         theirs = self._guard.call("prepare", method, *given)
         types = self._guard.call("sumo_type", self._vehicle.sumo_type, theirs)
         return _Prepared(n, theirs, SumoType(*(

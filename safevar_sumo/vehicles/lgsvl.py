@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.records import Command, FloatArray, Observation
+from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
 from safevar_sumo.vehicles.slope import LEVEL, Slope
 
@@ -123,7 +123,8 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     wheel_damping_share: Annotated[float, Meta(ge=0, le=1)]
     steering_design_angle: Annotated[float, Meta(gt=0, lt=90)] = 39.4
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL) -> _Prepared:
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
+                wet: bool | BoolArray = False) -> _Prepared:
         c, substep = characteristics, step / SUBSTEPS
         inertia = WHEELS * 0.5 * c["wheelMass"] * c["radius"] * c["radius"]
         damping = WHEELS * self.wheel_damping_share * c["wheelDamping"]

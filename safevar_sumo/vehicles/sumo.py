@@ -7,7 +7,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.records import Command, FloatArray, Observation
+from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
 from safevar_sumo.vehicles.delay import delayed, history, remembered
 from safevar_sumo.vehicles.sensors import late_and_near
@@ -62,7 +62,8 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     reference_mass: Annotated[float, Meta(gt=0)] = 1500.0
     tyre_friction: Annotated[float, Meta(gt=0)] = 0.9
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL) -> _Prepared:
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
+                wet: bool | BoolArray = False) -> _Prepared:
         c = characteristics
         load = self.reference_mass / c["mass"]
         return _Prepared(

@@ -7,14 +7,20 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.records import Command, FloatArray, Observation
+from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
 from safevar_sumo.vehicles.delay import delayed, history, remembered
 from safevar_sumo.vehicles.sensors import late_and_near
 from safevar_sumo.vehicles.slope import LEVEL, Slope
 
-NEW_TREAD, LEGAL_TREAD = 8.0, 1.6
-"""Tread depth of a new tyre, and the least that is legal in Europe [mm]."""
+DEEP_TREAD, HALF_WORN_TREAD, LEGAL_TREAD = 6.7, 3.0, 1.6
+"""Tread depths with published stopping distances; the last is the least that is legal in Europe [mm]."""
+FROM_DEEP = 1.368
+"""Stopping distance at 1.6 mm over that at 6.7 mm on wet hot rolled asphalt (MIRA for RoSPA) [-]."""
+FROM_HALF_WORN = 39.9 / 31.7
+"""The same over that at 3 mm, from 50 mph on a wet road (MIRA for Continental; both in m) [-]."""
+LOST_HALF_WORN = (1 - FROM_HALF_WORN / FROM_DEEP) / (1 - 1 / FROM_DEEP)
+"""Share of the loss of friction at 1.6 mm that tyres of 3 mm have: friction goes as one over the distance [-]."""
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 
 
@@ -57,14 +63,19 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     tyre_friction
         Friction coefficient on a dry road [-].
     tread_loss
-        Share of the friction that tyres worn down to 1.6 mm have lost on a wet road [-]. 0.27: they took 36.8 % more way to stop
-        from 80 km/h than tyres of 6.7 mm (MIRA for RoSPA, hot rolled asphalt); linear in the depth (assumption).
+        Share of the friction that tyres worn down to 1.6 mm have lost on a wet road [-]. By default 1 - 1 / 1.368: they took 36.8 %
+        more way to stop than tyres of 6.7 mm (MIRA for RoSPA, hot rolled asphalt). See the notes for other depths.
     max_speed
         [m/s]
 
     Notes
     -----
-    A road is wet where its friction is below the dry one's. Deceleration a: of a = F / m, of an axle at its limit
+    The loss of friction on a wet road by tread depth goes through published points: none from 6.7 mm on, at 3 mm as much as makes the
+    way at 1.6 mm 39.9 / 31.7 times as long (MIRA for Continental, from 50 mph), at 1.6 mm `tread_loss`; straight lines between, the last
+    one goes on below 1.6 mm (assumption). Measured from 50 mph, it acts at every speed (assumption; slower, tyres lose less). Whether a
+    road is wet, the weather says; on a dry one tread does nothing.
+
+    Deceleration a: of a = F / m, of an axle at its limit
     mu m (g x -+ a h) / L with the other braking its share, and of a = mu g, the least holds. On a slope g is what presses onto the
     road, and what pulls along it acts beside a. Nobody rolls back.
     """
@@ -82,18 +93,18 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     brake_force: Positive = 16500.0
     front_share: Annotated[float, Meta(gt=0, lt=1)] = 0.7
     tyre_friction: Positive = 0.9
-    tread_loss: Annotated[float, Meta(ge=0, lt=1)] = 0.27
+    tread_loss: Annotated[float, Meta(ge=0, lt=0.5)] = 1 - 1 / FROM_DEEP
     max_speed: Positive = 55.56
 
-    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL) -> _Prepared:
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
+                wet: bool | BoolArray = False) -> _Prepared:
         c = characteristics
         mass = self.kerb_mass + c["payload"]
         centre = (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"]) / mass / self.wheelbase
-        worn = np.minimum(np.maximum((NEW_TREAD - c["treadDepth"]) / (NEW_TREAD - LEGAL_TREAD), 0.0), 1.0)
-        wet = np.where(np.asarray(road_friction) < 1, 1 - self.tread_loss * worn, 1.0)
+        held = np.where(wet, 1 - self.tread_loss * _worn(np.maximum(c["treadDepth"], 0.0)), 1.0)
         return _Prepared(
             step=step, mass=mass, drive=self.drive_force / mass, brake=c["brakeTorque"] * (self.brake_force / mass),
-            grip=self.tyre_friction * road_friction * wet, front_load=1 - centre, rear_load=centre, response=c["brakeResponse"],
+            grip=self.tyre_friction * road_friction * held, front_load=1 - centre, rear_load=centre, response=c["brakeResponse"],
             sensor_range=c["sensorRange"], latency=c["sensorLatency"], slope=slope)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
@@ -132,3 +143,10 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         rear_slides = (self.front_share * wanted + p.grip * p.slope.down * p.rear_load) / (1 + lever)
         front_slides = ((1 - self.front_share) * wanted + p.grip * p.slope.down * p.front_load) / (1 - lever)
         return np.minimum(np.minimum(wanted, p.grip * p.slope.down), np.minimum(rear_slides, front_slides))
+
+
+def _worn(depth: FloatArray) -> FloatArray:
+    """How much of the loss at 1.6 mm tyres of a tread depth [mm] have on a wet road [-], shape (N,)."""
+    first = np.minimum(np.maximum((DEEP_TREAD - depth) / (DEEP_TREAD - HALF_WORN_TREAD), 0.0), 1.0)
+    second = np.maximum((HALF_WORN_TREAD - depth) / (HALF_WORN_TREAD - LEGAL_TREAD), 0.0)
+    return np.asarray(LOST_HALF_WORN * first + (1 - LOST_HALF_WORN) * second)

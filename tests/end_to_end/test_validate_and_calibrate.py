@@ -97,7 +97,7 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
 def test_calibrate_without_data_fits_the_original_vehicle_alone(in_tmp: Path) -> None:
     run("calibrate", "rain", "--trials", "5", "--out", "rain.toml")
     found = tomllib.loads(Path("rain.toml").read_text())
-    assert set(found["weather"]) == {"name", "road_friction", "visibility", "recognition_delay", "hesitation", "light"}
+    assert set(found["weather"]) == {"name", "road_friction", "visibility", "recognition_delay", "hesitation", "light", "wet"}
     assert found["vehicle"]["parameters"] == load_study("sun").vehicle.parameters
 
 

@@ -39,11 +39,11 @@ class Drive(NamedTuple):
 
 
 def drive(model: str, settings: np.ndarray, pedals: Pedals, duration: float, step: float = STEP, road: float = 1.0,
-          rolling: float = 0.0, grade: float = 0.0) -> Drive:
+          rolling: float = 0.0, grade: float = 0.0, wet: bool = False) -> Drive:
     """Drive settings, shape (N, n); pedals(t) -> (throttle, brake), for all or by vehicle. `rolling` is the speed at the start."""
     system = SYSTEMS[model]
     values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    prepared = system.vehicle.prepare(values, road, step, slope_of(np.full(len(settings), grade)))
+    prepared = system.vehicle.prepare(values, road, step, slope_of(np.full(len(settings), grade)), wet)
     states = [_rolling(system.vehicle.at_rest(prepared), prepared, rolling)]
     for k in range(round(duration / step)):
         throttle, brake = pedals(round(k * step, 9))

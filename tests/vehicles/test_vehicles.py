@@ -137,8 +137,8 @@ def speed_at(time: float, pedals: Callable[[float], tuple[float, float]] = full_
     return lambda model, population: drive(model, population, pedals, time, road=road).speed[-1]
 
 
-def stopping_distance(brake: float, road: float = 1.0) -> Callable[..., np.ndarray]:
-    return lambda model, population: drive(model, population, lambda time: (0.0, brake), 15, rolling=8.0, road=road).distance[-1]
+def stopping_distance(brake: float, road: float = 1.0, wet: bool = False) -> Callable[..., np.ndarray]:
+    return lambda model, population: drive(model, population, lambda time: (0.0, brake), 15, rolling=8.0, road=road, wet=wet).distance[-1]
 
 
 def coasting_loss(start: float, duration: float) -> Callable[..., np.ndarray]:
@@ -173,7 +173,7 @@ ACTS = {
         "tau": (speed_at(1), -1), "brakeDelay": (stopping_distance(0.6), +1), "brakeGain": (stopping_distance(0.6), -1),
     },
     "worn": {
-        "treadDepth": (stopping_distance(1.0, road=0.85), -1), "brakeTorque": (stopping_distance(0.6), -1),
+        "treadDepth": (stopping_distance(1.0, road=0.85, wet=True), -1), "brakeTorque": (stopping_distance(0.6), -1),
         "brakeResponse": (stopping_distance(0.6), +1), "payload": (stopping_distance(0.6), +1),
     },
 }

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safevar_sumo.records import Observation
-from safevar_sumo.vehicles.slope import GRAVITY
+from safevar_sumo.records import Command, Observation
+from safevar_sumo.simulation import assemble, evaluate
+from safevar_sumo.study import load_study
+from safevar_sumo.vehicles.slope import GRAVITY, LEVEL
 from safevar_sumo.vehicles.worn import WornVehicle
 
 CAR = WornVehicle()
@@ -14,8 +16,18 @@ HEALTHY = {"treadDepth": 8.0, "brakeTorque": 1.0, "brakeResponse": 0.1, "payload
            "sensorLatency": 0.05}
 
 
-def prepared(road: float, **changes: float):  # type: ignore[no-untyped-def]
-    return CAR.prepare({name: np.array([value]) for name, value in {**HEALTHY, **changes}.items()}, road, 0.05)
+def prepared(road: float, wet: bool = False, step: float = 0.05, **changes: float):  # type: ignore[no-untyped-def]
+    return CAR.prepare({name: np.array([value]) for name, value in {**HEALTHY, **changes}.items()}, road, step, LEVEL, wet)
+
+
+def stopping_distance(tread: float, wet: bool = True) -> float:
+    """Full braking from 50 mph on a straight road of the weather `wet` [m]."""
+    p = prepared(0.71, wet, 0.001, treadDepth=tread, brakeResponse=0.001)
+    state, way = CAR.at_speed(p, np.full(1, 22.352)), 0.0
+    while state.speed[0] > 0:
+        before, state = state.speed[0], CAR.advance(p, state, Command(np.zeros(1), np.ones(1)))
+        way += (before + state.speed[0]) / 2 * 0.001
+    return way
 
 
 @pytest.mark.parametrize("road", [1.0, 0.85, 0.5, 0.2])
@@ -44,10 +56,27 @@ def test_where_the_load_lies_counts_once_an_axle_is_at_its_limit() -> None:
     assert len(set(np.round(decel, 6))) > 1
 
 
-def test_worn_tyres_have_lost_what_mira_measured_on_a_wet_road_and_nothing_on_a_dry_one() -> None:
-    new, worn = prepared(0.85), prepared(0.85, treadDepth=1.6)
-    assert worn.grip[0] / new.grip[0] == pytest.approx(0.73)
-    assert prepared(1.0, treadDepth=1.6).grip[0] == prepared(1.0).grip[0]
+def test_stopping_distances_of_worn_tyres_are_in_the_published_ratios_on_a_wet_road_and_equal_on_a_dry_one() -> None:
+    """MIRA for RoSPA: +36.8 % from 6.7 to 1.6 mm; MIRA for Continental, from 50 mph: 31.7 m at 3 mm, 39.9 m at 1.6 mm."""
+    worn = stopping_distance(1.6)
+    assert worn / stopping_distance(6.7) == pytest.approx(1.368, rel=0.01)
+    assert worn / stopping_distance(3) == pytest.approx(39.9 / 31.7, rel=0.01)
+    assert stopping_distance(8) == pytest.approx(stopping_distance(6.7))
+    assert stopping_distance(1.6, wet=False) == pytest.approx(stopping_distance(8, wet=False))
+    depths = prepared(0.71, True, treadDepth=np.linspace(0.0, 9, 91)).grip[0]
+    assert (np.diff(depths) >= 0).all()
+    assert depths[0] > 0
+
+
+@pytest.mark.parametrize(("weather", "is_wet"), [
+    ("clear", False), ("wet", True), ("soft_rain", True), ("hard_rain", True), ("fog", False), ("night", False),
+    ({"name": "polished", "road_friction": 0.6, "visibility": 1.0}, False),
+    ({"name": "puddles", "road_friction": 1.0, "visibility": 1.0, "wet": True}, True)])
+def test_tread_counts_where_the_weather_is_wet_and_not_where_friction_is_low(weather: object, is_wet: bool) -> None:
+    study = load_study({"extends": "wear", "name": "one", "weather": weather,
+                        "matrix": {"tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 40}}]}})
+    new, worn = evaluate(assemble(study), np.array([[8, 1, 0.1, 75, 1.4, 80, 0.05], [1.6, 1, 0.1, 75, 1.4, 80, 0.05]])).metrics["ave_dece"]
+    assert (worn < 0.9 * new) == is_wet
 
 
 def test_dirty_sensors_see_late_and_not_far() -> None:
