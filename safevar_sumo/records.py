@@ -129,8 +129,8 @@ class Trace:
     """T samples of N vehicles, `step` seconds apart; arrays of shape (T, N), `time` (T,).
 
     A vehicle's samples count while `active`; later ones are whatever SUMO did with the rest of the batch.
-    `vehicle_length`, `position` along the way, `gap` and `lateral` in m, speeds in m/s, `throttle` and `brake` as commanded;
-    `obstacle_speed` is the obstacle's along the vehicle's way.
+    `vehicle_length`, `position` along the way, `gap` and `lateral` in m, speeds in m/s, `throttle` and `brake` as commanded,
+    `pedal` is where the brake pedal stands; `obstacle_speed` is the obstacle's along the vehicle's way.
     """
 
     step: float
@@ -146,6 +146,7 @@ class Trace:
     gear: FloatArray
     active: BoolArray
     obstacle_speed: FloatArray = field(default_factory=lambda: NOTHING)
+    pedal: FloatArray = field(default_factory=lambda: NOTHING)
 
     def of(self, vehicles: slice) -> Trace:
         """The trace of some of the vehicles."""

@@ -1,6 +1,6 @@
 """What an engineer asks of a finding: which changes did it, how far may each go, how likely is it, in which region."""
 
-from safevar_sumo.answers.because import Because, Braking, Course
+from safevar_sumo.answers.braking_comparison import Braking, BrakingComparison, Course
 from safevar_sumo.answers.explanation import explain
 from safevar_sumo.answers.figures import necessity_figure, pairs_figure, profiles_figure, save, sensitivity_figure
 from safevar_sumo.answers.findings import Cause, Explained, Explanation
@@ -15,7 +15,7 @@ from safevar_sumo.answers.where import points_in_words, points_of
 from safevar_sumo.answers.words import ask, changes, command, joined, number_of, rule_in_words, sentence
 
 __all__ = [
-    "Because", "Braking", "Cause", "Course", "Explained", "Explanation", "Preventability", "PreventableBy", "Risk", "Robustness", "Rule",
-    "Rules", "Tolerance", "Unsafe", "ask", "changes", "command", "explain", "joined", "lead", "necessity_figure", "number_of",
-    "pairs_figure", "points_in_words", "points_of", "preventability", "preventable_by", "profiles_figure", "risk", "rule_in_words",
-    "rules", "save", "sensitivity_figure", "sentence", "tolerance"]
+    "Braking", "BrakingComparison", "Cause", "Course", "Explained", "Explanation", "Preventability", "PreventableBy", "Risk",
+    "Robustness", "Rule", "Rules", "Tolerance", "Unsafe", "ask", "changes", "command", "explain", "joined", "lead", "necessity_figure",
+    "number_of", "pairs_figure", "points_in_words", "points_of", "preventability", "preventable_by", "profiles_figure", "risk",
+    "rule_in_words", "rules", "save", "sensitivity_figure", "sentence", "tolerance"]

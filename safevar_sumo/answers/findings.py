@@ -7,7 +7,7 @@ from typing import Any
 
 import pandas as pd
 
-from safevar_sumo.answers.because import Because
+from safevar_sumo.answers.braking_comparison import BrakingComparison
 from safevar_sumo.answers.preventability import Preventability
 from safevar_sumo.answers.robustness import Robustness
 from safevar_sumo.answers.unsafe import Unsafe
@@ -59,7 +59,7 @@ class Explanation:
     necessary: tuple[str, ...]
     causes: tuple[Cause, ...]
     robustness: Robustness
-    because: Because
+    because: BrakingComparison
     preventable: str = ""
     points: tuple[str, ...] = ()
 

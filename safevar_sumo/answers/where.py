@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.answers.because import Because, because, course
+from safevar_sumo.answers.braking_comparison import BrakingComparison, compare, course
 from safevar_sumo.answers.unsafe import Unsafe
 from safevar_sumo.records import FloatArray
 from safevar_sumo.simulation import AtPoint, System, at_every_point, worst_points
@@ -26,7 +26,7 @@ class Where(NamedTuple):
         Names of the points of a matrix at which it is unsafe, in the study's order.
     """
 
-    because: Because
+    because: BrakingComparison
     points: tuple[str, ...]
 
 
@@ -38,7 +38,7 @@ def where(system: System, original: FloatArray, settings: FloatArray, unsafe: Un
     for row, (failing, at) in enumerate(zip(names, worst.tolist(), strict=True), 1):
         one = found[at]
         first, other = (course(one.drives, column, float(one.evaluations.f_safe[column])) for column in (0, row))
-        told.append(Where(because(first, other, one.point.name), failing))
+        told.append(Where(compare(first, other, one.point.name), failing))
     return told, found[0].drives.trace.step
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from shlex import quote
 
-from safevar_sumo.answers.because import REMAINDER, Because, Course
+from safevar_sumo.answers.braking_comparison import REMAINDER, BrakingComparison, Course
 from safevar_sumo.answers.rules import Rule
 from safevar_sumo.answers.unsafe import Unsafe
 from safevar_sumo.records import Outcome
@@ -16,8 +16,11 @@ WORTH_A_WORD = 0.005
 ENDS = {
     Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is still under way at the end",
     Outcome.NEVER_MOVED: "never moves", Outcome.SIMULATOR_ERROR: "could not be simulated"}
-PARTS = {"place": ("it begins to brake nearer", "it begins to brake farther away"), "speed": ("it is faster", "it is slower"),
-         "delay": ("it brakes in full later", "it brakes in full sooner"), "deceleration": ("it brakes more weakly", "it brakes harder")}
+PARTS = {
+    "place": ("it begins to brake nearer", "it begins to brake farther away"), "speed": ("it is faster", "it is slower"),
+    "delay": ("its brake pedal follows later", "its brake pedal follows sooner"),
+    "slowing": ("it slows less while the pedal moves", "it slows more while the pedal moves"),
+    "deceleration": ("it brakes more weakly", "it brakes harder")}
 """What costs distance, and what gains some."""
 
 
@@ -62,7 +65,7 @@ def how(course: Course) -> str:
     return end if course.safety_degree != course.safety_degree else f"{end}, safety degree {course.safety_degree:.2f} m"
 
 
-def sentence(told: Because) -> str:
+def sentence(told: BrakingComparison) -> str:
     """Why the changed vehicle is less safe than the original, in one sentence or two."""
     at = f"At {told.place}: the" if told.place else "The"
     ends = f"{at} original {how(told.original)}; this one {how(told.changed)}."
@@ -70,28 +73,30 @@ def sentence(told: Because) -> str:
     if one is None and other is None:
         return f"{ends} Neither of them brakes."
     if not told.parts:
-        return f"{ends} {'The original' if one is None else 'It'} does not brake."
-    unbraked = "" if other is not None else " without braking"
-    pieces = [f"{abs(told.parts[name]):.2f} m {'' if told.parts[name] > 0 else 'gained '}because {PARTS[name][told.parts[name] < 0]}"
+        return f"{ends} {'The original' if one is None else 'It'} does not slow down by its brake."
+    unbraked = "" if other is not None else ", without any effect of its brake"
+    costs, gains = ("", "gained ") if told.lost >= 0 else ("lost ", "")
+    pieces = [f"{abs(told.parts[name]):.2f} m {costs if told.parts[name] > 0 else gains}because {PARTS[name][told.parts[name] < 0]}"
               f"{_numbers(told, name)}"
               for name in sorted(PARTS, key=lambda name: -told.parts[name]) if abs(told.parts[name]) >= WORTH_A_WORD]
     if abs(told.parts["remainder"]) > REMAINDER:
         pieces.append(f"{told.parts['remainder']:+.2f} m that this does not explain")
     if not pieces:
         return f"{ends} They brake alike."
-    return f"{ends} Of the {told.lost:.2f} m lost{unbraked}: {joined(pieces)}."
+    return f"{ends} Of the {abs(told.lost):.2f} m {'lost' if told.lost >= 0 else 'gained'}{unbraked}: {joined(pieces)}."
 
 
-def _numbers(told: Because, part: str) -> str:
+def _numbers(told: BrakingComparison, part: str) -> str:
     """What a part was, and what it is with the original."""
     one, other = told.original.braking, told.changed.braking
     if one is None or other is None:
         return ""
-    pairs = {"place": (other.gap, one.gap, "m before"), "speed": (other.full_speed, one.full_speed, "m/s"),
-             "delay": (other.delay, one.delay, "s after the command"),
+    pairs = {"place": (other.gap, one.gap, "m before"), "speed": (other.speed, one.speed, "m/s at the command"),
+             "delay": (other.delay, one.delay, "s after the command"), "slowing": (told.slowing[1], told.slowing[0], "m saved"),
              "deceleration": (other.deceleration, one.deceleration, "m/s^2")}
     there, here, name = pairs[part]
-    return f" ({there:.2f} instead of {here:.2f} {name})"
+    decimals = next((digits for digits in range(2, 9) if f"{there:.{digits}f}" != f"{here:.{digits}f}"), 2)
+    return f" ({there:.{decimals}f} instead of {here:.{decimals}f} {name})"
 
 
 def number_of(count: int, what: str) -> str:

@@ -104,7 +104,7 @@ def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watch
         command = parts.braked(command)
         log.write(sample, place=world.vehicle_positions(VUT), speed=speed, gap=scene.gap, lateral=scene.lateral,
                   lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active,
-                  obstacle_speed=scene.obstacle_speed)
+                  obstacle_speed=scene.obstacle_speed, pedal=state.brake)
         if not verdict.open.any():
             break
         if watch is None:
@@ -147,7 +147,8 @@ def _surface(points: Sequence[Point], n: int) -> list[Any]:
 class _Log:
     """Samples of a run in arrays of shape (T, N), and where the vehicles were on SUMO's plane, shape (T, N, 2)."""
 
-    _COLUMNS = ("speed", "gap", "lateral", "lateral_speed", "throttle", "brake", "gear", "active", "obstacle_speed")
+    _COLUMNS = ("speed", "gap", "lateral", "lateral_speed", "throttle", "brake", "gear", "active", "obstacle_speed",
+                "pedal")
 
     def __init__(self, n: int, length: int, way: Frame) -> None:
         self.length, self._way = length, way

@@ -9,7 +9,18 @@ from functools import partial
 from rich.console import Console
 from rich.markup import escape
 
-from safevar_sumo.answers import Because, Cause, Explained, Explanation, ask, changes, command, number_of, points_in_words, sentence
+from safevar_sumo.answers import (
+    BrakingComparison,
+    Cause,
+    Explained,
+    Explanation,
+    ask,
+    changes,
+    command,
+    number_of,
+    points_in_words,
+    sentence,
+)
 from safevar_sumo.simulation import assemble
 from safevar_sumo.terminal.plain import WholeTable, print_meanings
 from safevar_sumo.vehicles import CharacteristicSet
@@ -81,14 +92,14 @@ def _print_cause(console: Console, again: Again, cause: Cause, members: Characte
     _say(console, f"Still unsafe at {cause.fraction:.1%} of these changes, safe just below. {again(cause.changes)}")
 
 
-def _side_by_side(told: Because) -> WholeTable:
+def _side_by_side(told: BrakingComparison) -> WholeTable:
     """Original and changed vehicle, and what each line explains of the lost distance."""
     table = WholeTable("", "unit")
     for head in ("original", "changed", "explains, m"):
         table.add_column(head, justify="right")
     one, other = told.original.braking, told.changed.braking
-    rows = (("brakes first at", "s", "time", None), ("distance there", "m", "gap", "place"), ("speed there", "m/s", "speed", None),
-            ("until full deceleration", "s", "delay", "delay"), ("speed then", "m/s", "full_speed", "speed"),
+    rows = (("brakes first at", "s", "time", None), ("distance there", "m", "gap", "place"), ("speed there", "m/s", "speed", "speed"),
+            ("until the pedal has followed", "s", "delay", "delay"), ("speed lost meanwhile", "m/s", "speed_lost", "slowing"),
             ("mean deceleration from then", "m/s^2", "deceleration", "deceleration"), ("distance needed", "m", "needed", None),
             ("distance there - needed", "m", "margin", "all"))
     for head, unit, field, part in rows:

@@ -1,0 +1,157 @@
+"""Why a setting is less safe than the original: two drives side by side, and what the lost distance is made of.
+
+A vehicle commands the brake with a gap G before it, at a speed v. A time t later its brake pedal stands where it is
+commanded to; until then it drives at a mean speed v - e and slows by d. From there on its mean deceleration is a. So it needs the distance
+
+    D = (v - e) t + (v - d)^2 / (2 a)
+
+to stand, and its margin is G - D. Differences of products are shared among their factors at the factors' means,
+D(x y) = Dx (y1 + y2) / 2 + Dy (x1 + x2) / 2, which is exact. So the margin lost between two drives is a sum of parts,
+each with the sign of one difference: place (G smaller), speed (v larger), delay (t larger), slowing (e and d: less speed
+lost while the pedal moves) and deceleration (a smaller).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.records import STANDSTILL, Drives
+
+FULL = 0.9
+"""The brake pedal has followed its command where it stands at this share of it [-]: at 0.9 where full braking is commanded."""
+REMAINDER = 0.05
+"""A part of the lost distance up to which it is not worth a word [m]."""
+
+
+class Braking(NamedTuple):
+    """How a vehicle braked for what is before it.
+
+    Attributes
+    ----------
+    time, gap, speed
+        When it first commanded the brake, with how much distance there, how fast [s, m, m/s].
+    delay
+        From the command until its brake pedal has followed it [s].
+    mean_speed_lost, speed_lost
+        By how much its mean speed meanwhile, and its speed at the end of it, are below the one at the command [m/s].
+    deceleration
+        Mean deceleration over the distance from there on [m/s^2], as UN R13-H takes the mean of fully developed braking.
+    """
+
+    time: float
+    gap: float
+    speed: float
+    delay: float
+    mean_speed_lost: float
+    speed_lost: float
+    deceleration: float
+
+    @property
+    def needed(self) -> float:
+        """Distance from the command until it stands [m]; where the drive ends before, it goes on at that deceleration."""
+        return (self.speed - self.mean_speed_lost) * self.delay + (self.speed - self.speed_lost)**2 / (2 * self.deceleration)
+
+    @property
+    def margin(self) -> float:
+        """Gap at the command less the distance needed [m]."""
+        return self.gap - self.needed
+
+
+class Course(NamedTuple):
+    """One drive as far as it matters: how it ended, its braking (None without any), and the distance left at its closest.
+
+    `safety_degree` is in m, or -m/s; NaN if undefined. `closest` is the gap at the closest place [m], NaN on a collision.
+    """
+
+    outcome: str
+    safety_degree: float
+    braking: Braking | None
+    closest: float
+    collision_speed: float
+
+
+class BrakingComparison(NamedTuple):
+    """Original and changed vehicle side by side; `parts` [m] add up to the distance lost, the remainder included.
+
+    `parts` is empty where one of the two never braked and there is nothing to compare; `place` names the point of a matrix.
+    `slowing` are the distances that the two save by slowing down while the pedal moves [m].
+    """
+
+    original: Course
+    changed: Course
+    parts: dict[str, float]
+    place: str = ""
+    slowing: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def lost(self) -> float:
+        """Distance lost [m]."""
+        return sum(self.parts.values())
+
+
+def course(drives: Drives, column: int, safety_degree: float) -> Course:
+    """What there is to tell of one of N drives."""
+    trace, encounter = drives.trace, drives.encounter
+    active = np.flatnonzero(trace.active[:, column])
+    counted = trace.active[:, column] & encounter.in_conflict[:, column]
+    speed_then, collided = float(drives.collision_speed[column]), bool(np.isfinite(drives.collision_speed[column]))
+    if not active.size:
+        return Course(str(drives.outcome[column]), safety_degree, None, np.nan, speed_then)
+    last, closest = int(active[-1]), np.nan
+    if counted.any() and not collided:
+        last = int(np.argmin(np.where(counted, encounter.separation[:, column], np.inf)))
+        closest = float(trace.gap[last, column])
+    braked = (trace.brake[:last + 1, column] > 0) & (trace.speed[:last + 1, column] > STANDSTILL) & trace.active[:last + 1, column]
+    braking = _braking(drives, column, int(np.argmax(braked)), last) if braked.any() else None
+    return Course(str(drives.outcome[column]), safety_degree, braking, closest, speed_then)
+
+
+def _braking(drives: Drives, column: int, first: int, last: int) -> Braking | None:
+    """The braking from sample `first` to `last`; None where the vehicle does not slow down once the pedal has followed."""
+    trace = drives.trace
+    speed, place = trace.speed[:last + 1, column], trace.position[:last + 1, column]
+    followed = trace.pedal[first:last + 1, column] >= FULL * trace.brake[first:last + 1, column]
+    down = first + int(np.argmax(followed))
+    way, energy = float(place[last] - place[down]), float(speed[down]**2 - speed[last]**2) / 2
+    if not followed.any() or way <= 0 or energy <= 0:
+        return None
+    begins, delay = float(speed[first]), (down - first) * trace.step
+    return Braking(
+        time=float(trace.time[first]), gap=float(trace.gap[first, column]), speed=begins, delay=delay,
+        mean_speed_lost=begins - float(place[down] - place[first]) / delay if down > first else 0.0,
+        speed_lost=begins - float(speed[down]), deceleration=energy / way)
+
+
+def compare(original: Course, changed: Course, place: str = "") -> BrakingComparison:
+    """Compare a changed vehicle's drive with the original's at the same place."""
+    one, other = original.braking, _as_the_original_would(changed, original)
+    if one is None or other is None:
+        return BrakingComparison(original, changed, {}, place)
+    parts, slowing = _parts(one, other)
+    left = original.closest - one.margin, changed.closest - other.margin
+    rest = [0.0 if np.isnan(value) else value for value in left]
+    return BrakingComparison(original, changed, {**parts, "remainder": rest[0] - rest[1]}, place, slowing)
+
+
+def _as_the_original_would(changed: Course, original: Course) -> Braking | None:
+    """A vehicle that hits without braking needs the way that the original would need from there, at its speed."""
+    if changed.braking is not None or original.braking is None or not np.isfinite(changed.collision_speed):
+        return changed.braking
+    return original.braking._replace(time=np.nan, gap=0.0, speed=max(changed.collision_speed, original.braking.speed_lost))
+
+
+def _parts(one: Braking, other: Braking) -> tuple[dict[str, float], tuple[float, float]]:
+    """What of the margin lost from one braking to the other comes from what [m], and what each saves while its pedal moves."""
+    mean_delay, mean_weakness = (one.delay + other.delay) / 2, (1 / one.deceleration + 1 / other.deceleration) / 2
+    speeds = [braking.speed - braking.speed_lost for braking in (one, other)]
+    mean_speed = sum(speeds) / 2
+    driven = [braking.speed - braking.mean_speed_lost for braking in (one, other)]
+    saved = [braking.mean_speed_lost * mean_delay + braking.speed_lost * mean_speed * mean_weakness for braking in (one, other)]
+    return {
+        "place": one.gap - other.gap,
+        "speed": (other.speed - one.speed) * (mean_delay + mean_speed * mean_weakness),
+        "delay": (other.delay - one.delay) * sum(driven) / 2,
+        "slowing": saved[0] - saved[1],
+        "deceleration": (1 / other.deceleration - 1 / one.deceleration) * (speeds[0]**2 + speeds[1]**2) / 4}, (saved[0], saved[1])
