@@ -27,6 +27,7 @@ class Outcome(StrEnum):
     COLLISION = "collision"
     TIMEOUT = "timeout"
     NEVER_MOVED = "never-moved"
+    INVALID_TEST = "invalid-test"
     SIMULATOR_ERROR = "simulator-error"
 
 
@@ -154,20 +155,48 @@ class Trace:
         return replace(self, **{name: values[:, vehicles] for name, values in columns.items() if np.ndim(values) == 2})
 
 
+class Contact(NamedTuple):
+    """Where N vehicles were touched first, shape (N,).
+
+    `side` is one of `SIDES`, empty without a contact. `place` is that of the obstacle's middle [% of the vehicle's width from the side
+    that its `lateral` is negative on, or of its length from the front], within 0 to 100, NaN without a contact.
+    """
+
+    side: npt.NDArray[np.str_]
+    place: FloatArray
+
+
+NO_CONTACT = Contact(np.array("", dtype="U5"), np.array(np.nan))
+"""No contact of N vehicles."""
+UNDEFINED: FloatArray = np.array(np.nan)
+"""What is undefined for N vehicles."""
+for _array in (*NO_CONTACT, UNDEFINED):
+    _array.flags.writeable = False
+
+
 @dataclass(frozen=True, kw_only=True)
 class Drives:
-    """N simulations as they went; `outcome` holds values of `Outcome`, `collision_speed` is NaN without one [m/s]."""
+    """N simulations as they went; `outcome` holds values of `Outcome`, `collision_speed` is NaN without one [m/s].
+
+    `test_speed_error` is the worst deviation from a test's speed before the system acted, NaN where there is none to hold [m/s].
+    """
 
     trace: Trace
     encounter: Encounter
     outcome: npt.NDArray[np.str_]
     collision_speed: FloatArray
+    contact: Contact = NO_CONTACT
+    test_speed_error: FloatArray = field(default_factory=lambda: UNDEFINED)
 
     def of(self, vehicles: slice) -> Drives:
         """The drives of some of the vehicles."""
+        def some(values: np.ndarray) -> np.ndarray:
+            return values[vehicles] if values.ndim else values
+
         return Drives(
             trace=self.trace.of(vehicles), encounter=Encounter._make(values[:, vehicles] for values in self.encounter),
-            outcome=self.outcome[vehicles], collision_speed=self.collision_speed[vehicles])
+            outcome=self.outcome[vehicles], collision_speed=self.collision_speed[vehicles],
+            contact=Contact._make(map(some, self.contact)), test_speed_error=some(self.test_speed_error))
 
     @property
     def relative_speed(self) -> FloatArray:
@@ -220,8 +249,13 @@ class Evaluations:
 
     @property
     def valid(self) -> BoolArray:
-        """Where the simulation ended in a way that can be scored."""
-        return np.asarray(self.outcome != Outcome.SIMULATOR_ERROR)
+        """Where the simulation ended in a way that can be scored: neither a simulator's error nor an invalid test."""
+        return np.asarray(~self.failed & (self.outcome != Outcome.INVALID_TEST))
+
+    @property
+    def failed(self) -> BoolArray:
+        """What could not be simulated."""
+        return np.asarray(self.outcome == Outcome.SIMULATOR_ERROR)
 
     def reason(self, row: int) -> str:
         """Why a setting that is not valid could not be scored."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from safevar_sumo.campaign.keys import RunKey
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import SPARE, Failure, Journal
 from safevar_sumo.search import Search
 
@@ -61,7 +61,7 @@ class Run:
         self.finished = False
         if journal.cut:
             observer.warned(f"{journal.path}: the last {journal.cut} bytes were torn; what they held is simulated again")
-        if retry and journal.content.evaluations is not None and not journal.content.evaluations.valid.all():
+        if retry and journal.content.evaluations is not None and journal.content.evaluations.failed.any():
             journal.retry()
         if journal.content.evaluations is not None:
             self._learn(journal.content.positions, journal.content.evaluations)
@@ -76,7 +76,7 @@ class Run:
         """Settings of this run that could not be simulated."""
         return [Failure(self.key.algorithm, self.key.run, position, evaluations.reason(i))
                 for position, evaluations, i in sorted(self._known.values(), key=lambda known: known[0])
-                if 0 <= position < self._budget and evaluations.outcome[i] == Outcome.SIMULATOR_ERROR]
+                if 0 <= position < self._budget and evaluations.failed[i]]
 
     @property
     def collisions(self) -> int:
@@ -111,7 +111,7 @@ class Run:
     def samples(self, rng: np.random.Generator) -> list[Evaluations]:
         """The most severe evaluation, which will be looked at, the last one, in which most has come together, and others by chance."""
         scored = [known for known in self._known.values()
-                  if 0 <= known[0] < self._budget and known[1].outcome[known[2]] != Outcome.SIMULATOR_ERROR]
+                  if 0 <= known[0] < self._budget and known[1].valid[known[2]]]
         if not scored:
             return []
         scored.sort(key=lambda known: known[0])

@@ -19,7 +19,8 @@ READABLE = (1, FORMAT)
 MAGIC = b"SVJ\n"
 HEAD = struct.Struct("<4sII")
 OUTCOMES = {
-    Outcome.STOPPED: 0, Outcome.PASSED: 1, Outcome.COLLISION: 2, Outcome.TIMEOUT: 3, Outcome.NEVER_MOVED: 4, Outcome.SIMULATOR_ERROR: 5}
+    Outcome.STOPPED: 0, Outcome.PASSED: 1, Outcome.COLLISION: 2, Outcome.TIMEOUT: 3, Outcome.NEVER_MOVED: 4, Outcome.SIMULATOR_ERROR: 5,
+    Outcome.INVALID_TEST: 6}
 """How journals write an outcome down; numbers are never given anew."""
 _OUTCOME_OF = {code: outcome.value for outcome, code in OUTCOMES.items()}
 SPARE = -1
@@ -151,10 +152,10 @@ def content_of(frames: list[Frame]) -> Content:
 
 def _without_failures(positions: list[int], evaluations: Evaluations) -> tuple[list[int], Evaluations]:
     """What is left to a run that tries its failed settings again."""
-    valid = evaluations.valid
-    first = min((position for position, fine in zip(positions, valid, strict=True) if not fine), default=max(positions) + 1)
-    kept = [position if position < first else SPARE for position, fine in zip(positions, valid, strict=True) if fine]
-    return kept, evaluations.take(valid)
+    simulated = ~evaluations.failed
+    first = min((position for position, fine in zip(positions, simulated, strict=True) if not fine), default=max(positions) + 1)
+    kept = [position if position < first else SPARE for position, fine in zip(positions, simulated, strict=True) if fine]
+    return kept, evaluations.take(simulated)
 
 
 def _frame_at(data: bytes, offset: int, path: Path) -> tuple[Frame | None, int]:

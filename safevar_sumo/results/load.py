@@ -95,7 +95,7 @@ def load(directory: str | Path) -> Results:
         evaluations = content.evaluations.take([row for _, row in asked])
         everything.append(((algorithm, run), evaluations))
         positions += [position for position, _ in asked]
-        failures += [Failure(algorithm, run, asked[row][0], evaluations.reason(row)) for row in np.flatnonzero(~evaluations.valid).tolist()]
+        failures += [Failure(algorithm, run, asked[row][0], evaluations.reason(row)) for row in np.flatnonzero(evaluations.failed).tolist()]
         result = content.result(budget)
         if result is not None:
             solved.append(((algorithm, run), content.by_position(result.positions)))

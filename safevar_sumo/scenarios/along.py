@@ -44,6 +44,11 @@ class Along(BehindSomebody, frozen=True, kw_only=True):
     pre_crash = PreCrash.PEDESTRIAN
 
     @property
+    def test_speed(self) -> float:
+        """That the vehicle is to hold until it brakes [m/s]."""
+        return self.speed * KMH
+
+    @property
     def duration(self) -> float:
         """Length of a run [s]."""
         return self.time_to_impact + self.time_after

@@ -117,7 +117,8 @@ class Scenario(Protocol):
     It may have a `grade`, by how much its road rises over the way [%]: SUMO's plane is then that road, and gravity acts in the
     vehicles. It may have a `pre_crash`, what type of NHTSA's it is of. It may have `actors(roads) -> Actors`, what its
     parameters make of the network's traffic, and `remarks() -> list[str]`,
-    what a user should know of them.
+    what a user should know of them. It may have a `test_speed` [m/s]: a robot then holds the vehicle at that speed until the system
+    brakes, a run that leaves the tolerance before that is no valid test, and only what the front hits is a collision.
     """
 
     network: str

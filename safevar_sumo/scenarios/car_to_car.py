@@ -65,6 +65,11 @@ class CarToCar(BehindSomebody, frozen=True, kw_only=True):
         return PRE_CRASH[self.test]
 
     @property
+    def test_speed(self) -> float:
+        """That the vehicle is to hold until it brakes [m/s]."""
+        return self.speed * KMH
+
+    @property
     def duration(self) -> float:
         """Length of a run [s]."""
         return self._time_to_impact() + self.time_after

@@ -111,6 +111,11 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     pre_crash = PreCrash.PEDESTRIAN
 
     @property
+    def test_speed(self) -> float:
+        """That the vehicle is to hold until it brakes [m/s]."""
+        return self.speed * KMH
+
+    @property
     def duration(self) -> float:
         """Length of a run [s]."""
         return self.time_to_impact + self.time_after

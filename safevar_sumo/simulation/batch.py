@@ -13,6 +13,8 @@ from safevar_sumo.plugins import undisturbed
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Drives, Evaluations, FloatArray, Outcome, Trace
 from safevar_sumo.scenarios import VUT, Lane, Point
 from safevar_sumo.scenarios.frame import Frame
+from safevar_sumo.simulation.contact import Contacts
+from safevar_sumo.simulation.driving_robot import DrivingRobot
 from safevar_sumo.simulation.parts import Parts
 from safevar_sumo.simulation.staging import staged
 from safevar_sumo.simulation.sumo import Engine, world_on
@@ -28,11 +30,15 @@ Watcher = Callable[[SumoWorld], None]
 @np.errstate(all="ignore")
 def score(system: System, settings: FloatArray, run: Drives) -> Evaluations:
     """Metrics and objectives of simulated settings."""
+    metrics = {name: metric(run, system.metrics) for name, metric in system.measuring.metrics.items()}
+    invalid = run.outcome == Outcome.INVALID_TEST
+    if invalid.any():
+        metrics = {name: np.where(invalid, np.nan, values) for name, values in metrics.items()}
     return Evaluations(
         settings=settings,
         outcome=run.outcome,
         collision_speed=run.collision_speed,
-        metrics={**{name: metric(run, system.metrics) for name, metric in system.measuring.metrics.items()},
+        metrics={**metrics,
                  **{name: change.function(settings, system.characteristics) for name, change in system.measuring.changes.items()}},
         f_diff=system.characteristics.largest_change(settings),
         f_num_diff=system.characteristics.number_changed(settings))
@@ -91,17 +97,18 @@ def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watch
         raise InputError("scenario.parameters.network", f"the scenario does not find what it looks for: {str(error).strip()}",
                          "a network and traffic with the ids that the scenario names") from None
     log = _Log(n, int(parts.last.max()) + 1, way)
-    verdict = _Verdict(n)
+    verdict, robot = _Verdict(n), DrivingRobot(system.points, vehicle, prepared, state, step)
+    contacts = Contacts(n, robot.tested)
     for sample in range(log.length):
         if watch is not None:
             watch(world)
         speed = world.speeds()
         scene = parts.scene()
-        active = verdict.judge(speed, scene.over, world.collisions(), last=sample >= parts.last)
+        active = verdict.judge(speed, scene.over, contacts.collisions(world, verdict.open, scene), last=sample >= parts.last)
         seen = parts.seen(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
         seen, state = vehicle.sense(prepared, state, seen)
         command, driver = system.ads.drive(seen, driver)
-        command = parts.braked(command)
+        command, state = robot.drive(parts.braked(command), state, verdict.open)
         log.write(sample, place=world.vehicle_positions(VUT), speed=speed, gap=scene.gap, lateral=scene.lateral,
                   lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active,
                   obstacle_speed=scene.obstacle_speed, pedal=state.brake)
@@ -113,7 +120,9 @@ def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watch
         _refuse_no_number(state.speed, settings, system.characteristics)
         world.advance(np.where(verdict.open, state.speed, 0.0))
     trace = log.trace(sample + 1, step, length)
-    return Drives(trace=trace, encounter=parts.encounter(trace), outcome=verdict.outcome(), collision_speed=verdict.collision_speed)
+    return Drives(trace=trace, encounter=parts.encounter(trace), outcome=np.where(robot.invalid, Outcome.INVALID_TEST, verdict.outcome()),
+                  collision_speed=np.where(robot.invalid, np.nan, verdict.collision_speed), contact=contacts.contact(),
+                  test_speed_error=robot.error)
 
 
 def _refuse_no_number(speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet) -> None:

@@ -7,7 +7,6 @@ is straight and nobody reacts to the vehicle under test; whoever uses it holds i
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -21,7 +20,7 @@ from safevar_sumo.simulation.network import copied_network
 from safevar_sumo.simulation.staging import staged
 from safevar_sumo.simulation.sumo import Engine, open_world
 from safevar_sumo.simulation.system import System
-from safevar_sumo.simulation.world import SumoWorld
+from safevar_sumo.simulation.world import Body, SumoWorld, direction_of
 from safevar_sumo.vehicles import SumoType
 
 
@@ -52,7 +51,7 @@ class KinematicWorld(SumoWorld):
         super().depart()
         vehicle, vut = self._api.vehicle, self.ids(VUT)[0]
         self._start = np.array(vehicle.getPosition(vut))
-        self._along = _direction(vehicle.getAngle(vut))
+        self._along = direction_of(vehicle.getAngle(vut))
         self._body = vehicle.getLength(vut), vehicle.getWidth(vut)
         self._speeds += vehicle.getSpeed(vut)
 
@@ -76,16 +75,22 @@ class KinematicWorld(SumoWorld):
 
     def collisions(self) -> dict[int, float]:
         hit = np.zeros(self.n, dtype=bool)
-        for front, along, length, width in self._others():
-            hit |= self._overlaps(front, along, length, width)
+        for _, *body in self._others():
+            hit |= self._overlaps(*body)
         return dict(zip(np.flatnonzero(hit).tolist(), self._speeds[hit].tolist(), strict=True))
 
-    def _others(self) -> Iterator[tuple[FloatArray, FloatArray, float, float]]:
-        """Front, direction, length and width of everybody else."""
+    def bodies(self, copy: int) -> tuple[Body, Body]:
+        own = Body.behind(self.vehicle_positions(VUT)[copy], self._along, *self._body, float(self._speeds[copy]))
+        struck = next(name for name, *body in self._others() if self._overlaps(*body)[copy])
+        return own, self._body_of(struck)
+
+    def _others(self) -> Iterator[tuple[str, FloatArray, FloatArray, float, float]]:
+        """Id, front, direction, length and width of everybody else."""
         for api in (self._api.vehicle, self._api.person):
             for name in api.getIDList():
                 if name != self.ids(VUT)[0]:
-                    yield np.array(api.getPosition(name)), _direction(api.getAngle(name)), api.getLength(name), api.getWidth(name)
+                    yield (name, np.array(api.getPosition(name)), direction_of(api.getAngle(name)), api.getLength(name),
+                           api.getWidth(name))
 
     def _overlaps(self, front: FloatArray, along: FloatArray, length: float, width: float) -> BoolArray:
         """Whether rectangles overlap: no side of either parts them."""
@@ -100,11 +105,6 @@ class KinematicWorld(SumoWorld):
         for axis, reach in reaches:
             overlaps &= np.abs(to_other @ axis) < reach / 2
         return overlaps
-
-
-def _direction(angle: float) -> FloatArray:
-    """Unit vector of SUMO's angle: degrees clockwise from north."""
-    return np.array([math.sin(math.radians(angle)), math.cos(math.radians(angle))])
 
 
 def _left(direction: FloatArray) -> FloatArray:

@@ -12,8 +12,9 @@ import numpy.typing as npt
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Drives, Encounter, Evaluations, FloatArray, Trace
+from safevar_sumo.records import Contact, Drives, Encounter, Evaluations, FloatArray, Outcome, Trace
 from safevar_sumo.scenarios import Point
+from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.simulation.batch import Watcher, drive_all, score
 from safevar_sumo.simulation.network import empty_fingerprint, lanes_of
 from safevar_sumo.simulation.staging import staged
@@ -38,12 +39,17 @@ class AtPoint(NamedTuple):
 
 
 def point_record(found: AtPoint, row: int = 0) -> dict[str, Any]:
-    """One setting at one point as plain values: where that is, how it ended, speeds of the impact [m/s]; undefined is None."""
+    """One setting at one point as plain values: where that is, how it ended, speeds of the impact [m/s], the worst deviation from the
+    test's speed before the system acted [km/h], who was touched where [%]; undefined is None.
+    """
     evaluations, relative = found.evaluations, found.drives.relative_speed
     numbers = {"impact_speed": evaluations.collision_speed[row], "relative_impact_speed": relative[row],
-               "safety_degree": evaluations.f_safe[row]}
+               "safety_degree": evaluations.f_safe[row],
+               "test_speed_error": np.broadcast_to(found.drives.test_speed_error, relative.shape)[row] / KMH}
+    side, place = (np.broadcast_to(values, relative.shape)[row] for values in found.drives.contact)
     return {"point": found.point.name, **dict(found.point.place), "outcome": str(evaluations.outcome[row]),
-            **{name: None if np.isnan(value) else float(value) for name, value in numbers.items()}}
+            **{name: None if np.isnan(value) else float(value) for name, value in numbers.items()},
+            "contact": {"side": str(side), "place": float(place)} if side else None}
 
 
 def remarks_of(scenario: Any) -> list[str]:
@@ -177,10 +183,19 @@ def _together(points: Sequence[Point], most: int) -> Iterator[tuple[Point, ...]]
 
 
 def worst_points(found: Sequence[AtPoint]) -> npt.NDArray[np.intp]:
-    """For every setting the number of the point with the least safety degree; among equals the first by name."""
+    """For every setting the number of the point with the least safety degree; among equals the first by name.
+
+    A collision at a valid point stands, whatever the others are. Without one, a single invalid test makes it unknown whether the
+    setting is safe: then that point counts.
+    """
     order = sorted(range(len(found)), key=lambda k: found[k].point.name)
     degrees = np.stack([found[k].evaluations.f_safe for k in order])
-    return np.asarray(np.array(order)[np.argmin(np.where(np.isnan(degrees), np.inf, degrees), axis=0)])
+    degrees = np.where(np.isnan(degrees), np.inf, degrees)
+    invalid = np.stack([found[k].evaluations.outcome == Outcome.INVALID_TEST for k in order])
+    if invalid.any():
+        collided = np.stack([found[k].evaluations.collided for k in order]).any(axis=0)
+        degrees = np.where(invalid & ~collided, -np.inf, degrees)
+    return np.asarray(np.array(order)[np.argmin(degrees, axis=0)])
 
 
 def _picked(drives: Sequence[Drives], number: npt.NDArray[np.intp]) -> Drives:
@@ -192,6 +207,9 @@ def _picked(drives: Sequence[Drives], number: npt.NDArray[np.intp]) -> Drives:
         return np.stack(whole)[number, :, columns].T
 
     longest = max((one.trace for one in drives), key=lambda trace: len(trace.time))
+    def of_each(values: list[np.ndarray]) -> np.ndarray:
+        return np.stack([np.broadcast_to(one, number.shape) for one in values])[number, columns]
+
     names = [one.name for one in fields(Trace) if np.ndim(getattr(longest, one.name)) == 2]
     columns_of: dict[str, Any] = {name: picked([getattr(one.trace, name) for one in drives]) for name in names}
     trace = replace(longest, **columns_of)
@@ -200,5 +218,6 @@ def _picked(drives: Sequence[Drives], number: npt.NDArray[np.intp]) -> Drives:
     encounters = zip(*(one.encounter for one in drives), strict=True)
     return Drives(
         trace=replace(trace, active=active), encounter=Encounter._make(picked(list(values)) for values in encounters),
-        outcome=np.stack([one.outcome for one in drives])[number, columns],
-        collision_speed=np.stack([one.collision_speed for one in drives])[number, columns])
+        outcome=of_each([one.outcome for one in drives]), collision_speed=of_each([one.collision_speed for one in drives]),
+        contact=Contact._make(of_each(list(values)) for values in zip(*(one.contact for one in drives), strict=True)),
+        test_speed_error=of_each([one.test_speed_error for one in drives]))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from itertools import chain
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,21 @@ from safevar_sumo.scenarios.base import lane_through
 from safevar_sumo.simulation.copies import copied_id, copy_and_name
 from safevar_sumo.simulation.standing import StandingSumo
 from safevar_sumo.vehicles import SumoType
+
+class Body(NamedTuple):
+    """A vehicle or a person as a rectangle: its middle and direction, a unit vector, shape (2,); m, m, m/s."""
+
+    middle: FloatArray
+    along: FloatArray
+    length: float
+    width: float
+    speed: float
+
+    @classmethod
+    def behind(cls, front: FloatArray, along: FloatArray, length: float, width: float, speed: float) -> Body:
+        """From the middle of its front."""
+        return cls(front - along * (length / 2), along, length, width, speed)
+
 
 # Speed mode: SUMO obeys every speed that is set and yields to nobody on a junction (TraCI "set speed mode", bit 5).
 OBEY = 32
@@ -35,6 +51,8 @@ class SumoWorld:
         self._last_speeds, self._last_positions = np.zeros(n), np.zeros((n, 2))
         """Speeds and positions of vehicles under test that have left the road."""
         self._speeds_now: FloatArray | None = None
+        self._struck: dict[int, str] = {}
+        """By copy, whom the vehicles under test were reported to collide with last."""
         self._ids: dict[str, list[str]] = {}
         self._positions: dict[str, FloatArray] = {}
         self._copy_of = {name: copy for copy, name in enumerate(self.ids(VUT))}
@@ -106,9 +124,18 @@ class SumoWorld:
 
     def collisions(self) -> dict[int, float]:
         """Copies whose vehicle under test collides in this step, and its speed [m/s]."""
-        return {
-            self._copy_of[collision.collider]: collision.colliderSpeed
-            for collision in self._api.simulation.getCollisions() if collision.collider in self._copy_of}
+        reported = [one for one in self._api.simulation.getCollisions() if one.collider in self._copy_of]
+        self._struck = {self._copy_of[one.collider]: one.victim for one in reported}
+        return {self._copy_of[one.collider]: one.colliderSpeed for one in reported}
+
+    def bodies(self, copy: int) -> tuple[Body, Body]:
+        """A vehicle under test that collides in this step, and whom it collides with."""
+        return self._body_of(self.ids(VUT)[copy]), self._body_of(self._struck[copy])
+
+    def _body_of(self, name: str) -> Body:
+        kind = self._api.person if name in self._api.person.getIDList() else self._api.vehicle
+        return Body.behind(np.array(kind.getPosition(name)), direction_of(kind.getAngle(name)), kind.getLength(name),
+                           kind.getWidth(name), kind.getSpeed(name))
 
     def leave(self, copies: Sequence[int]) -> None:
         """Take vehicles under test off the road whose runs are over: they are told to be as they were, and cost nothing."""
@@ -224,6 +251,11 @@ def present_world() -> SumoWorld:
     """The world that is being driven."""
     assert _present is not None
     return _present
+
+
+def direction_of(angle: float) -> FloatArray:
+    """Unit vector of SUMO's angle: degrees clockwise from north."""
+    return np.array([math.sin(math.radians(angle)), math.cos(math.radians(angle))])
 
 
 def _direct(api: Any, domain: str, name: str) -> Callable[..., Any]:

@@ -195,22 +195,32 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         p, nothing = prepared, np.zeros_like(prepared.mass)
         rim, force = self._rim_at(p, speed)
         wheel_speed = rim / p.radius
+        resists = p.wheel_damping * wheel_speed + p.radius * force
+
+        def engine_in(ratio: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+            """Torque through the clutch, what is left of it for the brake, and the engine's speed."""
+            # Downhill the engine brakes, and the brake takes what is left; then w_e = G w_w + m / k_c with m = -c_e w_e.
+            dragged = -p.damping_engaged * ratio * wheel_speed / (1 + p.damping_engaged / p.clutch)
+            through_clutch = np.maximum(resists / ratio, dragged)
+            return (through_clutch, ratio * (dragged - resists / ratio),
+                    np.minimum(ratio * wheel_speed + through_clutch / p.clutch, p.engine_limit))
+
         gear = nothing + 1
         for ratio in OVERALL_RATIOS[1:-1]:
-            gear += wheel_speed * ratio > p.shift_up * p.engine_limit
-        ratio = OVERALL_RATIOS[gear.astype(np.intp)]
-        through_clutch = (p.wheel_damping * wheel_speed + p.radius * force) / ratio
-        # Downhill the engine brakes, and the brake takes what is left; then w_e = G w_w + m / k_c with m = -c_e w_e.
-        dragged = -p.damping_engaged * ratio * wheel_speed / (1 + p.damping_engaged / p.clutch)
-        brake = np.minimum(np.maximum(ratio * (dragged - through_clutch) / p.brake_torque, 0.0), 1.0)
-        through_clutch = np.maximum(through_clutch, dragged)
-        engine_speed = np.minimum(ratio * wheel_speed + through_clutch / p.clutch, p.engine_limit)
+            gear += engine_in(ratio)[-1] > p.shift_up * p.engine_limit
+        through_clutch, left, engine_speed = engine_in(OVERALL_RATIOS[gear.astype(np.intp)])
+        brake = np.minimum(np.maximum(left / p.brake_torque, 0.0), 1.0)
         state = CarlaState(speed, wheel_speed, engine_speed, gear, gear, nothing, nothing, nothing)
         pull = self._torque(p, engine_speed) - (p.damping_full - p.damping_engaged) * engine_speed
         throttle = (p.damping_engaged * engine_speed + through_clutch) / np.maximum(pull, 1.0)
         throttle = np.where(brake > 0, 0.0, np.minimum(throttle, 1.0))
         lugs = (gear > 1) & (engine_speed < p.shift_down * p.engine_limit)
         return state._replace(throttle=throttle, brake=brake, since_shift=np.where(lugs, p.shift_time, p.shift_latency))
+
+    def hold_gear(self, prepared: _Prepared, state: CarlaState, holds: BoolArray) -> CarlaState:
+        """Keep the gear of vehicles, shape (N,), as a lever does; where it is let go again the last shift is long over."""
+        free = np.where(state.since_shift < 0, prepared.shift_latency, state.since_shift)
+        return state._replace(since_shift=np.where(holds, -np.inf, free))
 
     def _rim_at(self, p: _Prepared, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Speed of the wheels' rim at which the tyres push as hard as air and slope resist [m/s], and that force [N]."""
