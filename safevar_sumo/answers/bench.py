@@ -64,7 +64,7 @@ class Bench:
         """
         evaluations = self.evaluate(self.characteristics.original[np.newaxis], "original vehicle")
         if not evaluations.valid[0]:
-            raise SimulationError(f"study {self.study.name!r} cannot be simulated with the original vehicle")
+            raise SimulationError(f"study {self.study.name!r} cannot be simulated with the original vehicle: {evaluations.outcome[0]}")
         return evaluations
 
     def with_step(self, step: float) -> Bench:

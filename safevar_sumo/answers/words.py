@@ -15,7 +15,8 @@ WORTH_A_WORD = 0.005
 """A part of a distance that rounds to less than a centimetre is left out of a sentence [m]."""
 ENDS = {
     Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is still under way at the end",
-    Outcome.NEVER_MOVED: "never moves", Outcome.SIMULATOR_ERROR: "could not be simulated"}
+    Outcome.NEVER_MOVED: "never moves", Outcome.SIMULATOR_ERROR: "could not be simulated",
+    Outcome.INVALID_TEST: "leaves the tolerance of the test's speed"}
 PARTS = {
     "place": ("it begins to brake nearer", "it begins to brake farther away"), "speed": ("it is faster", "it is slower"),
     "delay": ("its brake pedal follows later", "its brake pedal follows sooner"),

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 WORDS = {
     Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is under way when the time is up",
-    Outcome.NEVER_MOVED: "never moves"}
+    Outcome.NEVER_MOVED: "never moves", Outcome.INVALID_TEST: "leaves the tolerance of the test's speed before the system acts"}
 
 
 @dataclass(frozen=True, kw_only=True)

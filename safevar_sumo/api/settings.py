@@ -51,7 +51,8 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | npt.ArrayLike, *, filter
     pandas.DataFrame
         One row per setting, in their order and with a frame's index: the characteristics as simulated, f_safe [m or -m/s],
         f_diff [fraction], f_num_diff, the metrics in their units (NaN where undefined), collision_speed [m/s], outcome.
-        A setting that cannot be simulated has the outcome simulator-error.
+        A setting that cannot be simulated has the outcome simulator-error, one that leaves a test's speed before the system acts
+        invalid-test: neither is a failure or a success, and neither has metrics.
 
     Raises
     ------

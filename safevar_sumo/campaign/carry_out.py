@@ -13,6 +13,7 @@ from safevar_sumo.campaign.keys import RunKey, algorithm_of, run_generator
 from safevar_sumo.campaign.rechecking import Rechecking
 from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.computing import PersistentPool, Pool, check_isolation, first_of, packed, result_of
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import SAFEVAR, Scoring
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ORIGINAL, Failure, JournalBusy, ResultsDirectory
@@ -25,7 +26,8 @@ class Campaign(NamedTuple):
     """What runs of a study found: the original vehicle's evaluation and the solutions of every finished run.
 
     `failures` are settings that could not be simulated; `busy` runs are in the hands of another process; `scoring` is what
-    was measured and minimised; `collisions` counts the different settings of each finished run that collided.
+    was measured and minimised; `collisions` counts the different settings of each finished run that collided, `invalid_tests` those
+    that left the tolerance of a test's speed.
     """
 
     original: Evaluations
@@ -33,6 +35,7 @@ class Campaign(NamedTuple):
     failures: list[Failure]
     busy: list[RunKey]
     collisions: dict[RunKey, int]
+    invalid_tests: dict[RunKey, int]
     scoring: Scoring = SAFEVAR
 
 
@@ -61,12 +64,15 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     persistent, work = PersistentPool(pool, study), packed(study, results.manifest)
     original = _original(study, work, characteristics, results, persistent, observer)
+    if not original.valid[0]:
+        raise InputError(f"study {study.name!r}", "the original vehicle leaves the tolerance of a test's speed before the ADS acts "
+                         "(invalid-test): nothing can be compared with it", "tests whose speed the vehicle can hold")
     if original.collided[0]:
         observer.warned(f"study {study.name!r}: the original vehicle itself collides, no change is needed for that")
     results.begin(original)
     problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,
                       population=study.search.population, scoring=results.scoring)
-    campaign = Campaign(original, {}, [], [], {}, results.scoring)
+    campaign = Campaign(original, {}, [], [], {}, {}, results.scoring)
     waiting, runs = deque(keys), set[Run]()
 
     def begun(key: RunKey) -> Search:
@@ -84,6 +90,7 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
     def finish(run: Run) -> None:
         run.finish()
         campaign.solutions[run.key], campaign.collisions[run.key] = run.result, run.collisions
+        campaign.invalid_tests[run.key] = run.invalid_tests
         campaign.failures.extend(run.failures)
         runs.discard(run)
         run.close()

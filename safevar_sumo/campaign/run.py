@@ -9,7 +9,7 @@ import numpy as np
 
 from safevar_sumo.campaign.keys import RunKey
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import SPARE, Failure, Journal
 from safevar_sumo.search import Search
 
@@ -81,7 +81,15 @@ class Run:
     @property
     def collisions(self) -> int:
         """How many different settings that this run asked for collided."""
-        return sum(evaluations.outcome[i] == Outcome.COLLISION for position, evaluations, i in self._known.values()
+        return self._number_of(Outcome.COLLISION)
+
+    @property
+    def invalid_tests(self) -> int:
+        """How many different settings that this run asked for left the tolerance of a test's speed."""
+        return self._number_of(Outcome.INVALID_TEST)
+
+    def _number_of(self, outcome: Outcome) -> int:
+        return sum(evaluations.outcome[i] == outcome for position, evaluations, i in self._known.values()
                    if 0 <= position < self._budget)
 
     def advance(self) -> bool:

@@ -23,7 +23,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import tags
-from safevar_sumo.simulation import System, assemble, at_every_point, named_point, point_record, remarks_of
+from safevar_sumo.simulation import System, assemble, at_every_point, named_point, point_record, remarks_of, vehicle_remarks
 from safevar_sumo.study import check_writable
 from safevar_sumo.terminal.matrix import print_matrix
 from safevar_sumo.terminal.simulation import print_simulation, print_sweep
@@ -103,7 +103,7 @@ def _tell(target: Target, system: System, found: Simulation, as_json: bool) -> N
         print_matrix(Console(), points)
         Console().print(tags(system.points), soft_wrap=True, markup=False, highlight=False)
     remarks = [remark for one in system.points for remark in remarks_of(one.scenario)]
-    for remark in dict.fromkeys([*remarks, *system.network_remarks]):
+    for remark in dict.fromkeys([*remarks, *system.network_remarks, *vehicle_remarks(system)]):
         click.echo(f"note: {remark}", err=True)
     for name, value in found.put_back.items():
         click.echo(f"note: {name} = {value:g} is so near the original that the filter put {found.setting[name]:g} back; "

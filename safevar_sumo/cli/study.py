@@ -15,6 +15,7 @@ from safevar_sumo.cli.completion import complete_study
 from safevar_sumo.cli.program import commands, tell_remarks
 from safevar_sumo.errors import InputError
 from safevar_sumo.progress import CampaignProgress
+from safevar_sumo.simulation import vehicle_remarks
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.terminal.campaign import print_forecast, print_summary
 
@@ -39,7 +40,7 @@ def study(study: str, batch: int | None, out: Path | None, jobs: int | None, clu
           retry_failed: bool, quiet: bool, dry_run: bool, **options: Any) -> None:
     """Search STUDY; the same command again goes on where it was stopped."""
     chosen, system = prepared(_with_options(load_study(study), **options), study)
-    tell_remarks(chosen, system.network_remarks)
+    tell_remarks(chosen, [*system.network_remarks, *vehicle_remarks(system)])
     keys = _selected(all_runs(chosen), only, shard)
     directory = out or Path("results") / chosen.name
     with a_pool(chosen, jobs, cluster) as pool:

@@ -73,7 +73,7 @@ def _far_apart(characteristics: CharacteristicSet) -> FloatArray:
 
 def _difference(one: Evaluations, other: Evaluations) -> tuple[str, object, object] | None:
     """The first number in which two evaluations of a setting differ, and both values; failures tell nothing."""
-    if not (one.valid[0] and other.valid[0]):
+    if one.failed[0] or other.failed[0]:
         return None
     if one.outcome[0] != other.outcome[0]:
         return "outcome", str(one.outcome[0]), str(other.outcome[0])

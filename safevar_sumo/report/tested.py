@@ -12,6 +12,7 @@ from safevar_sumo.answers import number_of
 from safevar_sumo.report.material import Material
 from safevar_sumo.scenarios import SCENARIOS, Point, tags
 from safevar_sumo.showing.comparison import number, raised
+from safevar_sumo.simulation import vehicle_remarks
 from safevar_sumo.vehicles import VEHICLES
 
 
@@ -28,7 +29,8 @@ def tested(material: Material) -> dict[str, Any]:
         "characteristics": [
             {"name": one.name, "unit": "" if one.unit == "-" else raised(one.unit), "original": number(one.original),
              "lower": number(one.lower), "upper": number(one.upper), "threshold": number(one.threshold)} for one in case.characteristics],
-        "remarks": [*case.remarks, *([material.lacking] if material.lacking else [])]}
+        "remarks": [*case.remarks, *([material.lacking] if material.lacking else []),
+                    *(vehicle_remarks(material.system) if material.system else [])]}
 
 
 def _where(material: Material) -> str:

@@ -35,6 +35,10 @@ def trust(material: Material, explained: Found | None) -> dict[str, Any]:
     failed = int((case.evaluations["outcome"] == str(Outcome.SIMULATOR_ERROR)).sum())
     if failed:
         told.append(f"{failed} of {len(case.evaluations)} settings could not be simulated; they are in no result.")
+    invalid = int((case.evaluations["outcome"] == str(Outcome.INVALID_TEST)).sum())
+    if invalid:
+        told.append(f"{invalid} of {len(case.evaluations)} settings left the tolerance of a test's speed before the driving system acted: "
+                    "they are neither failures nor successes.")
     if explained:
         shares = [failure["robustness"] for failure in explained if failure.get("robustness") is not None]
         if shares:

@@ -101,5 +101,5 @@ def _run(path: Path, of: str, algorithm: str, run: int, budget: int) -> tuple[Ru
     valid = found.take(found.valid)
     state = "finished" if content.result(budget) is not None else "begun"
     best = float(np.min(valid.f_safe)) if len(valid) else None
-    return (RunStatus(algorithm, run, state, len(found), int(np.count_nonzero(found.collided)), len(found) - len(valid), best),
+    return (RunStatus(algorithm, run, state, len(found), int(np.count_nonzero(found.collided)), int(np.count_nonzero(found.failed)), best),
             np.stack([valid.f_safe, valid.f_diff, valid.f_num_diff], axis=1))

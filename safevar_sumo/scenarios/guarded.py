@@ -14,6 +14,8 @@ from safevar_sumo.scenarios.base import STEEPEST, Actors, Roads, Scenario, Scene
 SCENARIO_CONTRACT = Contract.of(Scenario, "a scenario")
 LONGEST = 3600.0
 """Of a run [s]."""
+FASTEST_TEST = 100.0
+"""[m/s]"""
 
 
 class GuardedScenario:
@@ -28,6 +30,9 @@ class GuardedScenario:
         duration = guard.numbers("__init__", "duration", guard.field("__init__", scenario, "duration"), (), 0.0, LONGEST, above=True)
         self.duration = float(duration)
         grade = guard.numbers("__init__", "grade", getattr(scenario, "grade", 0.0), (), -STEEPEST, STEEPEST)
+        speed = getattr(scenario, "test_speed", None)
+        self.test_speed = speed if speed is None else float(
+            guard.numbers("__init__", "test_speed", speed, (), 0.0, FASTEST_TEST, above=True))
         self.grade, self.pre_crash = float(grade), str(getattr(scenario, "pre_crash", ""))
 
     def actors(self, roads: Roads) -> Actors:

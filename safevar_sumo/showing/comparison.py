@@ -20,7 +20,8 @@ from safevar_sumo.vehicles import CharacteristicSet
 ORIGINAL, CHANGED = 0, 1
 """Rows of a comparison."""
 WORDS = {Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is still driving at the end",
-         Outcome.NEVER_MOVED: "never moves", Outcome.SIMULATOR_ERROR: "cannot be simulated"}
+         Outcome.NEVER_MOVED: "never moves", Outcome.SIMULATOR_ERROR: "cannot be simulated",
+         Outcome.INVALID_TEST: "leaves the test's speed"}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,7 @@ from safevar_sumo.simulation.matrix import (
     remarks_of,
     simulate,
     study_at,
+    vehicle_remarks,
     worst_points,
 )
 from safevar_sumo.simulation.network import network_files, network_fingerprint
@@ -21,4 +22,5 @@ from safevar_sumo.simulation.system import System, assemble, models_of
 
 __all__ = [
     "AtPoint", "Engine", "System", "aggregated", "assemble", "at_every_point", "at_worst", "evaluate", "models_of", "named_point",
-    "network_files", "network_fingerprint", "point_record", "remarks_of", "score", "simulate", "simulate_alone", "study_at", "worst_points"]
+    "network_files", "network_fingerprint", "point_record", "remarks_of", "score", "simulate", "simulate_alone", "study_at",
+    "vehicle_remarks", "worst_points"]

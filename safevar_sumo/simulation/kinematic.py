@@ -75,28 +75,26 @@ class KinematicWorld(SumoWorld):
 
     def collisions(self) -> dict[int, float]:
         hit = np.zeros(self.n, dtype=bool)
-        for _, *body in self._others():
-            hit |= self._overlaps(*body)
+        for name in self._others():
+            hit |= self._overlaps(self._body_of(name))
         return dict(zip(np.flatnonzero(hit).tolist(), self._speeds[hit].tolist(), strict=True))
 
     def bodies(self, copy: int) -> tuple[Body, Body]:
         own = Body.behind(self.vehicle_positions(VUT)[copy], self._along, *self._body, float(self._speeds[copy]))
-        struck = next(name for name, *body in self._others() if self._overlaps(*body)[copy])
-        return own, self._body_of(struck)
+        return own, next(body for body in map(self._body_of, self._others()) if self._overlaps(body)[copy])
 
-    def _others(self) -> Iterator[tuple[str, FloatArray, FloatArray, float, float]]:
-        """Id, front, direction, length and width of everybody else."""
+    def _others(self) -> Iterator[str]:
+        """Ids of everybody else."""
         for api in (self._api.vehicle, self._api.person):
             for name in api.getIDList():
                 if name != self.ids(VUT)[0]:
-                    yield (name, np.array(api.getPosition(name)), direction_of(api.getAngle(name)), api.getLength(name),
-                           api.getWidth(name))
+                    yield name
 
-    def _overlaps(self, front: FloatArray, along: FloatArray, length: float, width: float) -> BoolArray:
+    def _overlaps(self, other: Body) -> BoolArray:
         """Whether rectangles overlap: no side of either parts them."""
-        own_length, own_width = self._body
+        (own_length, own_width), (length, width), along = self._body, (other.length, other.width), other.along
         own, across, other_across = self._along, _left(self._along), _left(along)
-        to_other = front - along * (length / 2) - (self.vehicle_positions(VUT) - own * (own_length / 2))
+        to_other = other.middle - (self.vehicle_positions(VUT) - own * (own_length / 2))
         cosine, sine = abs(along @ own), abs(other_across @ own)
         reaches = (
             (own, own_length + length * cosine + width * sine), (across, own_width + length * sine + width * cosine),

@@ -49,13 +49,27 @@ def point_record(found: AtPoint, row: int = 0) -> dict[str, Any]:
     side, place = (np.broadcast_to(values, relative.shape)[row] for values in found.drives.contact)
     return {"point": found.point.name, **dict(found.point.place), "outcome": str(evaluations.outcome[row]),
             **{name: None if np.isnan(value) else float(value) for name, value in numbers.items()},
-            "contact": {"side": str(side), "place": float(place)} if side else None}
+            **({"contact": {"side": str(side), "place": float(place)}} if side else {})}
 
 
 def remarks_of(scenario: Any) -> list[str]:
     """What a user should know of a scenario's parameters."""
     remarks = getattr(scenario, "remarks", None)
     return [] if remarks is None else remarks()
+
+
+def vehicle_remarks(system: System) -> list[str]:
+    """What a user should know of a vehicle that is tested faster than what it was fitted to."""
+    fitted = getattr(system.vehicle, "FITTED_UP_TO", None)
+    speeds = [getattr(point.scenario, "test_speed", None) or 0.0 for point in system.points]
+    if fitted is None or max(speeds) <= fitted:
+        return []
+    tables = system.nominal.tables()
+    fastest = min(max(speeds), float(tables.speeds[-1]))
+    drag = float(np.interp(fastest, tables.speeds, tables.coasting))
+    return [f"the vehicle was fitted to drives of up to {fitted / KMH:.0f} km/h, and is tested at up to {max(speeds) / KMH:.0f} km/h: "
+            f"what it does above is its equations alone, such as losing {drag:.1f} m/s^2 at {fastest / KMH:.0f} km/h with the "
+            "accelerator released"]
 
 
 def evaluate(system: System, settings: FloatArray) -> Evaluations:

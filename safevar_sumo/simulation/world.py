@@ -18,6 +18,12 @@ from safevar_sumo.simulation.copies import copied_id, copy_and_name
 from safevar_sumo.simulation.standing import StandingSumo
 from safevar_sumo.vehicles import SumoType
 
+# Speed mode: SUMO obeys every speed that is set and yields to nobody on a junction (TraCI "set speed mode", bit 5).
+OBEY = 32
+# Lane change mode: none at all (TraCI "set lane change mode").
+KEEP_LANE = 0
+
+
 class Body(NamedTuple):
     """A vehicle or a person as a rectangle: its middle and direction, a unit vector, shape (2,); m, m, m/s."""
 
@@ -31,12 +37,6 @@ class Body(NamedTuple):
     def behind(cls, front: FloatArray, along: FloatArray, length: float, width: float, speed: float) -> Body:
         """From the middle of its front."""
         return cls(front - along * (length / 2), along, length, width, speed)
-
-
-# Speed mode: SUMO obeys every speed that is set and yields to nobody on a junction (TraCI "set speed mode", bit 5).
-OBEY = 32
-# Lane change mode: none at all (TraCI "set lane change mode").
-KEEP_LANE = 0
 
 
 class SumoWorld:

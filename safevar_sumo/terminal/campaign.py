@@ -67,6 +67,10 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
         console.print(f"{len(campaign.failures)} settings could not be simulated (simulator-error); they are in no result:")
         for line in failure_lines(campaign.failures):
             console.print(f"  {line}", soft_wrap=True, markup=False, highlight=False)
+    invalid = sum(campaign.invalid_tests.values())
+    if invalid:
+        console.print(f"{invalid} settings leave the tolerance of a test's speed before the ADS acts (invalid-test): "
+                      "neither failures nor successes, they are in no result.", soft_wrap=True, markup=False, highlight=False)
     _print_most_critical(console, study, campaign)
     case = case_of(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
                    scoring=campaign.scoring)

@@ -8,6 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
+from safevar_sumo.records import Outcome
 from safevar_sumo.simulation import AtPoint, point_record
 from safevar_sumo.terminal.plain import WholeTable, plain
 
@@ -32,6 +33,9 @@ def print_matrix(console: Console, found: Sequence[AtPoint], row: int = 0) -> No
         hit = [told["point"] for told in records if told["impact_speed"] is not None]
         first = "; ".join(hit[:NAMED]) + (f" and {len(hit) - NAMED} more" if len(hit) > NAMED else "")
         summary = f"{len(hit)} of {len(records)} points fail{': ' + first if hit else ''}."
+        invalid = sum(told["outcome"] == Outcome.INVALID_TEST for told in records)
+        if invalid:
+            summary += f" {invalid} are no valid tests: the vehicle leaves the tolerance of their speed before the ADS acts."
         console.print(summary, soft_wrap=True, markup=False, highlight=False)
 
 
@@ -55,8 +59,11 @@ def _row(place: dict[str, Any]) -> str:
 
 
 def _cell(told: dict[str, Any]) -> Text:
+    if told["outcome"] == Outcome.INVALID_TEST:
+        return Text(f"{told['outcome']} ({told['test_speed_error']:+.1f} km/h)", "magenta")
     if told["impact_speed"] is None:
-        return Text("avoided" if told["outcome"] in ("stopped", "passed") else told["outcome"], "green")
+        touched = f", {told['contact']['side']} side touched" if "contact" in told else ""
+        return Text("avoided" + touched if told["outcome"] in (Outcome.STOPPED, Outcome.PASSED) else told["outcome"], "green")
     relative = (told["relative_impact_speed"] or 0.0) * KMH
     colour = next((colour for below, colour in BANDS if relative < below), "red")
     return Text(f"{told['impact_speed'] * KMH:.1f} km/h", colour)

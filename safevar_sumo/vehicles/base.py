@@ -43,6 +43,10 @@ class Vehicle(Protocol):
     Every method is a pure function over arrays of N vehicles: element i of a result depends on
     element i of the arguments alone, to the bit. So methods use only + - * / and square roots,
     comparisons, minima and maxima: those are exact on every machine and for every N.
+
+    It may have `hold_gear(prepared, state, holds)`, the state in which the vehicles that `holds`, of shape (N,), do not change gear
+    and the others do by themselves: a driver needs it who holds the speed of a test. It may have `FITTED_UP_TO`, the fastest speed
+    that its parameters were identified at [m/s].
     """
 
     UNITS: Mapping[str, str]

@@ -8,7 +8,7 @@ then engine, clutch and wheels implicitly and in closed form, so that the stiff 
 from __future__ import annotations
 
 import math
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -128,6 +128,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         "gearSwitchTime": "s", "clutchStrength": "kg m^2/s", "mass": "kg", "dragCoeff": "-", "tireFric": "-",
         "dampRate": "kg m^2/s", "radius": "cm", "maxBrakeTorque": "N m",
     }
+    FITTED_UP_TO: ClassVar[float] = 6.2  # m/s; the fastest drive of the published settings sun and rain, simulated
 
     tyre_friction: Positive
     longitudinal_stiffness: Positive

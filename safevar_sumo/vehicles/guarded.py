@@ -83,6 +83,12 @@ class GuardedVehicle:
             raise ForeignError(self._guard.source, problem, "a vehicle with it, or traffic that departs with speed 0")
         return self._state("at_speed", prepared.n, self._guard.call("at_speed", self._vehicle.at_speed, prepared.theirs, lent(speed)))
 
+    def hold_gear(self, prepared: _Prepared, state: _State, holds: BoolArray) -> _State:
+        if not hasattr(self._vehicle, "hold_gear"):
+            return state
+        given = self._guard.call("hold_gear", self._vehicle.hold_gear, prepared.theirs, state.theirs, lent(holds))
+        return self._state("hold_gear", prepared.n, given)
+
     def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
         given = self._guard.call("sense", self._vehicle.sense, prepared.theirs, state.theirs, lent(seen))
         theirs, after = self._guard.parts("sense", given, "(Observation, state)")

@@ -225,7 +225,7 @@ def test_a_full_disk_leaves_what_was_there_and_can_go_on(tmp_path: Path, monkeyp
 
 def test_outcomes_are_written_as_ever() -> None:
     assert {str(outcome): code for outcome, code in OUTCOMES.items()} == {
-        "stopped": 0, "passed": 1, "collision": 2, "timeout": 3, "never-moved": 4, "simulator-error": 5}
+        "stopped": 0, "passed": 1, "collision": 2, "timeout": 3, "never-moved": 4, "simulator-error": 5, "invalid-test": 6}
     assert set(OUTCOMES) == set(Outcome), "a new outcome needs a number of its own"
 
 
