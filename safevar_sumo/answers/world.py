@@ -16,6 +16,10 @@ from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 Quantile = Callable[[FloatArray], FloatArray]
 """From probabilities to values in the characteristic's unit."""
 
+WIDEST = 100
+"""Standard deviation of a normal law cut off at the domain, in widths of the domain: beyond, it is uniform to a 20,000th, and at last
+its numbers break down."""
+
 
 class World:
     """How the characteristics of a study vary.
@@ -68,12 +72,14 @@ class World:
                 return lambda p: np.asarray(triangle.ppf(p))
             case Normal():
                 mean = self._within(member, "mean", law.mean, member.original)
+                self._not_wider(member, "deviation", law.deviation, high - low)
                 cut = scipy.stats.truncnorm((low - mean) / law.deviation, (high - mean) / law.deviation, loc=mean, scale=law.deviation)
                 return lambda p: np.asarray(cut.ppf(p))
             case Lognormal():
                 if low <= 0:
                     raise InputError(self._source, f"variation.{member.name}: lognormal, with a domain from {low:g} on", "a domain above 0")
                 middle, sigma = np.log(self._within(member, "median", law.median, member.original)), law.sigma
+                self._not_wider(member, "sigma", sigma, float(np.log(high / low)))
                 logarithm = scipy.stats.truncnorm((np.log(low) - middle) / sigma, (np.log(high) - middle) / sigma, loc=middle, scale=sigma)
                 return lambda p: np.exp(logarithm.ppf(p))
 
@@ -86,12 +92,19 @@ class World:
             raise InputError(self._source, f"variation.{member.name}.{key} = {chosen:g}", f"a number in [{low:g}, {high:g}]{member.suffix}")
         return chosen
 
+    def _not_wider(self, member: Characteristic, key: str, spread: float, width: float) -> None:
+        """Refuse a normal law so wide that its part in the domain cannot be told from a uniform one, or be computed."""
+        if spread > WIDEST * width:
+            raise InputError(self._source, f"variation.{member.name}.{key} = {spread:g}",
+                             f"at most {WIDEST * width:g}, {WIDEST} times the domain's width; for more take distribution = \"uniform\"")
+
     def _cholesky(self, correlations: Sequence[Correlation]) -> FloatArray | None:
         """The factor that makes independent normal variables correlated; None without correlations."""
         if not correlations:
             return None
         names = self._members.names
         matrix = np.eye(len(names))
+        given: dict[frozenset[str], float] = {}
         for one in correlations:
             for name in one.between:
                 if name not in names:
@@ -99,6 +112,11 @@ class World:
             first, second = (names.index(name) for name in one.between)
             if first == second:
                 raise InputError(self._source, f"correlations.between = {list(one.between)}", "two different characteristics")
+            pair = frozenset(one.between)
+            if pair in given:
+                raise InputError(self._source, f"correlations: {one.between[0]} and {one.between[1]} stand twice, "
+                                 f"with {given[pair]:g} and {one.value:g}", "each pair once")
+            given[pair] = one.value
             matrix[first, second] = matrix[second, first] = one.value
         try:
             return np.asarray(np.linalg.cholesky(matrix), dtype=float)

@@ -34,7 +34,9 @@ def risk(material: Material, jobs: int | None, progress: Progress) -> Found:
         return answers.risk(material.case.study, **material.options["risk"].keywords(), jobs=jobs, progress=progress).record()
 
     found = stored(material, "risk", compute)
-    varied = "[variation]" if getattr(material.case.study, "variation", None) else "uniformly over their domains"
+    study = material.case.study
+    varied = "[variation]" if getattr(study, "variation", None) else "uniformly over their domains"
+    varied += " with [[correlations]]" if getattr(study, "correlations", None) else ""
     return {**found, "varied": varied, "chart": _sensitivity(material, found["sensitivity"])}
 
 

@@ -76,7 +76,7 @@ def evaluate(system: System, settings: FloatArray) -> Evaluations:
     """Simulate filtered settings, shape (N, n), in one batch and score them.
 
     A pure function: row i of the result depends on row i of `settings` alone, to the bit. In a matrix a setting's row is that
-    of the point in which it comes off worst; with the aggregate `mean` its safety degree is the mean over the points.
+    of the point in which it comes off worst.
     """
     most = _most_copies(system)
     parts = [settings[first:first + most] for first in range(0, len(settings), most)] or [settings]
@@ -96,14 +96,7 @@ def aggregated(system: System, found: Sequence[AtPoint]) -> Evaluations:
     settings = found[0].evaluations.settings
     row_of, columns = worst_points(found), np.arange(len(settings))
     every = Evaluations.concatenate([one.evaluations for one in found])
-    result = every.take(row_of * len(settings) + columns)
-    if system.aggregate == "mean":
-        degrees = np.stack([one.evaluations.f_safe for one in found])
-        total = np.add.accumulate(np.where(np.isnan(degrees), 0.0, degrees), axis=0)[-1]
-        number = np.count_nonzero(~np.isnan(degrees), axis=0)
-        mean = np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
-        result = replace(result, metrics={**result.metrics, "safety_degree": mean})
-    return result
+    return every.take(row_of * len(settings) + columns)
 
 
 def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = (),

@@ -58,7 +58,6 @@ class System:
     measuring: Measuring
     step_length: float | None = None
     matrix: tuple[Point, ...] = ()
-    aggregate: str = "worst"
 
     @property
     def points(self) -> tuple[Point, ...]:
@@ -107,7 +106,7 @@ def _assembled(study: Study, source: str) -> System:
     return System(
         characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
         metrics=study.metrics, nominal=nominal, members=(*models.members, *measuring.members), measuring=measuring,
-        step_length=study.step_length, matrix=matrix, aggregate="worst" if study.matrix is None else study.matrix.aggregate)
+        step_length=study.step_length, matrix=matrix)
 
 
 def models_of(study: Study, source: str) -> Models:

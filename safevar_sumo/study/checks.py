@@ -67,6 +67,9 @@ def implausible(source: object, study: Study) -> Iterator[InputError]:
     for name, free in study.calibration.items():
         if free.lower >= free.upper:
             yield InputError(source, f"calibration.{name!r}: lower = {free.lower} and upper = {free.upper}", "numbers, lower < upper")
+    if study.matrix is not None and study.matrix.aggregate == "mean":
+        yield InputError(source, "matrix.aggregate = 'mean' would average distances [m] with minus the speeds of collisions [m/s]",
+                         "'worst', the point in which a setting comes off worst")
     for name, number in study.published.items():
         if number == 0:
             yield InputError(source, f"published.{name} = 0", "a number other than 0")

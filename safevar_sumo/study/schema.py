@@ -145,7 +145,8 @@ class MatrixTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Several scenario points in which every setting is simulated.
 
-    `aggregate` is what becomes of their safety degrees: that of the point in which the setting comes off worst, or the mean.
+    `aggregate` is what becomes of their safety degrees: that of the point in which the setting comes off worst. (A mean
+    is refused: it would average distances with minus the speeds of collisions.)
     """
 
     tests: Annotated[list[MatrixTest], Meta(min_length=1)]

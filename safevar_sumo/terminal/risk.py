@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from safevar_sumo.answers import Risk
+from safevar_sumo.study import Study
 from safevar_sumo.terminal.plain import WholeTable, print_meanings
 from safevar_sumo.variation import Uniform
 from safevar_sumo.vehicles import CharacteristicSet
@@ -19,9 +20,7 @@ def print_risk(console: Console, told: Risk) -> None:
     _say(console, told.study.title)
     _say(console, f"Unsafe: {told.unsafe}. {told.failures} of {told.samples} vehicles.")
     _say(console, f"Probability {told.probability:.4g}, with {told.confidence:.0%} confidence from {low:.4g} to {high:.4g}.")
-    laws = {name: law.__struct_config__.tag for name, law in told.study.variation.items() if not isinstance(law, Uniform)}
-    varied = "; ".join(f"{name} {law}" for name, law in laws.items())
-    _say(console, f"They vary as the study says: {varied}; the others uniformly." if laws else "They vary uniformly over the whole domain.")
+    _say(console, _variation(told.study))
     if told.sensitivity is None or told.sensitivity_of_unsafe is None:
         return
     table = WholeTable("characteristic", title="What decides: share of the variance", title_justify="left")
@@ -37,6 +36,14 @@ def print_risk(console: Console, told: Risk) -> None:
         _say(console, "Too few settings are unsafe, or safe, to tell what decides that; the safety degree tells more.")
     print_meanings(console, CharacteristicSet.of(told.study.vehicle.characteristics))
     console.print(f"Sobol indices, first order and total, with half of their {told.confidence:.0%} intervals.", highlight=False)
+
+
+def _variation(study: Study) -> str:
+    """How vehicles vary, in a sentence."""
+    laws = [f"{name} {law.__struct_config__.tag}" for name, law in study.variation.items() if law != Uniform()]
+    correlated = ", ".join(f"{' with '.join(one.between)} {one.value:g}" for one in study.correlations)
+    varied = f"as the study says: {'; '.join(laws)}; the others uniformly" if laws else "uniformly over the whole domain"
+    return f"They vary {varied}{f', correlated: {correlated}' if correlated else ''}."
 
 
 def _index(row: object, name: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import re
@@ -11,12 +12,14 @@ import msgspec
 import numpy as np
 import pytest
 from known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
+from rich.console import Console
 
 from safevar_sumo.answers import Risk, risk
 from safevar_sumo.answers.world import World
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import load_study
+from safevar_sumo.terminal.risk import print_risk
 
 
 def of(region: Region, **options: Any) -> Risk:
@@ -112,9 +115,14 @@ def test_correlations_are_those_of_the_copula() -> None:
     ({"correlations": [{"between": ["mass", "mass"], "value": 0.5}]}, "two different"),
     ({"correlations": [{"between": ["mass", "radius"], "value": 1.5}]}, "correlations"),
     ({"correlations": [{"between": pair, "value": -0.9} for pair in (["mass", "radius"], ["mass", "tireFric"], ["radius", "tireFric"])]},
-     "contradict each other")])
+     "contradict each other"),
+    ({"correlations": [{"between": ["mass", "radius"], "value": 0.5}, {"between": ["radius", "mass"], "value": -0.5}]},
+     "radius and mass stand twice, with 0.5 and -0.5"),
+    ({"correlations": [{"between": ["mass", "radius"], "value": 0.5}] * 2}, "stand twice"),
+    ({"variation": {"mass": {"distribution": "normal", "deviation": 1e300}}}, "variation.mass.deviation = 1e+300\nlegal: at most 66000, "),
+    ({"variation": {"mass": {"distribution": "lognormal", "sigma": 1e300}}}, "variation.mass.sigma")])
 def test_impossible_distributions_are_refused(changes: dict[str, Any], says: str) -> None:
-    with pytest.raises(InputError, match=says.replace("[", r"\[")):
+    with pytest.raises(InputError, match=says.replace("[", r"\[").replace("+", r"\+")):
         World(load_study("smoke", **changes))
 
 
@@ -122,3 +130,14 @@ def test_another_distribution_replaces_the_row_that_a_study_extends() -> None:
     study = load_study("smoke", variation={"mass": {"distribution": "normal", "deviation": 50}})
     assert msgspec.to_builtins(load_study(study, variation={"mass": {"distribution": "fixed"}}).variation)["mass"] == {
         "distribution": "fixed", "value": None}
+
+
+def test_the_way_vehicles_vary_names_the_correlation_and_narrower_limits() -> None:
+    study = load_study(made_up_study(2), correlations=[{"between": ["a", "b"], "value": 0.8}])
+    with Console(record=True, width=300, file=io.StringIO()) as console:
+        print_risk(console, risk(study, unsafe="collision", samples=100, pool=Plant(study, box)))
+        narrower = load_study(study, variation={"a": {"distribution": "uniform", "upper": 6.0}})
+        print_risk(console, risk(narrower, unsafe="collision", samples=100, pool=Plant(narrower, box)))
+    told = console.export_text()
+    assert "They vary uniformly over the whole domain, correlated: a with b 0.8." in told
+    assert "They vary as the study says: a uniform; the others uniformly, correlated: a with b 0.8." in told

@@ -20,8 +20,8 @@ TESTS = [
 ]
 
 
-def study(tests: list[MatrixTest], aggregate: str = "worst") -> Study:
-    return msgspec.structs.replace(BASE, matrix=MatrixTable(tests=tests, aggregate=aggregate))  # type: ignore[arg-type]
+def study(tests: list[MatrixTest]) -> Study:
+    return msgspec.structs.replace(BASE, matrix=MatrixTable(tests=tests))
 
 
 SYSTEM = assemble(study(TESTS))
@@ -63,11 +63,9 @@ def test_neither_the_batch_nor_the_order_of_points_nor_how_many_share_a_simulati
     assert same(evaluate(SYSTEM, population), whole)
 
 
-def test_the_mean_is_that_of_the_points_safety_degrees() -> None:
-    mean = assemble(study(TESTS, "mean"))
-    population = drawn(mean, 3)
-    expected = np.mean([one.evaluations.f_safe for one in at_every_point(mean, population)], axis=0)
-    assert evaluate(mean, population).f_safe == pytest.approx(expected)
+def test_a_mean_of_distances_and_speeds_is_refused() -> None:
+    with pytest.raises(InputError, match=r"(?s)wear.toml: matrix\.aggregate = 'mean'.*'worst'"):
+        load_study("wear", matrix={"aggregate": "mean", "tests": [{"name": "CPNA", "parameters": {"test": "CPNA"}}]})
 
 
 def test_a_point_is_named() -> None:
