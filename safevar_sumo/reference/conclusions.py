@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.analysis.case import ALGORITHM_TITLES
-from safevar_sumo.analysis.inference import ALPHA
+from safevar_sumo.analysis.inference import ALPHA, magnitude
 from safevar_sumo.reference.agreement import rank_correlation
 from safevar_sumo.reference.beside import HERE, THERE, Beside
 
@@ -23,8 +23,9 @@ MOSTLY, PARTLY = 0.8, 0.6
 LEANING = 0.2
 """A characteristic is mostly increased or decreased if that is by so much of its changes more frequent than the other."""
 RULES = (
-    f"Tests (RQ1, RQ2): *{HOLDS}* if both sides are significant (p < {ALPHA:g}) to the same side, or neither is significant; "
-    f"*{DIRECTION}* if one alone is significant and both effect sizes lie on the same side of 0.5; else *{DIFFERS}*.",
+    f"Tests (RQ1, RQ2): *{HOLDS}* if both are significant (p < {ALPHA:g}) or neither is, both effect sizes are of the same magnitude "
+    f"(Kitchenham's negligible, small, medium, large) and, where they are significant and not negligible, on the same side of 0.5; "
+    f"*{DIRECTION}* if they only lie on the same side of 0.5; else *{DIFFERS}*.",
     f"Numbers of changes (RQ3.1): *{HOLDS}* if the most frequent number is the same, *{DIRECTION}* if the means differ by at most 1.",
     f"Orders (RQ3.2, weather): *{HOLDS}* from a rank correlation of {CLOSE:g}, *{DIRECTION}* from {ALIKE:g}.",
     f"Directions of changes (RQ3.3): *{HOLDS}* if at least {100 * MOSTLY:.0f} % of the characteristics that lean to one side there "
@@ -57,17 +58,20 @@ def _tests(question: str, who: str, better: str) -> Any:
             if a is None or b is None or p is None or q is None:
                 yield Conclusion(question, row["setting"], subject, OPEN, "there is no test " + (HERE if a is None else THERE))
                 continue
-            told = _difference(b, q, better)
-            verdict = HOLDS if (p < ALPHA) == (q < ALPHA) and (q >= ALPHA or _same_side(a, b)) else (
-                DIRECTION if (p < ALPHA) != (q < ALPHA) and _same_side(a, b) else DIFFERS)
-            yield Conclusion(question, row["setting"], f"{subject}: {told}", verdict,
+            yield Conclusion(question, row["setting"], f"{subject}: {_difference(b, q, better)}", grade(a, p, b, q),
                              f"effect size {a:.2f} here ({row[f'magnitude {HERE}']}, p {p:.2g}), {b:.2f} published "
                              f"({row[f'magnitude {THERE}']}, p {q:.2g})")
     return read
 
 
-def _same_side(one: float, other: float) -> bool:
-    return (one - 0.5) * (other - 0.5) > 0
+def grade(effect: float, p: float, published_effect: float, published_p: float) -> str:
+    """How far a published test holds here, by direction, magnitude and significance; see `RULES`."""
+    same_side = (effect - 0.5) * (published_effect - 0.5) > 0
+    as_significant = (p < ALPHA) == (published_p < ALPHA)
+    bands = {magnitude(effect), magnitude(published_effect)}
+    if as_significant and len(bands) == 1 and (same_side or p >= ALPHA or bands == {"negligible"}):
+        return HOLDS
+    return DIRECTION if same_side else DIFFERS
 
 
 def _difference(effect: float, p: float, better: str) -> str:

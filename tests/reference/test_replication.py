@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 from safevar_sumo.analysis import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.reference.beside import paired, tables_beside
-from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, conclusions
+from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, conclusions, grade
 from safevar_sumo.reference.nearness import nearness
 from safevar_sumo.reference.rows import read_reference
 from safevar_sumo.study import load_study
@@ -54,6 +54,20 @@ def sides(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def told(sides: Path, here: str, there: str) -> dict[tuple[str, str], str]:
     tables = tables_beside(paired(load_cases([sides / here]), load_cases([sides / there])))
     return {(one.question, one.words.split(":")[0]): one.verdict for one in conclusions(tables)}
+
+
+@pytest.mark.parametrize(("here", "published", "verdict"), [
+    ((0.00, 1e-9), (0.42, 1e-9), DIRECTION),  # large here, small there: only the sign agrees
+    ((0.05, 1e-9), (0.20, 1e-9), HOLDS),
+    ((0.80, 1e-9), (0.20, 1e-9), DIFFERS),
+    ((0.53, 0.3), (0.48, 0.4), HOLDS),  # negligible on both sides, wherever they lie
+    ((0.53, 0.3), (0.60, 0.4), DIRECTION),
+    ((0.40, 0.3), (0.60, 0.4), HOLDS),  # no difference on either side
+    ((0.60, 1e-9), (0.60, 0.4), DIRECTION),
+    ((0.40, 1e-9), (0.60, 0.4), DIFFERS)])
+def test_a_test_holds_in_direction_magnitude_and_significance(
+        here: tuple[float, float], published: tuple[float, float], verdict: str) -> None:
+    assert grade(*here, *published) == verdict
 
 
 def test_what_is_the_same_holds(sides: Path) -> None:
