@@ -27,7 +27,8 @@ PARTS = {
 
 def change(member: Characteristic, value: float) -> str:
     """One change, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
-    return f"{member.name} {member.original:g} -> {value:.6g}{member.suffix} ({(value - member.original) / abs(member.original):+.1%})"
+    share = (value - member.original) / abs(member.original)
+    return f"{member.name} {member.original:g} -> {member.text(value)}{member.suffix} ({share:+.1%})"
 
 
 def changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:

@@ -18,11 +18,12 @@ from safevar_sumo.results import make_directory, write_whole
 @commands.command()
 @click.argument("place", metavar="DIR|STUDY")
 @options_of(ExplainOptions)
+@click.option("--full", is_flag=True, help="Print every explanation in full, not the answer alone.")
 @point_option
 @jobs_option
 @json_option
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write causes.json, causes.csv and a picture there.")
-def explain(place: str, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **given: Any) -> None:
+def explain(place: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **given: Any) -> None:
     """Explain failures of results in DIR, or all over the domain of STUDY: which changes did it, how little is enough, why."""
     from safevar_sumo import answers
     from safevar_sumo.terminal.explanation import print_explained
@@ -37,7 +38,7 @@ def explain(place: str, point: str | None, jobs: int | None, as_json: bool, out:
     if as_json:
         click.echo(records)
     else:
-        print_explained(Console(), place, told, point or "")
+        print_explained(Console(), place, told, point or "", full=full)
     if out is not None:
         write_whole(out / "causes.json", records + "\n")
         write_whole(out / "causes.csv", told.frame().to_csv(index=False, lineterminator="\n"))

@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from safevar_sumo.campaign import Campaign, Forecast
 from safevar_sumo.computing import Pool
-from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import failure_lines, record, solutions_frame
 from safevar_sumo.study import Study
 from safevar_sumo.terminal.plain import WholeTable
@@ -36,17 +36,13 @@ def print_forecast(console: Console, study: Study, runs: int, told: Forecast) ->
 def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path, pool: Pool) -> None:
     """The answer; per algorithm what was found, beside the original vehicle; the most critical setting; what RQ1 and RQ2 say of it."""
     from safevar_sumo.analysis import brief, case_of  # takes longer to load than all the rest
-    from safevar_sumo.answers import lead, preventability
-    from safevar_sumo.answers.bench import Bench
+    from safevar_sumo.answers import lead
 
     names = tuple(study.vehicle.characteristics)
     solutions = solutions_frame(names, campaign.solutions.items())
     if len(solutions):
         for line in lead(study, solutions, campaign.original, pool, str(directory)):
             console.print(line, soft_wrap=True, markup=False, highlight=False)
-        collided = solutions.loc[solutions["outcome"] == str(Outcome.COLLISION), list(names)].to_numpy(dtype=float)
-        if len(collided):
-            console.print(str(preventability(Bench(study, pool), collided)), soft_wrap=True, markup=False, highlight=False)
     found = {"original vehicle": campaign.original}
     for algorithm in study.search.labels:
         of_it = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]

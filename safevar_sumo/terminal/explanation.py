@@ -21,19 +21,22 @@ from safevar_sumo.answers import (
     points_in_words,
     sentence,
 )
+from safevar_sumo.answers.explanation import REASONS, ROBUST
+from safevar_sumo.answers.in_short import Finding, in_short
 from safevar_sumo.simulation import assemble
 from safevar_sumo.terminal.plain import WholeTable, print_meanings
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 CAUSES_SHOWN = 3
 """Minimal causes of a failure, and distinct ones of all failures, that a table has room for."""
 DISTINCT_SHOWN = 10
+NECESSARY_SHOWN = 4
 Again = Callable[[Mapping[str, float]], str]
 """The command that simulates these changes."""
 
 
-def print_explained(console: Console, place: str, told: Explained, point: str = "") -> None:
-    """Every explanation, then what all failures have in common; commands that are told are about `place`, and its `point`."""
+def print_explained(console: Console, place: str, told: Explained, point: str = "", *, full: bool = False) -> None:
+    """The answer in about ten lines; `full` explains every chosen failure. Commands that are told are about `place`, and its `point`."""
     members = CharacteristicSet.of(told.study.vehicle.characteristics)
     _say(console, told.study.title)
     _say(console, f"Unsafe: {told.unsafe}. {number_of(told.failures, 'failure')} among {told.looked_at} different settings.")
@@ -42,11 +45,66 @@ def print_explained(console: Console, place: str, told: Explained, point: str = 
     if not told.explanations:
         _say(console, f"Nothing unsafe found. How far each characteristic may go: {ask('tolerance', place, point)}")
         return
+    again: Again = partial(command, place, point=point)
+    _print_answer(console, again, told, members)
+    if not full:
+        _say(console, f"All {number_of(len(told.explanations), 'failure')} explained in full: {ask('explain', place, point)} --full")
+        return
+    _say(console, _sawtooth(told))
     for one in told.explanations:
-        _print_one(console, partial(command, place, point=point), one, members, told)
+        _print_one(console, again, one, members, told)
     if told.preventability.looked_at:
         _say(console, str(told.preventability))
     _print_common(console, told)
+
+
+def _print_answer(console: Console, again: Again, told: Explained, members: CharacteristicSet) -> None:
+    """The paragraph; of the failure that leads, why and how little is enough; which changes and causes are common."""
+    first = told.explanations[0]
+    by_reason = {reason: one for one in told.explanations for reason in one.reasons}
+    smallest, robust = by_reason.get(REASONS["fewest"], first), by_reason.get(ROBUST)
+    _say(console, in_short(assemble(told.study), told.original, _finding(smallest), _finding(robust), told.preventability))
+    name = str(first.handle or "the first setting")
+    _say(console, f"Why, of {name}: {sentence(first.because)}")
+    for cause in [one for one in first.causes if one.changes][:1]:
+        limits = [f"{_named(member)} {member.original:g} -> {member.text(cause.boundary[member.name])}{member.suffix}"
+                  for member in members if member.name in cause.boundary]
+        _say(console, f"How little is enough: {', '.join(limits)}. {again(cause.boundary)}")
+    if told.analysed and len(told.distinct):
+        _say(console, f"Necessary most often ({_looked_at(told)}): {_most_necessary(told, members)}.")
+        common = told.distinct.iloc[0]
+        _say(console, f"{number_of(len(told.distinct), 'distinct minimal cause')}; the most frequent: "
+                      f"{', '.join(common['cause']) or 'none'} ({common['share']:.0%} of the failures).")
+
+
+def _finding(one: Explanation | None) -> Finding | None:
+    """A failure as the paragraph tells of it; None for what is not unsafe."""
+    if one is None or not one.causes:
+        return None
+    return Finding(str(one.handle or "a setting of its own"), {name: one.setting[name] for name in one.changed}, one.outcome,
+                   one.safety_degree, one.robustness, len(one.causes[0].changes))
+
+
+def _most_necessary(told: Explained, members: CharacteristicSet) -> str:
+    called = {member.name: _named(member) for member in members}
+    rows = told.necessity[told.necessity["necessary"] > 0].head(NECESSARY_SHOWN).to_dict("records")
+    return ", ".join(f"{called[row['characteristic']]} {row['necessary']:.0%}" for row in rows) or "none, causes differ"
+
+
+def _named(member: Characteristic) -> str:
+    """Its name with what it is, in short."""
+    return member.name if member.short_name == member.name else f"{member.name} ({member.short_name})"
+
+
+def _sawtooth(told: Explained) -> str:
+    """How exact a value along a characteristic can be: the way that the vehicle covers between two decisions."""
+    step = next(iter(told.explanations[0].robustness.by_step), None)
+    braking = told.explanations[0].because.original.braking
+    if step is None or braking is None:
+        return ""
+    return (f"How exact: decisions fall into frames of {step:g} s, in which the vehicle covers {braking.speed * step:.2f} m at "
+            f"{braking.speed:.1f} m/s. Along a characteristic the safety degree is a sawtooth of about that height: more digits of "
+            "a value mean nothing.")
 
 
 def _print_one(console: Console, again: Again, one: Explanation, members: CharacteristicSet, told: Explained) -> None:
@@ -81,15 +139,15 @@ def _print_cause(console: Console, again: Again, cause: Cause, members: Characte
         return
     _say(console, f"Minimal cause: {changes(members, cause.changes)}: {cause.outcome}, SD {_decimal(cause.safety_degree)}")
     table = WholeTable("characteristic", "unit")
-    for head in ("original", "here", "all shrunk", "alone back to"):
+    for head in ("original", "here", "limit (all scaled)", "limit (this one only)"):
         table.add_column(head, justify="right")
     for member in members:
         if member.name in cause.changes:
-            values = (member.original, cause.changes[member.name], cause.boundary[member.name], cause.alone[member.name])
-            table.add_row(escape(member.name), escape(member.unit), *(f"{value:.6g}" for value in values))
+            values = (cause.changes[member.name], cause.boundary[member.name], cause.alone[member.name])
+            table.add_row(escape(member.name), escape(member.unit), f"{member.original:g}", *(member.text(value) for value in values))
     console.print(table)
     print_meanings(console, [member for member in members if member.name in cause.changes])
-    _say(console, f"Still unsafe at {cause.fraction:.1%} of these changes, safe just below. {again(cause.changes)}")
+    _say(console, f"Scaling all changes to {cause.fraction:.0%} is still unsafe; slightly less is safe. {again(cause.changes)}")
 
 
 def _side_by_side(told: BrakingComparison) -> WholeTable:
@@ -112,8 +170,7 @@ def _side_by_side(told: BrakingComparison) -> WholeTable:
 
 
 def _print_common(console: Console, told: Explained) -> None:
-    looked = "all of them" if told.analysed == told.failures else f"a random sample of {told.analysed} of the {told.failures}"
-    table = WholeTable("characteristic", title=f"Changed is not needed: {looked}", title_justify="left")
+    table = WholeTable("characteristic", title=f"Changed vs. necessary ({_looked_at(told)})", title_justify="left")
     for head in ("changed", "necessary", "in some cause"):
         table.add_column(head, justify="right")
     for row in told.necessity.to_dict("records"):
@@ -126,6 +183,12 @@ def _print_common(console: Console, told: Explained) -> None:
     for row in told.distinct.head(DISTINCT_SHOWN).to_dict("records"):
         causes.add_row(escape(", ".join(row["cause"]) or "none: the original vehicle"), str(row["failures"]), f"{row['share']:.0%}")
     console.print(causes)
+
+
+def _looked_at(told: Explained) -> str:
+    if told.analysed == told.failures:
+        return f"all {told.failures} failures"
+    return f"random sample: {told.analysed} of {told.failures} failures"
 
 
 def _decimal(value: float | None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -59,6 +60,10 @@ class Characteristic:
     def farthest(self) -> float:
         """Largest magnitude that is taken when values beyond the domain are asked for."""
         return FARTHEST * max(abs(self.lower), abs(self.upper))
+
+    def text(self, value: float) -> str:
+        """A value with the digits that matter: the last one is worth no more than a quarter of the threshold, and no less than 1/40."""
+        return f"{value:.{max(0, math.ceil(-math.log10(self.threshold / 4)))}f}"
 
     @property
     def suffix(self) -> str:

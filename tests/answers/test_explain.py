@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from io import StringIO
 from itertools import combinations
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from in_process import Here
+from rich.console import Console
 
 from safevar_sumo.analysis import Case, load_cases
 from safevar_sumo.answers import Explained, explain, lead
@@ -19,6 +22,8 @@ from safevar_sumo.answers.robustness import robustness
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import handles
+from safevar_sumo.terminal.explanation import print_explained
+from safevar_sumo.vehicles import CharacteristicSet
 
 
 @pytest.fixture(scope="module")
@@ -129,13 +134,53 @@ def test_what_cannot_be_read_is_refused(slippery: Path, arguments: list[str], sa
     assert says in str(done.exception)
 
 
-def test_the_summary_of_a_study_leads_with_the_answer(case: Case) -> None:
+def printed(told: Explained, *, full: bool) -> str:
+    console = Console(file=StringIO(), width=80, _environ={})
+    print_explained(console, "here", told, full=full)
+    return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
+
+
+def test_the_answer_takes_ten_lines_and_the_rest_is_asked_for(told: Explained) -> None:
+    """The vehicle covers v dt between two decisions: that is how high the sawtooth of a profile is."""
+    short, full = printed(told, full=False).splitlines(), printed(told, full=True)
+    assert len(short) <= 10
+    assert short[:-1] == full.splitlines()[:len(short) - 1]
+    assert short[-1].endswith("python -m safevar_sumo explain here --full")
+    assert_tells_a_manager(short[2], told)
+    braking = told.explanations[0].because.original.braking
+    assert braking is not None
+    assert f"frames of 0.05 s, in which the vehicle covers {braking.speed * 0.05:.2f} m at {braking.speed:.1f} m/s" in full
+    assert re.search(r"max_rpm 5800 -> \d+ r/min", full), "28 r/min are no change at all: no decimals"
+    assert not re.search(r"max_rpm 5800 -> \d+\.", full)
+
+
+def assert_tells_a_manager(paragraph: str, told: Explained) -> None:
+    """Conditions, original, what suffices for what, how robust, avoidable by whom: the numbers are those of `explain`."""
+    by_reason = {reason: one for one in told.explanations for reason in one.reasons}
+    fewest, robust = by_reason["fewest changes"], by_reason["smallest robust"]
+    degree = float(told.original.f_safe[0])
+    assert paragraph.startswith(f"In wet leaves, the original vehicle stops {degree:.2f} m short of the pedestrian. ")
+    for one in (fewest, robust):
+        assert f"for a collision at {-3.6 * (one.safety_degree or 0):.0f} km/h: " in paragraph
+        word = "borderline: only" if one.robustness.borderline else "robust:"
+        assert f"({word} {100 * one.robustness.share:.0f} % of its neighbours are unsafe too" in paragraph
+    assert f"The smallest robust failure ({robust.handle}): " in paragraph
+    members = CharacteristicSet.of(told.study.vehicle.characteristics)
+    largest = max((member for member in members if member.name in fewest.changed),
+                  key=lambda member: abs(fewest.setting[member.name] / member.original - 1))
+    assert f"{largest.short_name} {100 * (fewest.setting[largest.name] / largest.original - 1):+.0f} %" in paragraph
+    share = told.preventability.to_dict()["competent_driver"]
+    assert f"a competent driver avoids {100 * share:.0f} %" in paragraph
+
+
+def test_the_summary_of_a_study_leads_with_the_answer(case: Case, told: Explained) -> None:
     original = Bench(case.study, Here()).original()
-    first, *others, more = lead(case.study, case.solutions, original, Here(), "my results")
+    paragraph, first, *others, more = lead(case.study, case.solutions, original, Here(), "my results")
     crashes = int((case.solutions["outcome"] == "collision").sum())
-    assert first == f"Unsafe (collision): {crashes} of {len(case.solutions)} solutions."
+    assert_tells_a_manager(paragraph, told)
+    assert first == f"{crashes} of {len(case.solutions)} vehicles found collide."
     assert [line.partition(":")[0] for line in others] == ["Fewest changes", "Smallest changes", "Most severe"]
-    assert all(" It takes " in line for line in others)
+    assert all(" These changes alone cause it: " in line for line in others)
     safe = case.solutions[case.solutions["f_safe"] > 2]
     assert more == "Why, and how far: python -m safevar_sumo explain 'my results'"
     nothing, more = lead(case.study, safe, original, Here(), "out")
