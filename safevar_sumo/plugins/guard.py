@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import ForeignError, told
+from safevar_sumo.errors import ForeignError, InputError, told
 from safevar_sumo.records import BoolArray, FloatArray
 
 _OURS = str(Path(__file__).resolve().parents[1])
@@ -59,7 +59,8 @@ class Guard(NamedTuple):
     def failed(self, method: str, error: BaseException) -> ForeignError:
         """The error that tells of an exception."""
         place = self._place(error)
-        return ForeignError(self.source, f"{self.name} raised in {method}: {told(error)}{f' ({place})' if place else ''}")
+        legal = error.legal if isinstance(error, InputError) else ""
+        return ForeignError(self.source, f"{self.name} raised in {method}: {told(error)}{f' ({place})' if place else ''}", legal)
 
     def wrong(self, method: str, what: str, got: object, expected: str) -> ForeignError:
         """The error that tells of a result; one wording for all of them."""

@@ -127,7 +127,7 @@ class Lookup(NamedTuple):
             raise ForeignError(self.source, problem, legal) from error
         finally:
             sys.dont_write_bytecode = writes_bytecode
-            _remember(set(sys.modules) - before, places)
+            remember(set(sys.modules) - before, places)
         return module, place or _folder_of(sys.modules[top])
 
     def _refuse_taken(self, top: str, place: str, guard: Guard) -> None:
@@ -188,8 +188,18 @@ def _forget(names: Iterable[str]) -> None:
             sys.modules.pop(name, None)
 
 
-def _remember(names: Iterable[str], places: Iterable[str]) -> None:
+def foreign_modules(top: str) -> list[str]:
+    """Names of the modules that were loaded from users' folders, and of an installed package of theirs as far as it is loaded."""
+    if top in _loaded:
+        return list(_loaded)
+    return [*_loaded, *(name for name in list(sys.modules) if name.partition(".")[0] == top)]
+
+
+def remember(names: Iterable[str], places: Iterable[str]) -> None:
+    """Take note of those modules that were loaded from users' folders."""
     for name in names:
+        if name in _loaded:
+            continue
         file = str(getattr(sys.modules.get(name), "__file__", None) or "")
         folder = next((place for place in places if file and Path(place) in Path(file).parents), "")
         if folder and name.partition(".")[0] not in _NOT_FOREIGN and "site-packages" not in Path(file).parts:

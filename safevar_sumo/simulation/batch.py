@@ -20,7 +20,7 @@ from safevar_sumo.simulation.staging import staged
 from safevar_sumo.simulation.sumo import Engine, world_on
 from safevar_sumo.simulation.system import System
 from safevar_sumo.simulation.world import SumoWorld
-from safevar_sumo.vehicles import LEVEL, CharacteristicSet, at_start, slope_of
+from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, at_start, slope_of
 
 SURE_BRAKES = 9.0
 """SUMO puts nobody onto the road who might not stop before what is ahead; there everybody brakes so hard at least [m/s^2]."""
@@ -90,9 +90,10 @@ def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watch
     length, way = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
 
     state = at_start(vehicle, prepared, world.speeds())
+    world.sensors = _sensors(system, prepared, n)
     driver = system.ads.start(n, system.nominal, step)
     try:
-        parts = Parts(system.points, world, n, own_reactions=getattr(system.ads, "own_reactions", False))
+        parts = Parts(system.points, world, n, own_reactions=_own_reactions(system))
     except world.api.TraCIException as error:
         raise InputError("scenario.parameters.network", f"the scenario does not find what it looks for: {str(error).strip()}",
                          "a network and traffic with the ids that the scenario names") from None
@@ -151,6 +152,21 @@ def _surface(points: Sequence[Point], n: int) -> list[Any]:
     grades, wet = [getattr(point.scenario, "grade", 0.0) for point in points], [point.weather.wet for point in points]
     slope = slope_of(np.repeat(grades, n // len(points))) if any(grades) else LEVEL
     return [slope, np.repeat(wet, n // len(points))] if any(wet) else [slope] if any(grades) else []
+
+
+def _sensors(system: System, prepared: Any, n: int) -> Sensors:
+    """The vehicles' sensors in the weathers of their points, where it takes longer to recognise somebody and one does not see so far."""
+    of_vehicle = getattr(system.vehicle, "sensors", None)
+    own = (None if of_vehicle is None else of_vehicle(prepared)) or Sensors.perfect(n)
+    weathers = [point.weather.without_reactions if _own_reactions(system) else point.weather for point in system.points]
+    delay = np.repeat([weather.recognition_delay for weather in weathers], n // len(weathers))
+    visibility = np.repeat([weather.visibility for weather in weathers], n // len(weathers))
+    return Sensors(own.latency + delay, own.reach * visibility, own.scale)
+
+
+def _own_reactions(system: System) -> bool:
+    """Whether the ADS has reactions of its own, so that the weather's do not act on it."""
+    return bool(getattr(system.ads, "own_reactions", False))
 
 
 class _Log:

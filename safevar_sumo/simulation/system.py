@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -12,16 +13,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.errors import InputError, unknown
-from safevar_sumo.plugins import Guard, Lookup, Member, check_parameters, made, undisturbed
+from safevar_sumo.plugins import Guard, Lookup, Member, OwnModules, check_parameters, made, undisturbed
 from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, weather_of
 from safevar_sumo.simulation.checking import check_network, network_remarks
 from safevar_sumo.simulation.measuring import TAKEN, Measuring, measuring_of
 from safevar_sumo.simulation.sources import is_network, is_shipped
 from safevar_sumo.simulation.traci_controller import TraciController
+from safevar_sumo.simulation.traci_module import importable
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, foreign_names
 from safevar_sumo.vehicles import VEHICLE_CONTRACT, VEHICLES, CharacteristicSet, GuardedVehicle, Vehicle, calibration_drive
 
@@ -101,6 +104,9 @@ def _assembled(study: Study, source: str) -> System:
         check_network(network)
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     nominal = calibration_drive(models.vehicle, characteristics)
+    if isinstance(models.ads, TraciController) and isinstance(models.vehicle, GuardedVehicle):
+        ends = np.stack([characteristics.original, characteristics.lower, characteristics.upper])
+        models.vehicle.refuse_unknown_sensors(dict(zip(characteristics.names, np.ascontiguousarray(ends.T), strict=True)))
     if models.members[0].guard is not None:
         nominal.tables()  # what is wrong with a vehicle from outside shows here, whoever drives it
     return System(
@@ -118,17 +124,26 @@ def models_of(study: Study, source: str) -> Models:
 
 def _traci(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
     """A function `step(traci, vehicle_id)` or a class with that method, written for SUMO."""
-    member, name = lookup.find({}, choice.model, "ads.model"), f"ads.model = {choice.model!r}"
-    what, make = member.what, partial(made, member, choice.parameters, name, "ads.parameters", lookup.source)
-    if not callable(getattr(what, "step", None) if inspect.isclass(what) else what):
-        raise InputError(lookup.source, f"{name} has no step", STEP)
-    if inspect.isclass(what):
-        make()
-    else:
-        check_parameters(what, (None, None), choice.parameters, name, "ads.parameters", lookup.source)
-        function = partial(what, **choice.parameters)
-        make = partial(lambda: function)
-    return TraciController(make, member.guard or Guard(lookup.source, name)), member
+    name = f"ads.model = {choice.model!r}"
+    with importable():
+        member = lookup.find({}, choice.model, "ads.model")
+        what = member.what
+        if not callable(getattr(what, "step", None) if inspect.isclass(what) else what):
+            raise InputError(lookup.source, f"{name} has no step", STEP)
+        if not inspect.isclass(what):
+            check_parameters(what, (None, None), choice.parameters, name, "ads.parameters", lookup.source)
+
+        def controller_of(what: Any) -> Any:
+            """A controller for one vehicle, from what the module that it has for itself says."""
+            if not inspect.isclass(what):
+                return partial(what, **choice.parameters)
+            return made(member._replace(what=what), choice.parameters, name, "ads.parameters", lookup.source)
+
+        controller_of(what)
+    places, attribute = [*lookup.places, os.getcwd()], choice.model.partition(":")[2]
+    modules = partial(OwnModules, member, attribute, places)
+    guard, own_reactions = member.guard or Guard(lookup.source, name), bool(getattr(member.what, "own_reactions", False))
+    return TraciController(modules, controller_of, guard, own_reactions=own_reactions), member
 
 
 def _matrix(study: Study, source: str) -> tuple[Point, ...]:

@@ -16,7 +16,7 @@ from safevar_sumo.scenarios import VUT, Lane
 from safevar_sumo.scenarios.base import lane_through
 from safevar_sumo.simulation.copies import copied_id, copy_and_name
 from safevar_sumo.simulation.standing import StandingSumo
-from safevar_sumo.vehicles import SumoType
+from safevar_sumo.vehicles import Sensors, SumoType
 
 # Speed mode: SUMO obeys every speed that is set and yields to nobody on a junction (TraCI "set speed mode", bit 5).
 OBEY = 32
@@ -62,6 +62,8 @@ class SumoWorld:
         """Speeds that the vehicles under test were last told to reach."""
         self.step_length: float = api.simulation.getDeltaT()
         self._pause = self.step_length if watched else 0.0
+        self.sensors = Sensors.perfect(n)
+        """Through which the ADSs see it that read it themselves, weather included."""
 
     def ids(self, name: str) -> list[str]:
         """The ids of an actor in its copies."""

@@ -10,6 +10,7 @@ from safevar_sumo.vehicles.changes import CHANGES, Change, foreign_change
 from safevar_sumo.vehicles.characteristics import Characteristic, CharacteristicSet
 from safevar_sumo.vehicles.guarded import VEHICLE_CONTRACT, GuardedVehicle
 from safevar_sumo.vehicles.lgsvl import Lgsvl
+from safevar_sumo.vehicles.sensors import Sensors
 from safevar_sumo.vehicles.slope import LEVEL, Slope, slope_of
 from safevar_sumo.vehicles.sumo import SumoVehicle
 from safevar_sumo.vehicles.worn import WornVehicle
@@ -23,4 +24,4 @@ VEHICLES: Mapping[str, type[Any]] = {
 
 __all__ = [
     "CHANGES", "LEVEL", "VEHICLES", "VEHICLE_CONTRACT", "Carla", "Change", "Characteristic", "CharacteristicSet", "GuardedVehicle",
-    "Slope", "SumoType", "Vehicle", "VehicleState", "at_start", "calibration_drive", "foreign_change", "slope_of"]
+    "Sensors", "Slope", "SumoType", "Vehicle", "VehicleState", "at_start", "calibration_drive", "foreign_change", "slope_of"]

@@ -15,6 +15,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
+from safevar_sumo.vehicles.sensors import Sensors
 from safevar_sumo.vehicles.slope import GRAVITY, LEVEL, Slope
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
@@ -232,6 +233,9 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             left = left - (left * left * left - 1 + share) / (3 * left * left)
         pushes = (p.slip_stiffness * speed + p.slip_offset * (1 - left)) / (p.slip_stiffness - 1 + left)
         return np.where(force < 0, speed - (speed + p.slip_offset) * (1 - left) / p.slip_stiffness, pushes), force
+
+    def sensors(self, prepared: _Prepared) -> Sensors:
+        return Sensors.perfect(len(prepared.mass))._replace(scale=prepared.assumed_height)
 
     def sense(self, prepared: _Prepared, state: CarlaState, seen: Observation) -> tuple[Observation, CarlaState]:
         """The camera stands where the wheels put it."""

@@ -11,12 +11,14 @@ from safevar_sumo.errors import ForeignError
 from safevar_sumo.plugins import Contract, Guard, lent, takes
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType, Vehicle
+from safevar_sumo.vehicles.sensors import Sensors
 from safevar_sumo.vehicles.slope import LEVEL, Slope
 
 VEHICLE_CONTRACT = Contract.of(Vehicle, "a vehicle", optional=("at_speed",))
 FASTEST = 1000.0
 """No vehicle is faster [m/s]; what is has diverged."""
 ROUNDING = 1e-9
+PROBE_STEP = 0.1  # s
 _BOUNDS = {"speed": (0.0, FASTEST), "throttle": (0.0, 1.0), "brake": (0.0, 1.0)}
 
 
@@ -88,6 +90,30 @@ class GuardedVehicle:
             return state
         given = self._guard.call("hold_gear", self._vehicle.hold_gear, prepared.theirs, state.theirs, lent(holds))
         return self._state("hold_gear", prepared.n, given)
+
+    def sensors(self, prepared: _Prepared) -> Sensors | None:
+        """What the model says of its sensors; None if it says nothing."""
+        if not hasattr(self._vehicle, "sensors"):
+            return None
+        theirs = self._guard.call("sensors", self._vehicle.sensors, prepared.theirs)
+        return Sensors(*(self._guard.numbers("sensors", name, self._guard.field("sensors", theirs, name), (prepared.n,), 0.0,
+                                             above=name == "scale", infinite=name == "reach") for name in Sensors._fields))
+
+    def refuse_unknown_sensors(self, characteristics: Characteristics) -> None:
+        """Refuse a model whose `sense` changes what is seen and that has no method `sensors`, for drivers that `sense` does not reach."""
+        if hasattr(self._vehicle, "sensors"):
+            return
+        prepared = self.prepare(characteristics, 1.0, PROBE_STEP)
+        state, nothing = self.at_rest(prepared), np.zeros(prepared.n)
+        for sample, gap in enumerate((60.0, 5.0, 2000.0)):
+            seen = Observation(sample * PROBE_STEP, nothing, nothing + gap, nothing + sample, nothing - 1 - sample, nothing + sample, 0.5,
+                               nothing - sample, nothing, nothing)
+            found, state = self.sense(prepared, state, seen)
+            for name, value in seen._asdict().items():
+                if not np.array_equal(getattr(found, name), value):
+                    problem = f"{self._guard.name} changes {name} in sense, which nothing that a controller reads through TraCI passes"
+                    raise ForeignError(self._guard.source, problem, "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors("
+                                       "latency, reach, scale); or an ADS that is given what is sensed, without ads.kind = \"traci\"")
 
     def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
         given = self._guard.call("sense", self._vehicle.sense, prepared.theirs, state.theirs, lent(seen))

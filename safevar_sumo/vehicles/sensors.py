@@ -2,10 +2,29 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from safevar_sumo.records import FloatArray, Observation
 from safevar_sumo.vehicles.delay import delayed, history, remembered
+
+
+class Sensors(NamedTuple):
+    """What lies between the world and the ADSs of N vehicles, each of shape (N,): s, m, -.
+
+    They tell of others `latency` late, of nobody beyond `reach` in clear weather, and `scale` times as far away as they are.
+    A vehicle's method `sensors(prepared)` returns them; `Vehicle.sense` does the same to an observation.
+    """
+
+    latency: FloatArray
+    reach: FloatArray
+    scale: FloatArray
+
+    @classmethod
+    def perfect(cls, n: int) -> Sensors:
+        """At once, however far."""
+        return cls(np.zeros(n), np.full(n, np.inf), np.ones(n))
 
 
 def late_and_near(seen: Observation, past: FloatArray | None, latency: FloatArray, reach: FloatArray,

@@ -10,7 +10,7 @@ from msgspec import Meta, Struct
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
 from safevar_sumo.vehicles.delay import delayed, history, remembered
-from safevar_sumo.vehicles.sensors import late_and_near
+from safevar_sumo.vehicles.sensors import Sensors, late_and_near
 from safevar_sumo.vehicles.slope import LEVEL, Slope
 
 
@@ -88,6 +88,9 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         throttle = np.minimum(np.maximum(p.back / p.accel, 0.0), 1.0)
         return rest._replace(speed=speed, acceleration=rest.acceleration + p.back, throttle=throttle, brake=brake,
                              brake_commands=rest.brake_commands + brake)
+
+    def sensors(self, prepared: _Prepared) -> Sensors:
+        return Sensors(prepared.reaction_time, prepared.sensor_range, np.ones_like(prepared.sensor_range))
 
     def sense(self, prepared: _Prepared, state: SumoState, seen: Observation) -> tuple[Observation, SumoState]:
         """Sensors report what was `reactionTime` ago, and nothing beyond `sensorRange` times the visibility."""

@@ -10,7 +10,7 @@ from msgspec import Meta, Struct
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import Characteristics, SumoType
 from safevar_sumo.vehicles.delay import delayed, history, remembered
-from safevar_sumo.vehicles.sensors import late_and_near
+from safevar_sumo.vehicles.sensors import Sensors, late_and_near
 from safevar_sumo.vehicles.slope import LEVEL, Slope
 
 DEEP_TREAD, HALF_WORN_TREAD, LEGAL_TREAD = 6.7, 3.0, 1.6
@@ -123,6 +123,9 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         brake = np.minimum(np.maximum(-p.slope.back / p.brake, 0.0), 1.0)
         throttle = np.minimum(np.maximum(p.slope.back / p.drive, 0.0), 1.0)
         return rest._replace(speed=speed, throttle=throttle, brake=brake, brake_commands=rest.brake_commands + brake)
+
+    def sensors(self, prepared: _Prepared) -> Sensors:
+        return Sensors(prepared.latency, prepared.sensor_range, np.ones_like(prepared.sensor_range))
 
     def sense(self, prepared: _Prepared, state: WornState, seen: Observation) -> tuple[Observation, WornState]:
         """Dirty sensors report what was `sensorLatency` ago, and nothing beyond `sensorRange` times the visibility."""
