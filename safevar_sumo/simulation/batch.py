@@ -19,6 +19,7 @@ from safevar_sumo.simulation.parts import Parts
 from safevar_sumo.simulation.staging import staged
 from safevar_sumo.simulation.sumo import Engine, world_on
 from safevar_sumo.simulation.system import System
+from safevar_sumo.simulation.traci_controller import TraciController
 from safevar_sumo.simulation.world import SumoWorld
 from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, at_start, slope_of
 
@@ -90,7 +91,8 @@ def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watch
     length, way = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
 
     state = at_start(vehicle, prepared, world.speeds())
-    world.sensors = _sensors(system, prepared, n)
+    if isinstance(system.ads, TraciController):  # any other is given what is sensed
+        world.sensors = _sensors(system, prepared, n)
     driver = system.ads.start(n, system.nominal, step)
     try:
         parts = Parts(system.points, world, n, own_reactions=_own_reactions(system))
