@@ -21,10 +21,12 @@ class OwnModules:
         What the member is called in its module.
     places
         Folders that are the user's, as for `Lookup`.
+    others
+        Names of modules that are known not to be from there; they are added to.
     """
 
-    def __init__(self, member: Member, attribute: str, places: Sequence[str]) -> None:
-        self._member, self._attribute, self._places = member, attribute, places
+    def __init__(self, member: Member, attribute: str, places: Sequence[str], others: set[str]) -> None:
+        self._member, self._attribute, self._places, self._others = member, attribute, places, others
         self._modules: dict[str, ModuleType] = {}
 
     def load(self) -> Any:
@@ -42,8 +44,10 @@ class OwnModules:
         finally:
             sys.dont_write_bytecode = writes_bytecode
             if len(sys.modules) != number:
-                remember(list(sys.modules), self._places)
+                remember(sys.modules.keys() - self._others, self._places)
             self._modules = self._taken_out()
+            if len(sys.modules) + len(self._modules) != number:
+                self._others.update(sys.modules)
             sys.modules.update(shared)
 
     def _taken_out(self) -> dict[str, ModuleType]:

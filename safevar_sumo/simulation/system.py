@@ -141,7 +141,7 @@ def _traci(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
 
         controller_of(what)
     places, attribute = [*lookup.places, os.getcwd()], choice.model.partition(":")[2]
-    modules = partial(OwnModules, member, attribute, places)
+    modules = partial(OwnModules, member, attribute, places, set())
     guard, own_reactions = member.guard or Guard(lookup.source, name), bool(getattr(member.what, "own_reactions", False))
     return TraciController(modules, controller_of, guard, own_reactions=own_reactions), member
 
