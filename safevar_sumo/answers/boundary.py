@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -20,15 +21,26 @@ RESOLUTION = 1 / (GRID * FINER**ROUNDS)
 """How near to the truth a boundary is, as a share of the line."""
 
 
+class End(StrEnum):
+    """What is just below the smallest unsafe share of a line."""
+
+    SAFE = "safe"
+    FILTER = "filter threshold"
+    NOT_SIMULATED = "not simulated"
+
+
 class Boundary(NamedTuple):
     """The smallest unsafe share of a cause's changes, and the setting there, shape (n,).
 
-    `alone` are, by column, the values that the changes can be taken back to one at a time, the others as they are.
+    `alone` are, by column, the values that the changes can be taken back to one at a time, the others as they are. `end` tells what is
+    just below the share; where the filter's threshold ends the line, `at_threshold` is the column of the change that it takes for none.
     """
 
     fraction: float
     setting: FloatArray
     alone: dict[int, float]
+    end: End = End.SAFE
+    at_threshold: int | None = None
 
 
 def boundaries(bench: Bench, causes: list[MinimalCause], unsafe: Unsafe) -> list[Boundary]:
@@ -39,7 +51,7 @@ def boundaries(bench: Bench, causes: list[MinimalCause], unsafe: Unsafe) -> list
     together = [(cause, cause.columns) for cause in causes]
     alone = [(cause, (column,)) for cause in causes for column in cause.columns]
     lines = [Line.moving(bench, cause, columns) for cause, columns in [*together, *alone]]
-    fractions = first_unsafe(bench, lines, unsafe)
+    fractions, ends = edges(bench, lines, unsafe)
     single = iter(zip(lines[len(causes):], fractions[len(causes):], strict=True))
     shrunk = []
     for i, cause in enumerate(causes):
@@ -50,7 +62,9 @@ def boundaries(bench: Bench, causes: list[MinimalCause], unsafe: Unsafe) -> list
         for column in cause.columns:
             line, fraction = next(single)
             of_it[column] = float(line.at(np.array([fraction]))[0, column])
-        shrunk.append(Boundary(float(fractions[i]), lines[i].at(fractions[i:i + 1])[0], of_it))
+        setting = lines[i].at(fractions[i:i + 1])[0]
+        limiting = lines[i].first_filtered(bench.characteristics.threshold) if ends[i] == End.FILTER else None
+        shrunk.append(Boundary(float(fractions[i]), setting, of_it, ends[i], limiting))
     return shrunk
 
 
@@ -71,6 +85,11 @@ class Line(NamedTuple):
         ways = np.abs(cause.setting - members.original)[which]
         return cls(start, cause.setting, float(np.max(members.threshold[which] / ways, initial=0.0)))
 
+    def first_filtered(self, threshold: FloatArray) -> int:
+        """The column whose change first falls to the filter's threshold on the way back."""
+        way = np.abs(self.end - self.start)
+        return int(np.argmax(np.divide(threshold, way, out=np.zeros_like(way), where=way > 0)))
+
     def at(self, shares: FloatArray) -> FloatArray:
         """Settings at shares of the line, shape (K, n)."""
         part = shares[:, np.newaxis]
@@ -79,14 +98,27 @@ class Line(NamedTuple):
 
 def first_unsafe(bench: Bench, lines: list[Line], unsafe: Unsafe, what: str = "boundaries") -> FloatArray:
     """The first unsafe share of every line, whose end is unsafe; exact to `RESOLUTION` of what counts of it."""
-    low, high = np.array([line.lowest for line in lines]), np.ones(len(lines))
+    return edges(bench, lines, unsafe, what)[0]
+
+
+def edges(bench: Bench, lines: list[Line], unsafe: Unsafe, what: str = "boundaries") -> tuple[FloatArray, list[End]]:
+    """The first unsafe share of every line as `first_unsafe`, and what is just below it.
+
+    A place that cannot be simulated is neither safe nor unsafe: the search goes past it as past a safe one, and tells if it ends there.
+    """
+    lowest = np.array([line.lowest for line in lines])
+    low, high, simulated = lowest, np.ones(len(lines)), np.ones(len(lines), dtype=bool)
     for parts in (GRID, *(FINER,) * ROUNDS):
         shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(1, parts + 1) / parts
         shares[:, -1] = high
         inner = np.concatenate([line.at(of_it[:-1]) for line, of_it in zip(lines, shares, strict=True)]) if lines else np.zeros((0, 0))
-        is_unsafe = np.ones(shares.shape, dtype=bool)
-        is_unsafe[:, :-1] = unsafe.of(bench.evaluate(inner, what)).reshape(len(lines), parts - 1)
+        evaluations = bench.evaluate(inner, what)
+        is_unsafe, valid = (np.ones(shares.shape, dtype=bool) for _ in range(2))
+        is_unsafe[:, :-1] = unsafe.of(evaluations).reshape(len(lines), parts - 1)
+        valid[:, :-1] = evaluations.valid.reshape(len(lines), parts - 1)
         first = np.argmax(is_unsafe, axis=1)
         rows = np.arange(len(lines))
+        simulated = np.where(first > 0, valid[rows, np.maximum(first - 1, 0)], simulated)
         low, high = np.where(first > 0, shares[rows, np.maximum(first - 1, 0)], low), shares[rows, first]
-    return high
+    ends = np.where((low == lowest) & (lowest > 0), End.FILTER, np.where(simulated, End.SAFE, End.NOT_SIMULATED))
+    return high, [End(end) for end in ends]

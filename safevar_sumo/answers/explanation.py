@@ -78,7 +78,8 @@ def explain(source: Study | Case, *, solutions: Sequence[str] = (), unsafe: str 
     of_sample = [causes[row] for row in sample]
     return Explained(
         study=study, unsafe=found.unsafe, original=original, explanations=explanations,
-        necessity=necessity(bench.characteristics, changed, of_sample), distinct=distinct_causes(bench.characteristics, of_sample),
+        necessity=necessity(bench.characteristics, changed, of_sample, len(found.rows)),
+        distinct=distinct_causes(bench.characteristics, of_sample),
         looked_at=len(found.evaluations), failures=len(found.rows), analysed=len(sample), otherwise=found.otherwise,
         preventability=preventable)
 
@@ -138,7 +139,8 @@ def _explained(found: Failures, bench: Bench, original: Evaluations, causes: Cau
                 changes={names[column]: float(cause.setting[column]) for column in cause.columns},
                 boundary={names[column]: float(boundary.setting[column]) for column in cause.columns}, fraction=boundary.fraction,
                 alone={names[column]: value for column, value in boundary.alone.items()}, outcome=cause.outcome,
-                safety_degree=cause.safety_degree))
+                safety_degree=cause.safety_degree, end=boundary.end,
+                at_threshold=None if boundary.at_threshold is None else names[boundary.at_threshold]))
         changed = bench.characteristics.changed(here.settings[i])
         explanations.append(Explanation(
             handle=found.handles[row], reasons=reasons[row], setting=dict(zip(names, here.settings[i].tolist(), strict=True)),

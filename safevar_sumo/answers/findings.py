@@ -7,6 +7,7 @@ from typing import Any
 
 import pandas as pd
 
+from safevar_sumo.answers.boundary import End
 from safevar_sumo.answers.braking_comparison import BrakingComparison
 from safevar_sumo.answers.preventability import Preventability
 from safevar_sumo.answers.robustness import Robustness
@@ -32,6 +33,8 @@ class Cause:
         How far each value alone can be taken back, the others as in `changes`.
     outcome, safety_degree
         What `changes` do [m, or -m/s].
+    end, at_threshold
+        What is just below `fraction`; where the filter's threshold ends the line, the characteristic whose change it takes for none.
     """
 
     changes: dict[str, float]
@@ -40,6 +43,16 @@ class Cause:
     alone: dict[str, float]
     outcome: str
     safety_degree: float | None
+    end: End = End.SAFE
+    at_threshold: str | None = None
+
+    @property
+    def limit(self) -> str:
+        """How little of the changes is enough, and what ends it, in a sentence."""
+        below = {End.SAFE: "slightly less is safe",
+                 End.FILTER: f"with less, the change of {self.at_threshold} falls below the filter's threshold and counts as none",
+                 End.NOT_SIMULATED: "slightly less could not be simulated"}[self.end]
+        return f"Scaling all changes to {self.fraction:.0%} is still unsafe; {below}."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +82,7 @@ class Explanation:
             "algorithm": self.handle.algorithm if self.handle else None, "run": self.handle.run if self.handle else None,
             "index": self.handle.row if self.handle else None, "setting": self.setting, "outcome": self.outcome,
             "safety_degree": self.safety_degree, "changed": list(self.changed),
-            "minimal_causes": [{name: getattr(cause, name) for name in ("changes", "boundary", "fraction", "outcome", "safety_degree")}
+            "minimal_causes": [{name: getattr(cause, name) for name in ("changes", "boundary", "fraction", "outcome", "safety_degree", "end")}
                                for cause in self.causes],
             "robustness": self.robustness.share, "because": sentence(self.because),
             "reasons": list(self.reasons)}
@@ -108,7 +121,9 @@ class Explained:
     def records(self) -> list[dict[str, Any]]:
         """As `explain --json` prints them: one for each failure, and a summary."""
         of_it = self.necessity.set_index("characteristic")
-        shares = {name: dict(zip(of_it.index, of_it[name].tolist(), strict=True)) for name in ("necessary", "changed")}
+        shares: dict[str, Any] = {name: dict(zip(of_it.index, of_it[name].tolist(), strict=True)) for name in ("necessary", "changed")}
+        ends = zip(of_it["necessary_lower"].tolist(), of_it["necessary_upper"].tolist(), strict=True)
+        shares["necessary_interval"] = dict(zip(of_it.index, map(list, ends), strict=True))
         return [*(one.record() for one in self.explanations), {"summary": {**shares, "preventable": self.preventability.to_dict()}}]
 
     def __repr__(self) -> str:

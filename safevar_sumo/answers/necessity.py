@@ -9,10 +9,13 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.answers.causes import MinimalCause, involved, necessary
+from safevar_sumo.answers.risk import interval_of
 from safevar_sumo.answers.words import direction
 from safevar_sumo.records import BoolArray
 from safevar_sumo.vehicles import CharacteristicSet
 
+CONFIDENCE = 0.95
+"""Of the interval of a sample's share."""
 Key = tuple[str, ...]
 """A cause without its sizes: its changes with their directions, such as ('mass up', 'tireFric down')."""
 
@@ -21,7 +24,8 @@ def key_of(characteristics: CharacteristicSet, cause: MinimalCause) -> Key:
     return tuple(direction(characteristics.members[column], float(cause.setting[column])) for column in cause.columns)
 
 
-def necessity(characteristics: CharacteristicSet, changed: BoolArray, causes: Sequence[Sequence[MinimalCause]]) -> pd.DataFrame:
+def necessity(characteristics: CharacteristicSet, changed: BoolArray, causes: Sequence[Sequence[MinimalCause]],
+              failures: int) -> pd.DataFrame:
     """How often each characteristic is changed, and how often it is needed.
 
     Parameters
@@ -30,19 +34,27 @@ def necessity(characteristics: CharacteristicSet, changed: BoolArray, causes: Se
         Which characteristics each of M failures changes, shape (M, n).
     causes
         The minimal causes of each.
+    failures
+        How many failures there are; if more than M, the M are a random sample of them.
 
     Returns
     -------
     pandas.DataFrame
         One row per characteristic: `characteristic`, and shares of the failures: `changed`; `necessary`, in every minimal
-        cause; `involved`, in one at least. Ordered by necessary, involved, changed; without rows if there is no failure.
+        cause; `involved`, in one at least; and `necessary_lower` and `necessary_upper`, the `CONFIDENCE` interval of `necessary` among
+        all failures: Clopper and Pearson's for a sample (a little too wide, as it is drawn without replacement from finitely many),
+        the share itself where all failures were analysed. Ordered by necessary, involved, changed; without rows if there is no failure.
     """
     columns = range(len(characteristics) if len(changed) else 0)
     counts = {"changed": _count(frozenset(np.flatnonzero(row).tolist()) for row in changed),
               "necessary": _count(map(necessary, causes)), "involved": _count(map(involved, causes))}
+    sampled = len(changed) < failures
+    intervals = [interval_of(counts["necessary"][column], len(changed), CONFIDENCE) if sampled
+                 else (counts["necessary"][column] / len(changed),) * 2 for column in columns]
     frame = pd.DataFrame({
         "characteristic": pd.Series([characteristics.names[column] for column in columns], dtype=object),
-        **{name: pd.Series([count[column] / len(changed) for column in columns], dtype=float) for name, count in counts.items()}})
+        **{name: pd.Series([count[column] / len(changed) for column in columns], dtype=float) for name, count in counts.items()},
+        **{f"necessary_{end}": pd.Series([interval[i] for interval in intervals], dtype=float) for i, end in enumerate(("lower", "upper"))}})
     return frame.sort_values(["necessary", "involved", "changed"], ascending=False, kind="stable", ignore_index=True)
 
 
