@@ -82,8 +82,9 @@ class Explanation:
             "algorithm": self.handle.algorithm if self.handle else None, "run": self.handle.run if self.handle else None,
             "index": self.handle.row if self.handle else None, "setting": self.setting, "outcome": self.outcome,
             "safety_degree": self.safety_degree, "changed": list(self.changed),
-            "minimal_causes": [{name: getattr(cause, name) for name in ("changes", "boundary", "fraction", "outcome", "safety_degree", "end")}
-                               for cause in self.causes],
+            "minimal_causes": [
+                {name: getattr(cause, name) for name in ("changes", "boundary", "fraction", "outcome", "safety_degree", "end")}
+                for cause in self.causes],
             "robustness": self.robustness.share, "because": sentence(self.because),
             "reasons": list(self.reasons)}
 
@@ -121,7 +122,8 @@ class Explained:
     def records(self) -> list[dict[str, Any]]:
         """As `explain --json` prints them: one for each failure, and a summary."""
         of_it = self.necessity.set_index("characteristic")
-        shares: dict[str, Any] = {name: dict(zip(of_it.index, of_it[name].tolist(), strict=True)) for name in ("necessary", "changed")}
+        shares: dict[str, Any] = {
+            name: dict(zip(of_it.index, of_it[name].tolist(), strict=True)) for name in ("necessary", "changed")}
         ends = zip(of_it["necessary_lower"].tolist(), of_it["necessary_upper"].tolist(), strict=True)
         shares["necessary_interval"] = dict(zip(of_it.index, map(list, ends), strict=True))
         return [*(one.record() for one in self.explanations), {"summary": {**shares, "preventable": self.preventability.to_dict()}}]

@@ -54,7 +54,8 @@ def necessity(characteristics: CharacteristicSet, changed: BoolArray, causes: Se
     frame = pd.DataFrame({
         "characteristic": pd.Series([characteristics.names[column] for column in columns], dtype=object),
         **{name: pd.Series([count[column] / len(changed) for column in columns], dtype=float) for name, count in counts.items()},
-        **{f"necessary_{end}": pd.Series([interval[i] for interval in intervals], dtype=float) for i, end in enumerate(("lower", "upper"))}})
+        "necessary_lower": pd.Series([low for low, _ in intervals], dtype=float),
+        "necessary_upper": pd.Series([high for _, high in intervals], dtype=float)})
     return frame.sort_values(["necessary", "involved", "changed"], ascending=False, kind="stable", ignore_index=True)
 
 

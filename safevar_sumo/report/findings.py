@@ -38,7 +38,7 @@ def explanations(material: Material, jobs: int | None, progress: Progress) -> Fo
 
 def necessity(found: Found, material: Material) -> Markup | None:
     """How often each characteristic is changed in a failure, and how often it is needed."""
-    shares: dict[str, dict[str, float]] = next((one["summary"] for one in found if "summary" in one), {})
+    shares: dict[str, dict[str, Any]] = next((one["summary"] for one in found if "summary" in one), {})
     names = [name for name in shares.get("necessary", {}) if shares["changed"].get(name)]
     if not names:
         return None
@@ -46,9 +46,15 @@ def necessity(found: Found, material: Material) -> Markup | None:
     pieces = [[Bar(0, shares["changed"][name], "weak", f"{name}: changed in {shares['changed'][name]:.0%} of the failures"),
                Bar(0, shares["necessary"][name], "hit", f"{name}: needed in {shares['necessary'][name]:.0%} of the failures")]
               for name in ordered]
-    ends = [("", f"needed {shares['necessary'][name]:.0%}, changed {shares['changed'][name]:.0%}") for name in ordered]
+    ends = [("", f"needed {shares['necessary'][name]:.0%}{_interval(*shares['necessary_interval'][name])}, "
+                 f"changed {shares['changed'][name]:.0%}") for name in ordered]
     told = f"{material.case.name}: how often a characteristic is needed for a failure, beside how often it is changed"
     return rows(told, ordered, pieces, [None] * len(ordered), ends)
+
+
+def _interval(low: float, high: float) -> str:
+    """A sample's 95 % interval; nothing where all failures were analysed."""
+    return f" ({low:.0%} to {high:.0%})" if low < high else ""
 
 
 def causes(found: Found, material: Material) -> list[dict[str, Any]]:
@@ -98,7 +104,7 @@ def _told(material: Material, place: int, one: dict[str, Any]) -> dict[str, Any]
             "end": comparison.verdict(comparison.rows[-1]), "because": one["because"], "robustness": one["robustness"],
             "handle": one["handle"], "where": material.where(setting),
             "whole": material.anchor("replay", one["handle"]), "boundary": changes_in_words(material.case.characteristics, boundary),
-            "fraction": cause["fraction"], "replay": material.replay(setting)}
+            "fraction": cause["fraction"], "below": cause["end"], "replay": material.replay(setting)}
 
 
 def replays(material: Material, explained: Found | None) -> list[dict[str, Any]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -23,6 +24,7 @@ from safevar_sumo.answers import (
 )
 from safevar_sumo.answers.explanation import REASONS, ROBUST
 from safevar_sumo.answers.in_short import Finding, in_short
+from safevar_sumo.answers.necessity import CONFIDENCE
 from safevar_sumo.simulation import assemble
 from safevar_sumo.terminal.plain import WholeTable, print_meanings
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
@@ -88,7 +90,13 @@ def _finding(one: Explanation | None) -> Finding | None:
 def _most_necessary(told: Explained, members: CharacteristicSet) -> str:
     called = {member.name: _named(member) for member in members}
     rows = told.necessity[told.necessity["necessary"] > 0].head(NECESSARY_SHOWN).to_dict("records")
-    return ", ".join(f"{called[row['characteristic']]} {row['necessary']:.0%}" for row in rows) or "none, causes differ"
+    return ", ".join(f"{called[row['characteristic']]} {_necessary(row)}" for row in rows) or "none, causes differ"
+
+
+def _necessary(row: Mapping[Any, Any]) -> str:
+    """The share of failures that need a characteristic, with the interval of a sample."""
+    interval = f" ({row['necessary_lower']:.0%} to {row['necessary_upper']:.0%})" if row["necessary_lower"] < row["necessary_upper"] else ""
+    return f"{row['necessary']:.0%}{interval}"
 
 
 def _named(member: Characteristic) -> str:
@@ -147,7 +155,7 @@ def _print_cause(console: Console, again: Again, cause: Cause, members: Characte
             table.add_row(escape(member.name), escape(member.unit), f"{member.original:g}", *(member.text(value) for value in values))
     console.print(table)
     print_meanings(console, [member for member in members if member.name in cause.changes])
-    _say(console, f"Scaling all changes to {cause.fraction:.0%} is still unsafe; slightly less is safe. {again(cause.changes)}")
+    _say(console, f"{cause.limit} {again(cause.changes)}")
 
 
 def _side_by_side(told: BrakingComparison) -> WholeTable:
@@ -174,9 +182,11 @@ def _print_common(console: Console, told: Explained) -> None:
     for head in ("changed", "necessary", "in some cause"):
         table.add_column(head, justify="right")
     for row in told.necessity.to_dict("records"):
-        table.add_row(escape(row["characteristic"]), *(f"{row[name]:.0%}" for name in ("changed", "necessary", "involved")))
+        table.add_row(escape(row["characteristic"]), f"{row['changed']:.0%}", _necessary(row), f"{row['involved']:.0%}")
     console.print(table)
-    console.print("necessary: in every minimal cause of a failure; shares of the failures.")
+    sampled = "" if told.analysed == told.failures else (
+        f" In brackets: {CONFIDENCE:.0%} intervals for all {told.failures} (Clopper and Pearson's, a little too wide for a finite number).")
+    _say(console, f"necessary: in every minimal cause of a failure; shares of the failures.{sampled}")
     causes = WholeTable("minimal cause", title=f"Distinct minimal causes: {len(told.distinct)}", title_justify="left")
     for head in ("failures", "share"):
         causes.add_column(head, justify="right")

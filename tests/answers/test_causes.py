@@ -6,11 +6,13 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given
 from hypothesis import strategies as st
-from known_regions import ORIGINAL, box, diagonal_band, everywhere, made_up_bench, nowhere, two_islands
+from known_regions import ORIGINAL, Plant, box, diagonal_band, everywhere, made_up_bench, made_up_study, nowhere, two_islands
 
-from safevar_sumo.answers.boundary import RESOLUTION, boundaries
+from safevar_sumo.answers.bench import Bench
+from safevar_sumo.answers.boundary import RESOLUTION, End, boundaries
 from safevar_sumo.answers.causes import affordable, involved, minimal_causes, necessary
 from safevar_sumo.answers.necessity import distinct_causes, necessity
 from safevar_sumo.answers.robustness import robustness, smallest_robust
@@ -56,6 +58,7 @@ def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None
     assert found.fraction == pytest.approx(1.5 / 4.5, abs=2 * RESOLUTION)
     assert found.setting[0] > 6.5 >= found.setting[0] - 2 * RESOLUTION * 4.5
     assert found.alone == {0: found.setting[0]}
+    assert (found.end, found.at_threshold) == (End.SAFE, None)
 
 
 def test_each_value_of_a_cause_alone_goes_back_farther_than_all_together() -> None:
@@ -74,6 +77,15 @@ def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
     threshold = bench.characteristics.threshold[0]
     assert found.setting[0] == pytest.approx(ORIGINAL + threshold, rel=1e-3)
     assert bench.characteristics.filter(found.setting)[0] == found.setting[0]
+    assert (found.end, found.at_threshold) == (End.FILTER, 0)
+
+
+def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
+    study = made_up_study(1)
+    bench = Bench(study, Plant(study, lambda rows: rows[:, 0] > 7, failing=lambda rows: (rows[:, 0] > 6) & (rows[:, 0] <= 7)))
+    (causes,) = minimal_causes(bench, np.array([[9.0]]), COLLISION)
+    (found,) = boundaries(bench, causes, COLLISION)
+    assert (found.setting[0], found.end) == (pytest.approx(7, abs=1e-3), End.NOT_SIMULATED)
 
 
 def test_an_original_that_is_unsafe_itself_needs_no_change() -> None:
@@ -106,9 +118,13 @@ def test_necessary_and_changed_over_failures() -> None:
     bench = made_up_bench(3, lambda settings: box(settings) | (settings[:, 2] > 9))
     settings = np.array([[9.0, 1.0, 5.0], [9.0, 1.0, 8.0], [9.0, 1.0, 9.5]])
     causes = minimal_causes(bench, settings, COLLISION)
-    frame = necessity(bench.characteristics, bench.characteristics.changed(settings), causes).set_index("characteristic")
+    frame = necessity(bench.characteristics, bench.characteristics.changed(settings), causes, 3).set_index("characteristic")
     assert frame["changed"].to_dict() == pytest.approx({"a": 1, "b": 1, "c": 2 / 3})
     assert frame["necessary"].to_dict() == pytest.approx({"a": 2 / 3, "b": 2 / 3, "c": 1 / 3})
+    assert frame["necessary_lower"].equals(frame["necessary"]), "of all failures the shares are exact"
+    sampled = necessity(bench.characteristics, bench.characteristics.changed(settings), causes, 4).set_index("characteristic").loc["c"]
+    ends = [scipy.stats.beta.ppf(q, *shape) for q, shape in ((0.025, (1, 3)), (0.975, (2, 2)))]
+    assert sampled[["necessary_lower", "necessary_upper"]].tolist() == pytest.approx(ends), "1 of a sample of 3"
     distinct = distinct_causes(bench.characteristics, causes)
     assert list(zip(distinct["cause"], distinct["failures"], strict=True)) == [(("a up", "b down"), 2), (("c up",), 1)]
 

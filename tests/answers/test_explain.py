@@ -72,13 +72,13 @@ def test_the_records_are_those_of_the_solutions(case: Case, told: Explained) -> 
         assert one["setting"] == row[list(case.characteristics.names)].to_dict()
         assert (one["outcome"], one["safety_degree"]) == (row["outcome"], row["safety_degree"])
         for cause in one["minimal_causes"]:
-            assert list(cause) == ["changes", "boundary", "fraction", "outcome", "safety_degree"]
+            assert list(cause) == ["changes", "boundary", "fraction", "outcome", "safety_degree", "end"]
             assert set(cause["changes"]) <= set(one["changed"])
             assert all(one["setting"][name] == value for name, value in cause["changes"].items())
         assert 0 <= one["robustness"] <= 1
         assert one["because"].startswith("The original stops")
     assert list(last) == ["summary"]
-    assert list(last["summary"]) == ["necessary", "changed", "preventable"]
+    assert list(last["summary"]) == ["necessary", "changed", "necessary_interval", "preventable"]
     assert all(share <= last["summary"]["changed"][name] for name, share in last["summary"]["necessary"].items())
 
 

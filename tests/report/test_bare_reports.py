@@ -41,7 +41,7 @@ def test_of_an_original_that_collides_no_change_is_called_the_cause(
     manifest = json.loads((slippery / "manifest.json").read_text())
     manifest["original"] |= {"outcome": "collision", "collision": True, "collision_speed": 3.9, "safety_degree": -3.9, "f_safe": -3.9}
     (tmp_path / "copy/manifest.json").write_text(json.dumps(manifest))
-    empty = {"changes": {}, "boundary": {}, "fraction": 0.0, "outcome": "collision", "safety_degree": -3.9}
+    empty = {"changes": {}, "boundary": {}, "fraction": 0.0, "end": "safe", "outcome": "collision", "safety_degree": -3.9}
     failure = {"algorithm": "nsga2", "run": 0, "index": 0, "minimal_causes": [empty], "robustness": 1.0, "because": "it collides anyhow"}
     monkeypatch.setattr(findings, "explain", lambda *_, **__: SimpleNamespace(records=lambda: [failure]))
     page = make_report([tmp_path / "copy"], only=["verdict", "causes"], jobs=1)

@@ -68,12 +68,14 @@ class Explained:
         row = case.solutions.iloc[0]
         changes = {name: float(row[name]) for name, value in zip(case.characteristics.names, case.characteristics.original, strict=True)
                    if row[name] != value}
-        cause = {"changes": changes, "boundary": changes, "fraction": 0.9968, "outcome": row["outcome"], "safety_degree": row["f_safe"]}
+        cause = {"changes": changes, "boundary": changes, "fraction": 0.9968, "outcome": row["outcome"],
+                 "safety_degree": row["f_safe"], "end": "safe"}
         self._records = [
             {"algorithm": row["algorithm"], "run": int(row["run"]), "index": 0, "setting": changes,
              "outcome": row["outcome"], "safety_degree": row["f_safe"], "changed": list(changes), "minimal_causes": [cause],
              "robustness": 0.5, "because": "<because>"},
-            {"summary": {name: dict.fromkeys(changes, 1.0) for name in ("necessary", "changed")}}]
+            {"summary": {**{name: dict.fromkeys(changes, 1.0) for name in ("necessary", "changed")},
+                         "necessary_interval": {name: [0.8, 1.0] for name in changes}}}]
 
     def records(self) -> list[dict[str, Any]]:
         return self._records
