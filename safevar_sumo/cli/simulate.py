@@ -103,7 +103,7 @@ def _tell(target: Target, system: System, found: Simulation, as_json: bool) -> N
         print_matrix(Console(), points)
         Console().print(tags(system.points), soft_wrap=True, markup=False, highlight=False)
     remarks = [remark for one in system.points for remark in remarks_of(one.scenario)]
-    for remark in dict.fromkeys([*remarks, *system.network_remarks, *vehicle_remarks(system)]):
+    for remark in dict.fromkeys([*remarks, *system.remarks, *vehicle_remarks(system)]):
         click.echo(f"note: {remark}", err=True)
     for name, value in found.put_back.items():
         click.echo(f"note: {name} = {value:g} is so near the original that the filter put {found.setting[name]:g} back; "

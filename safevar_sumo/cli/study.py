@@ -40,7 +40,7 @@ def study(study: str, batch: int | None, out: Path | None, jobs: int | None, clu
           retry_failed: bool, quiet: bool, dry_run: bool, **options: Any) -> None:
     """Search STUDY; the same command again goes on where it was stopped."""
     chosen, system = prepared(_with_options(load_study(study), **options), study)
-    tell_remarks(chosen, [*system.network_remarks, *vehicle_remarks(system)])
+    tell_remarks(chosen, [*system.remarks, *vehicle_remarks(system)])
     keys = _selected(all_runs(chosen), only, shard)
     directory = out or Path("results") / chosen.name
     with a_pool(chosen, jobs, cluster) as pool:

@@ -72,11 +72,22 @@ class System:
         return replace(self, scenario=point.scenario, weather=point.weather, matrix=())
 
     @property
-    def network_remarks(self) -> list[str]:
-        """What the networks say of the vehicle under test and is not used."""
+    def remarks(self) -> list[str]:
+        """What of the networks and the weathers is not used."""
+        in_traci = isinstance(self.ads, TraciController)
         networks = dict.fromkeys(point.scenario.network for point in self.points)
-        return [remark for network in networks for remark in
-                network_remarks(network, self.nominal.max_speed, sumo_drives=isinstance(self.ads, TraciController))]
+        found = [remark for network in networks for remark in network_remarks(network, self.nominal.max_speed, sumo_drives=in_traci)]
+        hazy = {point.weather.name: point.weather.visibility for point in self.points if point.weather.visibility != 1}
+        if in_traci and not self._sees_a_limited_way():
+            found += [f"weather {name!r}: visibility = {value:g} does nothing: the vehicle has no sensor range, and a controller written "
+                      "for TraCI sees as far" for name, value in hazy.items()]
+        return found
+
+    def _sees_a_limited_way(self) -> bool:
+        sensors = getattr(self.vehicle, "sensors", None)
+        original = dict(zip(self.characteristics.names, self.characteristics.original[:, np.newaxis], strict=True))
+        own = None if sensors is None else sensors(self.vehicle.prepare(original, 1.0, 0.1))
+        return own is not None and bool(np.isfinite(own.reach).all())
 
 
 def assemble(study: Study, source: str = "") -> System:

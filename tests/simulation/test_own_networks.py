@@ -195,11 +195,11 @@ def test_numbers_that_nothing_can_have_are_refused(mine: Path, file: str, old: s
 
 
 def test_what_a_network_says_of_the_vehicle_and_is_not_used_is_mentioned(mine: Path) -> None:
-    assert on("sun", mine).network_remarks == []
+    assert on("sun", mine).remarks == []
     rewritten(mine / "network.edg.xml", 'id="approach" from="west" to="crossing" numLanes="1" width="4" speed="70"',
               'id="approach" from="west" to="crossing" numLanes="1" width="4" speed="8.33"')
     rewritten(mine / "traffic.rou.xml", '<vType id="vut"', '<vType id="vut" carFollowModel="IDM" speedFactor="0.8" accel="3"')
-    (remark,) = on("sun", mine).network_remarks
+    (remark,) = on("sun", mine).remarks
     assert remark.startswith(f"{mine / 'traffic.rou.xml'}: not used of vehicle 'vut': carFollowModel = IDM, speedFactor = 0.8, accel = 3, "
                              "the speed limit of lane 'approach_0' (8.33 m/s)")
 

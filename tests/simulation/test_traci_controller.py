@@ -146,6 +146,16 @@ def test_worse_sensors_make_a_controller_brake_too_late(values: dict[str, float]
     assert simulate(best, changed(best)).outcome[0] == Outcome.STOPPED
 
 
+def test_a_visibility_that_does_nothing_is_mentioned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_controller.py").write_text(SCRIPT)
+    monkeypatch.chdir(tmp_path)
+    table = ModelTable(model="my_controller:step", kind="traci")
+    far, near = (assemble(msgspec.structs.replace(load_study(name, weather="fog"), ads=table)) for name in ("sun", "native"))
+    assert far.remarks == ["weather 'fog': visibility = 0.6 does nothing: the vehicle has no sensor range, and a controller written for "
+                           "TraCI sees as far"]
+    assert near.remarks == []
+
+
 SUBSCRIBES = """
 import traci.constants as tc
 
