@@ -84,16 +84,22 @@ class Tables(NamedTuple):
 class Nominal(NamedTuple):
     """The original vehicle on a dry road: all that an ADS knows of the vehicle.
 
-    `mass` [kg], `accel`, `decel` [m/s^2], `max_speed` [m/s] and `tau` [s] are those of its SUMO type; `tables` drives it, once
-    somebody asks, and returns what `speeds`, `full_throttle`, `coasting` and `braking` are of.
+    `mass` [kg], `accel`, `decel` [m/s^2] and `max_speed` [m/s] are those of its SUMO type; `actuator_lag` [s] is the time constant
+    with which its wheels follow the pedals, which its SUMO type has as `tau`. `tables` drives it, once somebody asks, and returns
+    what `speeds`, `full_throttle`, `coasting` and `braking` are of.
     """
 
     mass: float
     accel: float
     decel: float
     max_speed: float
-    tau: float
+    actuator_lag: float
     tables: Callable[[], Tables]
+
+    @property
+    def tau(self) -> float:
+        """`actuator_lag` by its former name, for ADSs that were written with it."""
+        return self.actuator_lag
 
     @property
     def speeds(self) -> FloatArray:

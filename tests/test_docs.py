@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -70,3 +71,47 @@ def test_every_shipped_characteristic_is_explained_in_its_study_and_in_the_gloss
     for key, row in load_study(name).vehicle.characteristics.items():
         assert row.meaning, key
         assert f"| `{key}` | {row.meaning} | {row.counterpart} |" in glossary
+
+
+class Numbers(NamedTuple):
+    """A comment of a page: commands, and of the last one's JSON the values at some paths, as the page's next paragraph has them."""
+
+    page: str
+    commands: list[str]
+    values: dict[str, str]
+    paragraph: str
+
+
+def marked(page: str) -> list[Numbers]:
+    """Every comment that begins with `numbers:`: lines of commands, then lines of `path = number`."""
+    found = []
+    for comment, paragraph in re.findall(r"<!-- numbers:\n(.*?)-->\n+(.*?)(?=\n\n|\Z)", (ROOT / page).read_text(), flags=re.DOTALL):
+        lines = [line.strip() for line in comment.splitlines() if line.strip()]
+        values = dict(line.split(" = ") for line in lines if not line.startswith(PROGRAM))
+        found.append(Numbers(page, [line for line in lines if line.startswith(PROGRAM)], values, paragraph))
+    return found
+
+
+MARKED = [one for page in PAGES for one in marked(page)]
+
+
+def test_marked_numbers_stand_in_the_paragraph_below_them() -> None:
+    assert MARKED
+    for one in MARKED:
+        for value in one.values.values():
+            assert value in one.paragraph, f"{one.page}: {value}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("numbers", MARKED, ids=lambda one: one.page)
+def test_marked_numbers_are_those_that_their_commands_print(numbers: Numbers, in_tmp: Path) -> None:
+    """Shares are given in whole per cent."""
+    for command in numbers.commands:
+        done = CliRunner().invoke(commands, shlex.split(command.removeprefix(PROGRAM)), catch_exceptions=False)
+        assert done.exit_code == 0, f"{command}\n{done.output}"
+    records = json.loads(done.stdout)
+    for path, value in numbers.values.items():
+        found = records
+        for key in path.split("."):
+            found = found[int(key) if isinstance(found, list) else key]
+        assert f"{100 * found:.0f} %" == value, f"{numbers.page}: {path}"

@@ -26,7 +26,7 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Okabe and Ito's, which colour-blind readers can tell apart; markers and line styles tell the same again."""
 MARKERS, DASHES = ("o", "X", "^", "s", "D", "v"), ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
 INCREASE, DECREASE = COLOURS[1], COLOURS[0]
-OBJECTIVE_TITLES = {"f_safe": "f_safe: safety degree [m, -m/s]", "f_diff": "f_diff: largest change [% of the original]",
+OBJECTIVE_TITLES = {"f_safe": "f_safe: safety degree [m, -m/s]", "f_diff": "f_diff: largest change [fraction of the original]",
                     "f_num_diff": "f_numDiff: characteristics changed"}
 DPI = 200
 FONT = 8
@@ -133,7 +133,7 @@ def pareto_fronts(case: Case) -> Figure:
         If there is no solution.
     """
     goals = case.scoring.objectives
-    scales = [one.sign * (100 if one.name == F_DIFF.name else 1) for one in goals]
+    scales = [one.sign for one in goals]
     fronts = {}
     for algorithm in case.algorithms:
         points = objectives(case, case.solutions_of(algorithm))

@@ -56,8 +56,8 @@ def _front(told: Status) -> RenderableType:
     front = nondominated(told.points)
     front = front[front[:, 0].argsort(kind="stable")]
     table = WholeTable(title=f"Front so far: {len(front)} points, the most severe ones", title_justify="left")
-    for head in ("safety degree [m, -m/s]", "largest change [%]", "changed"):
+    for head in ("safety degree [m, -m/s]", "f_diff [fraction]", "changed"):
         table.add_column(head, justify="right")
     for f_safe, f_diff, number in front[:FRONT].tolist():
-        table.add_row(f"{f_safe:.2f}", f"{100 * f_diff:.1f}", f"{number:.0f}")
+        table.add_row(f"{f_safe:.2f}", f"{f_diff:.3f}", f"{number:.0f}")
     return table

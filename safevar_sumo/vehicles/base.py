@@ -15,7 +15,10 @@ Characteristics = Mapping[str, FloatArray]
 
 
 class SumoType(NamedTuple):
-    """The attributes of N SUMO vehicle types, each of shape (N,): kg, m/s^2, m/s^2, m/s, s."""
+    """The attributes of N SUMO vehicle types, each of shape (N,): kg, m/s^2, m/s^2, m/s, s.
+
+    `tau` is SUMO's desired headway; vehicles set their actuator lag there. SUMO's models do not drive the vehicle, so nothing acts on it.
+    """
 
     mass: FloatArray
     accel: FloatArray

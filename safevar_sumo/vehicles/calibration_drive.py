@@ -20,7 +20,8 @@ def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> N
     """The original vehicle, driven on a dry road as soon as somebody asks for what it does there."""
     types = vehicle.sumo_type(vehicle.prepare(_original(characteristics), 1.0, STEP))
     tables = cache(partial(_driven, vehicle, characteristics))  # type: ignore[arg-type]
-    return Nominal(**{name: float(values[0]) for name, values in types._asdict().items()}, tables=tables)
+    mass, accel, decel, max_speed, lag = (float(values[0]) for values in types)
+    return Nominal(mass=mass, accel=accel, decel=decel, max_speed=max_speed, actuator_lag=lag, tables=tables)
 
 
 def _original(characteristics: CharacteristicSet) -> dict[str, FloatArray]:

@@ -23,7 +23,7 @@ class _Prepared(NamedTuple):
     decel: FloatArray
     grip: float | FloatArray
     max_speed: FloatArray
-    tau: FloatArray
+    actuator_lag: FloatArray
     sensor_range: FloatArray
     reaction_time: FloatArray
     brake_delay: FloatArray
@@ -68,13 +68,15 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         load = self.reference_mass / c["mass"]
         return _Prepared(
             step=step, mass=c["mass"], accel=c["accel"] * load, decel=c["decel"] * load,
-            grip=self.tyre_friction * road_friction * slope.down, max_speed=c["maxSpeed"], tau=c["tau"], sensor_range=c["sensorRange"],
+            grip=self.tyre_friction * road_friction * slope.down, max_speed=c["maxSpeed"], actuator_lag=c["tau"],
+            sensor_range=c["sensorRange"],
             reaction_time=c["reactionTime"], brake_delay=c["brakeDelay"], brake_gain=c["brakeGain"],
             back=slope.back)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
-        return SumoType(mass=p.mass, accel=np.minimum(p.accel, p.grip), decel=np.minimum(p.decel, p.grip), max_speed=p.max_speed, tau=p.tau)
+        return SumoType(mass=p.mass, accel=np.minimum(p.accel, p.grip), decel=np.minimum(p.decel, p.grip), max_speed=p.max_speed,
+                        tau=p.actuator_lag)
 
     def at_rest(self, prepared: _Prepared) -> SumoState:
         nothing = np.zeros_like(prepared.mass)
@@ -98,13 +100,13 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return late, state._replace(seen=past)
 
     def advance(self, prepared: _Prepared, state: SumoState, command: Command) -> SumoState:
-        """What the wheels do follows the pedals with time constant tau; dv/dt = a - g sin, da/dt = (wanted - a) / tau."""
+        """What the wheels do follows the pedals with the actuator lag T; dv/dt = a - g sin, da/dt = (wanted - a) / T."""
         p = prepared
         commands = remembered(state.brake_commands, command.brake)
         brake = delayed(commands, p.brake_delay, p.step)
         wanted = np.where(brake > 0, -brake * p.brake_gain * p.decel, command.throttle * p.accel)
         wanted = np.minimum(np.maximum(wanted, -p.grip), p.grip)
-        acceleration = state.acceleration + (wanted - state.acceleration) * (p.step / (p.tau + p.step))
+        acceleration = state.acceleration + (wanted - state.acceleration) * (p.step / (p.actuator_lag + p.step))
         # Whoever brakes is not driven on by what is left of the last acceleration.
         acceleration = np.where(brake > 0, np.minimum(acceleration, 0.0), acceleration)
         speed = np.minimum(np.maximum(state.speed + (acceleration - p.back) * p.step, 0.0), np.maximum(p.max_speed, state.speed))

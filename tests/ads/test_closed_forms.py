@@ -16,7 +16,7 @@ STEP = 0.05
 FAR = 1e6
 COASTING, FULL, BRAKING = 0.1, 2.0, 10.0
 SPEEDS = np.arange(0.0, 20.5, 0.5)
-KNOWN = Nominal(mass=1500.0, accel=3.0, decel=8.0, max_speed=50.0, tau=0.2, tables=lambda: Tables(
+KNOWN = Nominal(mass=1500.0, accel=3.0, decel=8.0, max_speed=50.0, actuator_lag=0.2, tables=lambda: Tables(
     speeds=SPEEDS, full_throttle=np.full(len(SPEEDS), FULL), coasting=np.full(len(SPEEDS), COASTING), braking=BRAKING))
 
 
@@ -135,6 +135,6 @@ def test_krauss_aims_at_the_speed_from_which_it_can_still_stop(speed: float, gap
     b = 0.6 * KNOWN.decel
     room = max(gap - 2.5, 0.0)
     safe = float(np.roots([1 / (2 * b), 1.0, -room]).max()) if room else 0.0
-    wanted = (min(safe, 13.89) - speed) / (STEP + KNOWN.tau)
+    wanted = (min(safe, 13.89) - speed) / (STEP + KNOWN.actuator_lag)
     assert command.throttle[0] == pytest.approx(min(max(wanted / KNOWN.accel, 0), 1), abs=1e-6)
     assert command.brake[0] == pytest.approx(min(max(-wanted / KNOWN.decel, 0), 1), abs=1e-6)

@@ -129,6 +129,13 @@ def _texts(figure: Figure) -> Iterator[Text]:
                 yield from (tick.label2 for tick in axis.get_major_ticks() if low - 1e-9 <= tick.get_loc() <= high + 1e-9)
 
 
+def test_f_diff_has_the_unit_of_solutions_csv_in_figures_too(case: Case) -> None:
+    (axis,) = [one for one in pareto_fronts(case).axes if one.get_xlabel().startswith("f_diff")]
+    assert "[fraction of the original]" in axis.get_xlabel()
+    largest = case.solutions["f_diff"].max()
+    assert 0 < max(float(np.max(line.get_xdata())) for line in axis.lines) <= largest
+
+
 def test_each_algorithm_has_its_own_colour_and_marker(case: Case) -> None:
     lines = [line for line in pareto_fronts(case).axes[0].lines if line.get_label().startswith(("NSGA", "RS"))]
     assert len({line.get_color() for line in lines}) == len({line.get_marker() for line in lines}) == 2
