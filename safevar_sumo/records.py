@@ -219,7 +219,8 @@ class Evaluations:
     `settings` has shape (M, n) and holds the filtered values in their table units, all else (M,).
     `metrics` has the columns of `safevar_sumo.metrics.METRICS`; an undefined value is NaN.
     `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count. `reasons` tells of settings, by their
-    bytes, why they could not be simulated.
+    bytes, why they could not be simulated. `files` are digests of files, by name, that other people's code read for a batch and
+    that nobody knew of before; they belong to the batch, not to its rows.
     """
 
     settings: FloatArray
@@ -229,6 +230,7 @@ class Evaluations:
     f_diff: FloatArray
     f_num_diff: FloatArray
     reasons: Mapping[bytes, str] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.settings)

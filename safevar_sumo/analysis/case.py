@@ -15,7 +15,7 @@ import pandas as pd
 from safevar_sumo.errors import InputError, told
 from safevar_sumo.metrics import SAFEVAR, MetricFacts, Scoring
 from safevar_sumo.records import FloatArray, Outcome
-from safevar_sumo.results import Failure, failure_lines, load
+from safevar_sumo.results import Failure, failure_lines, load, places_of
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Origin, Study, Weather, invalid
 from safevar_sumo.vehicles import CharacteristicSet
@@ -164,7 +164,7 @@ def load_case(directory: Path) -> Case:
     """Read one results directory."""
     manifest, evaluations, solutions, finished, failures = load(directory)
     try:
-        study = msgspec.structs.replace(msgspec.convert(manifest["study"], Study), origin=_origin(directory))
+        study = msgspec.structs.replace(msgspec.convert(manifest["study"], Study), origin=Origin(places=places_of(directory)))
     except msgspec.ValidationError as error:
         raise invalid(directory / "manifest.json", manifest["study"], error, "study") from None
     original = manifest.get("original")
@@ -175,12 +175,6 @@ def load_case(directory: Path) -> Case:
     except msgspec.ValidationError as error:
         raise invalid(directory / "manifest.json", manifest["scoring"], error, "scoring") from None
     return case_of(study, original, solutions, evaluations, finished, "imported" not in manifest, failures, scoring)
-
-
-def _origin(directory: Path) -> Origin:
-    """Where a study's plug-ins may lie, as far as results tell: beside their directory, or beside its folder."""
-    above = directory.resolve().parents
-    return Origin(places=tuple(map(str, above[:2])))
 
 
 def case_of(study: Study, original: Mapping[str, Any], solutions: pd.DataFrame, evaluations: pd.DataFrame,

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 
 def explain(source: StudyLike | Results, *, solutions: Sequence[str] = (), unsafe: str | None = None, top: int = ExplainOptions.top,
-            limit: int = ExplainOptions.limit, pool: Pool | None = None, jobs: int | None = None) -> Explained:
+            limit: int = ExplainOptions.limit, pool: Pool | None = None, jobs: int | None = None,
+            as_it_is_now: bool = False) -> Explained:
     """Explain failures: minimal causes, their boundaries, why, and whether they hang on a hair.
 
     Parameters
@@ -32,27 +33,33 @@ def explain(source: StudyLike | Results, *, solutions: Sequence[str] = (), unsaf
         Simulations, about, that the minimal causes of all failures may take; of more failures a random sample is looked into.
     pool, jobs
         Where to simulate: a pool, or that many worker processes, by default one for each core.
+    as_it_is_now
+        Simulate with what is there now if results were computed with something else, and warn; by default that is refused.
 
     Raises
     ------
     InputError
-        If something that is asked for is not there or cannot be used.
+        If something that is asked for is not there or cannot be used, or has changed since the results were computed.
     """
     from safevar_sumo import answers
 
-    return answers.explain(study_or_case(source), solutions=solutions, unsafe=unsafe, top=top, limit=limit, pool=pool, jobs=jobs)
+    subject = study_or_case(source, as_it_is_now=as_it_is_now)
+    return answers.explain(subject, solutions=solutions, unsafe=unsafe, top=top, limit=limit, pool=pool, jobs=jobs)
 
 
 def tolerance(study: StudyLike | Results, *, unsafe: str | None = None, characteristics: Sequence[str] | None = None, pairs: bool = False,
-              pool: Pool | None = None, jobs: int | None = None) -> Tolerance:
+              pool: Pool | None = None, jobs: int | None = None,
+              as_it_is_now: bool = False) -> Tolerance:
     """How far characteristics may go: each alone, with `pairs` two together, and all together. Otherwise as `explain`."""
     from safevar_sumo import answers
 
-    return answers.tolerance(study_of(study), unsafe=unsafe, characteristics=characteristics, pairs=pairs, pool=pool, jobs=jobs)
+    subject = study_of(study, as_it_is_now=as_it_is_now)
+    return answers.tolerance(subject, unsafe=unsafe, characteristics=characteristics, pairs=pairs, pool=pool, jobs=jobs)
 
 
 def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, confidence: float = RiskOptions.confidence,
-         width: float | None = None, unsafe: str | None = None, pool: Pool | None = None, jobs: int | None = None) -> Risk:
+         width: float | None = None, unsafe: str | None = None, pool: Pool | None = None, jobs: int | None = None,
+         as_it_is_now: bool = False) -> Risk:
     """How likely an unsafe outcome is when vehicles vary as the study says, and what decides.
 
     At most `samples` vehicles are drawn, fewer if the interval of the probability is no wider than `width` before.
@@ -60,12 +67,14 @@ def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, conf
     """
     from safevar_sumo import answers
 
-    return answers.risk(study_of(study), samples=samples, confidence=confidence, width=width, unsafe=unsafe, pool=pool, jobs=jobs)
+    subject = study_of(study, as_it_is_now=as_it_is_now)
+    return answers.risk(subject, samples=samples, confidence=confidence, width=width, unsafe=unsafe, pool=pool, jobs=jobs)
 
 
 def rules(study: StudyLike | Results, *, samples: int = RulesOptions.samples, unsafe: str | None = None, pool: Pool | None = None,
-          jobs: int | None = None) -> Rules:
+          jobs: int | None = None, as_it_is_now: bool = False) -> Rules:
     """Rules that tell where it is unsafe, from `samples` settings spread over the whole domain. Otherwise as `explain`."""
     from safevar_sumo import answers
 
-    return answers.rules(study_of(study), samples=samples, unsafe=unsafe, pool=pool, jobs=jobs)
+    subject = study_of(study, as_it_is_now=as_it_is_now)
+    return answers.rules(subject, samples=samples, unsafe=unsafe, pool=pool, jobs=jobs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,13 +11,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from safevar_sumo.errors import InputError, did_you_mean, one_of
-from safevar_sumo.results import read_manifest
+from safevar_sumo.results import begun_and_now, differences_now, manifest_of, read_later, read_manifest
+from safevar_sumo.results.manifest import MANIFEST
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from safevar_sumo.analysis import Case
+
+MOST = 3
+"""So many things that have changed are named in one line."""
 
 
 @dataclass(frozen=True)
@@ -80,27 +85,60 @@ def load(directory: str | Path) -> Results:
     return Results(Path(directory), load_cases([directory])[0])
 
 
-def study_or_case(source: StudyLike | Results) -> Study | Case:
-    """What a question is about: a study, or the case that results or their directory hold.
+def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False) -> Study | Case:
+    """What a question is about: a study, or the case that results or their directory hold, whose settings are simulated anew.
+
+    Warns
+    -----
+    UserWarning
+        With `as_it_is_now` of what has changed since the results were computed.
 
     Raises
     ------
     InputError
-        If it is neither.
+        If it is neither, or something that the results were computed with has changed since.
     """
-    if isinstance(source, Results):
-        return source.case
     if isinstance(source, str | Path) and str(source) not in study_names():
         if os.path.isdir(source):  # whatever the text is, as no method of a path
-            return load(source).case
-        if not os.path.exists(source):
+            source = load(source)
+        elif not os.path.exists(source):
             legal = f"a directory that the command study has written, {one_of(study_names())}, or the path of a study file (TOML)"
             problem = f"is no results directory, no study and no file{did_you_mean(source, study_names())}"
             raise InputError(source, problem, legal)
+    if isinstance(source, Results):
+        for told in changes_since(source.directory, source.case, as_it_is_now=as_it_is_now):
+            warnings.warn(f"{source.directory}: {told}", stacklevel=3)
+        return source.case
     return load_study(source)
 
 
-def study_of(source: StudyLike | Results) -> Study:
+def study_of(source: StudyLike | Results, *, as_it_is_now: bool = False) -> Study:
     """The study itself, or the one of the results; raises as `study_or_case`."""
-    found = study_or_case(source)
+    found = study_or_case(source, as_it_is_now=as_it_is_now)
     return found if isinstance(found, Study) else found.study
+
+
+def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) -> list[str]:
+    """In what that is simulated now differs from what results were computed with; of imported results nobody knows.
+
+    Raises
+    ------
+    InputError
+        If it differs in anything and `as_it_is_now` does not allow that; names the files.
+    """
+    from safevar_sumo.campaign import read_by_algorithms
+    from safevar_sumo.computing import identity_of, local_pool, sources_of
+    from safevar_sumo.simulation import assemble
+
+    manifest, study = read_manifest(directory), case.study
+    if "imported" in manifest:
+        return []
+    with local_pool(1, study.search.time_limit) as pool:
+        sources = {**sources_of(study, pool), **read_by_algorithms(study)}
+    manifest, sources = begun_and_now(manifest, sources, read_later(directory), study.origin.places)
+    changed = differences_now(manifest, manifest_of(study, identity_of(study, assemble(study, str(directory)), sources)))
+    if changed and not as_it_is_now:
+        more = f" (and {len(changed) - MOST} more)" if len(changed) > MOST else ""
+        raise InputError(directory / MANIFEST, f"{'; '.join(changed[:MOST])}{more}: what is simulated now is not what these results hold",
+                         "what was there then; or --as-it-is-now (as_it_is_now=True), which simulates with what is there now and says so")
+    return [f"{one}; simulated as it is now" for one in changed]

@@ -12,8 +12,8 @@ from rich.console import Console
 
 from safevar_sumo.api.once import assembled
 from safevar_sumo.api.results import Results, load
-from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, carry_out
-from safevar_sumo.computing import Pool, available_cores, cluster_pool, identity_of, local_pool
+from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, carry_out, read_by_algorithms
+from safevar_sumo.computing import Pool, available_cores, cluster_pool, identity_of, local_pool, sources_of
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.results import ResultsDirectory
@@ -85,7 +85,8 @@ def carried_out(study: Study, system: System, keys: list[RunKey], directory: Pat
     SafevarError
         If another process works on one of the runs, or as `carry_out`.
     """
-    results = ResultsDirectory(directory, study, identity_of(study, system), system.measuring.scoring)
+    sources = {**sources_of(study, pool), **read_by_algorithms(study)}
+    results = ResultsDirectory(directory, study, identity_of(study, system, sources), system.measuring.scoring)
     campaign = carry_out(study, keys, results, pool, observer, batch, retry_failed=retry_failed)
     if campaign.busy:
         raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: the same again later finishes the study")

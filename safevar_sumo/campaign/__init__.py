@@ -8,8 +8,8 @@ batches for a pool: a lost worker costs a batch, and no result depends on who co
 from safevar_sumo.campaign.carry_out import Campaign, carry_out
 from safevar_sumo.campaign.forecast import Forecast, forecast
 from safevar_sumo.campaign.gathering import BATCH
-from safevar_sumo.campaign.keys import RunKey, algorithm_member, algorithm_of, all_runs, run_generator
+from safevar_sumo.campaign.keys import RunKey, algorithm_member, algorithm_of, all_runs, read_by_algorithms, run_generator
 from safevar_sumo.campaign.run import Observer
 
 __all__ = ["BATCH", "Campaign", "Forecast", "Observer", "RunKey", "algorithm_member", "algorithm_of", "all_runs", "carry_out", "forecast",
-           "run_generator"]
+           "read_by_algorithms", "run_generator"]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.campaign.gathering import BATCH, Gathering
-from safevar_sumo.campaign.keys import RunKey, algorithm_of, run_generator
+from safevar_sumo.campaign.keys import RunKey, search_of
 from safevar_sumo.campaign.rechecking import Rechecking
 from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.computing import PersistentPool, Pool, check_isolation, first_of, packed, result_of
@@ -62,7 +62,7 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
         If a journal cannot be written or the study itself is at fault.
     """
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    persistent, work = PersistentPool(pool, study), packed(study, results.manifest)
+    persistent, work = PersistentPool(pool, study, results.note), packed(study, results.inputs)
     original = _original(study, work, characteristics, results, persistent, observer)
     if not original.valid[0]:
         raise InputError(f"study {study.name!r}", "the original vehicle leaves the tolerance of a test's speed before the ADS acts "
@@ -76,7 +76,7 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
     waiting, runs = deque(keys), set[Run]()
 
     def begun(key: RunKey) -> Search:
-        return algorithm_of(key.algorithm, study).search(problem, run_generator(study, key))
+        return search_of(key, study, problem, results.note)
 
     gathering, rechecking = Gathering(persistent, work, batch or BATCH), Rechecking(study, results, persistent, begun)
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import zlib
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from safevar_sumo.errors import InputError, unknown
-from safevar_sumo.plugins import Lookup, Member, made, undisturbed
-from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm
+from safevar_sumo.plugins import Files, Lookup, Member, digests, forget_foreign, made, noted_reading, undisturbed
+from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm, Problem, Search
 from safevar_sumo.study import SearchTable, Study
 
 
@@ -46,8 +47,45 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
             raise unknown(source, f"search.{stray}: there is no such key and no such algorithm", stray, legal)
     member = algorithm_member(name, study)
     with undisturbed(source, [name] if member.guard else []):
-        algorithm = made(member, search.parameters.get(label, {}), f"search.algorithms: {name!r}", key, source)
+        parameters = Lookup(source, study.origin.places).with_paths(member, search.parameters.get(label, {}), key)
+        algorithm = made(member, parameters, f"search.algorithms: {name!r}", key, source)
     return algorithm if member.guard is None else GuardedAlgorithm(algorithm, member.guard)
+
+
+def read_by_algorithms(study: Study) -> Files:
+    """Digests of what a study's algorithms from outside read while they are loaded and made, in this process."""
+    own = _packages(study)
+    if not own:
+        return {}
+    forget_foreign()
+    with noted_reading() as reading:
+        for label in study.search.labels:
+            algorithm_of(label, study)
+    return digests(reading.files(own), study.origin.places)
+
+
+def search_of(key: RunKey, study: Study, problem: Problem, note: Callable[[Files], None]) -> Search:
+    """The search of a run; `note` is told after every step which files an algorithm from outside has read."""
+    own, rng, ended = _packages(study), run_generator(study, key), False
+    search: Search | None = None
+    answer: Any = None  # what begins a generator
+    while True:
+        with noted_reading() as reading:
+            try:
+                search = search or algorithm_of(key.algorithm, study).search(problem, rng)
+                step: Any = search.send(answer)
+            except StopIteration as end:
+                ended, step = True, end.value
+        if own:
+            note(digests(reading.files(own), study.origin.places))
+        if ended:
+            return step  # type: ignore[no-any-return]
+        answer = yield step
+
+
+def _packages(study: Study) -> list[str]:
+    """The top modules of algorithms from outside."""
+    return [name.partition(":")[0].partition(".")[0] for name in study.search.algorithms if ":" in name]
 
 
 def algorithm_member(name: str, study: Study) -> Member:

@@ -32,7 +32,7 @@ class Rechecking:
 
     def __init__(self, study: Study, results: ResultsDirectory, pool: PersistentPool, begun: Callable[[RunKey], Search]) -> None:
         self._study, self._pool, self._begun = study, pool, begun
-        self._work = packed(study, results.manifest, afresh=True) if foreign_names(study) else None
+        self._work = packed(study, results.inputs, afresh=True) if foreign_names(study) else None
         self._begun_twice: set[str] = set()
         self.under_way: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}
 

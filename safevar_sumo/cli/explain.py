@@ -10,7 +10,7 @@ import click
 from rich.console import Console
 
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.simulating import jobs_option, json_option, options_of, point_option, results_or_study
+from safevar_sumo.cli.simulating import jobs_option, json_option, now_option, options_of, point_option, results_or_study
 from safevar_sumo.options import ExplainOptions
 from safevar_sumo.results import make_directory, write_whole
 
@@ -20,6 +20,7 @@ from safevar_sumo.results import make_directory, write_whole
 @options_of(ExplainOptions)
 @click.option("--full", is_flag=True, help="Print every explanation in full, not the answer alone.")
 @point_option
+@now_option
 @jobs_option
 @json_option
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write causes.json, causes.csv and a picture there.")

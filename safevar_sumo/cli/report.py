@@ -10,7 +10,7 @@ from rich.console import Console
 
 from safevar_sumo.cli.outputs import check_output
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.simulating import jobs_option, point_option
+from safevar_sumo.cli.simulating import as_it_is_now, jobs_option, now_option, point_option
 from safevar_sumo.results import write_whole
 
 
@@ -20,6 +20,7 @@ from safevar_sumo.results import write_whole
               help="The page.")
 @click.option("--only", metavar="SECTION,...", help="These sections alone, separated by commas: tested, verdict, causes, ...")
 @point_option
+@now_option
 @jobs_option
 def report(directories: tuple[str, ...], out: Path, only: str | None, point: str | None, jobs: int | None) -> None:
     """Write one self-contained page about the results directories DIR...: verdict, causes, replays, tables, figures."""
@@ -30,7 +31,7 @@ def report(directories: tuple[str, ...], out: Path, only: str | None, point: str
     sections = [name.strip() for name in only.split(",")] if only is not None else []
     with stages(Console(stderr=True)) as progress, warnings.catch_warnings(record=True) as otherwise:
         warnings.simplefilter("always", UserWarning)
-        page = make_report(directories, sections, jobs, progress, point=point or "")
+        page = make_report(directories, sections, jobs, progress, point=point or "", as_it_is_now=as_it_is_now())
     for one in otherwise:
         click.echo(f"warning: {one.message}", err=True)
     write_whole(out, page)

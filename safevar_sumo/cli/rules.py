@@ -9,7 +9,7 @@ import click
 from rich.console import Console
 
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.simulating import jobs_option, json_option, options_of, point_option, study_of
+from safevar_sumo.cli.simulating import jobs_option, json_option, now_option, options_of, point_option, study_of
 from safevar_sumo.options import RulesOptions
 
 
@@ -17,6 +17,7 @@ from safevar_sumo.options import RulesOptions
 @click.argument("place", metavar="STUDY|DIR")
 @options_of(RulesOptions)
 @point_option
+@now_option
 @jobs_option
 @json_option
 def rules(place: str, point: str | None, jobs: int | None, as_json: bool, **given: Any) -> None:

@@ -18,6 +18,7 @@ from safevar_sumo.cli.completion import complete_changes, complete_study
 from safevar_sumo.cli.outputs import refuse_inputs
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.showing import Shown, showing_options
+from safevar_sumo.cli.simulating import now_option
 from safevar_sumo.cli.target import Target, replay_options, target_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
@@ -38,6 +39,7 @@ from safevar_sumo.terminal.simulation import print_simulation, print_sweep
 @click.option("--beyond", is_flag=True, help="Take values beyond the domains too.")
 @click.option("--trace", type=click.Path(path_type=Path), metavar="FILE.csv", help="Write the simulation step by step.")
 @showing_options
+@now_option
 @click.option("--point", metavar="NAME", help="Of a study with a matrix: this point alone.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def simulate_command(study: str, solution: str | None, choice: str | None, changes: tuple[str, ...], no_filter: bool, beyond: bool,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,22 @@ jobs_option = click.option("--jobs", type=click.IntRange(1, 1024), help="Worker 
 point_option = click.option("--point", metavar="NAME", help="Of a study with a matrix: ask about this point of it alone.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 Command = Callable[..., Any]
+AS_IT_IS_NOW = "safevar_sumo.as_it_is_now"
+"""Where the context of a command keeps that flag, for whatever of it reads a results directory."""
+
+
+def _keep(context: click.Context, _option: click.Parameter, value: bool) -> None:
+    context.meta[AS_IT_IS_NOW] = value
+
+
+now_option = click.option(
+    "--as-it-is-now", is_flag=True, expose_value=False, callback=_keep,
+    help="Simulate with the files and versions that are there now where results were computed with others, and say so.")
+
+
+def as_it_is_now() -> bool:
+    """Whether the command that runs was given that flag."""
+    return bool(click.get_current_context().meta.get(AS_IT_IS_NOW))
 
 
 def options_of(question: type[Options]) -> Callable[[Command], Command]:
@@ -62,7 +79,11 @@ def results_or_study(place: str, point: str | None = None) -> Study | Case:
     """
     from safevar_sumo.api.results import study_or_case
 
-    found = study_or_case(place)
+    with warnings.catch_warnings(record=True) as changed:
+        warnings.simplefilter("always", UserWarning)
+        found = study_or_case(place, as_it_is_now=as_it_is_now())
+    for one in changed:
+        click.echo(f"warning: {one.message}", err=True)
     if point is None:
         return found
     if isinstance(found, Study):

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import click
 
-from safevar_sumo.api.results import study_of
+from safevar_sumo.cli.simulating import results_or_study, study_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import Handle, chosen_handle, position_of
@@ -55,7 +55,9 @@ def target_of(place: str, solution: str | None, choice: str | None) -> Target:
         raise InputError(place, "is a study and has no solutions", "a directory that the command study has written")
     from safevar_sumo.analysis import load_cases  # takes longer to load than the simulation
 
-    (case,) = load_cases([place])
+    case = results_or_study(place)
+    if isinstance(case, Study):
+        (case,) = load_cases([place])
     if solution is not None:
         handle = Handle.parse(solution)
     else:

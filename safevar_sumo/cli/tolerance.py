@@ -11,7 +11,7 @@ from rich.console import Console
 
 from safevar_sumo.cli.outputs import PICTURES, check_output
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.simulating import jobs_option, json_option, options_of, point_option, study_of
+from safevar_sumo.cli.simulating import jobs_option, json_option, now_option, options_of, point_option, study_of
 from safevar_sumo.options import ToleranceOptions
 
 
@@ -19,6 +19,7 @@ from safevar_sumo.options import ToleranceOptions
 @click.argument("place", metavar="STUDY|DIR")
 @options_of(ToleranceOptions)
 @point_option
+@now_option
 @jobs_option
 @json_option
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FILE",

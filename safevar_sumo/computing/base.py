@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Future
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Protocol
 
 import msgspec
 
-from safevar_sumo.computing.identity import Inputs, changed, inputs_of, networks_of
+from safevar_sumo.computing.identity import Inputs, networks_of
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.plugins import forget_foreign
+from safevar_sumo.plugins import Files, changes, digests, forget_foreign, noted_reading
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.simulation import System, assemble, evaluate, score, simulate_alone
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, foreign_packages
 
-SHARED = ("network", "sources", "code")
+SHARED = ("network", "sources")
 """Layers of a study's identity that every worker must have alike."""
 
 
@@ -60,15 +61,15 @@ def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, alone: bool
     Parameters
     ----------
     inputs
-        Layers of the study's identity by name; workers that have other files compute nothing. By default the files as
-        they are now.
+        Layers of the study's identity by name: workers that have other files compute nothing, and tell which files other
+        people's code reads that are not among the `sources`. By default the networks as they are now.
     alone
         To be simulated beside one copy of the network for all settings (`simulate_alone`).
     afresh
         By models that are loaded anew, with nothing in their modules and classes that earlier batches left there.
     """
     if inputs is None:
-        inputs = inputs_of(study, assemble(study))
+        inputs = {"network": networks_of(assemble(study))}
     return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED if layer in inputs}, alone, afresh))
 
 
@@ -82,27 +83,38 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
     """
     if msgspec.msgpack.decode(work, type=_How).afresh:
         forget_foreign()
-        system, network, alone = _system.__wrapped__(work)
+        assembled = _assembled.__wrapped__
     else:
-        system, network, alone = _system(work)
-    _refuse_changes(network, {"network": networks_of(system)})
-    beside = alone and not system.matrix
-    evaluations = score(system, settings, simulate_alone(system, settings)) if beside else evaluate(system, settings)
-    _refuse_changes(network, {"network": networks_of(system)})
-    return evaluations
+        assembled = _assembled
+    with noted_reading() as reading:
+        this, system = assembled(work)
+        _refuse_changes(this.inputs, system)
+        beside = this.alone and not system.matrix
+        evaluations = score(system, settings, simulate_alone(system, settings)) if beside else evaluate(system, settings)
+    _refuse_changes(this.inputs, system)
+    return replace(evaluations, files=_unknown(this, digests(reading.files(foreign_packages(this.study)), this.study.origin.places)))
 
 
 @lru_cache(maxsize=4)
-def _system(packed_work: bytes) -> tuple[System, Inputs, bool]:
-    """The system that a study names and what its network is to be; code that is loaded stays, whatever becomes of its files."""
-    work = msgspec.msgpack.decode(packed_work, type=_Work)
-    system = assemble(work.study)
-    _refuse_changes(work.inputs, inputs_of(work.study, system))
-    return system, {layer: files for layer, files in work.inputs.items() if layer == "network"}, work.alone
+def _assembled(work: bytes) -> tuple[_Work, System]:
+    """What is to be computed, and the system that the study names; code that is loaded stays, whatever becomes of its files."""
+    this = msgspec.msgpack.decode(work, type=_Work)
+    return this, assemble(this.study)
 
 
-def _refuse_changes(expected: Inputs, here: Inputs) -> None:
-    files = changed(expected, here)
+def _refuse_changes(expected: Inputs, system: System) -> None:
+    if "network" in expected:
+        _refuse(changes(expected["network"], networks_of(system)))
+
+
+def _unknown(this: _Work, files: Files) -> Files:
+    """Of the files that were read those that the study did not begin with; others that it did not begin with so are refused."""
+    known = this.inputs.get("sources", {})
+    _refuse([name for name, digest in files.items() if known.get(name, digest) != digest])
+    return {name: digest for name, digest in files.items() if name not in known}
+
+
+def _refuse(files: list[str]) -> None:
     if files:
         raise InputError(files[0], "is not the file that this study began with: it was changed meanwhile, or a worker has another one",
                          "the file as it was, and the same command; or another --out")

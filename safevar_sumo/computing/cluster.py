@@ -21,6 +21,7 @@ from safevar_sumo.computing.base import PoolLostError, WorkerLostError, evaluate
 from safevar_sumo.computing.interrupts import interrupts_noted
 from safevar_sumo.errors import InputError, told
 from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import RESULTS
 
 ADDRESS = re.compile(r"[a-z]+://[^\s/]+:\d+/?")
 CERTIFICATES = "for tls:// certificates in Dask's configuration: distributed.comm.tls.ca-file and .client.cert, .client.key"
@@ -114,7 +115,7 @@ def _evaluate_within(time_limit: float, versions: dict[str, str], study: bytes, 
 
 @cache
 def _versions() -> dict[str, str]:
-    return {name: version(name) for name in VERSIONED}
+    return {**{name: version(name) for name in VERSIONED}, "results": str(RESULTS)}
 
 
 def _hand_on(done: Future[Evaluations], outer: Future[Evaluations]) -> None:

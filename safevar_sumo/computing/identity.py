@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Mapping
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import msgspec
 
-from safevar_sumo.computing.sources import DIGITS, foreign_code, package_code
-from safevar_sumo.results import fixed
+from safevar_sumo.plugins import DIGITS, named_files
+from safevar_sumo.results import RESULTS, fixed
 from safevar_sumo.simulation import System, network_files
 from safevar_sumo.study import Study
 
@@ -22,29 +24,28 @@ EXPONENTS = (1 / 21, 1 / 20, -21.0, 21.0)
 POWERS = 2000
 
 
-def identity_of(study: Study, system: System) -> dict[str, Any]:
+def identity_of(study: Study, system: System, sources: Mapping[str, str] = MappingProxyType({})) -> dict[str, Any]:
     """The layers of a manifest beside the study: plain values, the same in every process and for every worker.
 
-    `resolved` are the study's tables with models' defaults and the weather's numbers, `network`, `sources` and `code`
-    digests by file, `platform` the machine as far as the last bit of a result may depend on it.
+    `resolved` are the study's tables with models' defaults and the weather's numbers, `network` and `sources` digests by file,
+    `results` the number that stands for the package's own code, `platform` the machine as far as the last bit of a result may
+    depend on it.
+
+    Parameters
+    ----------
+    sources
+        Digests of the files that other people's code reads: see `safevar_sumo.computing.sources_of`.
     """
     resolved = fixed(study)
     for table, model in (("vehicle", system.vehicle), ("ads", system.ads), ("scenario", system.scenario)):
         if isinstance(model, msgspec.Struct):
-            names = {key: value for key, value in resolved[table]["parameters"].items() if isinstance(value, str)}
+            names = {key: value for key, value in resolved[table]["parameters"].items()
+                     if isinstance(value, str) or any(named_files(value, study.origin.places))}
             resolved[table] = {**resolved[table], "parameters": {**msgspec.to_builtins(model), **names}}
     resolved["weather"] = msgspec.to_builtins(system.weather)
     if system.matrix:
         resolved["weathers"] = [msgspec.to_builtins(point.weather) for point in system.matrix]
-    return {"resolved": resolved, **inputs_of(study, system), "platform": _platform()}
-
-
-def inputs_of(study: Study, system: System) -> Inputs:
-    """Digests of the files that every worker must have alike."""
-    modules = [member.module for member in system.members if member.guard is not None]
-    modules += [name.partition(":")[0] for name in study.search.algorithms if ":" in name]
-    parameters = [study.vehicle.parameters, study.ads.parameters, study.scenario.parameters, study.search.parameters]
-    return {"network": networks_of(system), "sources": foreign_code(modules, parameters), "code": dict(package_code())}
+    return {"resolved": resolved, "network": networks_of(system), "sources": dict(sources), "results": RESULTS, "platform": _platform()}
 
 
 def networks_of(system: System) -> dict[str, str]:
@@ -53,12 +54,6 @@ def networks_of(system: System) -> dict[str, str]:
     if len(folders) == 1:
         return network_files(folders[0])
     return {f"{Path(folder).name}/{name}": digest for folder in folders for name, digest in network_files(folder).items()}
-
-
-def changed(there: Inputs, here: Inputs) -> list[str]:
-    """Names of files whose digests differ in the layers that are there."""
-    return [name for layer in there for name in sorted({*there[layer], *here.get(layer, {})})
-            if there[layer].get(name) != here.get(layer, {}).get(name)]
 
 
 @cache

@@ -10,6 +10,7 @@ from safevar_sumo.computing.base import Pool, packed
 from safevar_sumo.computing.interrupts import first_of
 from safevar_sumo.computing.isolation import check_isolation
 from safevar_sumo.computing.persistent import PersistentPool
+from safevar_sumo.computing.sources import inputs_of
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -27,7 +28,7 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     Models that are not ours are first seen to keep settings apart (`check_isolation`). `done` is called with the number of
     settings of every batch that is finished.
     """
-    persistent, work = PersistentPool(pool, study), packed(study, alone=alone)
+    persistent, work = PersistentPool(pool, study), packed(study, inputs_of(study, pool), alone=alone)
     if work not in _isolated:
         check_isolation(study, CharacteristicSet.of(study.vehicle.characteristics), lambda rows: persistent.submit(work, rows))
         _isolated.add(work)

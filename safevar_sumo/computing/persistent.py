@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shlex
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from functools import partial
 
@@ -41,10 +41,12 @@ class PersistentPool:
         Computes batches.
     study
         What is computed.
+    note
+        Is told of files that other people's code reads and that the study did not begin with; may refuse them.
     """
 
-    def __init__(self, pool: Pool, study: Study) -> None:
-        self._pool, self._study, self._in_a_row = pool, study, 0
+    def __init__(self, pool: Pool, study: Study, note: Callable[[Mapping[str, str]], None] = lambda files: None) -> None:
+        self._pool, self._study, self._note, self._in_a_row = pool, study, note, 0
         self._characteristics, self._foreign = CharacteristicSet.of(study.vehicle.characteristics), foreign_names(study)
 
     @property
@@ -87,6 +89,11 @@ class PersistentPool:
         """Have a batch computed; `then` is told its evaluations or its error."""
         def done(attempt: Future[Evaluations]) -> None:
             error = PoolLostError("the batch was cancelled") if attempt.cancelled() else attempt.exception()
+            if error is None and attempt.result().files:
+                try:
+                    self._note(attempt.result().files)
+                except SafevarError as refused:
+                    error = refused
             then(attempt.result() if error is None else None, error)
 
         try:

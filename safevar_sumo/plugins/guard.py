@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import ForeignError, InputError, told
+from safevar_sumo.plugins.reading import watch
 from safevar_sumo.records import BoolArray, FloatArray
 
 _OURS = str(Path(__file__).resolve().parents[1])
@@ -45,6 +46,7 @@ class Guard(NamedTuple):
         ForeignError
             Whatever it raises, an attempt to end the process included.
         """
+        watch.inside += 1
         try:
             return function(*arguments)
         except ForeignError:
@@ -55,6 +57,8 @@ class Guard(NamedTuple):
             raise self.failed(method, error) from error  # Ctrl-C does not reach a worker: the plug-in has raised it
         except BaseException as error:
             raise self.failed(method, error) from error
+        finally:
+            watch.inside -= 1
 
     def failed(self, method: str, error: BaseException) -> ForeignError:
         """The error that tells of an exception."""

@@ -17,7 +17,9 @@ from typing import Any, NamedTuple
 
 from safevar_sumo.errors import ForeignError, InputError, did_you_mean, one_of
 from safevar_sumo.plugins.contract import Contract
+from safevar_sumo.plugins.digests import beside
 from safevar_sumo.plugins.guard import Guard
+from safevar_sumo.plugins.reading import is_foreign, watch
 
 _NOT_FOREIGN = {__name__.partition(".")[0], *sys.stdlib_module_names}
 
@@ -106,6 +108,32 @@ class Lookup(NamedTuple):
             raise InputError(self.source, f"{key} = {name!r} {reason}", "; or ".join([*map(str, contracts), *filter(None, [otherwise])]))
         return found
 
+    def with_paths(self, member: Member, parameters: Mapping[str, Any], key: str) -> dict[str, Any]:
+        """Parameters for a member from outside: texts that name files beside the study's file as whole paths.
+
+        Raises
+        ------
+        InputError
+            If a text names a file of the working directory alone, which would be another file in another one.
+        """
+        if member.guard is None or not self.places:
+            return dict(parameters)
+        return {name: self._with_paths(value, f"{key}.{name}") for name, value in parameters.items() if name != "network"} | {
+            name: value for name, value in parameters.items() if name == "network"}
+
+    def _with_paths(self, value: Any, key: str) -> Any:
+        if isinstance(value, dict):
+            return {name: self._with_paths(one, f"{key}.{name}") for name, one in value.items()}
+        if isinstance(value, list):
+            return [self._with_paths(one, key) for one in value]
+        if not isinstance(value, str):
+            return value
+        found = beside(value, self.places)
+        if not found and beside(value, [os.getcwd()]):
+            raise InputError(self.source, f"{key} = {value!r}: that file lies in the working directory, not beside the study's file",
+                             f"a path relative to {self.places[0]}")
+        return found or value
+
     def _imported(self, name: str, guard: Guard, places: list[str]) -> tuple[ModuleType, str]:
         """The module, and the folder that its top package lies in."""
         importlib.invalidate_caches()
@@ -172,8 +200,14 @@ def make_reachable(places: Iterable[str]) -> None:
 
 
 def forget_foreign() -> None:
-    """Drop all modules that were loaded from users' folders: who looks one up next has it loaded anew."""
+    """Drop all modules that other people's code consists of: who looks one up next has it loaded anew."""
     _forget(list(_loaded))
+    for name in sorted(watch.imported):
+        module = sys.modules.get(name)
+        place = getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", [])), "")  # a namespace package has no file
+        if place and is_foreign(str(place)) and name.partition(".")[0] not in _NOT_FOREIGN:
+            del sys.modules[name]
+    watch.imported.clear()
 
 
 def _forget_all_but(places: Iterable[str]) -> None:

@@ -12,6 +12,7 @@ import msgspec
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins.guard import Guard
 from safevar_sumo.plugins.lookup import Member
+from safevar_sumo.plugins.reading import watch
 from safevar_sumo.study import converted
 
 
@@ -32,7 +33,11 @@ def made(member: Member, parameters: Mapping[str, Any], name: str, key: str, sou
     """
     cls = member.what
     if issubclass(cls, msgspec.Struct):
-        return converted(source, parameters, cls, key)
+        watch.inside += member.guard is not None
+        try:
+            return converted(source, parameters, cls, key)
+        finally:
+            watch.inside -= member.guard is not None
     check_parameters(cls, (), parameters, name, key, source)
     return (member.guard or Guard(source, name)).call("__init__", partial(cls, **parameters))
 

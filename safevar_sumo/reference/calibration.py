@@ -15,8 +15,8 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.computing import PersistentPool, Pool, evaluate_all, packed, result_of
-from safevar_sumo.computing.identity import inputs_of
 from safevar_sumo.computing.many import BATCH
+from safevar_sumo.computing.sources import inputs_of
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
@@ -122,7 +122,7 @@ class _Trial:
     def __init__(self, study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> None:
         self.study, self._references = study, references
         self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-        self._inputs = inputs_of(study, assemble(study))
+        self._inputs = inputs_of(study, pool)
         self._lower, self._upper = np.array([(row.lower, row.upper) for row in study.calibration.values()]).T
         self._pool = PersistentPool(pool, study)
         settings = [self._characteristics.original[np.newaxis], *(data.settings for data in references.values())]

@@ -14,6 +14,7 @@ import numpy as np
 from safevar_sumo.analysis import Case, load_cases
 from safevar_sumo.analysis.case import collided
 from safevar_sumo.answers import Unsafe, points_of
+from safevar_sumo.api.results import changes_since
 from safevar_sumo.errors import InputError
 from safevar_sumo.options import ExplainOptions, Options, RiskOptions, RulesOptions, ToleranceOptions
 from safevar_sumo.records import Evaluations, FloatArray
@@ -42,7 +43,8 @@ class Material:
 
     `place` is its results directory as it was given, `number` its place among the studies, from 1; `system` is None where
     what the study names cannot be simulated here, and `lacking` says why. `point` is the one of its matrix that is asked
-    about, to which all of the case belongs then; nothing where it is the whole study.
+    about, to which all of the case belongs then; nothing where it is the whole study. `changed` tells what that is simulated for
+    the page is not what the results were computed with.
     """
 
     number: int
@@ -52,6 +54,7 @@ class Material:
     system: System | None
     lacking: str = ""
     point: str = ""
+    changed: Sequence[str] = ()
     _compared: dict[bytes, Comparison] = field(default_factory=dict)
     _again: dict[bytes, Again] = field(default_factory=dict)
 
@@ -128,26 +131,30 @@ class Material:
         return "".join(sign if sign.isascii() and sign.isalnum() else "-" for sign in words)
 
 
-def gather(directories: Iterable[str | Path], point: str = "") -> list[Material]:
+def gather(directories: Iterable[str | Path], point: str = "", *, as_it_is_now: bool = False) -> list[Material]:
     """Read results directories, or what their solutions are at one point of a matrix, where they are simulated once more.
 
     Raises
     ------
     InputError
-        If one is no results directory, is damaged or is given twice, or a study has no such point.
+        If one is no results directory, is damaged or is given twice, a study has no such point, or something that the results were
+        computed with has changed since and `as_it_is_now` does not allow that.
     """
     places = [Path(directory) for directory in directories]
     found = []
     for number, (place, case) in enumerate(zip(places, load_cases(places), strict=True), 1):
-        system, lacking = None, ""
-        if point:
-            case = _at_point(case, point)
+        system, lacking, changed = None, "", list[str]()
         try:
             system = assemble(case.study, str(place))
         except InputError as error:
             lacking = f"What this study is about cannot be simulated here: {error.source}: {error.problem}."
+        else:
+            changed = changes_since(place, case, as_it_is_now=as_it_is_now)
+        if point:
+            case = _at_point(case, point)
+            system = assemble(case.study, str(place))
         found.append(Material(number=number, place=place, case=case, manifest=read_manifest(place), system=system, lacking=lacking,
-                              point=point))
+                              point=point, changed=changed))
     return found
 
 

@@ -40,7 +40,7 @@ PARTS = {"causes": "explain", **{name: name for name in LIMITS}}
 
 
 def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), jobs: int | None = None, progress: Progress = silent,
-                *, point: str = "") -> str:
+                *, point: str = "", as_it_is_now: bool = False) -> str:
     """One self-contained page about the results of one or several studies; the same results give the same page.
 
     Parameters
@@ -55,11 +55,13 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
         Is told what is being made, how much of it is done, and of how much.
     point
         Name of a point of a matrix, to be asked about alone; the research questions are about whole studies and left out.
+    as_it_is_now
+        Simulate with what is there now where results were computed with something else; the page says so.
 
     Warns
     -----
     UserWarning
-        Of solutions that, simulated again, are not what the results say.
+        Of solutions that, simulated again, are not what the results say; with `as_it_is_now` of what has changed.
 
     Raises
     ------
@@ -74,7 +76,10 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
         if "questions" in only:
             raise InputError("only", "the research questions are about whole studies", "sections other than questions with --point")
         wanted = [name for name in wanted if name != "questions"]
-    materials = gather(directories, point)
+    materials = gather(directories, point, as_it_is_now=as_it_is_now)
+    for material in materials:
+        for told in material.changed:
+            warnings.warn(f"{material.place}: {told}", stacklevel=2)
     studies = [_study(material, wanted, jobs, progress) for material in materials]
     progress("tables and figures", 0, 1)
     cases = [material.case for material in materials]
@@ -108,7 +113,7 @@ def _study(material: Material, wanted: Sequence[str], jobs: int | None, progress
                       "those of the study?", stacklevel=2)
     return {"name": material.case.name, "title": material.case.study.title, "anchor": material.anchor(), "replays": shown,
             "otherwise": otherwise,
-            "lacking": material.lacking, "original_fails": material.original_fails,
+            "lacking": material.lacking, "changed": material.changed, "original_fails": material.original_fails,
             "front": front(material, [one["handle"] for one in shown]) if shown else None,
             **limits, **{name: make() for name, make in made.items() if name in wanted or (name == "necessity" and "causes" in wanted)}}
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import cache
 from hashlib import sha256
 from importlib.metadata import version
 from typing import Any
 
 from safevar_sumo.errors import SafevarError
+from safevar_sumo.plugins import digest_of
 from safevar_sumo.report.material import Material
-from safevar_sumo.results import write_whole
+from safevar_sumo.results import RESULTS, write_whole
 from safevar_sumo.results.manifest import MANIFEST
 from safevar_sumo.results.store import SOLUTIONS
-from safevar_sumo.study import refuse_other_than_file
+from safevar_sumo.shipped import PACKAGE
+from safevar_sumo.study import foreign_names, refuse_other_than_file
 
 FOLDER = "answers"
 """Of a results directory."""
@@ -22,8 +25,10 @@ FOLDER = "answers"
 def stored(material: Material, name: str, compute: Callable[[], Any]) -> Any:
     """What `compute` gives as plain values; from the results directory if it was computed from the same results before.
 
-    Where the directory cannot be written, nothing is kept.
+    Where the directory cannot be written, or nothing tells which code an answer comes from, nothing is kept.
     """
+    if material.changed or ("imported" in material.manifest and foreign_names(material.case.study)):
+        return json.loads(json.dumps(compute(), allow_nan=False))
     at = f"-{material.anchor(material.point)}" if material.point else ""
     file, identity = material.place / FOLDER / f"{name}{at}.json", _identity(material, name)
     try:
@@ -43,11 +48,19 @@ def stored(material: Material, name: str, compute: Callable[[], Any]) -> Any:
 
 
 def _identity(material: Material, name: str) -> str:
-    """Results of other content, other options, or another version of this package give other answers."""
-    digest = sha256(version("safevar_sumo").encode())
+    """Results of other content, other options, another package or other files of the study give other answers."""
+    digest = sha256(_package().encode())
     for kept in (MANIFEST, SOLUTIONS):
         file = material.place / kept
         content = file.read_bytes() if file.is_file() else b""
         digest.update(len(content).to_bytes(8, "big") + content)
-    digest.update(repr(material.case.finished).encode() + material.point.encode() + repr(material.options[name]).encode())
+    told = [material.case.finished, material.point, material.options[name]]
+    digest.update(repr(told).encode())
     return digest.hexdigest()
+
+
+@cache
+def _package() -> str:
+    """Tells versions of this package apart, and states of it between two versions: an answer hangs on more code than results do."""
+    files = sorted(PACKAGE.rglob("*.py"))
+    return repr([version("safevar_sumo"), RESULTS, [(file.relative_to(PACKAGE).as_posix(), digest_of(file)) for file in files]])

@@ -56,15 +56,16 @@ def reproduce(materials: Sequence[Material], parts: Sequence[str]) -> list[dict[
     commands = []
     for material in materials:
         place, study = shlex.quote(str(material.place)), material.case.study
+        now = " --as-it-is-now" if material.changed else ""
         if material.case.has_runs:
             commands.append({"what": f"The study {study.name}, as its manifest.json records it whole, into another directory",
                              "command": _again(study, f"{material.place}-again", material.place)})
-        commands += [{"what": f"The part {part}", "command": material.options[part].command_line(str(material.place), material.point)}
+        commands += [{"what": f"The part {part}", "command": material.options[part].command_line(str(material.place), material.point) + now}
                      for part in parts]
         if material.point:
             continue
         commands.append({"what": "A replay, with figure and animation",
-                         "command": f"{RUN} simulate {place} --most-severe --plot it.png --animate it.html"})
+                         "command": f"{RUN} simulate {place} --most-severe --plot it.png --animate it.html{now}"})
     if any(material.point for material in materials):
         return commands
     commands.append({"what": "The tables of RQ1 to RQ3", "command": f"{RUN} tables {places}"})

@@ -181,11 +181,12 @@ def _occurrences(data: bytes, start: int) -> Iterator[int]:
 
 def _unpacked(batch: Batch) -> Evaluations:
     numbers = {name: _floats(values) for name, values in batch.numbers.items()}
-    named = {name: numbers.pop(name) for name in ("collision_speed", "f_diff", "f_num_diff")}
+    speed, f_diff, f_num_diff = (numbers.pop(name) for name in ("collision_speed", "f_diff", "f_num_diff"))
     outcome = np.array([_OUTCOME_OF[code] for code in batch.outcome], dtype="U16")
     settings = _floats(batch.settings).reshape(len(outcome), -1)
     reasons = {settings[row].tobytes(): reason for row, reason in batch.reasons.items()}
-    return Evaluations(settings=settings, outcome=outcome, metrics=numbers, reasons=reasons, **named)
+    return Evaluations(settings=settings, outcome=outcome, collision_speed=speed, metrics=numbers, f_diff=f_diff,
+                       f_num_diff=f_num_diff, reasons=reasons)
 
 
 def _floats(values: bytes) -> FloatArray:

@@ -14,8 +14,9 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results.files import make_directory, write_whole
-from safevar_sumo.results.manifest import FORMAT, MANIFEST, read_manifest
-from safevar_sumo.results.store import RUNS, SOLUTIONS, solutions_frame
+from safevar_sumo.results.inputs import digest_of_table, refuse_edited_table
+from safevar_sumo.results.manifest import DIGESTS, FORMAT, MANIFEST, RUNS, read_manifest
+from safevar_sumo.results.store import SOLUTIONS, solutions_frame
 from safevar_sumo.study import Study, refuse_other_than_file, tables_of
 
 if TYPE_CHECKING:
@@ -52,14 +53,16 @@ def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations
     earlier = _earlier(path, tables)
     frame = solutions_frame(names, [((name, 0), found) for name, found in solutions.items()]).drop(columns="run")
     if earlier:
+        refuse_edited_table(path / SOLUTIONS, earlier, "the file as it was, or another directory")
         there = read_imported(path, names)
         frame = pd.concat([there[~there["algorithm"].isin(list(solutions))], frame], ignore_index=True)
         frame = frame.sort_values(["algorithm", "f_safe", "f_diff", "f_num_diff", *names], kind="stable", ignore_index=True)
     known = earlier.get("original", {}) if original is None else original
+    text = frame.to_csv(index=False, lineterminator="\n")
     manifest: dict[str, Any] = {
         "format": FORMAT, "study": tables, "imported": {"files": {**earlier.get("imported", {}).get("files", {}), **files}},
-        "versions": {"safevar_sumo": version("safevar_sumo")}, "original": dict(known)}
-    write_whole(path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
+        "versions": {"safevar_sumo": version("safevar_sumo")}, "original": dict(known), DIGESTS: {SOLUTIONS: digest_of_table(text)}}
+    write_whole(path / SOLUTIONS, text)
     write_whole(path / MANIFEST, json.dumps(manifest, indent=2, allow_nan=False) + "\n")
 
 

@@ -11,9 +11,10 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.results.frames import NOTHING
 from safevar_sumo.results.imported import read_imported
+from safevar_sumo.results.inputs import refuse_edited_table
 from safevar_sumo.results.journal import read_journal
-from safevar_sumo.results.manifest import MANIFEST, owner, read_manifest
-from safevar_sumo.results.store import RUNS, evaluations_frame, solutions_frame
+from safevar_sumo.results.manifest import MANIFEST, RUNS, owner, read_manifest
+from safevar_sumo.results.store import SOLUTIONS, evaluations_frame, solutions_frame
 from safevar_sumo.study import label_of
 
 if TYPE_CHECKING:
@@ -82,6 +83,8 @@ def load(directory: str | Path) -> Results:
         budget = int(search["evaluations"])
     except (KeyError, TypeError, ValueError):
         raise InputError(place / MANIFEST, "tells of no characteristics or of no search", "what the command study has written") from None
+    again = "the same import again" if "imported" in manifest else "the same study again, which writes it from the journals"
+    refuse_edited_table(place / SOLUTIONS, manifest, f"the file as it was, or {again}")
     if "imported" in manifest:
         return Results(manifest, evaluations_frame(characteristics, []).assign(evaluation=0), read_imported(place, characteristics))
     everything, solved, positions, failures = [], [], [], []

@@ -12,8 +12,11 @@ from typing import Any
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import WORDS, Study, refuse_other_than_file, tables_of
 
-MANIFEST = "manifest.json"
-FORMAT = 2
+MANIFEST, RUNS = "manifest.json", "runs"
+FORMAT = 3
+READABLE = (2, FORMAT)
+RESULTS = 1
+"""Stands for the package's code in whatever hangs on its results: raised whenever they change, to which tests/golden forces."""
 VERSIONED = ("safevar_sumo", "libsumo", "eclipse-sumo", "deap", "numpy")
 FREE = ("title", "published", "repeatability", "fit", "calibration", "variation", "correlations")
 """Keys of a study that change no result of a campaign."""
@@ -21,8 +24,16 @@ FREE_OF_SEARCH = ("runs", "algorithms", "evaluations", "time_limit")
 """Keys of its search table that change no evaluation: which runs there are, how far they go, how long one may take."""
 LAYERS = {
     "resolved": "the same study and options", "network": "the network's file as it was", "sources": "the file as it was",
-    "code": "the package as it was", "versions": "those versions", "platform": "such a machine"}
+    "results": "that version", "versions": "those versions", "platform": "such a machine"}
 """What results depend on, as far as a manifest tells, and the way back where it differs."""
+OF_FILES = ("network", "sources")
+"""Layers of digests by file."""
+LAYERS_BEFORE = ("resolved", "network", "sources", "code", "versions", "platform")
+"""Those of format 2, which had digests of the package's files."""
+SIMULATORS = ("libsumo", "eclipse-sumo")
+"""Versions on which a simulation that is asked for now depends; the others are those of searches and of the package."""
+DIGESTS = "digests"
+"""Key of the digests of files of the directory itself."""
 
 
 def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
@@ -53,19 +64,32 @@ def fixed(study: Study) -> dict[str, Any]:
 def owner(manifest: Mapping[str, Any]) -> str:
     """The digest that the journals of a manifest's study carry."""
     if "format" in manifest:
-        return _digest({layer: manifest.get(layer) for layer in LAYERS})
+        return _digest({layer: manifest.get(layer) for layer in (LAYERS if manifest["format"] == FORMAT else LAYERS_BEFORE)})
     search = {key: value for key, value in manifest["study"]["search"].items() if key not in ("runs", "algorithms")}
     return _digest([{**manifest["study"], "search": search}, manifest["versions"], manifest.get("network")])
 
 
 def difference(stored: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str]:
     """In what two manifests differ so that results may, and the way back; two empty texts if in nothing."""
-    if "format" not in stored:
+    if stored.get("format") != FORMAT:
         return f"version {stored['versions'].get('safevar_sumo')} wrote them", "that version"
     for layer, way_back in LAYERS.items():
         for told in _differences(layer, stored.get(layer, {}), new.get(layer, {})):
             return told, way_back
     return "", ""
+
+
+def differences_now(stored: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """Everything in which what is simulated now differs from what results were computed with.
+
+    Other versions of what only searches, and another machine, change no simulation; nor does another version of this package
+    with the same number `RESULTS`.
+    """
+    if stored.get("format") != FORMAT:
+        return [f"version {stored['versions'].get('safevar_sumo')} wrote them"]
+    found = [told for layer in ("resolved", *OF_FILES, "results") for told in _differences(layer, stored.get(layer, {}), new[layer])]
+    there, here = ({name: of["versions"].get(name) for name in SIMULATORS} for of in (stored, new))
+    return [*found, *_differences("versions", there, here)]
 
 
 def counted(manifest: Mapping[str, Any]) -> Any:
@@ -87,7 +111,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     try:
         refuse_other_than_file(file)
         manifest = json.loads(file.read_text(encoding="utf-8"))
-        if isinstance(manifest["study"], dict) and isinstance(manifest["versions"], dict) and manifest.get("format", FORMAT) == FORMAT:
+        if isinstance(manifest["study"], dict) and isinstance(manifest["versions"], dict) and manifest.get("format", FORMAT) in READABLE:
             return dict(manifest)
     except FileNotFoundError:
         meant = Path("results") / directory.name
@@ -103,11 +127,12 @@ def read_manifest(directory: Path) -> dict[str, Any]:
 def _differences(layer: str, stored: Any, new: Any) -> Iterator[str]:
     """Everything in which a layer of two manifests differs, told for a person."""
     for key, there, here in _pairs(stored, new):
-        if layer in ("network", "sources", "code"):
+        if layer in OF_FILES:
             what = "is not there any more" if here is None else "was not there" if there is None else "has changed"
             yield f"{key} {what} since"
         else:
-            yield f"{'version of ' if layer == 'versions' else ''}{key} is {there!r} there and {here!r} here"
+            what = f"version of {key}" if layer == "versions" else key or "the number of the package's results"
+            yield f"{what} is {there!r} there and {here!r} here"
 
 
 def _pairs(stored: Any, new: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:

@@ -9,8 +9,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.results.journal import read_journal
-from safevar_sumo.results.manifest import MANIFEST, owner, read_manifest
-from safevar_sumo.results.store import RUNS
+from safevar_sumo.results.manifest import MANIFEST, RUNS, owner, read_manifest
 from safevar_sumo.study import label_of
 
 

@@ -16,14 +16,15 @@ from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS, SAFEVAR, Scoring
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results.files import make_directory, sync_directory, write_whole
+from safevar_sumo.results.inputs import begun_and_now, digest_of_table, note_reading, read_later, write_places
 from safevar_sumo.results.journal import Journal, JournalBusy, owner_of
-from safevar_sumo.results.manifest import MANIFEST, counted, difference, manifest_of, owner, read_manifest
+from safevar_sumo.results.manifest import DIGESTS, MANIFEST, RUNS, counted, difference, manifest_of, owner, read_manifest
 from safevar_sumo.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd
 
-SOLUTIONS, RUNS = "solutions.csv", "runs"
+SOLUTIONS = "solutions.csv"
 ORIGINAL = "original"
 """Name of the original vehicle's journal. Who writes it first owns the directory."""
 SECONDS_TO_CLAIM = 10.0
@@ -56,7 +57,30 @@ class ResultsDirectory:
         if scoring != SAFEVAR:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
         make_directory(path)
+        self._known: dict[str, str] = dict(self.manifest.get("sources", {}))
         self._refuse_another_study()
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """Digests of the files that workers must have alike, by layer: those that a study begins with, and what was read later."""
+        return {"network": self.manifest.get("network", {}), "sources": self._known}
+
+    def note(self, files: Mapping[str, str]) -> None:
+        """Take down files that other people's code has read since the study began, before anything that hangs on them is journalled.
+
+        Raises
+        ------
+        InputError
+            If one of them is known with another content.
+        """
+        for name, digest in files.items():
+            there = self._known.get(name) or read_later(self.path).get(name, digest)
+            if there != digest:
+                raise InputError(name, "is not the file that this study began with: it was changed meanwhile",
+                                 "the file as it was, and the same command; or another --out")
+            if name not in self._known:
+                note_reading(self.path, name, digest)
+                self._known[name] = digest
 
     def journal(self, run: str) -> Journal:
         """Open and lock the journal of a run, such as nsga2-03."""
@@ -70,15 +94,24 @@ class ResultsDirectory:
     def begin(self, original: Evaluations) -> None:
         """Write the manifest, with the original vehicle's evaluation; solutions of fewer or other runs are not kept beside it."""
         manifest = {**self.manifest, "original": record(original, 0)}
-        outdated = (self.path / MANIFEST).exists() and counted(read_manifest(self.path)) != counted(manifest)
-        write_whole(self.path / MANIFEST, json.dumps(manifest, indent=2, allow_nan=False) + "\n")
+        earlier = read_manifest(self.path) if (self.path / MANIFEST).exists() else manifest
+        outdated = counted(earlier) != counted(manifest)
+        if not outdated and DIGESTS in earlier:
+            manifest[DIGESTS] = earlier[DIGESTS]
+        self._write_manifest(manifest)
+        write_places(self.path, self._study)
         if outdated:
             self._remove(self.path / SOLUTIONS)
 
     def finish(self, solutions: Mapping[Any, Evaluations]) -> None:
         """Write the solutions of every run, by (algorithm, run)."""
         frame = solutions_frame(tuple(self._study.vehicle.characteristics), solutions.items())
-        write_whole(self.path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
+        text = frame.to_csv(index=False, lineterminator="\n")
+        write_whole(self.path / SOLUTIONS, text)
+        self._write_manifest({**read_manifest(self.path), DIGESTS: {SOLUTIONS: digest_of_table(text)}})
+
+    def _write_manifest(self, manifest: Mapping[str, Any]) -> None:
+        write_whole(self.path / MANIFEST, json.dumps(manifest, indent=2, allow_nan=False) + "\n")
 
     def _refuse_another_study(self) -> None:
         if not (self.path / MANIFEST).exists():
@@ -86,8 +119,11 @@ class ResultsDirectory:
             if foreign:
                 raise InputError("out", f"{self.path} holds other things: {foreign[0]}", "an empty directory, or one of this study")
             return
-        stored = read_manifest(self.path)
+        stored, later = read_manifest(self.path), read_later(self.path)
+        if "imported" not in stored and later:
+            stored, self.manifest["sources"] = begun_and_now(stored, self._known, later, self._study.origin.places)
         told, way_back = ("they are imported", "") if "imported" in stored else difference(stored, self.manifest)
+        self._known = {**self.manifest.get("sources", {}), **later}
         if told:
             legal = f"another --out, or {way_back}" if way_back else "another --out"
             raise InputError(self.path, f"holds results of another study: {told}", legal)

@@ -138,17 +138,17 @@ def _traci(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
     name = f"ads.model = {choice.model!r}"
     with importable():
         member = lookup.find({}, choice.model, "ads.model")
-        what = member.what
+        what, parameters = member.what, lookup.with_paths(member, choice.parameters, "ads.parameters")
         if not callable(getattr(what, "step", None) if inspect.isclass(what) else what):
             raise InputError(lookup.source, f"{name} has no step", STEP)
         if not inspect.isclass(what):
-            check_parameters(what, (None, None), choice.parameters, name, "ads.parameters", lookup.source)
+            check_parameters(what, (None, None), parameters, name, "ads.parameters", lookup.source)
 
         def controller_of(what: Any) -> Any:
             """A controller for one vehicle, from what the module that it has for itself says."""
             if not inspect.isclass(what):
-                return partial(what, **choice.parameters)
-            return made(member._replace(what=what), choice.parameters, name, "ads.parameters", lookup.source)
+                return partial(what, **parameters)
+            return made(member._replace(what=what), parameters, name, "ads.parameters", lookup.source)
 
         controller_of(what)
     places, attribute = [*lookup.places, os.getcwd()], choice.model.partition(":")[2]
@@ -216,13 +216,15 @@ def _check_units(study: Study, vehicle: Vehicle, ours: bool, source: str) -> Non
 
 def _vehicle(choice: VehicleTable, lookup: Lookup) -> tuple[Vehicle, Member]:
     member = lookup.class_of(VEHICLES, choice.model, "vehicle.model", VEHICLE_CONTRACT)
-    vehicle = made(member, choice.parameters, f"vehicle.model = {choice.model!r}", "vehicle.parameters", lookup.source)
+    parameters = lookup.with_paths(member, choice.parameters, "vehicle.parameters")
+    vehicle = made(member, parameters, f"vehicle.model = {choice.model!r}", "vehicle.parameters", lookup.source)
     return (vehicle if member.guard is None else GuardedVehicle(vehicle, member.guard)), member
 
 
 def _scenario(choice: ModelTable, lookup: Lookup) -> tuple[Scenario, Member]:
     member = lookup.class_of(SCENARIOS, choice.model, "scenario.model", SCENARIO_CONTRACT)
-    scenario = made(member, choice.parameters, f"scenario.model = {choice.model!r}", "scenario.parameters", lookup.source)
+    parameters = lookup.with_paths(member, choice.parameters, "scenario.parameters")
+    scenario = made(member, parameters, f"scenario.model = {choice.model!r}", "scenario.parameters", lookup.source)
     return _with_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.places), member
 
 
@@ -232,7 +234,7 @@ def _ads(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
     member = lookup.class_of(ADS, choice.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT,
                              otherwise=f'with ads.kind = "traci" {STEP}')
     name = f"ads.model = {choice.model!r}"
-    make = partial(made, member, choice.parameters, name, "ads.parameters", lookup.source)
+    make = partial(made, member, lookup.with_paths(member, choice.parameters, "ads.parameters"), name, "ads.parameters", lookup.source)
     driver = make()
     if issubclass(member.what, ScalarAds):
         guard = member.guard or Guard(lookup.source, name)

@@ -19,6 +19,7 @@ from safevar_sumo.study.schema import (
     VehicleTable,
     Weather,
     foreign_names,
+    foreign_packages,
     label_of,
     study_names,
     study_path,
@@ -28,5 +29,5 @@ from safevar_sumo.study.writing import check_writable, write_study
 
 __all__ = [
     "WORDS", "CharacteristicTable", "FitTable", "FreeParameter", "MatrixTable", "MatrixTest", "MetricsTable", "ModelTable", "Origin",
-    "SearchTable", "Study", "StudyLike", "VehicleTable", "Weather", "check_writable", "converted", "foreign_names", "invalid", "label_of",
-    "load_study", "refuse_other_than_file", "study_names", "study_path", "tables_of", "write_study"]
+    "SearchTable", "Study", "StudyLike", "VehicleTable", "Weather", "check_writable", "converted", "foreign_names", "foreign_packages",
+    "invalid", "label_of", "load_study", "refuse_other_than_file", "study_names", "study_path", "tables_of", "write_study"]

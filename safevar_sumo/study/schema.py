@@ -264,10 +264,20 @@ def study_path(study: str) -> Path:
 
 def foreign_names(study: Study) -> list[str]:
     """What of a study is computed by code from outside, as the study names it."""
+    return [f"{key} = {name!r}" for key, name in _foreign(study)]
+
+
+def foreign_packages(study: Study) -> list[str]:
+    """The top modules of that code."""
+    return sorted({name.partition(":")[0].partition(".")[0] for _, name in _foreign(study)})
+
+
+def _foreign(study: Study) -> list[tuple[str, str]]:
+    """Keys of a study and names that stand for code from outside."""
     tests = [] if study.matrix is None else [test.model for test in study.matrix.tests]
     named = {"vehicle.model": [study.vehicle.model], "ads.model": [study.ads.model], "scenario.model": [study.scenario.model, *tests],
              "metrics.also": study.metrics.also, "search.objectives": study.search.objectives}
-    return [f"{key} = {name!r}" for key, names in named.items() for name in dict.fromkeys(names) if ":" in name]
+    return [(key, name) for key, names in named.items() for name in dict.fromkeys(names) if ":" in name]
 
 
 def is_file(path: Path) -> bool:

@@ -10,8 +10,9 @@ import msgspec
 import pytest
 
 from safevar_sumo.computing import evaluate_batch, identity_of, packed
-from safevar_sumo.computing.identity import changed, inputs_of, powers_digest
+from safevar_sumo.computing.identity import networks_of, powers_digest
 from safevar_sumo.errors import InputError
+from safevar_sumo.plugins import changes
 from safevar_sumo.results.manifest import LAYERS
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.simulation import assemble
@@ -47,14 +48,13 @@ def test_what_a_characteristic_means_is_no_part_of_a_studys_identity() -> None:
     assert not {"meaning", "counterpart"} & set(identity_of(study, assemble(study))["resolved"]["vehicle"]["characteristics"]["mass"])
 
 
-@pytest.mark.parametrize("layer", ["network", "sources", "code"])
-def test_a_worker_with_another_file_computes_nothing(layer: str) -> None:
+def test_a_worker_with_another_network_computes_nothing() -> None:
     study = load_study("native")
     original = CharacteristicSet.of(study.vehicle.characteristics).original[None]
-    inputs = inputs_of(study, assemble(study))
+    inputs = {"network": networks_of(assemble(study))}
     evaluate_batch(packed(study, inputs), original)
-    inputs[layer] = {**inputs[layer], "a_file.py": "0123456789abcdef"}
-    with pytest.raises(InputError, match=r"a_file\.py: is not the file that this study began with"):
+    inputs["network"]["a_file.xml"] = "0123456789abcdef"
+    with pytest.raises(InputError, match=r"a_file\.xml: is not the file that this study began with"):
         evaluate_batch(packed(study, inputs), original)
 
 
@@ -62,11 +62,11 @@ def test_a_worker_with_another_file_computes_nothing(layer: str) -> None:
 def test_every_file_of_a_network_that_results_hang_on_counts(file: str, tmp_path: Path) -> None:
     shutil.copytree(NETWORKS / "lead_vehicle_stopped", tmp_path / "mine")
     study = load_study("native", scenario={"parameters": {"network": str(tmp_path / "mine")}})
-    before = inputs_of(study, assemble(study))["network"]
+    before = networks_of(assemble(study))
     text = (tmp_path / "mine" / file).read_text()
     (tmp_path / "mine" / file).write_text(text + "<!-- -->")
-    after = inputs_of(study, assemble(study))["network"]
-    assert changed({"network": before}, {"network": after}) == [file]
+    after = networks_of(assemble(study))
+    assert changes(before, after) == [file]
 
 
 def test_a_network_that_changes_between_two_batches_is_noticed(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import time
@@ -11,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 from processes import ended, started, until, workers_of, written
 
+import safevar_sumo as sv
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import load
@@ -72,6 +74,99 @@ def test_results_go_with_the_files_that_they_were_computed_with() -> None:
     Path("mine.toml").write_text(STUDY.replace('name = "mine"', 'name = "mine"\ntitle = "Another title"'))
     study()
     assert Path("out/solutions.csv").read_bytes() == before
+
+
+MATRIX = """
+[matrix]
+[[matrix.tests]]
+name = "as it is"
+[[matrix.tests]]
+name = "mine"
+model = "my_test:Test"
+parameters = { table = "table.txt" }
+over = { where = ["near.txt", "far.txt"] }
+"""
+TEST = """
+from pathlib import Path
+
+from safevar_sumo.scenarios import PedestrianCrossing
+
+
+class Test(PedestrianCrossing, frozen=True):
+    table: str = ""
+    where: str = ""
+
+    def observe(self, world, step, memory):
+        Path(self.where).read_bytes()
+        return super().observe(world, step, memory)
+"""
+
+
+def refused(*words: str) -> str:
+    """What a command says that ends with code 2."""
+    told = CliRunner().invoke(commands, words).exception
+    assert isinstance(told, InputError), (words, told)
+    return f"{told.problem}: {told.legal}"
+
+
+def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results_refuses_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("mine.toml").write_text(STUDY.replace("evaluations = 30", "evaluations = 4\npopulation = 2") + MATRIX)
+    files = {"my_test.py": TEST, "table.txt": "1", "near.txt": "2", "far.txt": "3"}
+    for name, text in files.items():
+        Path(name).write_text(text)
+    Path("elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")
+    ended(started("study", "../mine.toml", "--out", "../out", "--jobs", "1"), 0)
+    assert {*files, "my_ads.py", "my_map.py"} == set(json.loads(Path("../out/manifest.json").read_text())["sources"])
+    ended(started("study", "../mine.toml", "--out", "../out", "--runs", "2", "--jobs", "1"), 0)
+    for name, text in files.items():
+        Path("..", name).write_text(f"{text}\n# a comment\n")
+        if name == "my_test.py":
+            assert CliRunner().invoke(commands, ["simulate", "../out", "--most-severe"]).exit_code == 0, "a comment is no difference"
+            Path("..", name).write_text(f"{text}\nX = 1\n")
+        assert f"{name} has changed since" in refused("study", "../mine.toml", "--out", "../out", "--runs", "3")
+        assert "--as-it-is-now" in (told := refused("tolerance", "../out")), told
+        assert told.startswith(f"{name} has changed since: ")
+        Path("..", name).write_text(text)
+    Path("../far.txt").write_text("another")
+    for words in ("simulate ../out", "simulate ../out --most-severe", "explain ../out", "risk ../out", "rules ../out", "report ../out"):
+        assert "far.txt has changed since" in refused(*words.split())
+    with pytest.raises(InputError, match=r"far\.txt has changed since"):
+        sv.risk(sv.load("../out"))
+    done = CliRunner().invoke(commands, ["rules", "../out", "--samples", "8", "--jobs", "1", "--json", "--as-it-is-now"])
+    assert done.exit_code == 0, done.exception
+    assert "warning: ../out: far.txt has changed since; simulated as it is now" in done.stderr
+    done = CliRunner().invoke(commands, ["report", "../out", "--only", "verdict,reproduce", "--as-it-is-now", "--out", "page.html"])
+    assert "far.txt has changed since" in done.stderr
+    assert "far.txt has changed since" in Path("page.html").read_text()
+
+
+def test_a_file_that_is_read_later_counts_from_then_on() -> None:
+    top = sv.simulate("mine.toml").drives.trace.speed.max()
+    Path("my_ads.py").write_text(ADS.replace("def drive(self, seen):", f"""def drive(self, seen):
+        if seen.speed > {float(top)!r}:
+            open("tile.txt").read()"""))
+    Path("tile.txt").write_text("a tile")
+    edited("mine.toml", "evaluations = 30", "evaluations = 60")
+    study()
+    assert "tile.txt" not in json.loads(Path("out/manifest.json").read_text())["sources"], "the original vehicle is never so fast"
+    before = Path("out/solutions.csv").read_bytes()
+    study()
+    assert Path("out/solutions.csv").read_bytes() == before
+    Path("tile.txt").write_text("another tile")
+    assert "tile.txt has changed since" in refused("study", "mine.toml", "--out", "out", "--runs", "2")
+    assert "tile.txt has changed since" in refused("rules", "out")
+
+
+def test_a_table_that_was_edited_is_refused_until_the_study_writes_it_again() -> None:
+    study()
+    before = Path("out/solutions.csv").read_text()
+    Path("out/solutions.csv").write_text(before.replace("stopped", "collision"))
+    for words in ("simulate out", "tables out", "explain out", "report out", "figures out --out pictures"):
+        assert "was edited" in refused(*words.split())
+    study()
+    assert Path("out/solutions.csv").read_text() == before
+    assert len(load("out").solutions)
 
 
 def under_way() -> subprocess.Popen[str]:

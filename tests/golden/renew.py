@@ -13,7 +13,7 @@ from in_process import Here, Silent
 
 from safevar_sumo.campaign import all_runs, carry_out
 from safevar_sumo.computing import identity_of
-from safevar_sumo.results import ResultsDirectory, load
+from safevar_sumo.results import RESULTS, ResultsDirectory, load
 from safevar_sumo.simulation import assemble
 from safevar_sumo.study import Study, load_study
 
@@ -48,5 +48,8 @@ def platform_here() -> dict[str, str]:
 
 
 if __name__ == "__main__":
-    golden = {"platform": platform_here(), "studies": {name: computed(name) for name in STUDIES}}
+    stored, studies = json.loads(FILE.read_text(encoding="utf-8")), {name: computed(name) for name in STUDIES}
+    if studies != stored["studies"] and stored["results"] == RESULTS:
+        raise SystemExit(f"results have changed: raise RESULTS in safevar_sumo/results/manifest.py above {RESULTS} first")
+    golden = {"platform": platform_here(), "results": RESULTS, "studies": studies}
     FILE.write_text(json.dumps(golden, indent=2) + "\n", encoding="utf-8", newline="\n")

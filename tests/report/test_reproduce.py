@@ -17,7 +17,7 @@ from safevar_sumo.study import Study, load_study
 
 
 def first_command(study: Study) -> list[str]:
-    material: Any = SimpleNamespace(place=Path("its results"), point="", case=SimpleNamespace(study=study, has_runs=True))
+    material: Any = SimpleNamespace(place=Path("its results"), point="", changed=(), case=SimpleNamespace(study=study, has_runs=True))
     return shlex.split(reproduce([material], [])[0]["command"])
 
 
