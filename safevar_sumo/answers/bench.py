@@ -35,7 +35,7 @@ class Bench:
 
     def __init__(self, study: Study, pool: Pool, progress: Progress = silent) -> None:
         self.study, self.characteristics = study, CharacteristicSet.of(study.vehicle.characteristics)
-        self._pool, self._progress = pool, progress
+        self._pool, self.progress = pool, progress
         self.simulated = 0
 
     def evaluate(self, settings: FloatArray, what: str) -> Evaluations:
@@ -43,12 +43,12 @@ class Bench:
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
         done, total = 0, len(np.unique(settings, axis=0))
-        self._progress(what, 0, total)
+        self.progress(what, 0, total)
 
         def one_more(number: int) -> None:
             nonlocal done
             done += number
-            self._progress(what, done, total)
+            self.progress(what, done, total)
 
         evaluations = evaluate_all(self.study, settings, self._pool, one_more)
         self.simulated += total
@@ -74,7 +74,7 @@ class Bench:
 
     def of(self, study: Study) -> Bench:
         """A bench of another study, on the same pool."""
-        return Bench(study, self._pool, self._progress)
+        return Bench(study, self._pool, self.progress)
 
 
 @contextmanager

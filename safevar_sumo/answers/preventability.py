@@ -20,13 +20,16 @@ from safevar_sumo.answers.bench import Bench
 from safevar_sumo.answers.risk import interval_of
 from safevar_sumo.answers.words import number_of
 from safevar_sumo.records import FloatArray
-from safevar_sumo.simulation import System, assemble, simulate, study_at
+from safevar_sumo.simulation import System, assemble, at_every_point, simulate, study_at, worst_points
 from safevar_sumo.study import ModelTable, Study
 
 CONFIDENCE = 0.95
 """Of the interval of a sample's share."""
 LIMIT = 20_000
 """Simulations, about, that a study's preventability may take; of more collisions a random sample is looked at."""
+
+TOGETHER = 20
+"""Settings that are simulated at all points of a matrix at once: enough to fill its simulations."""
 
 
 class PreventableBy(StrEnum):
@@ -117,13 +120,13 @@ def preventable_by(bench: Bench, settings: FloatArray) -> list[PreventableBy | N
 
 
 def _worst_points(bench: Bench, system: System, settings: FloatArray) -> npt.NDArray[np.intp]:
-    """For every setting the number of the point with the least safety degree; among equals the first by name."""
-    if not system.matrix or not len(settings):
-        return np.zeros(len(settings), dtype=np.intp)
-    order = sorted(range(len(system.points)), key=lambda k: system.points[k].name)
-    degrees = [bench.of(study_at(bench.study, name, name)).evaluate(settings, f"collisions at {name}").f_safe
-               for name in (system.points[k].name for k in order)]
-    return np.asarray(np.array(order)[np.argmin(np.where(np.isnan(degrees), np.inf, degrees), axis=0)])
+    """For every setting the number of the point where it comes off worst."""
+    worst = np.zeros(len(settings), dtype=np.intp)
+    if system.matrix:
+        for start in range(0, len(settings), TOGETHER):
+            bench.progress("worst points of the collisions", start, len(settings))
+            worst[start:start + TOGETHER] = worst_points(at_every_point(system, settings[start:start + TOGETHER]))
+    return worst
 
 
 def _at_one_point(bench: Bench, system: System, settings: FloatArray) -> list[PreventableBy | None]:

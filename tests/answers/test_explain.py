@@ -79,6 +79,10 @@ def test_the_records_are_those_of_the_solutions(case: Case, told: Explained) -> 
         assert one["because"].startswith("The original stops")
     assert list(last) == ["summary"]
     assert list(last["summary"]) == ["necessary", "changed", "necessary_interval", "preventable"]
+    preventable = last["summary"]["preventable"]
+    assert list(preventable) == ["competent_driver", "full_braking", "nobody", "looked_at", "interval_competent_driver"]
+    assert sum(list(preventable.values())[:3]) == pytest.approx(1)
+    assert preventable["looked_at"] == told.failures
     assert all(share <= last["summary"]["changed"][name] for name, share in last["summary"]["necessary"].items())
 
 

@@ -38,7 +38,7 @@ def vehicle(brakes: float = 1.0, max_rpm: float = 1.0) -> FloatArray:
 
 def test_a_competent_driver_avoids_what_a_short_sighted_system_does_not_and_nobody_stops_without_brakes() -> None:
     both = np.stack([vehicle(), vehicle(brakes=0.1)])
-    assert preventable_by(bench(test="CPFA", speed=40), both) == [PreventableBy.COMPETENT_DRIVER, PreventableBy.NOBODY]
+    assert preventable_by(bench(test="CPFA", speed=30), both) == [PreventableBy.COMPETENT_DRIVER, PreventableBy.NOBODY]
 
 
 def test_a_child_that_comes_out_late_is_avoided_by_full_braking_alone() -> None:
@@ -48,7 +48,7 @@ def test_a_child_that_comes_out_late_is_avoided_by_full_braking_alone() -> None:
 def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     """Of 60 collisions, the 40 of the lowest engine speeds are the brakeless ones: those that come first when settings are sorted."""
     collisions = np.stack([vehicle(0.1, 1 - (60 - k) / 1e6) for k in range(40)] + [vehicle(1.0, 1 - k / 1e6) for k in range(20)])
-    here = bench(test="CPFA", speed=40)
+    here = bench(test="CPFA", speed=30)
     whole = preventability(here, np.concatenate([collisions, collisions])).to_dict()
     assert whole == {"competent_driver": pytest.approx(1 / 3), "full_braking": 0, "nobody": pytest.approx(2 / 3), "looked_at": 60,
                      "interval_competent_driver": [pytest.approx(1 / 3)] * 2}
@@ -70,7 +70,7 @@ def test_reference_drivers_approach_as_the_driving_system_does() -> None:
     danger = int(np.argmax(theirs.gap[:, 0] < 2 * theirs.speed[:, 0]))
     assert theirs.speed[danger, 0] > 4
     assert np.array_equal(theirs.position[:danger + 1], his.position[:danger + 1])
-    assert approach(assemble(bench(test="CPFA", speed=40).study)) == {}
+    assert approach(assemble(bench(test="CPFA", speed=30).study)) == {}
 
 
 def test_in_a_matrix_the_worst_point_counts() -> None:
@@ -83,5 +83,5 @@ def test_in_a_matrix_the_worst_point_counts() -> None:
 
 
 def test_without_a_collision_shares_are_undefined() -> None:
-    told = preventability(bench(test="CPFA", speed=40), np.zeros((0, len(NAMES))))
+    told = preventability(bench(test="CPFA", speed=30), np.zeros((0, len(NAMES))))
     assert (told.to_dict()["competent_driver"], told.to_dict()["looked_at"], str(told)) == (None, 0, "")
