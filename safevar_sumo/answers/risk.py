@@ -50,6 +50,11 @@ class Risk:
         return self.failures / self.samples
 
     @property
+    def of_domain(self) -> bool:
+        """Whether it is a share of the domain, no probability in the field: the study does not say how vehicles vary."""
+        return not self.study.variation
+
+    @property
     def interval(self) -> tuple[float, float]:
         return interval_of(self.failures, self.samples, self.confidence)
 

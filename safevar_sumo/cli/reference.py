@@ -24,6 +24,7 @@ from safevar_sumo.reference import (
     calibration_comment,
     evaluations_of,
     fitted_as,
+    keep_totals,
     original_metrics,
     plot_agreement,
     read_reference,
@@ -41,13 +42,17 @@ from safevar_sumo.vehicles import CharacteristicSet
 @click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw here against reference.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, as_json: bool) -> None:
+@click.option("--totals", type=click.Path(path_type=Path), metavar="FILE.toml",
+              help="Keep rank correlations, errors and counts of collisions there too: no row of the data.")
+def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, as_json: bool, totals: Path | None) -> None:
     """Compare STUDY with settings and metrics in the published package's CSV format."""
     chosen = load_study(study)
     tell_remarks(chosen)
     system = assemble(chosen, study)
     if plot is not None:
         check_output(plot, "--plot", PICTURES)
+    if totals is not None:
+        check_output(totals, "--totals", (".toml",))
     data = _read(reference, system.characteristics)
     settings = np.concatenate([system.characteristics.original[np.newaxis], data.settings])
     with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
@@ -60,6 +65,8 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     if plot is not None:
         plot_agreement(plot, f"{chosen.title}\nagainst {reference.name}", system.characteristics, data, here,
                        chosen.repeatability.get("safety_degree"))
+    if totals is not None:
+        keep_totals(totals, chosen, reference.name, result)
     if as_json:
         click.echo(json.dumps(result.to_dict(), indent=2, allow_nan=False))
     else:

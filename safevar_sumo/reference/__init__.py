@@ -5,7 +5,9 @@ from safevar_sumo.reference.agreement import Agreement, agreement, plot_agreemen
 from safevar_sumo.reference.calibration import Calibration, calibrate, fitted_as
 from safevar_sumo.reference.imported import evaluations_of, original_metrics
 from safevar_sumo.reference.parameters import with_values
+from safevar_sumo.reference.published import Totals, keep_totals, quoted
 from safevar_sumo.reference.rows import ReferenceData, package_filter, read_reference
 
-__all__ = ["Agreement", "Calibration", "ReferenceData", "agreement", "calibrate", "calibration_comment", "cost_line", "evaluations_of",
-           "fitted_as", "on_a_bound", "original_metrics", "package_filter", "plot_agreement", "read_reference", "with_values"]
+__all__ = ["Agreement", "Calibration", "ReferenceData", "Totals", "agreement", "calibrate", "calibration_comment", "cost_line",
+           "evaluations_of", "fitted_as", "keep_totals", "on_a_bound", "original_metrics", "package_filter", "plot_agreement", "quoted",
+           "read_reference", "with_values"]

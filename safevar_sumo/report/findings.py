@@ -10,11 +10,12 @@ from markupsafe import Markup
 from safevar_sumo.analysis.quality import nondominated
 from safevar_sumo.answers import explain
 from safevar_sumo.answers.bench import Progress
+from safevar_sumo.answers.robustness import is_borderline
 from safevar_sumo.report.material import Material
 from safevar_sumo.report.stored import stored
 from safevar_sumo.report.svg import Bar, rows
 from safevar_sumo.results import Handle, chosen_handle, unsafe_rows
-from safevar_sumo.showing.comparison import changes_in_words, differences, raised
+from safevar_sumo.showing.comparison import differences, number, raised, spaced
 
 Found = list[dict[str, Any]]
 """What `explain --json` prints."""
@@ -72,12 +73,6 @@ def causes(found: Found, material: Material) -> list[dict[str, Any]]:
     return [_told(material, place, one) for place, one in enumerate(ordered, 1)]
 
 
-def least_cause(found: Found, material: Material) -> dict[str, Any] | None:
-    """The minimal cause of the fewest changes, of those the one whose largest is smallest; the first of `causes`."""
-    all_of_them = [cause for failure in found for cause in _with_changes(failure)]
-    return min(all_of_them, key=lambda cause: _size(material, cause), default=None)
-
-
 def _with_changes(failure: dict[str, Any]) -> list[dict[str, Any]]:
     """The minimal causes of a failure; none where the original vehicle itself is unsafe, which no change causes."""
     return [cause for cause in failure.get("minimal_causes", []) if cause["changes"]]
@@ -95,15 +90,18 @@ def _size(material: Material, cause: dict[str, Any]) -> tuple[int, float]:
 
 def _told(material: Material, place: int, one: dict[str, Any]) -> dict[str, Any]:
     cause = one["cause"]
-    setting, boundary = material.setting_with(cause["changes"]), material.setting_with(cause["boundary"])
+    setting = material.setting_with(cause["changes"])
     members = {member.name: member for member in material.case.characteristics}
-    table = [{"name": name, "unit": "" if members[name].unit == "-" else members[name].unit, "original": members[name].original,
-             "boundary": cause["boundary"][name], "value": value} for name, value in cause["changes"].items()]
+    table = [{"name": name, "short": members[name].short_name, "words": members[name].words,
+              **{what: f"{number(one)}{spaced(members[name].unit)}" for what, one in (
+                  ("original", members[name].original), ("value", value), ("boundary", cause["boundary"][name]))}}
+             for name, value in cause["changes"].items()]
     comparison = material.compared(setting)
     return {"title": f"Cause {place}: {', '.join(cause['changes'])}", "anchor": material.anchor("cause", place), "rows": table,
             "end": comparison.verdict(comparison.rows[-1]), "because": one["because"], "robustness": one["robustness"],
+            "borderline": one["robustness"] is not None and is_borderline(one["robustness"]),
             "handle": one["handle"], "where": material.where(setting),
-            "whole": material.anchor("replay", one["handle"]), "boundary": changes_in_words(material.case.characteristics, boundary),
+            "whole": material.anchor("replay", one["handle"]),
             "fraction": cause["fraction"], "below": cause["end"], "replay": material.replay(setting)}
 
 
@@ -116,7 +114,7 @@ def replays(material: Material, explained: Found | None) -> list[dict[str, Any]]
         row, setting = material.solutions[handle], material.setting_of(Handle.parse(handle))
         one = {"handle": handle, "anchor": material.anchor("replay", handle), "f_safe": row["f_safe"], "f_diff": row["f_diff"],
                "f_num_diff": row["f_num_diff"], "outcome": row["outcome"], "open": place == 0 and not explained,
-               "differences": [], "where": None, "changes": changes_in_words(material.case.characteristics, setting)}
+               "differences": [], "where": None, "changes": material.changes(setting)}
         told.append(one if material.system is None else {
             **one, "replay": material.replay(setting), "where": material.where(setting),
             "differences": differences(material.again([setting])[0].evaluation, row)})

@@ -35,9 +35,8 @@ def risk(material: Material, jobs: int | None, progress: Progress) -> Found:
 
     found = stored(material, "risk", compute)
     study = material.case.study
-    varied = "[variation]" if getattr(study, "variation", None) else "uniformly over their domains"
-    varied += " with [[correlations]]" if getattr(study, "correlations", None) else ""
-    return {**found, "varied": varied, "chart": _sensitivity(material, found["sensitivity"])}
+    return {**found, "of_domain": not study.variation, "correlated": bool(study.correlations),
+            "chart": _sensitivity(material, found["sensitivity"])}
 
 
 def rules(material: Material, jobs: int | None, progress: Progress) -> Found:

@@ -22,6 +22,7 @@ from safevar_sumo.report.places import failing_places
 from safevar_sumo.results import Handle, handles
 from safevar_sumo.results.manifest import read_manifest
 from safevar_sumo.showing import Comparison, compare
+from safevar_sumo.showing.comparison import changes_in_words
 from safevar_sumo.showing.page import player_data
 from safevar_sumo.showing.scene import scene_of
 from safevar_sumo.simulation import System, aggregated, assemble, at_every_point, evaluate, study_at
@@ -75,6 +76,12 @@ class Material:
         for name, value in changes.items():
             setting[self.case.characteristics.names.index(name)] = value
         return setting
+
+    def changes(self, setting: FloatArray) -> list[dict[str, str]]:
+        """What differs from the original: a text with both values, and what the characteristic is, where the study says so."""
+        members = [member for member, value in zip(self.case.characteristics, setting.tolist(), strict=True) if value != member.original]
+        texts = changes_in_words(self.case.characteristics, setting)
+        return [{"text": text, "short": member.short_name, "words": member.words} for member, text in zip(members, texts, strict=True)]
 
     def compared(self, setting: FloatArray) -> Comparison:
         """A setting simulated beside the original vehicle, once."""

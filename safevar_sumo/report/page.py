@@ -22,15 +22,15 @@ from safevar_sumo.showing.page import environment, player_parts
 
 WEB = Path(__file__).parent / "web"
 SECTIONS = {
-    "tested": "What was tested",
     "verdict": "Verdict",
-    "causes": "What does it, and how it looks",
-    "tolerance": "How far each characteristic may go",
-    "risk": "How likely it is",
-    "rules": "Where failures lie, as rules",
-    "questions": "The research questions",
+    "tested": "What was tested",
+    "causes": "Causes",
+    "tolerance": "Tolerances",
+    "risk": "Share of unsafe vehicles",
+    "rules": "Failure regions",
+    "questions": "Research questions",
     "trust": "What was not tested, and how far to trust it",
-    "reproduce": "How to make every number again",
+    "reproduce": "How to reproduce every number",
 }
 """The sections of a report by the names that `--only` takes, in their order."""
 
@@ -103,7 +103,7 @@ def _study(material: Material, wanted: Sequence[str], jobs: int | None, progress
     shown = replays(material, explained) if "causes" in wanted else []
     made: dict[str, Callable[[], Any]] = {
         "tested": lambda: tested(material),
-        "verdict": lambda: verdict(material, explained),
+        "verdict": lambda: verdict(material, explained, limits.get("tolerance")),
         "causes": lambda: causes(explained or [], material),
         "necessity": lambda: necessity(explained or [], material),
         "trust": lambda: trust(material, explained)}

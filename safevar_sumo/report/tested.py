@@ -20,15 +20,15 @@ def tested(material: Material) -> dict[str, Any]:
     """Two sentences, and the characteristics that were varied."""
     case, study = material.case, material.case.study
     return {
-        "who": f"A vehicle ({_described(VEHICLES, study.vehicle.model) or study.vehicle.model}) of which "
-               f"{number_of(len(case.characteristics), 'characteristic')} may vary is driven by "
-               f"{_named(ADS, study.ads.model)} in the scenario {_named(SCENARIOS, study.scenario.model)}, "
-               f"{_where(material)}.",
+        "who": f"Vehicle: {_described(VEHICLES, study.vehicle.model) or study.vehicle.model} "
+               f"({number_of(len(case.characteristics), 'varied characteristic')}). Driving system: {_named(ADS, study.ads.model)}. "
+               f"Scenario: {_named(SCENARIOS, study.scenario.model)}; {_where(material)}.",
         "tags": "" if material.system is None else tags(material.system.points),
         "how": _how(material),
         "characteristics": [
             {"name": one.name, "unit": "" if one.unit == "-" else raised(one.unit), "original": number(one.original),
-             "lower": number(one.lower), "upper": number(one.upper), "threshold": number(one.threshold)} for one in case.characteristics],
+             "lower": number(one.lower), "upper": number(one.upper), "threshold": number(one.threshold),
+             "words": one.words} for one in case.characteristics],
         "remarks": [*case.remarks, *([material.lacking] if material.lacking else []),
                     *(vehicle_remarks(material.system) if material.system else [])]}
 

@@ -11,18 +11,20 @@ from typing import Any
 
 import msgspec
 
+from safevar_sumo.answers.robustness import BORDERLINE, is_borderline
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.options import RUN
 from safevar_sumo.records import Outcome
 from safevar_sumo.report.findings import Found
 from safevar_sumo.report.material import Material
+from safevar_sumo.report.verdict import agreement
 from safevar_sumo.study import Study, load_study, study_names
 
 NOT_MODELLED = (
     "A search finds failures; that it finds none proves nothing about what it did not try.",
     "One vehicle in its lane: no steering beyond lane keeping, no single wheels and axles, no suspension, no wind, no sensor "
     "noise, no traffic beyond the scenario's own, unless the study says otherwise.",
-    "Driving system and vehicle are models. docs/trust.md tells how far the ones of the published settings agree with its raw data.",
+    "Driving system and vehicle are models: the tables below show how far they agree with published data, where there is any.",
 )
 
 
@@ -42,12 +44,12 @@ def trust(material: Material, explained: Found | None) -> dict[str, Any]:
     if explained:
         shares = [failure["robustness"] for failure in explained if failure.get("robustness") is not None]
         if shares:
-            fragile = sum(share < 0.8 for share in shares)
-            told.append(f"Of {len(shares)} failures looked into, {fragile} hang on a hair: "
-                        "fewer than 80 % of their neighbours are unsafe too.")
+            fragile = sum(map(is_borderline, shares))
+            told.append(f"{fragile} of {len(shares)} failures analysed are borderline: "
+                        f"fewer than {BORDERLINE:.0%} of their neighbours are unsafe too.")
     if not rows:
         told.append("No published values of the original vehicle are known to hold the study against.")
-    return {"published": rows, "told": told, "general": NOT_MODELLED}
+    return {"published": rows, "told": told, "general": NOT_MODELLED, "agreement": agreement(material)["rows"]}
 
 
 def reproduce(materials: Sequence[Material], parts: Sequence[str]) -> list[dict[str, str]]:

@@ -1,38 +1,46 @@
-"""The verdict: what makes the original vehicle's driving system unsafe, in a few sentences."""
+"""The verdict: what makes the original vehicle's driving system unsafe, in a few sentences and four figures."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from safevar_sumo.analysis.case import collided
-from safevar_sumo.answers import joined
-from safevar_sumo.report.findings import Found, least_cause
+from safevar_sumo.answers.explanation import REASONS, ROBUST
+from safevar_sumo.answers.robustness import is_borderline
+from safevar_sumo.records import FloatArray
+from safevar_sumo.reference import Totals, quoted
+from safevar_sumo.report.findings import Found, handle_of
 from safevar_sumo.report.material import Material
-from safevar_sumo.results import CHOICES, Handle, chosen_handle, unsafe_rows
-from safevar_sumo.showing.comparison import changes_in_words
+from safevar_sumo.results import Handle, chosen_handle, unsafe_rows
 
-ASKED = {"fewest": "With the fewest changes", "smallest": "With the smallest changes", "most_severe": "Most severe"}
+TITLES = {ROBUST: "Smallest robust failure", REASONS["fewest"]: "Fewest changes", REASONS["smallest"]: "Smallest changes",
+          REASONS["most_severe"]: "Most severe"}
+KMH = 3.6
+"""km/h in 1 m/s."""
+UNKNOWN = "–"  # noqa: RUF001
 
 
-def verdict(material: Material, explained: Found | None) -> dict[str, Any]:
-    """What happened to the original vehicle, and the changes that make it unsafe, the smallest first."""
+def verdict(material: Material, explained: Found | None, tolerance: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What happened to the original vehicle, and what makes it unsafe: the smallest robust failure first, every other one with a badge.
+
+    All values of a failure are those of its solution as it was found, nowhere shrunk.
+    """
     case = material.case
     degree = case.original["safety_degree"]
     unsafe = case.solutions[unsafe_rows(case.solutions, degree)]
     hits = bool(collided(case.solutions).any())
-    told: dict[str, Any] = {"unsafe": len(unsafe), "solutions": len(case.solutions), "rule": _rule(hits, degree), "findings": [],
-                            "original": _original(material), "hits": hits}
+    result: dict[str, Any] = {"unsafe": len(unsafe), "solutions": len(case.solutions), "rule": _rule(hits, degree), "findings": [],
+                              "original": _original(material), "hits": hits, "figures": [], "agreement": agreement(material)}
     if unsafe.empty and case.solutions.empty:
-        told["headline"] = "No solution was found: nothing to tell a failure from."
-        return told
-    choices = list(CHOICES) if len(unsafe) else ["most_severe"]
-    for choice in sorted(choices, key=list(ASKED).index):
-        handle = chosen_handle(case.solutions, degree, choice, material.place)
-        told["findings"].append(_finding(material, ASKED[choice], handle))
-    told["headline"] = _headline(told, explained, material)
-    return told
+        result["headline"] = "No solution was found: nothing to tell a failure from."
+        return result
+    result["findings"] = _findings(material, explained or [], any_unsafe=not unsafe.empty)
+    result["headline"] = _headline(result, material, explained)
+    result["figures"] = _figures(result, material, explained or [], tolerance)
+    return result
 
 
 def _rule(hits: bool, degree: float) -> str:
@@ -47,35 +55,130 @@ def _original(material: Material) -> str:
     return f"The original vehicle {material.compared(material.case.characteristics.original).verdict(0)}."
 
 
-def _headline(told: dict[str, Any], explained: Found | None, material: Material) -> str:
-    what = "collide" if told["hits"] else "unsafe"
-    if not told["unsafe"]:
-        return f"Nothing unsafe was found among {told['solutions']} solutions; the nearest miss is told below."
-    if material.original_fails:
-        return "No change is needed: the original vehicle itself collides."
-    least = least_cause(explained, material) if explained else None
-    changes = told["findings"][0]["changes"] if least is None else _changes(material, material.setting_with(least["boundary"]))
-    if len(changes) == 1:
-        return f"One change is enough to make it {what}: {changes[0]}."
-    return f"The fewest changes found that make it {what}: {joined(changes)}."
+def _findings(material: Material, explained: Found, *, any_unsafe: bool) -> list[dict[str, Any]]:
+    """The failures worth a sentence, each once, with all that it was chosen for; without explanations, chosen among the solutions alone."""
+    reasons: dict[str, list[str]] = {}
+    shares: dict[str, float] = {}
+    for failure in explained:
+        for reason in failure.get("reasons", []):
+            if reason in TITLES and handle_of(failure):
+                reasons.setdefault(handle_of(failure), []).append(reason)
+                shares[handle_of(failure)] = failure["robustness"]
+    if not reasons:
+        degree = material.case.original["safety_degree"]
+        for choice in REASONS if any_unsafe else ("most_severe",):
+            handle = chosen_handle(material.case.solutions, degree, choice, material.place)
+            reasons.setdefault(str(handle), []).append(REASONS[choice])
+    order = list(TITLES)
+    chosen = sorted(reasons.items(), key=lambda one: min(order.index(reason) for reason in one[1]))
+    return [_finding(material, handle, of_it, shares.get(handle)) for handle, of_it in chosen]
 
 
-def _finding(material: Material, title: str, handle: Handle) -> dict[str, Any]:
-    setting = material.setting_of(handle)
-    changes = _changes(material, setting)
-    share = float(material.case.characteristics.largest_change(setting[np.newaxis])[0])
-    return {"title": title, "handle": str(handle), "anchor": material.anchor("replay", handle), "changes": changes,
-            "end": _end(material, handle, setting), "where": material.where(setting),
-            "size": f"{len(changes)} of {len(setting)} characteristics changed, by {share:.0%} at the most"}
+def _finding(material: Material, handle: str, reasons: list[str], share: float | None) -> dict[str, Any]:
+    setting = material.setting_of(Handle.parse(handle))
+    changes = material.changes(setting)
+    largest = float(material.case.characteristics.largest_change(setting[np.newaxis])[0])
+    titles = [TITLES[reason] for reason in TITLES if reason in reasons]
+    return {"title": "; ".join([titles[0], *(title.lower() for title in titles[1:])]), "handle": handle, "reasons": reasons,
+            "anchor": material.anchor("replay", handle), "changes": changes, "end": _end(material, handle, setting),
+            "where": material.where(setting), "share": share, "borderline": share is not None and is_borderline(share),
+            "size": f"{len(changes)} of {len(setting)} characteristics changed, by at most {largest:.0%}",
+            "short": f"{_changes(len(changes))} of at most {largest:.0%}", "f_safe": material.solutions[handle]["f_safe"]}
 
 
-def _end(material: Material, handle: Handle, setting: np.ndarray) -> str:
+def _end(material: Material, handle: str, setting: FloatArray) -> str:
     if material.system is None:
-        return f"safety degree {material.solutions[str(handle)]['f_safe']:.2f}"
+        return f"safety degree {material.solutions[handle]['f_safe']:.2f}"
     comparison = material.compared(setting)
     return comparison.verdict(comparison.rows[-1])
 
 
-def _changes(material: Material, setting: np.ndarray) -> list[str]:
-    return changes_in_words(material.case.characteristics, setting)
+def _headline(result: Mapping[str, Any], material: Material, explained: Found | None) -> str:
+    if not result["unsafe"]:
+        return f"Nothing unsafe among {result['solutions']} solutions; the nearest miss is shown below."
+    if material.original_fails:
+        return "No change is needed: the original vehicle itself collides."
+    first = result["findings"][0]
+    what = "a collision" if result["hits"] else "an unsafe outcome"
+    number = len(first["changes"])
+    suffice = f"{_changes(number)} {'suffices' if number == 1 else 'suffice'} for {what}"
+    if ROBUST in first["reasons"]:
+        return f"{suffice} that is robust: the vehicle {first['end']}."
+    if explained:
+        return f"Every failure that was tried is borderline. {suffice} of the one with the fewest changes: the vehicle {first['end']}."
+    return f"{suffice}: the vehicle {first['end']}."
 
+
+def _changes(number: int) -> str:
+    return "1 change" if number == 1 else f"{number} changes"
+
+
+def _figures(result: Mapping[str, Any], material: Material, explained: Found, tolerance: Mapping[str, Any] | None) -> list[dict[str, str]]:
+    """The four key figures, each a title, a value and a note."""
+    by_reason = {reason: one for one in result["findings"] for reason in one["reasons"]}
+    preventable = next((one["summary"].get("preventable") for one in explained if "summary" in one), None)
+    return [_smallest(by_reason.get(ROBUST), explained, result), _severity(by_reason.get(REASONS["most_severe"]), material),
+            _avoided(preventable, result), _together(tolerance)]
+
+
+def _smallest(robust: Mapping[str, Any] | None, explained: Found, result: Mapping[str, Any]) -> dict[str, str]:
+    title = TITLES[ROBUST]
+    if robust is None:
+        tried = "every failure that was tried is borderline" if explained else "not computed"
+        note = tried if result["unsafe"] else "nothing is unsafe"
+        return {"title": title, "value": UNKNOWN, "note": note}
+    return {"title": title, "value": robust["short"], "note": f"{robust['share']:.0%} of its neighbours are unsafe too"}
+
+
+def _severity(worst: Mapping[str, Any] | None, material: Material) -> dict[str, str]:
+    degree = float(material.case.solutions["f_safe"].min()) if worst is None else worst["f_safe"]
+    if degree < 0:
+        return {"title": "Most severe", "value": f"collision at {-degree:.1f} m/s", "note": f"{-KMH * degree:.0f} km/h"}
+    return {"title": "Most severe", "value": f"{degree:.2f} m to spare", "note": "no collision among the solutions"}
+
+
+def _avoided(preventable: Mapping[str, Any] | None, result: Mapping[str, Any]) -> dict[str, str]:
+    title = "A competent driver avoids"
+    if preventable is None or preventable["competent_driver"] is None:
+        return {"title": title, "value": UNKNOWN, "note": "not computed" if result["hits"] else "there is no collision to avoid"}
+    low, high = preventable["interval_competent_driver"]
+    sampled = "all" if low == high else f"95 % interval {low:.0%} to {high:.0%};"
+    note = f"in the same vehicle ({sampled} {preventable['looked_at']} collisions looked at)"
+    return {"title": title, "value": f"{preventable['competent_driver']:.0%} of the collisions", "note": note}
+
+
+def _together(tolerance: Mapping[str, Any] | None) -> dict[str, str]:
+    title = "All characteristics together may go"
+    if tolerance is None:
+        return {"title": title, "value": UNKNOWN, "note": "not computed"}
+    factor, samples = tolerance["joint"]["factor"], tolerance["joint"]["samples"]
+    if not factor:
+        return {"title": title, "value": "nowhere", "note": "no box around the original is safe"}
+    return {"title": title, "value": f"{factor:.1%} of the way",
+            "note": f"from the original to the ends of their domains; none of {samples} vehicles within is unsafe"}
+
+
+def agreement(material: Material) -> dict[str, Any]:
+    """How well the study agrees with published data: a sentence, and the rows of a table; none where nothing is known."""
+    known = quoted(material.case.study)
+    if not known:
+        return {"sentence": "This study was not compared with published data: how far another simulator or a real vehicle does the same "
+                            "is unknown.", "rows": []}
+    first = max(known, key=lambda one: (one.reference, one.rows))
+    shares = "no published collision is among them" if first.recall is None else (
+        f"{first.both} of the {first.reference} published collisions collide here too (recall {first.recall:.2f})")
+    if first.precision is not None:
+        shares += f", and {first.both} of the {first.here} here are published ones (precision {first.precision:.2f})"
+    rho = first.spearman.get("safety_degree")
+    order = "" if rho is None else f" safety degrees are in the same order with a rank correlation of {rho:.2f} (1 is perfect);"
+    return {"sentence": f"Agreement with published data, {first.rows} vehicles simulated again:{order} {shares}.",
+            "rows": [_row(one) for one in known]}
+
+
+def _row(one: Totals) -> dict[str, str]:
+    def decimal(value: float | None) -> str:
+        return UNKNOWN if value is None else f"{value:.2f}"
+
+    return {"file": one.file, "vehicles": str(one.rows), "rho": decimal(one.spearman.get("safety_degree")),
+            "error": decimal(one.mean_absolute_error.get("safety_degree")), "reference": str(one.reference), "here": str(one.here),
+            "both": str(one.both), "recall": decimal(one.recall), "precision": decimal(one.precision)}

@@ -19,7 +19,10 @@ def print_risk(console: Console, told: Risk) -> None:
     low, high = told.interval
     _say(console, told.study.title)
     _say(console, f"Unsafe: {told.unsafe}. {told.failures} of {told.samples} vehicles.")
-    _say(console, f"Probability {told.probability:.4g}, with {told.confidence:.0%} confidence from {low:.4g} to {high:.4g}.")
+    name = "Share of the domain that is unsafe:" if told.of_domain else "Probability"
+    _say(console, f"{name} {told.probability:.4g}, with {told.confidence:.0%} confidence from {low:.4g} to {high:.4g}.")
+    if told.of_domain:
+        _say(console, "warning: this is no probability in the field: the study has no [variation] table that says how real vehicles vary.")
     _say(console, _variation(told.study))
     if told.sensitivity is None or told.sensitivity_of_unsafe is None:
         return

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import re
+from io import StringIO
 from typing import Any
 
 import msgspec
@@ -20,6 +21,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import load_study
 from safevar_sumo.terminal.risk import print_risk
+from safevar_sumo.variation import Distribution
 
 
 def of(region: Region, **options: Any) -> Risk:
@@ -58,6 +60,17 @@ def test_sobol_indices_of_ishigamis_function() -> None:
     assert (frame["first_order_lower"] < frame["first_order"]).all()
     assert told.sensitivity_of_unsafe is not None
     assert told.sensitivity_of_unsafe["total"].isna().all()
+
+
+@pytest.mark.parametrize(("variation", "says", "warns"), [
+    ({}, "Share of the domain that is unsafe: 0.", True), ({"a": {"distribution": "normal", "deviation": 1.0}}, "Probability 0.", False)])
+def test_a_share_of_the_domain_is_not_called_a_probability(variation: dict[str, Any], says: str, warns: bool) -> None:
+    study = msgspec.structs.replace(made_up_study(2), variation=msgspec.convert(variation, dict[str, Distribution]))
+    console = Console(file=StringIO(), width=200)
+    print_risk(console, risk(study, unsafe="collision", samples=200, pool=Plant(study, box)))
+    printed = console.file.getvalue()  # type: ignore[attr-defined]
+    assert says in printed
+    assert ("no probability in the field" in printed) == warns
 
 
 def test_the_promised_record_and_the_same_again() -> None:

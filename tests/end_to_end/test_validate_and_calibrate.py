@@ -40,7 +40,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_validate_agrees_perfectly_with_itself(data: Path, in_tmp: Path) -> None:
-    told = json.loads(run("validate", "sun", str(data), "--json", "--plot", "plot.png").stdout)
+    told = json.loads(run("validate", "sun", str(data), "--json", "--plot", "plot.png", "--totals", "kept.toml").stdout)
     assert list(told) == ["rows", "spearman", "mean_absolute_error", "bias", "collisions", "original", "precision", "recall",
                           "collision_speed", "in_repeats", "undecided", "by_predicted"]
     assert told["rows"] == 40
@@ -50,6 +50,9 @@ def test_validate_agrees_perfectly_with_itself(data: Path, in_tmp: Path) -> None
         assert set(told["original"][name]) == {"reference", "here"}
     assert told["collisions"]["reference"] == told["collisions"]["here"] == told["collisions"]["both"]
     assert (in_tmp / "plot.png").stat().st_size > 50_000
+    kept = tomllib.loads((in_tmp / "kept.toml").read_text())["sun"]["mine.csv"]
+    assert (kept["rows"], kept["collisions"]) == (40, told["collisions"])
+    assert kept["spearman"]["safety_degree"] == pytest.approx(1.0)
 
 
 def test_validate_prints_a_table(data: Path) -> None:

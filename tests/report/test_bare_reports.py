@@ -58,7 +58,7 @@ def test_what_comes_from_outside_is_called_by_its_name_once(slippery: Path) -> N
     others: Any = SimpleNamespace(case=dataclasses.replace(material.case, study=study), manifest=material.manifest, lacking="", point="",
                                   system=SimpleNamespace(points=points, matrix=()))
     told = what.tested(others)
-    assert "is driven by my_controller:Pilot in the scenario pedestrian_crossing (" in told["who"]
+    assert "Driving system: my_controller:Pilot. Scenario: pedestrian_crossing (" in told["who"]
     assert "NSGA-II (1 run)" in told["how"]
     assert told["tags"] == "It is by day; the scenario tells no pre-crash type."
 

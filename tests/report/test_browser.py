@@ -139,11 +139,22 @@ def axe(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.mark.slow
-def test_it_prints(browser: Chrome, report: Path) -> None:
+def test_it_prints_on_few_pages_with_all_values_and_nothing_to_press(browser: Chrome, report: Path) -> None:
     opened(browser, report)
     printed = base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", {"printBackground": True})["data"])
     assert printed.startswith(b"%PDF")
-    assert printed.count(b"/Type /Page\n") >= 3
+    assert 3 <= printed.count(b"/Type /Page\n") <= 8
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    try:
+        every = "return document.querySelectorAll(arguments[0]).length"
+        seen = "return [...document.querySelectorAll(arguments[0])].filter((one) => one.checkVisibility()).length"
+        assert browser.execute_script(seen, ".controls, nav, .play") == 0
+        stills = browser.execute_script(seen, ".player")
+        assert stills == browser.execute_script(every, ".causes > div"), "one still for each cause"
+        values = "details li, details td"
+        assert browser.execute_script(seen, values) == browser.execute_script(every, values) > 0, "closed details are printed too"
+    finally:
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
 
 
 @pytest.mark.slow
@@ -151,7 +162,7 @@ def test_without_javascript_it_stands_still_and_tells_the_same(browser: Chrome, 
     browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     try:
         opened(browser, report)
-        assert "The fewest changes found that make it collide" in browser.find_element(By.TAG_NAME, "main").text
+        assert "Smallest robust failure" in browser.find_element(By.TAG_NAME, "main").text
         player = browser.find_element(By.CSS_SELECTOR, ".player")
         assert "hits at" in player.text
         assert not player.find_element(By.CSS_SELECTOR, ".controls").is_displayed()

@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+import html
+import json
+import re
 import shlex
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import pytest
+from click.testing import CliRunner
 
 import safevar_sumo
 from safevar_sumo.cli import study as command
+from safevar_sumo.cli.program import commands
+from safevar_sumo.report import make_report, material
 from safevar_sumo.report.trust import reproduce
 from safevar_sumo.study import Study, load_study
 
 
 def first_command(study: Study) -> list[str]:
-    material: Any = SimpleNamespace(place=Path("its results"), point="", changed=(), case=SimpleNamespace(study=study, has_runs=True))
-    return shlex.split(reproduce([material], [])[0]["command"])
+    one: Any = SimpleNamespace(place=Path("its results"), point="", changed=(), case=SimpleNamespace(study=study, has_runs=True))
+    return shlex.split(reproduce([one], [])[0]["command"])
 
 
 def test_of_a_shipped_study_the_command_asks_for_the_same() -> None:
@@ -42,3 +49,42 @@ def test_any_other_study_is_carried_out_from_what_its_results_record(
     exec(script, {})
     assert asked["study"] == ("its results", study)
     assert asked["out"] == "its results-again"
+
+
+@pytest.mark.slow
+def test_every_printed_command_gives_the_numbers_of_the_page(
+        slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Made from what its own printed commands print, the page is the same to the last byte; the tables' numbers are those of `tables`."""
+    monkeypatch.setattr(material, "SAMPLES", 300)
+    place = tmp_path / "results"
+    shutil.copytree(slippery, place, ignore=shutil.ignore_patterns("answers"))
+    page = make_report([place], jobs=2)
+    commands_of_page = [shlex.split(html.unescape(line)) for line in re.findall("<code>(python -m .*?)</code>", page)]
+    printed = {typed[3]: typed[3:] for typed in commands_of_page}
+    assert {"explain", "tolerance", "risk", "rules", "simulate", "tables", "figures"} <= set(printed)
+
+    answers = place / "answers"
+    for question in ("explain", "tolerance", "risk"):
+        kept = json.loads((answers / f"{question}.json").read_text())
+        told = json.loads(output_of([*printed[question], "--json"]))
+        value = {**told, "verdict": kept["value"]["verdict"]} if question == "tolerance" else told
+        (answers / f"{question}.json").write_text(json.dumps({**kept, "value": value}))
+    assert make_report([place], jobs=2) == page
+
+    words = " ".join(output_of(printed["rules"]).split())
+    rules = json.loads((answers / "rules.json").read_text())["value"]
+    assert f"{rules['share']:.2%} of {rules['samples']} settings" in words
+    assert all(rule.replace("²", "^2").replace("³", "^3") in words for rule in rules["words"])
+    assert json.loads((answers / "tolerance.json").read_text())["value"]["verdict"] in " ".join(output_of(printed["tolerance"]).split())
+
+    cells = {text.strip() for text in re.findall(r"[^|\n]+", output_of([*printed["tables"], "--format", "markdown"]))}
+    section = page[page.index('<h2 id="questions">'):page.index('<h2 id="trust">')]
+    shown = [re.sub("<.*?>", "", html.unescape(cell)) for cell in re.findall("<td.*?>(.*?)</td>", section)]
+    assert len(shown) > 50
+    assert [one for one in shown if one and one not in {cell.strip("*") for cell in cells}] == []
+
+
+def output_of(typed: list[str]) -> str:
+    done = CliRunner().invoke(commands, typed, env={"COLUMNS": "400"})
+    assert done.exit_code == 0, done.output
+    return done.stdout

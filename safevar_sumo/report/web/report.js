@@ -32,6 +32,6 @@ document.addEventListener("click", (event) => {
   if (row && !event.target.closest("a")) { if (location.hash === `#${row.dataset.opens}`) open(); else location.hash = row.dataset.opens; }
 });
 let closed = [];
-addEventListener("beforeprint", () => { closed = [...document.querySelectorAll("details.replay:not([open])")].slice(0, 4); closed.forEach((one) => { one.open = true; }); });
+addEventListener("beforeprint", () => { closed = [...document.querySelectorAll("details:not([open])")]; closed.forEach((one) => { one.open = true; }); });
 addEventListener("afterprint", () => closed.forEach((one) => { one.open = false; }));
 open();
