@@ -56,7 +56,7 @@ def test_what_comes_from_outside_is_called_by_its_name_once(slippery: Path) -> N
     study = replace(material.case.study, ads=replace(material.case.study.ads, model="my_controller:Pilot"))
     points = [Point(scenario, material.case.weather)]  # type: ignore[arg-type]
     others: Any = SimpleNamespace(case=dataclasses.replace(material.case, study=study), manifest=material.manifest, lacking="", point="",
-                                  system=SimpleNamespace(points=points, matrix=()))
+                                  system=SimpleNamespace(points=points, matrix=(), vehicle=None))
     told = what.tested(others)
     assert "Driving system: my_controller:Pilot. Scenario: pedestrian_crossing (" in told["who"]
     assert "NSGA-II (1 run)" in told["how"]
