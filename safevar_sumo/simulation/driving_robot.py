@@ -16,14 +16,14 @@ TOO_FAST, TOO_SLOW = 1.0 * KMH, -0.5 * KMH
 """Tolerance of a test's speed until the system brakes [m/s]: +1.0 and -0.5 km/h (Euro NCAP, test protocols of AEB, test execution)."""
 PROPORTIONAL, INTEGRAL = 1.0, 1.0
 """Gains of the robot [pedal per m/s, pedal per m]: chosen, so that `carla` is within 0.1 km/h 3 s after its pedal stood 0.15 off."""
-BRAKES = 0.03
-"""Brake pedal beyond what holds the speed, from which on the system brakes [-]: about 0.3 m/s^2, at which Euro NCAP has an AEB begin."""
+ACTS = 0.03
+"""Pedal below what holds the speed at which the system acts [-]: about 0.3 m/s^2, at which Euro NCAP has an AEB begin."""
 
 
 class DrivingRobot:
     """Holds N vehicles at the speeds of their tests by accelerator and brake, in the gear that they begin in.
 
-    It acts as long as the system under test neither brakes nor has let go of an accelerator that it had pressed; once the system
+    It drives as long as the system under test neither brakes nor lets up on an accelerator that it had pressed; once the system
     has braked, the vehicle and its automatic gearbox are the system's own. Euro NCAP (test protocol AEB car-to-car, "test execution")
     has an automatic driven in D at a steady speed, a manual one in the highest gear of at least 1,500 r/min, and allows a cruise
     control for the speed: a gearbox that hunts between two gears at a steady speed would be no test.
@@ -44,12 +44,12 @@ class DrivingRobot:
         self._target = np.repeat([np.nan if speed is None else speed for speed in speeds], n // len(points))
         self.tested: BoolArray = ~np.isnan(self._target)
         """Whose scenario is a test at a speed."""
-        self._acts = self.tested.copy()
+        self._drives = self.tested.copy()
         self._any = bool(self.tested.any())
         self._prepared, self._hold_gear = prepared, getattr(vehicle, "hold_gear", None)
-        self._pedal, self._least_brake = state.throttle - state.brake, state.brake + BRAKES
+        self._pedal, self._least_brake = state.throttle - state.brake, state.brake + ACTS
         self._step, self._integral = step, np.zeros(n)
-        self._braked, self._pressed = ~self.tested, np.zeros(n, dtype=bool)
+        self._braked, self._most = ~self.tested, np.full(n, -np.inf)
         self.error = np.where(self.tested, 0.0, np.nan)
         """The deviation from the test's speed that was worst beside the tolerance, while the robot acted [m/s]; NaN without a test."""
 
@@ -60,17 +60,18 @@ class DrivingRobot:
         """
         if not self._any:
             return command, state
-        error = np.where(self._acts, state.speed - self._target, 0.0)
+        error = np.where(self._drives, state.speed - self._target, 0.0)
         self.error = np.where(open_ & (_share(error) > _share(self.error)), error, self.error)
         self._braked |= command.brake > self._least_brake
-        self._pressed |= command.throttle > 0
-        self._acts = ~self._braked & ~(self._pressed & (command.throttle <= 0))
-        error = np.where(self._acts, error, 0.0)
+        asked = command.throttle - command.brake
+        self._most = np.maximum(self._most, asked)
+        self._drives = ~self._braked & (asked >= np.minimum(self._most, self._pedal) - ACTS)
+        error = np.where(self._drives, error, 0.0)
         self._integral = np.minimum(np.maximum(self._integral - error * self._step, -1 / INTEGRAL), 1 / INTEGRAL)
         pedal = self._pedal - PROPORTIONAL * error + INTEGRAL * self._integral
-        held = Command(np.where(self._acts, np.minimum(np.maximum(pedal, 0.0), 1.0), command.throttle),
-                       np.where(self._acts, np.minimum(np.maximum(-pedal, 0.0), 1.0), command.brake))
-        return held, state if self._hold_gear is None else self._hold_gear(self._prepared, state, self._acts)
+        held = Command(np.where(self._drives, np.minimum(np.maximum(pedal, 0.0), 1.0), command.throttle),
+                       np.where(self._drives, np.minimum(np.maximum(-pedal, 0.0), 1.0), command.brake))
+        return held, state if self._hold_gear is None else self._hold_gear(self._prepared, state, self._drives)
 
     @property
     def invalid(self) -> BoolArray:
