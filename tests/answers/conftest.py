@@ -14,7 +14,9 @@ from safevar_sumo.study import Study
 def _made_up_studies_travel_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     pack = many.packed
 
-    def packed(study: Study, **options: Any) -> bytes:
-        return study.name.encode() if study.name == "made-up" else pack(study, **options)
+    def packed(study: Study, *inputs: Any, **options: Any) -> bytes:
+        return study.name.encode() if study.name == "made-up" else pack(study, *inputs, **options)
 
+    read = many.inputs_of
     monkeypatch.setattr(many, "packed", packed)
+    monkeypatch.setattr(many, "inputs_of", lambda study, pool: {} if study.name == "made-up" else read(study, pool))
