@@ -87,7 +87,9 @@ def differences_now(stored: Mapping[str, Any], new: Mapping[str, Any]) -> list[s
     """
     if stored.get("format") != FORMAT:
         return [f"version {stored['versions'].get('safevar_sumo')} wrote them"]
-    found = [told for layer in ("resolved", *OF_FILES, "results") for told in _differences(layer, stored.get(layer, {}), new[layer])]
+    found = [f"{key} is {there!r} there and {here!r} here" for key, there, here in _pairs(stored["resolved"], new["resolved"])
+             if there is not None]  # a key that came later: the number of results tells whether it changes any
+    found += [told for layer in (*OF_FILES, "results") for told in _differences(layer, stored.get(layer, {}), new[layer])]
     there, here = ({name: of["versions"].get(name) for name in SIMULATORS} for of in (stored, new))
     return [*found, *_differences("versions", there, here)]
 

@@ -16,7 +16,7 @@ import pytest
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import JournalBusy, ResultsDirectory, record, solutions_frame
-from safevar_sumo.results.manifest import owner
+from safevar_sumo.results.manifest import FORMAT, differences_now, owner
 from safevar_sumo.study import ModelTable, Study, load_study, tables_of
 
 NAMES = ("a", "b")
@@ -205,3 +205,10 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path, study: Study, monk
     with pytest.raises(SafevarError, match="No space left"):
         directory.finish({})
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_what_is_simulated_now_hangs_on_files_and_the_number_of_results_not_on_keys_that_came_later() -> None:
+    stored = {"format": FORMAT, "resolved": {"a": 1}, "network": {}, "sources": {"x.py": "0"}, "results": 1, "versions": {"numpy": "1"}}
+    assert differences_now(stored, {**stored, "resolved": {"a": 1, "b": False}, "versions": {"numpy": "2"}}) == []
+    assert differences_now(stored, {**stored, "resolved": {"a": 2}, "sources": {}, "results": 2}) == [
+        "a is 1 there and 2 here", "x.py is not there any more since", "the number of the package's results is 1 there and 2 here"]

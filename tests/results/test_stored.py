@@ -35,7 +35,7 @@ def test_the_format_that_is_written_now_is_stored_here() -> None:
 
 
 @pytest.mark.parametrize(("stored", "told"), [("format-1", r"version 0\.[12]\.0 wrote them"), ("format-2", r"version 0\.2\.0 wrote them"),
-                                              ("format-3", r"the number of the package's results is 1 there and 0 here")])
+                                              ("format-3", "holds results of another study")])
 def test_stored_results_are_not_gone_on_with_by_other_code(stored: str, told: str, tmp_path: Path) -> None:
     shutil.copytree(STORED / stored, tmp_path / "out")
     study = load_study("smoke", search={"algorithms": ["nsga2", "rs"], "evaluations": 10})
