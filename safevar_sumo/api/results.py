@@ -133,10 +133,11 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     manifest, study = read_manifest(directory), case.study
     if "imported" in manifest:
         return []
+    system = assemble(study, str(directory))
     with local_pool(1, study.search.time_limit) as pool:
         sources = {**sources_of(study, pool), **read_by_algorithms(study)}
     manifest, sources = begun_and_now(manifest, sources, read_later(directory), study.origin.places)
-    changed = differences_now(manifest, manifest_of(study, identity_of(study, assemble(study, str(directory)), sources)))
+    changed = differences_now(manifest, manifest_of(study, identity_of(study, system, sources)))
     if changed and not as_it_is_now:
         more = f" (and {len(changed) - MOST} more)" if len(changed) > MOST else ""
         raise InputError(directory / MANIFEST, f"{'; '.join(changed[:MOST])}{more}: what is simulated now is not what these results hold",

@@ -18,6 +18,7 @@ from typing import Any
 from safevar_sumo.computing.base import PoolLostError, WorkerLostError, evaluate_batch
 from safevar_sumo.computing.interrupts import interrupts_noted
 from safevar_sumo.errors import EnvironmentFault, SafevarError, told
+from safevar_sumo.plugins import inherit_reachable, reachable
 from safevar_sumo.records import Evaluations, FloatArray
 
 START_LIMIT = 120.0
@@ -119,7 +120,7 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         try:
             self._pipe, theirs = context.Pipe()
-            self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
+            self._process = context.Process(target=_serve, args=(theirs, reachable()), daemon=True)
             with _without_main():
                 self._process.start()
         except OSError as error:
@@ -171,8 +172,9 @@ def _without_main() -> Iterator[None]:
             sys.modules["__main__"] = main
 
 
-def _serve(pipe: connection.Connection[Any, Any]) -> None:
+def _serve(pipe: connection.Connection[Any, Any], folders: list[str]) -> None:
     """What a worker process does: answer batches until the other end of the pipe is closed."""
+    inherit_reachable(folders)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_the_caller, daemon=True).start()
     try:

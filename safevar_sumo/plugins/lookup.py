@@ -199,6 +199,16 @@ def make_reachable(places: Iterable[str]) -> None:
     sys.path[start:start] = _reachable
 
 
+def reachable() -> list[str]:
+    """The folders that `make_reachable` has put into Python's path."""
+    return list(_reachable)
+
+
+def inherit_reachable(folders: Iterable[str]) -> None:
+    """In a process that was given another one's path: those are what `make_reachable` had put there, for a study of its own."""
+    _reachable[:] = folders
+
+
 def forget_foreign() -> None:
     """Drop all modules that other people's code consists of: who looks one up next has it loaded anew."""
     _forget(list(_loaded))
