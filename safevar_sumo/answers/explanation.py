@@ -1,4 +1,4 @@
-"""Explain failures: which of the changes did it, how little of them is enough, why, and whether it hangs on a hair."""
+"""Explain failures: which of the changes did it, how little of them is enough, why, and whether the failure is robust."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def _explained(found: Failures, bench: Bench, original: Evaluations, causes: Cau
     rows = list(reasons)
     here, names = found.evaluations.take(rows), bench.characteristics.names
     beside, step = where(assemble(bench.study), original.settings, here.settings, found.unsafe)
-    hair = robustness(bench, here.settings, step, found.unsafe)
+    robust = robustness(bench, here.settings, step, found.unsafe)
     shrunk = iter(boundaries(bench, [cause for row in rows for cause in causes[row]], found.unsafe))
     collided = np.flatnonzero(here.collided)
     avoided = dict(zip(collided.tolist(), preventable_by(bench, here.settings[collided]), strict=True))
@@ -146,6 +146,6 @@ def _explained(found: Failures, bench: Bench, original: Evaluations, causes: Cau
             handle=found.handles[row], reasons=reasons[row], setting=dict(zip(names, here.settings[i].tolist(), strict=True)),
             outcome=str(here.outcome[i]), safety_degree=number(here.f_safe[i]),
             changed=tuple(name for name, is_changed in zip(names, changed, strict=True) if is_changed),
-            necessary=tuple(names[column] for column in sorted(necessary(causes[row]))), causes=tuple(of_it), robustness=hair[i],
+            necessary=tuple(names[column] for column in sorted(necessary(causes[row]))), causes=tuple(of_it), robustness=robust[i],
             because=beside[i].because, preventable=str(avoided.get(i) or ""), points=beside[i].points))
     return tuple(explanations)

@@ -42,7 +42,8 @@ def robustness(bench: Bench, settings: FloatArray, step: float, unsafe: Unsafe) 
     """How robust settings, shape (M, n), are.
 
     The neighbours of a setting differ from it in every characteristic by no more than the filter takes for no change;
-    they are simulated as they are, with the study's time step (`step` seconds), half of it and twice.
+    they are simulated as they are, with the study's time step (`step` seconds), half of it and twice. Neighbours that cannot be simulated
+    are left out of the share.
     """
     members = bench.characteristics
     offsets = np.random.default_rng(bench.study.search.seed).uniform(-1, 1, (NEIGHBOURS, len(members))) * members.threshold
@@ -50,8 +51,9 @@ def robustness(bench: Bench, settings: FloatArray, step: float, unsafe: Unsafe) 
     shares = {}
     for factor in STEP_FACTORS:
         on = bench if factor == 1 else bench.with_step(step * factor)
-        outcomes = unsafe.of(on.evaluate(around, f"neighbours at {step * factor:g} s a step"))
-        shares[step * factor] = outcomes.reshape(len(settings), NEIGHBOURS).mean(axis=1)
+        evaluations = on.evaluate(around, f"neighbours at {step * factor:g} s a step")
+        outcomes, valid = (truths.reshape(len(settings), NEIGHBOURS) for truths in (unsafe.of(evaluations), evaluations.valid))
+        shares[step * factor] = (outcomes & valid).sum(axis=1) / np.maximum(valid.sum(axis=1), 1)
     return [Robustness({step: float(of_it[row]) for step, of_it in shares.items()}) for row in range(len(settings))]
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def explain(source: StudyLike | Results, *, solutions: Sequence[str] = (), unsafe: str | None = None, top: int = ExplainOptions.top,
             limit: int = ExplainOptions.limit, pool: Pool | None = None, jobs: int | None = None,
             as_it_is_now: bool = False) -> Explained:
-    """Explain failures: minimal causes, their boundaries, why, and whether they hang on a hair.
+    """Explain failures: minimal causes, their boundaries, why, and whether they are robust.
 
     Parameters
     ----------
