@@ -106,7 +106,8 @@ def test_list_names_everything_in_text_and_json() -> None:
     assert {row["name"] for row in catalogue["studies"]} >= {"sun", "rain", "lgsvl", "native", "smoke"}
     carla = next(row for row in catalogue["vehicles"] if row["name"] == "carla")
     mass = next(row for row in carla["characteristics"] if row["name"] == "mass")
-    assert mass == {"name": "mass", "unit": "kg", "original": 2404, "lower": 2040, "upper": 2700, "threshold": pytest.approx(13.2)}
+    assert mass == {"name": "mass", "unit": "kg", "original": 2404, "lower": 2040, "upper": 2700, "threshold": pytest.approx(13.2),
+                    "meaning": "vehicle mass", "counterpart": "payload, passengers and equipment"}
     text = run("list", env={**os.environ, "COLUMNS": "200"}).stdout
     for rows in catalogue.values():
         for row in rows:
