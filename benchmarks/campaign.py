@@ -26,13 +26,16 @@ from evaluation import bare
 from measuring import Record, clock_seconds, processor_seconds, told
 
 from safevar_sumo.campaign import BATCH, RunKey, all_runs, carry_out
-from safevar_sumo.computing import Pool, cluster_pool, evaluate_batch, local_pool, packed
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import ResultsDirectory
-from safevar_sumo.simulation import assemble, simulate
-from safevar_sumo.simulation.staging import staged
 from safevar_sumo.study import Study, load_study
+from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.staging import staged
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.workers.cluster import cluster_pool
+from safevar_sumo.workers.evaluation import Pool, evaluate_batch, packed
+from safevar_sumo.workers.local import local_pool
 
 
 class Silent:

@@ -30,13 +30,14 @@ from safevar_sumo.ads.guarded import PerVehicle
 from safevar_sumo.campaign import BATCH
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import FloatArray, Observation
-from safevar_sumo.simulation import System, assemble, evaluate, simulate
-from safevar_sumo.simulation.batch import drive
-from safevar_sumo.simulation.network import copied_network
-from safevar_sumo.simulation.staging import staged
-from safevar_sumo.simulation.sumo import Engine, open_world, sumo_command
-from safevar_sumo.simulation.world import SumoWorld
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.batch import drive
+from safevar_sumo.sumo.engine import Engine, open_world, sumo_command
+from safevar_sumo.sumo.matrix import evaluate, simulate
+from safevar_sumo.sumo.network import copied_network
+from safevar_sumo.sumo.staging import staged
+from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.world import SumoWorld
 
 POPULATIONS = (50, 200, 1000)
 SOCKET_SETTINGS = 10

@@ -15,8 +15,9 @@ from campaign import drawn
 from measuring import Record, told
 
 from safevar_sumo.campaign import BATCH
-from safevar_sumo.computing import local_pool, packed
 from safevar_sumo.study import Study, load_study
+from safevar_sumo.workers.evaluation import packed
+from safevar_sumo.workers.local import local_pool
 
 FIRST = 5000
 """Evaluations after which a worker counts as grown up."""

@@ -11,26 +11,18 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from safevar_sumo.api import (
-        Figures,
-        Results,
-        Simulation,
-        Tables,
-        evaluate,
-        explain,
-        figures,
-        load,
-        risk,
-        rules,
-        run,
-        simulate,
-        tables,
-        tolerance,
-    )
+    from safevar_sumo.api.questions import Figures, Tables, explain, figures, risk, rules, tables, tolerance
+    from safevar_sumo.api.results import Results, load
+    from safevar_sumo.api.running import run
+    from safevar_sumo.api.settings import evaluate
+    from safevar_sumo.api.simulation import Simulation, simulate
     from safevar_sumo.errors import InputError, SafevarError, SimulationError
+    from safevar_sumo.replay.animation import animate
+    from safevar_sumo.replay.comparison import Comparison, compare
+    from safevar_sumo.replay.figure import draw_comparison
+    from safevar_sumo.replay.gui import show_in_gui
     from safevar_sumo.report import make_report
     from safevar_sumo.results import Status, status
-    from safevar_sumo.showing import Comparison, animate, compare, draw_comparison, show_in_gui
     from safevar_sumo.study import Study, Weather, load_study, study_names
 
     __version__: str

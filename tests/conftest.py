@@ -11,11 +11,11 @@ import hypothesis
 import pytest
 from slippery import make_results
 
-from safevar_sumo.simulation import System, assemble
 from safevar_sumo.study import load_study, study_names
+from safevar_sumo.sumo.system import System, assemble
 
 collect_ignore = [] if os.name == "posix" else [
-    "computing/test_local_pool.py",
+    "workers/test_local_pool.py",
     *(f"end_to_end/test_{name}.py" for name in ("cluster", "faults", "identities", "interruptions", "shares", "worlds_that_fail"))]
 """Tests that kill, stop and interrupt processes as POSIX has it."""
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from concurrent.futures import Future
 
-from safevar_sumo.computing import evaluate_batch
 from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.workers.evaluation import evaluate_batch
 
 
 class Here:

@@ -7,10 +7,10 @@ from pathlib import Path
 from in_process import Here, Silent
 
 from safevar_sumo.campaign import all_runs, carry_out
-from safevar_sumo.computing import identity_of
 from safevar_sumo.results import ResultsDirectory
-from safevar_sumo.simulation import assemble
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.workers.identity import identity_of
 
 STUDY = """
 extends = "smoke"

@@ -21,9 +21,9 @@ from safevar_sumo.errors import ForeignError, InputError, SafevarError
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Nominal, Observation, Tables
 from safevar_sumo.reference.rows import read_reference
-from safevar_sumo.simulation import assemble
 from safevar_sumo.study import Study, load_study, tables_of
-from safevar_sumo.study.reading import without_nothing
+from safevar_sumo.study.file import without_nothing
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
 TABLES = without_nothing(tables_of(load_study("smoke")))

@@ -9,8 +9,7 @@ from msgspec import Struct
 
 from safevar_sumo.ads.acc import KEEPING
 from safevar_sumo.ads.base import NotNegative, Positive
-from safevar_sumo.ads.reacting import HARDEST, TIME_ROUNDING, Reaction, Start, react, unaware
-from safevar_sumo.ads.way import in_the_way, time_to_reach
+from safevar_sumo.ads.reaction import HARDEST, TIME_ROUNDING, Reaction, Start, in_the_way, react, time_to_reach, unaware
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.ads.pedals import Trim, pedals, trim
-from safevar_sumo.ads.way import FARTHEST, in_the_way
+from safevar_sumo.ads.reaction import FARTHEST, in_the_way
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
 

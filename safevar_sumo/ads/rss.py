@@ -6,8 +6,7 @@ import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.ads.base import NotNegative, Positive
-from safevar_sumo.ads.reacting import HARDEST, Reaction, react, unaware
-from safevar_sumo.ads.way import in_the_way
+from safevar_sumo.ads.reaction import HARDEST, Reaction, in_the_way, react, unaware
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
 

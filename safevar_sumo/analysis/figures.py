@@ -1,309 +1,194 @@
-"""Pictures of results: one function a picture, from a case, or all of them, to a matplotlib figure."""
+"""Pictures of the answers, readable in print and for colour-blind readers."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from safevar_sumo.analysis.case import ALGORITHM_TITLES, Case, Unanswerable
-from safevar_sumo.analysis.discussion import effects
-from safevar_sumo.analysis.quality import WORST, convergence, nondominated, objectives
-from safevar_sumo.analysis.rq3 import ANY, critical, rq31, rq32
+from safevar_sumo.analysis.explain.result import Explained
+from safevar_sumo.analysis.risk.compute import Risk
+from safevar_sumo.analysis.tolerance.compute import Tolerance
+from safevar_sumo.analysis.tolerance.one_at_a_time import Alone
+from safevar_sumo.analysis.tolerance.pairs import Pair
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure
 
-FORMATS = ("png", "pdf", "svg")
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's, which colour-blind readers can tell apart; markers and line styles tell the same again."""
-MARKERS, DASHES = ("o", "X", "^", "s", "D", "v"), ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
-INCREASE, DECREASE = COLOURS[1], COLOURS[0]
-OBJECTIVE_TITLES = {"f_safe": "f_safe: safety degree [m, -m/s]", "f_diff": "f_diff: largest change [fraction of the original]",
-                    "f_num_diff": "f_numDiff: characteristics changed"}
 DPI = 200
 FONT = 8
-LONG_NAME = 28
-"""Letters that fit above a small axis."""
-PANELS = 3
-"""Panels of cases in a row."""
-BINS = 24
-"""Bins over a characteristic's domain."""
+DEGREE = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"
+UNSAFE = "#d55e00"
+CHANGED, INVOLVED, NECESSARY = "#bbbbbb", "#56b4e9", "#0072b2"
+"""Grey and Okabe and Ito's blues: of different lightness, so that they stay apart without colour."""
 
 
-def number_of_changes(cases: Sequence[Case]) -> Figure:
-    """RQ3.1: how many critical solutions of a run have j characteristics changed, as box plots over the runs; a panel per case.
+def necessity_figure(told: Explained) -> Figure:
+    """How often each characteristic is necessary, beside how often it is changed (RQ3.2 asked again)."""
+    frame = told.necessity.iloc[::-1]
+    figure, ((axis,),) = new_figure(f"{told.study.name}: changed is not needed", 1, 1, (6.4, 1.4 + 0.3 * max(len(frame), 4)))
+    names = [plain(name) for name in frame["characteristic"]]
+    for column, label, colour, height in (
+            ("changed", "changed", CHANGED, 0.8), ("involved", "in some minimal cause", INVOLVED, 0.5),
+            ("necessary", "necessary: in every minimal cause", NECESSARY, 0.24)):
+        axis.barh(names, 100 * frame[column], height=height, color=colour, label=label)
+    axis.set_xlim(0, 100)
+    axis.set_xlabel(f"share of {told.analysed} failures [%]")
+    axis.grid(visible=False, axis="y")
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=FONT)
+    return figure
 
-    Raises
-    ------
-    Unanswerable
-        As `rq31`, for the first case that holds no answer.
-    """
-    import seaborn as sns
 
-    counts = [rq31(case) for case in cases]
-    columns = min(len(cases), PANELS)
-    rows = -(-len(cases) // columns)
-    title = "number of changed characteristics"
-    figure, axes = _figure(f"{cases[0].name}: {title}" if len(cases) == 1 else title, rows, columns,
-                           (6.4 if columns == 1 else 3.9 * columns, 0.5 + 3.3 * rows))
-    for axis, case, of_it in zip(axes.flat, cases, counts, strict=False):
-        sns.boxplot(of_it, x="j", y="count", ax=axis, color="#56b4e9", linecolor="black", linewidth=0.8, fliersize=3)
-        axis.set_xlabel("characteristics changed")
-        axis.set_ylabel(f"critical solutions per run\n({of_it['run'].nunique()} runs)")
-        axis.set_title(_plain(case.name) if len(cases) > 1 else "", fontsize=FONT)
-        _whole_numbers(axis.yaxis)
-    for axis in list(axes.flat)[len(cases):]:
+def profiles_figure(told: Tolerance) -> Figure:
+    """The safety degree over the domain of each characteristic alone; the original marked, what is unsafe shaded."""
+    columns = min(4, len(told.alone))
+    rows = -(-len(told.alone) // columns)
+    title = f"{told.study.name}: one characteristic at a time (unsafe: {told.unsafe})"
+    figure, axes = new_figure(title, rows, columns, (max(2.3 * columns, 4.6), 1.0 + 1.75 * rows))
+    degrees = np.concatenate([one.profile["safety_degree"].dropna() for one in told.alone])
+    margin = 0.05 * (np.ptp(degrees) if degrees.size else 0.0) or 0.5
+    for axis, one in zip(axes.flat, told.alone, strict=False):
+        _profile(axis, one)
+        if degrees.size:
+            axis.set_ylim(degrees.min() - margin, degrees.max() + margin)  # the same for all: a steep one is one that matters
+    for axis in list(axes.flat)[len(told.alone):]:
         axis.set_axis_off()
+    figure.supylabel(DEGREE, fontsize=FONT)
+    told_of = {"dot: the original vehicle": True, "hatched: unsafe": any(one.unsafe for one in told.alone),
+               "below the dashed line: collisions": bool(degrees.size) and degrees.min() <= 0}
+    figure.supxlabel(";\n".join(words for words, is_drawn in told_of.items() if is_drawn), fontsize=FONT)
     return figure
 
 
-def changed_characteristics(case: Case) -> Figure:
-    """RQ3.2: in which share of the critical solutions with j changed each characteristic is changed, as a heat map."""
-    import seaborn as sns
-
-    _some_critical(case)
-    shares = rq32(case)
-    order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
-    grid = shares.pivot(index="characteristic", columns="j", values="percent").astype(float)
-    grid = grid.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=_plain)
-    figure, ((axis,),) = _figure(f"{case.name}: characteristics changed in critical solutions", 1, 1, (7.6, 1.4 + 0.3 * len(grid)))
-    sns.heatmap(grid, ax=axis, cmap="cividis", vmin=0, vmax=100, annot=True, fmt=".0f", annot_kws={"fontsize": 7}, linewidths=0.5,
-                cbar_kws={"label": "critical solutions\nin which it is changed [%]"})
-    axis.grid(visible=False)
-    colours = axis.collections[0].colorbar.ax
-    colours.tick_params(labelsize=FONT)
-    colours.yaxis.label.set_size(FONT)
-    axis.set_xlabel("number of characteristics changed (empty: no such solution)")
-    axis.set_ylabel("characteristic, most frequent first")
-    axis.tick_params(axis="both", length=0, rotation=0)
-    return figure
+def _profile(axis: Axes, one: Alone) -> None:
+    member, profile = one.characteristic, one.profile
+    axis.plot(profile["value"], profile["safety_degree"], color=NECESSARY, linewidth=1.2)
+    for low, high in one.unsafe:
+        axis.axvspan(low, high, facecolor=UNSAFE, alpha=0.35, hatch="////", edgecolor="white", linewidth=0)
+    at_original = profile.loc[profile["value"] == member.original, "safety_degree"]
+    axis.plot([member.original], at_original, marker="o", color="black", markersize=4)
+    if profile["safety_degree"].min() <= 0:
+        axis.axhline(0, color="black", linewidth=0.8, linestyle="--")
+    axis.set_xlim(member.lower, member.upper)
+    axis.set_title(plain(member.name), fontsize=FONT)
+    axis.set_xlabel(f"[{raised(member.unit)}]")
+    axis.locator_params(axis="x", nbins=4)
 
 
-def sizes_of_changes(case: Case) -> Figure:
-    """How each characteristic is changed in the critical solutions: the distribution of its signed changes."""
-    import seaborn as sns
-
-    total = _some_critical(case)
-    found = effects(case)
-    members = case.characteristics.members
-    columns = min(4, len(members))
-    rows = -(-len(members) // columns)
-    figure, axes = _figure(f"{case.name}: changes in critical solutions", rows, columns, (9.0, 1.0 + 1.85 * rows))
-    for axis, member in zip(axes.flat, members, strict=False):
-        change = found.loc[found["characteristic"] == member.name, "change"]
-        low, high = (float(f"{end - member.original:.9g}") for end in (member.lower, member.upper))
-        sides = {INCREASE: change[change > 0], DECREASE: change[change < 0]}
-        for colour, side in sides.items():
-            if len(side):
-                end = high if colour == INCREASE else low
-                edges = np.sort(np.linspace(0, end, 1 + max(1, round(BINS * abs(end) / (high - low)))))
-                sns.histplot(x=side, ax=axis, bins=edges, color=colour, edgecolor="white", linewidth=0.3, alpha=1)
-        axis.axvline(0, color="black", linewidth=0.8)
-        axis.set_xlim(low, high)
-        size = min(FONT, FONT * LONG_NAME / len(member.name))
-        axis.set_title(f"{_plain(member.name)}\n+{len(sides[INCREASE])}, -{len(sides[DECREASE])}", fontsize=size)
-        axis.set_xlabel(f"change [{_unit(member.unit)}]", fontsize=FONT)
-        axis.set_ylabel("")
-        axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
-        _whole_numbers(axis.yaxis, 4)
-    for axis in list(axes.flat)[len(members):]:
-        axis.set_axis_off()
-    figure.supylabel(f"how many of {total} critical solutions", fontsize=9)
-    figure.supxlabel("orange, right of 0: increases; blue, left of 0: decreases; titles tell how many of each;\n"
-                     "each axis spans the characteristic's domain", fontsize=FONT)
-    return figure
-
-
-def pareto_fronts(case: Case) -> Figure:
-    """The non-dominated solutions of each algorithm, all its runs together, in every pair of objectives.
-
-    Beside them the original vehicle, and the line at and left of which a solution is a collision.
-
-    Raises
-    ------
-    Unanswerable
-        If there is no solution.
-    """
-    goals = case.scoring.objectives
-    scales = [one.sign for one in goals]
-    fronts = {}
-    for algorithm in case.algorithms:
-        points = objectives(case, case.solutions_of(algorithm))
-        if len(points):
-            fronts[algorithm] = nondominated(points) * scales
-    if not fronts:
-        raise Unanswerable(case.name, "has no solution", "results with at least one finished run")
-    pairs = list(combinations(range(len(goals)), 2))
-    rows = next(rows for rows in (5, 2, 1) if len(pairs) % (3 * rows) == 0 or rows == 1)
-    columns = len(pairs) // rows
-    figure, axes = _figure(f"{case.name}: non-dominated solutions of each algorithm, all runs together", rows, columns,
-                           (max(3.2 * columns, 5), 3.7 * rows))
-    original = [_of_original(case, one) for one in goals]
-    for axis, (first, second) in zip(axes.flat, pairs, strict=True):
-        for i, (algorithm, points) in enumerate(fronts.items()):
-            axis.plot(points[:, first], points[:, second], linestyle="", marker=MARKERS[i % len(MARKERS)], markersize=4, alpha=0.6,
-                      markeredgewidth=0, color=COLOURS[i % len(COLOURS)], label=f"{_title(algorithm)} ({len(points)})")
-        if not np.isnan([original[first], original[second]]).any():
-            axis.plot(original[first], original[second], linestyle="", marker="*", markersize=9, color="black", label="original vehicle")
-        if goals[first] == F_SAFE:
-            axis.axvline(0, color="black", linewidth=0.8, linestyle="--", label="collision: 0 and left of it")
-        axis.set_xlabel(_objective_title(goals[first]))
-        axis.set_ylabel(_objective_title(goals[second]))
-    _legend_below(figure, axes.flat[0])
-    return figure
-
-
-def _objective_title(objective: Objective) -> str:
-    return OBJECTIVE_TITLES.get(objective.name) or f"{_plain(objective.title)} [{_unit(objective.unit)}]"
-
-
-def _of_original(case: Case, objective: Objective) -> float:
-    """The original vehicle's value; NaN where nobody knows it."""
-    if objective.name in (F_DIFF.name, F_NUM_DIFF.name):
-        return 0.0
-    return case.original.get("safety_degree" if objective == F_SAFE else objective.name, np.nan)
-
-
-def hypervolume_growth(case: Case) -> Figure:
-    """Convergence: the hypervolume of what was found against evaluations, median and range over the runs."""
-    growth = convergence(case)
-    figure, ((axis,),) = _figure(f"{case.name}: convergence", 1, 1, (6.4, 4.0))
-    for i, (algorithm, of_it) in enumerate(growth.groupby("algorithm", sort=False)):
-        over = of_it.groupby("evaluations")["hypervolume"].agg(["min", "median", "max"])
-        colour = COLOURS[i % len(COLOURS)]
-        axis.fill_between(over.index, over["min"], over["max"], color=colour, alpha=0.12, linewidth=0)
-        for edge in ("min", "max"):
-            axis.plot(over.index, over[edge], color=colour, linestyle=DASHES[i % len(DASHES)], linewidth=0.6)
-        axis.plot(over.index, over["median"], color=colour, linestyle=DASHES[i % len(DASHES)], linewidth=1.8,
-                  label=f"{_title(str(algorithm))} ({of_it['run'].nunique()} runs)")
-    axis.set_xlabel("evaluations")
-    axis.set_ylabel(f"hypervolume of all found, normalised\n(thick: median, thin: range over runs; reference point {WORST:g})")
-    _legend_below(figure, axis)
-    return figure
-
-
-OF_ALL: Mapping[str, Callable[[Sequence[Case]], Figure]] = {"rq3.1-number-of-changes": number_of_changes}
-OF_A_CASE: Mapping[str, Callable[[Case], Figure]] = {
-    "rq3.2-changed-characteristics": changed_characteristics,
-    "rq3.3-sizes-of-changes": sizes_of_changes,
-    "pareto-fronts": pareto_fronts,
-    "convergence": hypervolume_growth,
-}
-
-
-def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
-    """Every figure of the cases by name, and why some are not there; with several cases, a case's figures begin with its name.
-
-    Raises
-    ------
-    Unanswerable
-        If no figure can be drawn.
-    """
-    found, refused = {}, []
-    alone = len(cases) == 1
-    for name, of_all in OF_ALL.items():
-        able, unable = _able(cases)
-        refused += unable
-        if able:
-            found[name] = of_all(able)
-    for case in cases:
-        for name, of_it in OF_A_CASE.items():
-            try:
-                found[name if alone else f"{case.name}-{name}"] = of_it(case)
-            except Unanswerable as error:
-                refused.append(error)
-    if not found:
-        raise refused[0]
-    return found, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in refused))
-
-
-def _able(cases: Sequence[Case]) -> tuple[list[Case], list[Unanswerable]]:
-    """The cases that RQ3.1 can be asked of, and why the others cannot."""
-    able, refused = [], []
-    for case in cases:
-        try:
-            rq31(case)
-            able.append(case)
-        except Unanswerable as error:
-            refused.append(error)
-    return able, refused
-
-
-def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Path], list[str]]:
-    """Draw every figure into a file; returns the files, and why some figures are not there.
+def pairs_figure(told: Tolerance, most: int = 6) -> Figure:
+    """The planes of the worst pairs: those with the largest unsafe share, or the least safety degree where nothing is unsafe.
 
     Raises
     ------
     InputError
-        If the directory cannot be written, or no figure can be drawn.
+        If pairs were not looked at.
     """
-    figures, lacking = draw(cases)
-    written = []
-    for name, figure in figures.items():
-        path = directory / f"{_file_name(f'{cases[0].name}-{name}' if len(cases) == 1 else name)}.{kind}"
-        try:
-            directory.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path, dpi=DPI)
-        except OSError as error:
-            raise InputError(path, f"cannot be written: {error.strerror or error}", "a directory that can be written") from None
-        written.append(path)
-    return written, lacking
+    if not told.pairs:
+        raise InputError("pairs", "there is no pair to draw", "at least two characteristics, looked at in pairs")
+    worst = sorted(told.pairs, key=lambda pair: (-pair.unsafe_share, np.nanmin(pair.safety_degree)))[:most]
+    degrees = np.concatenate([pair.safety_degree.ravel() for pair in worst])
+    columns = min(3, len(worst))
+    rows = -(-len(worst) // columns)
+    title = f"{told.study.name}: the worst pairs (unsafe: {told.unsafe})"
+    figure, axes = new_figure(title, rows, columns, (max(3.0 * columns, 4.6), 1.1 + 2.4 * rows))
+    for axis, pair in zip(axes.flat, worst, strict=False):
+        colours = _plane(axis, pair, (float(np.nanmin(degrees)), float(np.nanmax(degrees))))
+    for axis in list(axes.flat)[len(worst):]:
+        axis.set_axis_off()
+    bar = figure.colorbar(colours, ax=axes, shrink=0.9)
+    bar.set_label(DEGREE, fontsize=FONT)
+    bar.ax.tick_params(labelsize=FONT)
+    figure.supxlabel("dot: the original vehicle; hatched: unsafe;\ncross: the unsafe setting nearest to the original", fontsize=FONT)
+    return figure
 
 
-def _figure(title: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
-    """A figure with its axes, shape (rows, columns), that no global state knows of."""
+def _plane(axis: Axes, pair: Pair, limits: tuple[float, float]) -> QuadMesh:
+    """One plane, the first characteristic across."""
+    first, second = pair.characteristics
+    colours = axis.pcolormesh(*pair.values, pair.safety_degree.T, cmap="cividis", vmin=limits[0], vmax=limits[1], shading="nearest")
+    if pair.unsafe.any():
+        axis.contourf(*pair.values, pair.unsafe.T.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
+        axis.contour(*pair.values, pair.unsafe.T.astype(float), levels=[0.5], colors=UNSAFE, linewidths=1.2)
+    axis.plot(first.original, second.original, marker="o", color="white", markeredgecolor="black", markersize=5)
+    if pair.nearest is not None:
+        axis.plot(*pair.nearest, marker="X", color=UNSAFE, markeredgecolor="white", markersize=7)
+    axis.set_xlabel(f"{plain(first.name)} [{raised(first.unit)}]")
+    axis.set_ylabel(f"{plain(second.name)} [{raised(second.unit)}]")
+    axis.set_xlim(first.lower, first.upper)
+    axis.set_ylim(second.lower, second.upper)
+    axis.grid(visible=False)
+    return colours
+
+
+def sensitivity_figure(told: Risk) -> Figure:
+    """First-order and total Sobol indices of every characteristic with their intervals, of the safety degree and of being unsafe.
+
+    Raises
+    ------
+    InputError
+        If there are none, because characteristics are correlated.
+    """
+    if told.sensitivity is None or told.sensitivity_of_unsafe is None:
+        raise InputError("correlations", "there are no sensitivity indices of correlated characteristics", "a study without correlations")
+    names = told.sensitivity.sort_values("total", kind="stable")["characteristic"].to_list()
+    title = f"{told.study.name}: what decides ({told.confidence:.0%} intervals)"
+    figure, (axes,) = new_figure(title, 1, 2, (7.2, 1.5 + 0.28 * max(len(names), 4)))
+    of_what = {"safety degree": told.sensitivity, f"unsafe ({told.unsafe})": told.sensitivity_of_unsafe}
+    for axis, (what, frame) in zip(axes, of_what.items(), strict=True):
+        rows = frame.set_index("characteristic").loc[names]
+        for column, label, colour, shift in (("total", "total: with all others", CHANGED, 0.2), ("first_order", "alone", NECESSARY, -0.2)):
+            width = (rows[f"{column}_upper"] - rows[column]).clip(lower=0)
+            axis.barh(np.arange(len(names)) + shift, rows[column], height=0.36, color=colour, xerr=width, label=label,
+                      error_kw={"elinewidth": 0.8, "ecolor": "black"})
+        axis.set_yticks(np.arange(len(names)), [plain(name) for name in names])
+        axis.set_title(plain(what), fontsize=FONT)
+        axis.set_xlabel("share of the variance [-]")
+        axis.set_xlim(0, 1)
+        if rows["total"].isna().all():
+            axis.text(0.5, 0.5, "too few settings are unsafe,\nor safe, to tell", transform=axis.transAxes, ha="center", fontsize=FONT)
+        axis.grid(visible=False, axis="y")
+    axes[1].set_yticklabels([])
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=FONT)
+    return figure
+
+
+def new_figure(title: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
+    """A figure that no global state knows of, and its axes, shape (rows, columns); `size` in inches."""
     import matplotlib.style
     from matplotlib.figure import Figure
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT, "axes.labelsize": FONT, "axes.titlesize": FONT}]):
-        figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.1))
+    with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT, "axes.labelsize": FONT, "axes.titlesize": FONT,
+                                                              "xtick.labelsize": FONT, "ytick.labelsize": FONT}]):
+        figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False)
-    figure.suptitle(_plain(title), fontsize=FONT + 2)
+    figure.suptitle(plain(title), fontsize=FONT + 2)
     return figure, axes
 
 
-def _legend_below(figure: Figure, axis: Axes) -> None:
-    handles, labels = axis.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3), frameon=False, fontsize=FONT)
+def save(figure: Figure, path: Path, source: str = "out") -> None:
+    """Write a figure to a file: png, pdf or svg.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    try:
+        figure.savefig(path, dpi=DPI)
+    except OSError as error:
+        raise InputError(source, f"cannot write {path}: {error.strerror or error}", "a directory that can be written") from None
 
 
-def _some_critical(case: Case) -> int:
-    """How many critical solutions there are; without any there is nothing to draw."""
-    number = len(critical(case))
-    if not number:
-        raise Unanswerable(case.name, "has no critical solution", "results with solutions that are more unsafe than the original")
-    return number
-
-
-def _whole_numbers(axis: object, steps: int = 6) -> None:
-    from matplotlib.ticker import MaxNLocator
-
-    axis.set_major_locator(MaxNLocator(steps, integer=True, min_n_ticks=1))  # type: ignore[attr-defined]
-
-
-def _title(algorithm: str) -> str:
-    return _plain(ALGORITHM_TITLES.get(algorithm, algorithm))
-
-
-def _plain(name: str) -> str:
+def plain(name: str) -> str:
     """A name in which matplotlib sees no formula."""
     return name.replace("$", r"\$")
 
 
-def _unit(unit: str) -> str:
+def raised(unit: str) -> str:
     """A unit with its powers raised."""
-    return re.sub(r"\^(-?\d+)", r"$^{\1}$", _plain(unit))
-
-
-def _file_name(name: str) -> str:
-    """A case's name without what file systems dislike."""
-    return "".join(sign if sign.isalnum() or sign in "._-" else "-" for sign in name).strip("-")
+    return re.sub(r"\^(-?\d+)", r"$^{\1}$", plain(unit))

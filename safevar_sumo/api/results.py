@@ -18,7 +18,7 @@ from safevar_sumo.study import Study, StudyLike, load_study, study_names
 if TYPE_CHECKING:
     import pandas as pd
 
-    from safevar_sumo.analysis import Case
+    from safevar_sumo.analysis.research_questions.case import Case
 
 MOST = 3
 """So many things that have changed are named in one line."""
@@ -80,7 +80,7 @@ def load(directory: str | Path) -> Results:
     InputError
         If it is none, or a file in it is damaged.
     """
-    from safevar_sumo.analysis import load_cases
+    from safevar_sumo.analysis.research_questions.case import load_cases
 
     return Results(Path(directory), load_cases([directory])[0])
 
@@ -127,8 +127,10 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
         If it differs in anything and `as_it_is_now` does not allow that; names the files.
     """
     from safevar_sumo.campaign import read_by_algorithms
-    from safevar_sumo.computing import identity_of, local_pool, sources_of
-    from safevar_sumo.simulation import assemble
+    from safevar_sumo.sumo.system import assemble
+    from safevar_sumo.workers.identity import identity_of
+    from safevar_sumo.workers.local import local_pool
+    from safevar_sumo.workers.sources import sources_of
 
     manifest, study = read_manifest(directory), case.study
     if "imported" in manifest:

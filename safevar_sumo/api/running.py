@@ -10,15 +10,19 @@ from typing import Any
 
 from rich.console import Console
 
-from safevar_sumo.api.once import assembled
 from safevar_sumo.api.results import Results, load
+from safevar_sumo.api.simulation import assembled
 from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, carry_out, read_by_algorithms
-from safevar_sumo.computing import Pool, available_cores, cluster_pool, identity_of, local_pool, sources_of
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.results import ResultsDirectory
-from safevar_sumo.simulation import System
 from safevar_sumo.study import Study, StudyLike
+from safevar_sumo.sumo.system import System
+from safevar_sumo.workers.cluster import cluster_pool
+from safevar_sumo.workers.evaluation import Pool
+from safevar_sumo.workers.identity import identity_of
+from safevar_sumo.workers.local import available_cores, local_pool
+from safevar_sumo.workers.sources import sources_of
 
 
 def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = None, cluster: str | None = None,

@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from safevar_sumo.api.once import assembled
-from safevar_sumo.computing import available_cores, evaluate_all, local_pool
+from safevar_sumo.api.simulation import assembled
 from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.progress import counted
@@ -19,6 +18,8 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import evaluations_frame
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.workers.batches import evaluate_all
+from safevar_sumo.workers.local import available_cores, local_pool
 
 LEGAL = "a pandas.DataFrame with a column of numbers for each characteristic that is changed, or an array of numbers, shape (M, n)"
 

@@ -5,9 +5,9 @@ new, journals the answers and sends them in: so a resumed run is a replayed one.
 batches for a pool: a lost worker costs a batch, and no result depends on who computed what with whom.
 """
 
-from safevar_sumo.campaign.carry_out import Campaign, carry_out
+from safevar_sumo.campaign.batcher import BATCH
+from safevar_sumo.campaign.campaign import Campaign, carry_out
 from safevar_sumo.campaign.forecast import Forecast, forecast
-from safevar_sumo.campaign.gathering import BATCH
 from safevar_sumo.campaign.keys import RunKey, algorithm_member, algorithm_of, all_runs, read_by_algorithms, run_generator
 from safevar_sumo.campaign.run import Observer
 

@@ -7,11 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.campaign.gathering import BATCH
-from safevar_sumo.computing import PersistentPool, Pool, packed, result_of
+from safevar_sumo.campaign.batcher import BATCH
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.workers.evaluation import Pool, packed
+from safevar_sumo.workers.local import result_of
+from safevar_sumo.workers.retrying import PersistentPool
 
 PROBE_BATCHES = 4
 """Batches on every worker that a forecast is measured with."""

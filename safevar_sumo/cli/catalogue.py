@@ -11,13 +11,13 @@ import msgspec
 from rich.console import Console
 
 from safevar_sumo.ads import ADS
+from safevar_sumo.cli.display.simulation import print_names
 from safevar_sumo.cli.program import commands
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study, study_names
-from safevar_sumo.terminal.plain import print_meanings
-from safevar_sumo.terminal.simulation import print_names
+from safevar_sumo.terminal import print_meanings
 from safevar_sumo.vehicles import VEHICLES, CharacteristicSet
 
 

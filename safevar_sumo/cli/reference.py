@@ -11,9 +11,9 @@ import numpy as np
 from rich.console import Console
 
 from safevar_sumo.cli.completion import complete_study
-from safevar_sumo.cli.outputs import PICTURES, check_output
+from safevar_sumo.cli.display.reference import print_agreement, print_calibration
+from safevar_sumo.cli.options import PICTURES, check_output
 from safevar_sumo.cli.program import commands, tell_remarks
-from safevar_sumo.computing import available_cores, evaluate_all, local_pool
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.progress import counted, counted_trials
 from safevar_sumo.records import Evaluations
@@ -30,10 +30,11 @@ from safevar_sumo.reference import (
     read_reference,
 )
 from safevar_sumo.results import write_imported
-from safevar_sumo.simulation import assemble
 from safevar_sumo.study import Study, check_writable, load_study, write_study
-from safevar_sumo.terminal.reference import print_agreement, print_calibration
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.workers.batches import evaluate_all
+from safevar_sumo.workers.local import available_cores, local_pool
 
 
 @commands.command()

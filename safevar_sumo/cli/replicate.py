@@ -7,13 +7,11 @@ from pathlib import Path
 
 import click
 
-from safevar_sumo.analysis import load_cases
-from safevar_sumo.analysis.case import Case
-from safevar_sumo.cli.outputs import refuse_inputs
+from safevar_sumo.analysis.research_questions.case import Case, load_cases
+from safevar_sumo.cli.options import refuse_inputs
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.reference.nearness import Nearness, nearness
-from safevar_sumo.reference.replication import paired, replication
+from safevar_sumo.reference.replication import Nearness, nearness, paired, replication
 from safevar_sumo.reference.rows import ReferenceData, read_reference
 from safevar_sumo.results import write_whole
 from safevar_sumo.study import check_writable

@@ -8,9 +8,9 @@ from pathlib import Path
 import click
 from rich.console import Console
 
-from safevar_sumo.cli.outputs import check_output
+from safevar_sumo.cli.options import check_output
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.simulating import as_it_is_now, jobs_option, now_option, point_option
+from safevar_sumo.cli.target import as_it_is_now, jobs_option, now_option, point_option
 from safevar_sumo.results import write_whole
 
 
@@ -25,7 +25,7 @@ from safevar_sumo.results import write_whole
 def report(directories: tuple[str, ...], out: Path, only: str | None, point: str | None, jobs: int | None) -> None:
     """Write one self-contained page about the results directories DIR...: verdict, causes, replays, tables, figures."""
     from safevar_sumo.report import make_report
-    from safevar_sumo.terminal.stages import stages
+    from safevar_sumo.terminal import stages
 
     check_output(out, "--out", (".html", ".htm"))
     sections = [name.strip() for name in only.split(",")] if only is not None else []

@@ -10,24 +10,21 @@ import click
 import numpy as np
 from rich.console import Console
 
-from safevar_sumo.api import Simulation
-from safevar_sumo.api.once import beside_the_original
 from safevar_sumo.api.settings import evaluated
-from safevar_sumo.cli.changes import read_changes, settings_of
+from safevar_sumo.api.simulation import Simulation, beside_the_original
 from safevar_sumo.cli.completion import complete_changes, complete_study
-from safevar_sumo.cli.outputs import refuse_inputs
+from safevar_sumo.cli.display.simulation import print_matrix, print_simulation, print_sweep
+from safevar_sumo.cli.options import read_changes, refuse_inputs, settings_of
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.showing import Shown, showing_options
-from safevar_sumo.cli.simulating import now_option
-from safevar_sumo.cli.target import Target, replay_options, target_of
+from safevar_sumo.cli.replay import Shown, showing_options
+from safevar_sumo.cli.target import Target, now_option, replay_options, target_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import tags
-from safevar_sumo.simulation import System, assemble, at_every_point, named_point, point_record, remarks_of, vehicle_remarks
 from safevar_sumo.study import check_writable
-from safevar_sumo.terminal.matrix import print_matrix
-from safevar_sumo.terminal.simulation import print_simulation, print_sweep
+from safevar_sumo.sumo.matrix import at_every_point, named_point, point_record, remarks_of, vehicle_remarks
+from safevar_sumo.sumo.system import System, assemble
 
 
 @commands.command(name="simulate")
@@ -114,7 +111,7 @@ def _tell(target: Target, system: System, found: Simulation, as_json: bool) -> N
 
 def _warn_of_differences(target: Target, found: Simulation) -> None:
     """A replay gives what was recorded, or there is a reason to be told."""
-    from safevar_sumo.showing import differences
+    from safevar_sumo.replay.comparison import differences
 
     assert target.recorded is not None
     for one in differences(found.evaluation, target.recorded):

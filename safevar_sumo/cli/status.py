@@ -9,8 +9,8 @@ import click
 from rich.console import Console
 from rich.live import Live
 
+from safevar_sumo.cli.options import Within
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.ranges import Within
 
 
 @commands.command()
@@ -21,8 +21,8 @@ from safevar_sumo.cli.ranges import Within
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; with --watch, a line for every look.")
 def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
     """Tell how far the study in DIR is, without disturbing it: runs, front so far, collisions, time left."""
+    from safevar_sumo.cli.display.campaign import status_view
     from safevar_sumo.results.status import status as look
-    from safevar_sumo.terminal.status import status_view
 
     told, begun = look(directory), time.monotonic()
     first = told

@@ -12,12 +12,12 @@ from rich.console import Console
 from safevar_sumo.api.running import a_pool, carried_out, prepared
 from safevar_sumo.campaign import BATCH, RunKey, all_runs, forecast
 from safevar_sumo.cli.completion import complete_study
+from safevar_sumo.cli.display.campaign import print_forecast, print_summary
 from safevar_sumo.cli.program import commands, tell_remarks
 from safevar_sumo.errors import InputError
 from safevar_sumo.progress import CampaignProgress
-from safevar_sumo.simulation import vehicle_remarks
 from safevar_sumo.study import Study, load_study
-from safevar_sumo.terminal.campaign import print_forecast, print_summary
+from safevar_sumo.sumo.matrix import vehicle_remarks
 
 
 @commands.command()

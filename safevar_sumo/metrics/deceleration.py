@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from safevar_sumo.metrics.base import Metric
-from safevar_sumo.metrics.sampling import every, total
+from safevar_sumo.metrics.base import Metric, every, total
 from safevar_sumo.records import STANDSTILL, Drives, FloatArray
 from safevar_sumo.study import MetricsTable
 

@@ -1,12 +1,14 @@
-"""The one guard around other people's code: whatever it raises or returns wrongly is told with name, method, file and line."""
+"""What other people's code is given: copies that it cannot write to, so that nothing it does reaches what is logged and measured."""
 
 from __future__ import annotations
 
 import importlib
 import multiprocessing
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +16,24 @@ import numpy as np
 from safevar_sumo.errors import ForeignError, InputError, told
 from safevar_sumo.plugins.reading import watch
 from safevar_sumo.records import BoolArray, FloatArray
+
+
+def lent(value: Any) -> Any:
+    """A copy of a record and of the records in it, in which every array is a read-only copy."""
+    if isinstance(value, np.ndarray):
+        copy = value.copy()
+        copy.flags.writeable = False
+        return copy
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return type(value)(*map(lent, value))
+    if type(value) is tuple:
+        return tuple(map(lent, value))
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{field.name: lent(getattr(value, field.name)) for field in fields(value)})
+    if isinstance(value, Mapping):
+        return MappingProxyType({key: lent(inner) for key, inner in value.items()})
+    return value
+
 
 _OURS = str(Path(__file__).resolve().parents[1])
 _IMPORTS = str(Path(importlib.__file__).parent)

@@ -6,20 +6,25 @@ It is one of ours, or `package.module:Name` from beside the study, from the work
 from __future__ import annotations
 
 import importlib
+import inspect
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from hashlib import sha256
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
+import msgspec
+
 from safevar_sumo.errors import ForeignError, InputError, did_you_mean, one_of
 from safevar_sumo.plugins.contract import Contract
 from safevar_sumo.plugins.digests import beside
 from safevar_sumo.plugins.guard import Guard
 from safevar_sumo.plugins.reading import is_foreign, watch
+from safevar_sumo.study import converted
 
 _NOT_FOREIGN = {__name__.partition(".")[0], *sys.stdlib_module_names}
 
@@ -255,3 +260,40 @@ def _digest(file: str) -> bytes:
         return sha256(Path(file).read_bytes()).digest()
     except OSError:
         return b""
+
+
+def made(member: Member, parameters: Mapping[str, Any], name: str, key: str, source: str) -> Any:
+    """An instance.
+
+    Parameters
+    ----------
+    name
+        The member as the study names it, such as `ads.model = 'my_ads:Careful'`.
+    key
+        Where its parameters stand in the study, such as `ads.parameters`.
+
+    Raises
+    ------
+    InputError
+        If the class does not take the parameters.
+    """
+    cls = member.what
+    if issubclass(cls, msgspec.Struct):
+        watch.inside += member.guard is not None
+        try:
+            return converted(source, parameters, cls, key)
+        finally:
+            watch.inside -= member.guard is not None
+    check_parameters(cls, (), parameters, name, key, source)
+    return (member.guard or Guard(source, name)).call("__init__", partial(cls, **parameters))
+
+
+def check_parameters(function: Callable[..., Any], arguments: tuple[Any, ...], parameters: Mapping[str, Any], name: str, key: str,
+                     source: str) -> None:
+    """Refuse parameters that a class or function does not take beside its arguments; otherwise as `made`."""
+    try:
+        inspect.signature(function).bind(*arguments, **parameters)
+    except TypeError as error:
+        raise InputError(source, f"{name} does not take {key} = {dict(parameters)}: {error}") from None
+    except ValueError:  # compiled, without a signature: it tells itself when it is called
+        pass

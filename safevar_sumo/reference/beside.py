@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis import answer
-from safevar_sumo.analysis.case import Case, Unanswerable
-from safevar_sumo.analysis.questions import Answer
-from safevar_sumo.analysis.rq3 import by_number, changes, critical
+from safevar_sumo.analysis.research_questions.answer import Answer, answer
+from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
+from safevar_sumo.analysis.research_questions.changes import by_number, changes, critical
 from safevar_sumo.errors import InputError
 
 HERE, THERE = "here", "published"

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.case import ALGORITHM_TITLES
-from safevar_sumo.analysis.inference import ALPHA, magnitude
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES
+from safevar_sumo.analysis.research_questions.comparisons import ALPHA, magnitude
 from safevar_sumo.reference.agreement import rank_correlation
 from safevar_sumo.reference.beside import HERE, THERE, Beside
 

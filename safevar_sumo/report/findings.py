@@ -7,15 +7,14 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from safevar_sumo.analysis.quality import nondominated
-from safevar_sumo.answers import explain
-from safevar_sumo.answers.bench import Progress
-from safevar_sumo.answers.robustness import is_borderline
-from safevar_sumo.report.material import Material
-from safevar_sumo.report.stored import stored
+from safevar_sumo.analysis.evaluator import Progress
+from safevar_sumo.analysis.explain.compute import explain_failures as explain
+from safevar_sumo.analysis.explain.necessity import is_borderline
+from safevar_sumo.analysis.research_questions.indicators import nondominated
+from safevar_sumo.replay.comparison import differences, number, raised, spaced
+from safevar_sumo.report.input import Material, stored
 from safevar_sumo.report.svg import Bar, rows
 from safevar_sumo.results import Handle, chosen_handle, unsafe_rows
-from safevar_sumo.showing.comparison import differences, number, raised, spaced
 
 Found = list[dict[str, Any]]
 """What `explain --json` prints."""

@@ -7,12 +7,14 @@ from typing import Any
 
 from markupsafe import Markup
 
-from safevar_sumo import answers
-from safevar_sumo.answers.bench import Progress
-from safevar_sumo.report.material import Material
-from safevar_sumo.report.stored import stored
+from safevar_sumo.analysis.evaluator import Progress
+from safevar_sumo.analysis.risk.compute import estimate_risk
+from safevar_sumo.analysis.rules.compute import find_rules
+from safevar_sumo.analysis.tolerance.compute import find_tolerances
+from safevar_sumo.analysis.words import number_of, rule_in_words
+from safevar_sumo.replay.comparison import number, raised, spaced
+from safevar_sumo.report.input import Material, stored
 from safevar_sumo.report.svg import Bar, rows
-from safevar_sumo.showing.comparison import number, raised, spaced
 from safevar_sumo.vehicles import Characteristic
 
 Found = dict[str, Any]
@@ -21,7 +23,7 @@ Found = dict[str, Any]
 def tolerance(material: Material, jobs: int | None, progress: Progress) -> Found:
     """Every characteristic's safe interval alone, as bars over its domain, and the factor for all together."""
     def compute() -> Found:
-        told = answers.tolerance(material.case.study, **material.options["tolerance"].keywords(), jobs=jobs, progress=progress)
+        told = find_tolerances(material.case.study, **material.options["tolerance"].keywords(), jobs=jobs, progress=progress)
         return {**told.record(), "verdict": told.verdict}
 
     found = stored(material, "tolerance", compute)
@@ -31,7 +33,7 @@ def tolerance(material: Material, jobs: int | None, progress: Progress) -> Found
 def risk(material: Material, jobs: int | None, progress: Progress) -> Found:
     """The probability of a failure with its interval, and what decides, as bars."""
     def compute() -> Found:
-        return answers.risk(material.case.study, **material.options["risk"].keywords(), jobs=jobs, progress=progress).record()
+        return estimate_risk(material.case.study, **material.options["risk"].keywords(), jobs=jobs, progress=progress).record()
 
     found = stored(material, "risk", compute)
     study = material.case.study
@@ -42,10 +44,10 @@ def risk(material: Material, jobs: int | None, progress: Progress) -> Found:
 def rules(material: Material, jobs: int | None, progress: Progress) -> Found:
     """Rules in words, with what they are worth on vehicles that they were not made from."""
     def compute() -> Found:
-        told = answers.rules(material.case.study, **material.options["rules"].keywords(), jobs=jobs, progress=progress)
+        told = find_rules(material.case.study, **material.options["rules"].keywords(), jobs=jobs, progress=progress)
         sure = [rule for rule in told.rules if rule.tells_more_than(told.unsafe_share)]
-        words = [raised(answers.rule_in_words(rule, material.case.characteristics, told.unsafe)) for rule in sure]
-        dropped = answers.number_of(len(told.rules) - len(sure), "rule")
+        words = [raised(rule_in_words(rule, material.case.characteristics, told.unsafe)) for rule in sure]
+        dropped = number_of(len(told.rules) - len(sure), "rule")
         remark = told.remark if len(sure) == len(told.rules) else (
             f"Left out: {dropped} that so few vehicles do not tell from chance; the command rules looks at more.")
         return {"words": words, "samples": told.samples, "share": told.unsafe_share, "remark": remark, "unsafe": str(told.unsafe)}

@@ -9,16 +9,15 @@ from typing import Any
 
 from markupsafe import Markup
 
-from safevar_sumo.answers.bench import Progress, silent
+from safevar_sumo.analysis.evaluator import Progress, silent
 from safevar_sumo.errors import InputError, did_you_mean
+from safevar_sumo.replay.page import environment, player_parts
 from safevar_sumo.report.findings import causes, explanations, necessity, replays
+from safevar_sumo.report.input import Material, gather
 from safevar_sumo.report.limits import LIMITS
-from safevar_sumo.report.material import Material, gather
 from safevar_sumo.report.questions import figures, front, tables
-from safevar_sumo.report.tested import tested
 from safevar_sumo.report.trust import reproduce, trust
-from safevar_sumo.report.verdict import verdict
-from safevar_sumo.showing.page import environment, player_parts
+from safevar_sumo.report.verdict import tested, verdict
 
 WEB = Path(__file__).parent / "web"
 SECTIONS = {

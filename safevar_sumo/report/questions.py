@@ -11,13 +11,14 @@ from urllib.parse import quote
 import numpy as np
 from markupsafe import Markup
 
-from safevar_sumo.analysis import Case, Unanswerable, answer
-from safevar_sumo.analysis.figures import draw
-from safevar_sumo.analysis.layout import Bold, Table, lay_out
+from safevar_sumo.analysis.research_questions.answer import answer
+from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
+from safevar_sumo.analysis.research_questions.figures import draw
+from safevar_sumo.analysis.research_questions.layout import Bold, Table, lay_out
+from safevar_sumo.replay.comparison import raised
 from safevar_sumo.report.findings import best_of, spread
-from safevar_sumo.report.material import Material
+from safevar_sumo.report.input import Material
 from safevar_sumo.report.svg import Dot, scatter
-from safevar_sumo.showing.comparison import raised
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,12 +11,12 @@ from typing import Any
 
 import msgspec
 
-from safevar_sumo.answers.robustness import BORDERLINE, is_borderline
+from safevar_sumo.analysis.explain.necessity import BORDERLINE, is_borderline
+from safevar_sumo.analysis.options import RUN
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.options import RUN
 from safevar_sumo.records import Outcome
 from safevar_sumo.report.findings import Found
-from safevar_sumo.report.material import Material
+from safevar_sumo.report.input import Material
 from safevar_sumo.report.verdict import agreement
 from safevar_sumo.study import Study, load_study, study_names
 

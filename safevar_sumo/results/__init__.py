@@ -2,12 +2,12 @@
 
 from safevar_sumo.results.files import make_directory, write_whole
 from safevar_sumo.results.frames import SPARE
-from safevar_sumo.results.handle import CHOICES, HALF, Handle, chosen_handle, handles, position_of, unsafe_rows
 from safevar_sumo.results.imported import UNKNOWN, write_imported
 from safevar_sumo.results.inputs import begun_and_now, places_of, read_later
 from safevar_sumo.results.journal import Journal, JournalBusy
 from safevar_sumo.results.load import Failure, Results, failure_lines, load
 from safevar_sumo.results.manifest import RESULTS, differences_now, fixed, manifest_of, read_manifest
+from safevar_sumo.results.solution_id import CHOICES, HALF, Handle, chosen_handle, handles, position_of, unsafe_rows
 from safevar_sumo.results.status import RunStatus, Status, status
 from safevar_sumo.results.store import ORIGINAL, ResultsDirectory, evaluations_frame, record, solutions_frame
 

@@ -44,7 +44,7 @@ def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
     study
         As it is run, options applied.
     identity
-        What its results depend on beside its file, by `LAYERS`: see `safevar_sumo.computing.identity_of`.
+        What its results depend on beside its file, by `LAYERS`: see `safevar_sumo.workers.identity_of`.
     """
     return {
         "format": FORMAT, "study": tables_of(study), "seed": study.search.seed, "resolved": fixed(study), **identity,

@@ -41,7 +41,7 @@ class ResultsDirectory:
     study
         The study as it is run, options applied.
     identity
-        What its results depend on beside its file: see `safevar_sumo.computing.identity_of`.
+        What its results depend on beside its file: see `safevar_sumo.workers.identity_of`.
     scoring
         What is measured and minimised.
 

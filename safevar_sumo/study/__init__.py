@@ -1,8 +1,7 @@
 """A study: data only, read strictly from a TOML file."""
 
-from safevar_sumo.study.files import refuse_other_than_file
-from safevar_sumo.study.mistakes import converted, invalid
-from safevar_sumo.study.reading import load_study
+from safevar_sumo.errors import refuse_other_than_file
+from safevar_sumo.study.file import check_writable, load_study, write_study
 from safevar_sumo.study.schema import (
     WORDS,
     CharacteristicTable,
@@ -25,7 +24,7 @@ from safevar_sumo.study.schema import (
     study_path,
     tables_of,
 )
-from safevar_sumo.study.writing import check_writable, write_study
+from safevar_sumo.study.validation import converted, invalid
 
 __all__ = [
     "WORDS", "CharacteristicTable", "FitTable", "FreeParameter", "MatrixTable", "MatrixTest", "MetricsTable", "ModelTable", "Origin",

@@ -10,10 +10,9 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from safevar_sumo.errors import unknown
+from safevar_sumo.errors import refuse_other_than_file, unknown
 from safevar_sumo.shipped import STUDIES
-from safevar_sumo.study.files import refuse_other_than_file
-from safevar_sumo.variation import Correlation, Distribution
+from safevar_sumo.study.variation import Correlation, Distribution
 
 Positive = Annotated[float, Meta(gt=0, le=1e6)]
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]

@@ -14,9 +14,8 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import Characteristics, SumoType
+from safevar_sumo.vehicles.base import GRAVITY, LEVEL, Characteristics, Slope, SumoType
 from safevar_sumo.vehicles.sensors import Sensors
-from safevar_sumo.vehicles.slope import GRAVITY, LEVEL, Slope
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 Share = Annotated[float, Meta(gt=0, le=1)]

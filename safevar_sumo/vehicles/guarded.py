@@ -10,9 +10,8 @@ import numpy as np
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.plugins import Contract, Guard, lent, takes
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import Characteristics, SumoType, Vehicle
+from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType, Vehicle
 from safevar_sumo.vehicles.sensors import Sensors
-from safevar_sumo.vehicles.slope import LEVEL, Slope
 
 VEHICLE_CONTRACT = Contract.of(Vehicle, "a vehicle", optional=("at_speed",))
 FASTEST = 1000.0

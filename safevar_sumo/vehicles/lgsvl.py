@@ -14,8 +14,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import Characteristics, SumoType
-from safevar_sumo.vehicles.slope import LEVEL, Slope
+from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType
 
 # Numbers that meet arrays in every step are arrays themselves: numpy would convert a float each time, which takes as long again.
 NOTHING, ONE, TWO, HALF = map(np.array, (0.0, 1.0, 2.0, 0.5))

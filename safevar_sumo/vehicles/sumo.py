@@ -8,10 +8,8 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import Characteristics, SumoType
-from safevar_sumo.vehicles.delay import delayed, history, remembered
-from safevar_sumo.vehicles.sensors import Sensors, late_and_near
-from safevar_sumo.vehicles.slope import LEVEL, Slope
+from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType
+from safevar_sumo.vehicles.sensors import Sensors, delayed, history, late_and_near, remembered
 
 
 class _Prepared(NamedTuple):

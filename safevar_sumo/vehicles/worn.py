@@ -8,10 +8,8 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import Characteristics, SumoType
-from safevar_sumo.vehicles.delay import delayed, history, remembered
-from safevar_sumo.vehicles.sensors import Sensors, late_and_near
-from safevar_sumo.vehicles.slope import LEVEL, Slope
+from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType
+from safevar_sumo.vehicles.sensors import Sensors, delayed, history, late_and_near, remembered
 
 DEEP_TREAD, HALF_WORN_TREAD, LEGAL_TREAD = 6.7, 3.0, 1.6
 """Tread depths with published stopping distances; the last is the least that is legal in Europe [mm]."""

@@ -14,8 +14,8 @@ from safevar_sumo.ads.world_on_rails import WorldOnRails
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, Nominal, Observation
-from safevar_sumo.simulation import assemble
 from safevar_sumo.study import ModelTable, load_study, study_names
+from safevar_sumo.sumo.system import assemble
 
 STEP = 0.05
 GUARD = Guard("study 'mine'", "ads.model = 'my_module:Wrong'", __file__)

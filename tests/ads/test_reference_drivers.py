@@ -18,8 +18,8 @@ from safevar_sumo.ads.r157 import R157
 from safevar_sumo.ads.rss import Rss
 from safevar_sumo.records import Nominal, Observation, Tables
 from safevar_sumo.shipped import NETWORKS
-from safevar_sumo.simulation.network import CopiedNetwork
-from safevar_sumo.simulation.sumo import open_world
+from safevar_sumo.sumo.engine import open_world
+from safevar_sumo.sumo.network import CopiedNetwork
 
 STEP = 0.05
 TABLE = np.arange(0.0, 20.5, 0.5)

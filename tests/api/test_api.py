@@ -14,10 +14,11 @@ import pandas as pd
 import pytest
 
 import safevar_sumo as sv
-from safevar_sumo.analysis import Case
+from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.api.results import study_of, study_or_case
-from safevar_sumo.simulation import assemble, simulate
 from safevar_sumo.study import load_study, tables_of
+from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
 

@@ -10,12 +10,12 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.campaign import Campaign, RunKey, all_runs, carry_out
-from safevar_sumo.computing import PoolLostError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.workers.evaluation import PoolLostError
 
 SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
 

@@ -14,12 +14,12 @@ from formulas import SUN, FormulaPool, Told, carried_out, evaluated, solutions, 
 from rich.console import Console
 
 from safevar_sumo.campaign import RunKey, all_runs, carry_out, run_generator
-from safevar_sumo.campaign.gathering import BATCHES_PER_WORKER
-from safevar_sumo.computing import PoolLostError
+from safevar_sumo.campaign.batcher import BATCHES_PER_WORKER
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory, load, status
 from safevar_sumo.study import Study, tables_of
+from safevar_sumo.workers.evaluation import PoolLostError
 
 
 def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches(study: Study, tmp_path: Path) -> None:

@@ -8,9 +8,9 @@ import pytest
 from formulas import FormulaPool, carried_out, with_search
 
 from safevar_sumo.campaign import forecast
-from safevar_sumo.computing import PoolLostError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.study import Study
+from safevar_sumo.workers.evaluation import PoolLostError
 
 
 def test_a_forecast_counts_and_measures(study: Study) -> None:

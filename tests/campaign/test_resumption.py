@@ -14,7 +14,6 @@ from formulas import SUN, FormulaPool, Told, carried_out, evaluated, solutions, 
 
 from safevar_sumo.campaign import RunKey, all_runs, carry_out
 from safevar_sumo.campaign.run import Run
-from safevar_sumo.computing import PoolLostError, WorkerLostError
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import Journal, ResultsDirectory, load
@@ -22,6 +21,7 @@ from safevar_sumo.results.frames import encoded, read_frames
 from safevar_sumo.results.journal import read_journal
 from safevar_sumo.search import Search
 from safevar_sumo.study import Study
+from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError
 
 
 def test_a_torn_tail_is_told_and_simulated_again(study: Study, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from safevar_sumo.cli.changes import read_changes, settings_of
+from safevar_sumo.cli.options import read_changes, settings_of
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import load_study

@@ -16,9 +16,9 @@ import pytest
 from processes import ended, killed, started, until, written
 from small import solutions
 
-from safevar_sumo.computing import cluster
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import load
+from safevar_sumo.workers import cluster
 
 Start = Callable[..., subprocess.Popen[str]]
 

@@ -9,10 +9,10 @@ import pytest
 from processes import ended, started, written
 from small import solutions, study
 
-from safevar_sumo.computing import identity_of
 from safevar_sumo.results import ResultsDirectory, load
-from safevar_sumo.simulation import assemble
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.workers.identity import identity_of
 
 pytestmark = pytest.mark.usefixtures("small")
 

@@ -15,7 +15,7 @@ from test_commands import run as run_process
 from typed import refused
 from typed import run_here as run
 
-from safevar_sumo.analysis import load_cases
+from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
 

@@ -17,8 +17,9 @@ from typed import refused
 from safevar_sumo.cli import reference
 from safevar_sumo.cli.program import commands
 from safevar_sumo.reference import with_values
-from safevar_sumo.simulation import assemble, evaluate
 from safevar_sumo.study import Study, load_study
+from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.system import assemble
 
 COLUMNS = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
 

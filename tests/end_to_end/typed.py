@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import pytest
 
-from safevar_sumo.cli import main
+from safevar_sumo.cli.program import main
 
 
 class Done(NamedTuple):

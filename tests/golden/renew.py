@@ -12,10 +12,10 @@ import msgspec
 from in_process import Here, Silent
 
 from safevar_sumo.campaign import all_runs, carry_out
-from safevar_sumo.computing import identity_of
 from safevar_sumo.results import RESULTS, ResultsDirectory, load
-from safevar_sumo.simulation import assemble
 from safevar_sumo.study import Study, load_study
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.workers.identity import identity_of
 
 STUDIES = ("sun", "rain", "lgsvl", "native", "smoke")
 FILE = Path(__file__).with_name("golden.json")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import Future
 
-from safevar_sumo.computing import evaluate_batch
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.simulation import System
+from safevar_sumo.sumo.system import System
+from safevar_sumo.workers.evaluation import evaluate_batch
 
 Mine = Callable[..., System]
 SCALAR = "from safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from beside import ADS, Mine
 
-from safevar_sumo.simulation import System, assemble
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.system import System, assemble
 
 
 @pytest.fixture

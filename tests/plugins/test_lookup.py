@@ -10,8 +10,9 @@ import pytest
 from beside import ADS, SCALAR, Mine
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.simulation import assemble, evaluate
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.system import assemble
 
 CHARACTERISTICS = "characteristics = { mass = { unit = 'kg', original = 1, lower = 0.5, upper = 2 } }\n"
 CONSTANT = SCALAR + "    def drive(self, seen):\n        return {}, 0.0\n"

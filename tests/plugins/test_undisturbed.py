@@ -12,14 +12,15 @@ from beside import SCALAR, Mine
 
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.metrics import deceleration
-from safevar_sumo.simulation import batch, evaluate
+from safevar_sumo.sumo import batch
+from safevar_sumo.sumo.matrix import evaluate
 
 DRIVE = "    def drive(self, seen):\n        {}\n        return 0.5, 0.0\n"
 
 
 IMPORTS = """import numpy as np
 import safevar_sumo.metrics.deceleration as deceleration
-import safevar_sumo.simulation.batch as batch
+import safevar_sumo.sumo.batch as batch
 """
 
 

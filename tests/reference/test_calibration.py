@@ -9,8 +9,9 @@ from in_process import Here
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.reference import ReferenceData, calibrate, fitted_as, with_values
-from safevar_sumo.simulation import assemble, evaluate
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
+from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.system import assemble
 
 GAP = "ads.parameters.brake_gap"
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from safevar_sumo.records import Evaluations, Outcome
-from safevar_sumo.reference.loss import original_cost
+from safevar_sumo.reference.fit import original_cost
 from safevar_sumo.study import FitTable
 
 PUBLISHED = {"safety_degree": 2.0, "tet": 1.0}

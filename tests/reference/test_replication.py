@@ -9,11 +9,11 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner, Result
 
-from safevar_sumo.analysis import load_cases
+from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.reference.beside import paired, tables_beside
 from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, conclusions, grade
-from safevar_sumo.reference.nearness import nearness
+from safevar_sumo.reference.replication import nearness
 from safevar_sumo.reference.rows import read_reference
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet

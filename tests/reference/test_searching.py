@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.records import FloatArray
-from safevar_sumo.reference.searching import Search
+from safevar_sumo.reference.fit import Search
 
 
 class Bowl:

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from safevar_sumo.reference.agreement import rank_correlation
-from safevar_sumo.simulation import assemble, score, simulate_alone
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.batch import score
+from safevar_sumo.sumo.kinematic import simulate_alone
+from safevar_sumo.sumo.system import assemble
 
 PUBLISHED_EFFECTS = {"tireFric": 1.2, "mass": -0.8, "maxBrakeTorque": 0.6, "dampRateZeroT_CE": 0.4, "radius": 0.4, "max_rpm": 0.2,
                      "dampRateZeroT_CD": 0.2}

@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from safevar_sumo import answers
-from safevar_sumo.answers import Rule, Unsafe
-from safevar_sumo.answers.bench import silent
-from safevar_sumo.report import findings, make_report
-from safevar_sumo.report import tested as what
+from safevar_sumo.analysis.criterion import Unsafe
+from safevar_sumo.analysis.evaluator import silent
+from safevar_sumo.analysis.rules.compute import Rule
+from safevar_sumo.report import findings, limits, make_report
+from safevar_sumo.report import verdict as what
 from safevar_sumo.report.limits import LIMITS, _percent
 from safevar_sumo.report.page import PARTS, gather
 from safevar_sumo.scenarios import Point
@@ -74,7 +74,7 @@ def test_a_rule_that_may_be_chance_is_no_finding(slippery: Path, tmp_path: Path,
     sure = Rule({"tireFric": (None, 1.2)}, 300, 290, 290, 0.95)
     everywhere = Rule({}, 300, 300, 300, 0.95)
     told = SimpleNamespace(rules=[sure, chance, everywhere], samples=4000, unsafe_share=0.15, remark="", unsafe=Unsafe())
-    monkeypatch.setattr(answers, "rules", lambda *_, **__: told)
+    monkeypatch.setattr(limits, "find_rules", lambda *_, **__: told)
     found = LIMITS["rules"](material, 1, silent)
     assert [words.partition(":")[0] for words in found["words"]] == ["tireFric below 1.2", "everywhere"]
     assert found["remark"].startswith("Left out: 1 rule that so few vehicles do not tell from chance")

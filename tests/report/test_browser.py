@@ -13,10 +13,12 @@ from browser import axe_core, chromium, resized, violations
 from selenium.webdriver import Chrome
 from selenium.webdriver.common.by import By
 
-from safevar_sumo.analysis import load_cases
-from safevar_sumo.report import make_report, material
-from safevar_sumo.showing import animate, compare
-from safevar_sumo.simulation import assemble
+from safevar_sumo.analysis.research_questions.case import load_cases
+from safevar_sumo.replay.animation import animate
+from safevar_sumo.replay.comparison import compare
+from safevar_sumo.report import input as material
+from safevar_sumo.report import make_report
+from safevar_sumo.sumo.system import assemble
 
 ORDER = "return [...arguments[0].tBodies[0].rows].map((row) => parseFloat(row.cells[2].textContent))"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from safevar_sumo.report.places import AVOIDED, failing_places
+from safevar_sumo.report.input import AVOIDED, failing_places
 from safevar_sumo.scenarios import Point
 
 

@@ -15,17 +15,18 @@ import pytest
 from click.testing import CliRunner
 
 from safevar_sumo.ads.full_braking import FullBraking
-from safevar_sumo.analysis import Case, load_cases
+from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.report import SECTIONS, findings, limits, make_report, material
+from safevar_sumo.replay.comparison import changes_in_words
+from safevar_sumo.report import SECTIONS, findings, limits, make_report
+from safevar_sumo.report import input as material
 from safevar_sumo.report.limits import LIMITS
 from safevar_sumo.report.page import gather
 from safevar_sumo.report.svg import Dot, scatter
 from safevar_sumo.report.verdict import verdict
 from safevar_sumo.results import Handle
-from safevar_sumo.showing.comparison import changes_in_words
-from safevar_sumo.simulation import assemble
+from safevar_sumo.sumo.system import assemble
 
 
 class Outline(HTMLParser):

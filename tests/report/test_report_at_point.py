@@ -9,13 +9,13 @@ import pytest
 from in_process import Here, Silent
 
 from safevar_sumo.campaign import all_runs, carry_out
-from safevar_sumo.computing import identity_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.report import make_report
 from safevar_sumo.report.page import gather
 from safevar_sumo.results import ResultsDirectory
-from safevar_sumo.simulation import assemble
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.workers.identity import identity_of
 
 DAY, RAIN = "crossing, clear", "crossing, hard_rain"
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from safevar_sumo.computing import identity_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import ResultsDirectory, load
 from safevar_sumo.results.manifest import FORMAT
-from safevar_sumo.simulation import assemble
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.workers.identity import identity_of
 
 STORED = Path(__file__).with_name("stored")
 

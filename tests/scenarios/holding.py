@@ -9,8 +9,9 @@ import numpy as np
 
 from safevar_sumo.records import Command, Drives, FloatArray, Nominal, Observation
 from safevar_sumo.scenarios import Scenario
-from safevar_sumo.simulation import System, assemble, simulate
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.system import System, assemble
 
 CARLA = assemble(load_study("sun"))
 NATIVE = assemble(load_study("native"))

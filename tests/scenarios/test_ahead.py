@@ -18,7 +18,7 @@ from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios.along import Along
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.euro_ncap import VUT_WIDTH
-from safevar_sumo.simulation import simulate
+from safevar_sumo.sumo.matrix import simulate
 
 KMH = 1 / 3.6
 STOPS_AT_ONCE = Hold(np.array([0.0]))

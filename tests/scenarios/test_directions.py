@@ -11,8 +11,9 @@ import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.shipped import NETWORKS
-from safevar_sumo.simulation import assemble, simulate
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.system import assemble
 
 TURNS = {"north": (0.0, 1.0), "west": (-1.0, 0.0), "north-west": (-0.6, 0.8)}
 """Where a road that leads east leads then."""

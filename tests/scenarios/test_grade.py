@@ -17,8 +17,9 @@ from safevar_sumo.scenarios.along import Along
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.euro_ncap import VUT_WIDTH
-from safevar_sumo.simulation import assemble, evaluate, simulate
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import evaluate, simulate
+from safevar_sumo.sumo.system import assemble
 
 WORN = assemble(load_study("wear", matrix=None))
 

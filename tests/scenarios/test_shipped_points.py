@@ -11,8 +11,9 @@ from holding import Hold, at_contact
 from safevar_sumo.records import Drives
 from safevar_sumo.scenarios import Crossing
 from safevar_sumo.scenarios.along import Along
-from safevar_sumo.simulation import System, assemble, at_every_point
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import at_every_point
+from safevar_sumo.sumo.system import System, assemble
 
 BRAKE = {"euro_ncap_pedestrian": "maxBrakeTorque", "euro_ncap_car_to_car": "maxBrakeTorque", "wear": "brakeTorque"}
 

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.records import Command
-from safevar_sumo.simulation import System, assemble
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import slope_of
 
 STEP = 0.05

@@ -23,8 +23,8 @@ from drives import (
 from safevar_sumo.records import Command, Observation
 from safevar_sumo.vehicles import VEHICLES
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, FINAL_RATIO, GEAR_RATIOS, Carla
-from safevar_sumo.vehicles.delay import delayed
 from safevar_sumo.vehicles.lgsvl import Lgsvl
+from safevar_sumo.vehicles.sensors import delayed
 
 MODELS = sorted(VEHICLES)
 

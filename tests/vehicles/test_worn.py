@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from safevar_sumo.records import Command, Observation
-from safevar_sumo.simulation import assemble, evaluate
 from safevar_sumo.study import load_study
-from safevar_sumo.vehicles.slope import GRAVITY, LEVEL
+from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.vehicles.base import GRAVITY, LEVEL
 from safevar_sumo.vehicles.worn import WornVehicle
 
 CAR = WornVehicle()

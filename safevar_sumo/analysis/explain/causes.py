@@ -1,0 +1,210 @@
+"""Minimal causes: the smallest subsets of a setting's changes that are unsafe by themselves.
+
+Outcomes need not be monotone: a change may take back what another one does. So nothing is inferred, every subset of a
+size is simulated, all those smaller than the smallest unsafe one included; that none of these is unsafe is what makes
+a cause minimal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+from itertools import combinations
+from math import comb
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.analysis.criterion import Unsafe
+from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.records import FloatArray
+
+CHUNK = 20_000
+"""Subsets that are held in memory at the same time."""
+
+
+class MinimalCause(NamedTuple):
+    """A smallest unsafe subset of a setting's changes: the columns that keep their values, and what they do by themselves.
+
+    `setting` has shape (n,); `safety_degree` is in m, or -m/s.
+    """
+
+    columns: tuple[int, ...]
+    setting: FloatArray
+    outcome: str
+    safety_degree: float | None
+
+
+class _Subset(NamedTuple):
+    """Which changes of which setting."""
+
+    setting: int
+    columns: tuple[int, ...]
+
+
+def minimal_causes(bench: Bench, settings: FloatArray, unsafe: Unsafe) -> list[list[MinimalCause]]:
+    """All smallest unsafe subsets of the changes of every setting, shape (M, n); none where no subset is unsafe.
+
+    The empty subset counts: a study whose original vehicle is unsafe needs no change.
+    """
+    original = bench.characteristics.original
+    changed = [tuple(np.flatnonzero(row).tolist()) for row in bench.characteristics.changed(settings)]
+    found: list[list[MinimalCause]] = [[] for _ in settings]
+    for size in range(max(map(len, changed), default=0) + 1):
+        subsets = [_Subset(setting, columns) for setting, of_it in enumerate(changed) if not found[setting]
+                   for columns in combinations(of_it, size)]
+        for start in range(0, len(subsets), CHUNK):
+            part = subsets[start:start + CHUNK]
+            tried = np.tile(original, (len(part), 1))
+            for row, (setting, columns) in enumerate(part):
+                tried[row, list(columns)] = settings[setting, list(columns)]
+            evaluations = bench.evaluate(tried, f"subsets of {size} changes")
+            for row in np.flatnonzero(unsafe.of(evaluations)).tolist():
+                found[part[row].setting].append(
+                    MinimalCause(part[row].columns, tried[row], str(evaluations.outcome[row]), number(evaluations.f_safe[row])))
+    return found
+
+
+def number(value: float) -> float | None:
+    """A number as records hold it: what is undefined is None."""
+    return None if np.isnan(value) else float(value)
+
+
+def expected_cost(changes: int) -> int:
+    """About how many subsets of so many changes are simulated until the smallest unsafe ones are found.
+
+    As if these had half of the changes, which is about what causes of the shipped studies come to.
+    """
+    return sum(comb(changes, size) for size in range((changes + 1) // 2 + 1))
+
+
+def affordable(settings: FloatArray, bench: Bench, limit: int) -> list[int]:
+    """Rows of settings whose minimal causes can be found with about `limit` simulations: all, or a random sample of them."""
+    costs = [expected_cost(int(changes)) for changes in bench.characteristics.number_changed(settings)]
+    if sum(costs) <= limit:
+        return list(range(len(settings)))
+    order = np.random.default_rng(bench.study.search.seed).permutation(len(settings))
+    within = np.cumsum([costs[row] for row in order]) <= limit
+    return sorted(order[within].tolist())
+
+
+def necessary(causes: Sequence[MinimalCause]) -> frozenset[int]:
+    """Columns that every one of a setting's minimal causes needs."""
+    return frozenset.intersection(*(frozenset(cause.columns) for cause in causes)) if causes else frozenset()
+
+
+def involved(causes: Sequence[MinimalCause]) -> frozenset[int]:
+    """Columns that one of a setting's minimal causes needs."""
+    return frozenset(column for cause in causes for column in cause.columns)
+
+
+GRID = 32
+"""Places that a line is looked at first: an island of unsafety as wide as one of them is not skipped."""
+FINER = 8
+"""Into how many parts the last safe part is divided, again and again."""
+ROUNDS = 3
+RESOLUTION = 1 / (GRID * FINER**ROUNDS)
+"""How near to the truth a boundary is, as a share of the line."""
+
+
+class End(StrEnum):
+    """What is just below the smallest unsafe share of a line."""
+
+    SAFE = "safe"
+    FILTER = "filter threshold"
+    NOT_SIMULATED = "not simulated"
+
+
+class Boundary(NamedTuple):
+    """The smallest unsafe share of a cause's changes, and the setting there, shape (n,).
+
+    `alone` are, by column, the values that the changes can be taken back to one at a time, the others as they are. `end` tells what is
+    just below the share; where the filter's threshold ends the line, `at_threshold` is the column of the change that it takes for none.
+    """
+
+    fraction: float
+    setting: FloatArray
+    alone: dict[int, float]
+    end: End = End.SAFE
+    at_threshold: int | None = None
+
+
+def boundaries(bench: Bench, causes: list[MinimalCause], unsafe: Unsafe) -> list[Boundary]:
+    """Shrink causes, all changes by a common factor and each alone, as far as they stay unsafe.
+
+    No change is shrunk into what the filter takes for none.
+    """
+    together = [(cause, cause.columns) for cause in causes]
+    alone = [(cause, (column,)) for cause in causes for column in cause.columns]
+    lines = [Line.moving(bench, cause, columns) for cause, columns in [*together, *alone]]
+    fractions, ends = edges(bench, lines, unsafe)
+    single = iter(zip(lines[len(causes):], fractions[len(causes):], strict=True))
+    shrunk = []
+    for i, cause in enumerate(causes):
+        if not cause.columns:
+            shrunk.append(Boundary(0.0, cause.setting, {}))
+            continue
+        of_it = {}
+        for column in cause.columns:
+            line, fraction = next(single)
+            of_it[column] = float(line.at(np.array([fraction]))[0, column])
+        setting = lines[i].at(fractions[i:i + 1])[0]
+        limiting = lines[i].first_filtered(bench.characteristics.threshold) if ends[i] == End.FILTER else None
+        shrunk.append(Boundary(float(fractions[i]), setting, of_it, ends[i], limiting))
+    return shrunk
+
+
+class Line(NamedTuple):
+    """Settings from `start` to `end`, shape (n,) each; those at the share `lowest` of it and below do not count."""
+
+    start: FloatArray
+    end: FloatArray
+    lowest: float
+
+    @classmethod
+    def moving(cls, bench: Bench, cause: MinimalCause, columns: tuple[int, ...]) -> Line:
+        """The line on which some columns of a cause go from the original to their values."""
+        members = bench.characteristics
+        which = list(columns)
+        start = cause.setting.copy()
+        start[which] = members.original[which]
+        ways = np.abs(cause.setting - members.original)[which]
+        return cls(start, cause.setting, float(np.max(members.threshold[which] / ways, initial=0.0)))
+
+    def first_filtered(self, threshold: FloatArray) -> int:
+        """The column whose change first falls to the filter's threshold on the way back."""
+        way = np.abs(self.end - self.start)
+        return int(np.argmax(np.divide(threshold, way, out=np.zeros_like(way), where=way > 0)))
+
+    def at(self, shares: FloatArray) -> FloatArray:
+        """Settings at shares of the line, shape (K, n)."""
+        part = shares[:, np.newaxis]
+        return np.where(part >= 1, self.end, self.start + part * (self.end - self.start))
+
+
+def first_unsafe(bench: Bench, lines: list[Line], unsafe: Unsafe, what: str = "boundaries") -> FloatArray:
+    """The first unsafe share of every line, whose end is unsafe; exact to `RESOLUTION` of what counts of it."""
+    return edges(bench, lines, unsafe, what)[0]
+
+
+def edges(bench: Bench, lines: list[Line], unsafe: Unsafe, what: str = "boundaries") -> tuple[FloatArray, list[End]]:
+    """The first unsafe share of every line as `first_unsafe`, and what is just below it.
+
+    A place that cannot be simulated is neither safe nor unsafe: the search goes past it as past a safe one, and tells if it ends there.
+    """
+    lowest = np.array([line.lowest for line in lines])
+    low, high, simulated = lowest, np.ones(len(lines)), np.ones(len(lines), dtype=bool)
+    for parts in (GRID, *(FINER,) * ROUNDS):
+        shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(1, parts + 1) / parts
+        shares[:, -1] = high
+        inner = np.concatenate([line.at(of_it[:-1]) for line, of_it in zip(lines, shares, strict=True)]) if lines else np.zeros((0, 0))
+        evaluations = bench.evaluate(inner, what)
+        is_unsafe, valid = (np.ones(shares.shape, dtype=bool) for _ in range(2))
+        is_unsafe[:, :-1] = unsafe.of(evaluations).reshape(len(lines), parts - 1)
+        valid[:, :-1] = evaluations.valid.reshape(len(lines), parts - 1)
+        first = np.argmax(is_unsafe, axis=1)
+        rows = np.arange(len(lines))
+        simulated = np.where(first > 0, valid[rows, np.maximum(first - 1, 0)], simulated)
+        low, high = np.where(first > 0, shares[rows, np.maximum(first - 1, 0)], low), shares[rows, first]
+    ends = np.where((low == lowest) & (lowest > 0), End.FILTER, np.where(simulated, End.SAFE, End.NOT_SIMULATED))
+    return high, [End(end) for end in ends]

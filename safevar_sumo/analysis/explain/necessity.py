@@ -1,0 +1,143 @@
+"""Over many failures: which characteristics are needed, beside how often they are changed; and which causes there are."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.analysis.criterion import Unsafe
+from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.explain.causes import MinimalCause, involved, necessary
+from safevar_sumo.analysis.risk.compute import interval_of
+from safevar_sumo.analysis.words import direction
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.vehicles import CharacteristicSet
+
+CONFIDENCE = 0.95
+"""Of the interval of a sample's share."""
+Key = tuple[str, ...]
+"""A cause without its sizes: its changes with their directions, such as ('mass up', 'tireFric down')."""
+
+
+def key_of(characteristics: CharacteristicSet, cause: MinimalCause) -> Key:
+    return tuple(direction(characteristics.members[column], float(cause.setting[column])) for column in cause.columns)
+
+
+def necessity(characteristics: CharacteristicSet, changed: BoolArray, causes: Sequence[Sequence[MinimalCause]],
+              failures: int) -> pd.DataFrame:
+    """How often each characteristic is changed, and how often it is needed.
+
+    Parameters
+    ----------
+    changed
+        Which characteristics each of M failures changes, shape (M, n).
+    causes
+        The minimal causes of each.
+    failures
+        How many failures there are; if more than M, the M are a random sample of them.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row per characteristic: `characteristic`, and shares of the failures: `changed`; `necessary`, in every minimal
+        cause; `involved`, in one at least; and `necessary_lower` and `necessary_upper`, the `CONFIDENCE` interval of `necessary` among
+        all failures: Clopper and Pearson's for a sample (a little too wide, as it is drawn without replacement from finitely many),
+        the share itself where all failures were analysed. Ordered by necessary, involved, changed; without rows if there is no failure.
+    """
+    columns = range(len(characteristics) if len(changed) else 0)
+    counts = {"changed": _count(frozenset(np.flatnonzero(row).tolist()) for row in changed),
+              "necessary": _count(map(necessary, causes)), "involved": _count(map(involved, causes))}
+    sampled = len(changed) < failures
+    intervals = [interval_of(counts["necessary"][column], len(changed), CONFIDENCE) if sampled
+                 else (counts["necessary"][column] / len(changed),) * 2 for column in columns]
+    frame = pd.DataFrame({
+        "characteristic": pd.Series([characteristics.names[column] for column in columns], dtype=object),
+        **{name: pd.Series([count[column] / len(changed) for column in columns], dtype=float) for name, count in counts.items()},
+        "necessary_lower": pd.Series([low for low, _ in intervals], dtype=float),
+        "necessary_upper": pd.Series([high for _, high in intervals], dtype=float)})
+    return frame.sort_values(["necessary", "involved", "changed"], ascending=False, kind="stable", ignore_index=True)
+
+
+def distinct_causes(characteristics: CharacteristicSet, causes: Sequence[Sequence[MinimalCause]]) -> pd.DataFrame:
+    """Every distinct minimal cause, most frequent first.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns `cause`, a tuple of changes with their directions; `failures`, how many have it; `share` of all failures.
+    """
+    counts = Counter(key for of_it in causes for key in {key_of(characteristics, cause) for cause in of_it})
+    order = sorted(counts, key=lambda key: (-counts[key], len(key), key))
+    return pd.DataFrame({
+        "cause": pd.Series(order, dtype=object), "failures": pd.Series([counts[key] for key in order], dtype=int),
+        "share": pd.Series([counts[key] / len(causes) for key in order], dtype=float)})
+
+
+def _count(sets: Iterable[frozenset[int]]) -> Counter[int]:
+    return Counter(column for columns in sets for column in columns)
+
+
+NEIGHBOURS = 64
+STEP_FACTORS = (1.0, 0.5, 2.0)
+"""Of the study's time step: itself, half of it, and twice."""
+BORDERLINE = 0.8
+"""A share of unsafe outcomes below which a finding is called borderline."""
+TOGETHER = 8
+"""Failures, the smallest first, that are tried at a time."""
+
+
+class Robustness(NamedTuple):
+    """Shares of unsafe outcomes among the neighbours of a setting, by time step [s]."""
+
+    by_step: dict[float, float]
+
+    @property
+    def share(self) -> float:
+        return sum(self.by_step.values()) / len(self.by_step)
+
+    @property
+    def borderline(self) -> bool:
+        return is_borderline(self.share)
+
+
+def is_borderline(share: float) -> bool:
+    """Whether so few of a finding's neighbours are unsafe too that small perturbations remove it."""
+    return share < BORDERLINE
+
+
+def robustness(bench: Bench, settings: FloatArray, step: float, unsafe: Unsafe) -> list[Robustness]:
+    """How robust settings, shape (M, n), are.
+
+    The neighbours of a setting differ from it in every characteristic by no more than the filter takes for no change;
+    they are simulated as they are, with the study's time step (`step` seconds), half of it and twice. Neighbours that cannot be simulated
+    are left out of the share.
+    """
+    members = bench.characteristics
+    offsets = np.random.default_rng(bench.study.search.seed).uniform(-1, 1, (NEIGHBOURS, len(members))) * members.threshold
+    around = np.clip(settings[:, np.newaxis] + offsets, members.lower, members.upper).reshape(-1, len(members))
+    shares = {}
+    for factor in STEP_FACTORS:
+        on = bench if factor == 1 else bench.with_step(step * factor)
+        evaluations = on.evaluate(around, f"neighbours at {step * factor:g} s a step")
+        outcomes, valid = (truths.reshape(len(settings), NEIGHBOURS) for truths in (unsafe.of(evaluations), evaluations.valid))
+        shares[step * factor] = (outcomes & valid).sum(axis=1) / np.maximum(valid.sum(axis=1), 1)
+    return [Robustness({step: float(of_it[row]) for step, of_it in shares.items()}) for row in range(len(settings))]
+
+
+def smallest_robust(bench: Bench, failures: Evaluations, step: float, unsafe: Unsafe, limit: int) -> int | None:
+    """The row of the smallest failure that is not borderline: of the fewest changes, then the smallest largest change.
+
+    They are tried in that order until one is robust or about `limit` simulations are spent; None if none is robust by then.
+    """
+    order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])
+    most = max(TOGETHER, limit // (NEIGHBOURS * len(STEP_FACTORS)))
+    for first in range(0, min(len(order), most), TOGETHER):
+        rows = order[first:first + TOGETHER]
+        for row, found in zip(rows.tolist(), robustness(bench, failures.settings[rows], step, unsafe), strict=True):
+            if not found.borderline:
+                return int(row)
+    return None

@@ -1,0 +1,151 @@
+"""What `explain` returns: records, frames, and what they are as JSON."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from safevar_sumo.analysis.criterion import Unsafe
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison
+from safevar_sumo.analysis.explain.causes import End
+from safevar_sumo.analysis.explain.necessity import Robustness
+from safevar_sumo.analysis.preventability import Preventability
+from safevar_sumo.analysis.words import sentence
+from safevar_sumo.records import Evaluations
+from safevar_sumo.results import Handle
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cause:
+    """A smallest subset of a failure's changes that is unsafe by itself, all else as in the original vehicle.
+
+    Attributes
+    ----------
+    changes
+        The failure's values of these characteristics, in their units.
+    boundary
+        The same, shrunk by a common factor as far as they stay unsafe: at `fraction` of the changes.
+    alone
+        How far each value alone can be taken back, the others as in `changes`.
+    outcome, safety_degree
+        What `changes` do [m, or -m/s].
+    end, at_threshold
+        What is just below `fraction`; where the filter's threshold ends the line, the characteristic whose change it takes for none.
+    """
+
+    changes: dict[str, float]
+    boundary: dict[str, float]
+    fraction: float
+    alone: dict[str, float]
+    outcome: str
+    safety_degree: float | None
+    end: End = End.SAFE
+    at_threshold: str | None = None
+
+    @property
+    def limit(self) -> str:
+        """How little of the changes is enough, and what ends it, in a sentence."""
+        below = {End.SAFE: "slightly less is safe",
+                 End.FILTER: f"with less, the change of {self.at_threshold} falls below the filter's threshold and counts as none",
+                 End.NOT_SIMULATED: "slightly less could not be simulated"}[self.end]
+        return f"Scaling all changes to {self.fraction:.0%} is still unsafe; {below}."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explanation:
+    """One failure explained; `handle` is None for what did not come from results, `reasons` tell why it was chosen.
+
+    `safety_degree` is in m, or -m/s; `changed` and `necessary` are names; `causes` are all minimal ones; `preventable` tells of
+    a collision who would have avoided it in the same vehicle; `points` are those of a matrix at which it is unsafe.
+    """
+
+    handle: Handle | None
+    reasons: tuple[str, ...]
+    setting: dict[str, float]
+    outcome: str
+    safety_degree: float | None
+    changed: tuple[str, ...]
+    necessary: tuple[str, ...]
+    causes: tuple[Cause, ...]
+    robustness: Robustness
+    because: BrakingComparison
+    preventable: str = ""
+    points: tuple[str, ...] = ()
+
+    def record(self) -> dict[str, Any]:
+        """As `explain --json` prints it."""
+        return {
+            "algorithm": self.handle.algorithm if self.handle else None, "run": self.handle.run if self.handle else None,
+            "index": self.handle.row if self.handle else None, "setting": self.setting, "outcome": self.outcome,
+            "safety_degree": self.safety_degree, "changed": list(self.changed),
+            "minimal_causes": [
+                {name: getattr(cause, name) for name in ("changes", "boundary", "fraction", "outcome", "safety_degree", "end")}
+                for cause in self.causes],
+            "robustness": self.robustness.share, "because": sentence(self.because),
+            "reasons": list(self.reasons)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explained:
+    """Failures explained, and what all of them have in common.
+
+    Attributes
+    ----------
+    explanations
+        The failures that were chosen.
+    necessity, distinct
+        Frames over all failures looked into, of `safevar_sumo.analysis.explain.necessity`.
+    looked_at, failures, analysed
+        How many settings were looked at, how many of them are unsafe, and over how many of these the two frames are.
+    otherwise
+        How many solutions do not end as the results say.
+    preventability
+        Who avoids the collisions among the settings looked at.
+    """
+
+    study: Study
+    unsafe: Unsafe
+    original: Evaluations
+    explanations: tuple[Explanation, ...]
+    necessity: pd.DataFrame
+    distinct: pd.DataFrame
+    looked_at: int
+    failures: int
+    analysed: int
+    otherwise: int
+    preventability: Preventability
+
+    def records(self) -> list[dict[str, Any]]:
+        """As `explain --json` prints them: one for each failure, and a summary."""
+        of_it = self.necessity.set_index("characteristic")
+        shares: dict[str, Any] = {
+            name: dict(zip(of_it.index, of_it[name].tolist(), strict=True)) for name in ("necessary", "changed")}
+        ends = zip(of_it["necessary_lower"].tolist(), of_it["necessary_upper"].tolist(), strict=True)
+        shares["necessary_interval"] = dict(zip(of_it.index, map(list, ends), strict=True))
+        return [*(one.record() for one in self.explanations), {"summary": {**shares, "preventable": self.preventability.to_dict()}}]
+
+    def __repr__(self) -> str:
+        return f"<Explained {self.study.name}, unsafe {self.unsafe}: {self.failures} of {self.looked_at}, {len(self.explanations)} in full>"
+
+    def frame(self) -> pd.DataFrame:
+        """One row for each change of each minimal cause of each explanation.
+
+        Columns: `failure`, counted from 0, `algorithm`, `run`, `index`, `cause`, counted from 0, `characteristic`, `unit`,
+        `original`, `value`, `boundary`, `alone` [unit], `fraction`, `outcome`, `safety_degree` [m or -m/s], `robustness`,
+        `whose`, and `points`, separated by semicolons.
+        """
+        rows = []
+        for i, one in enumerate(self.explanations):
+            algorithm, run, index = one.handle or (None, None, None)
+            for j, cause in enumerate(one.causes):
+                for member in CharacteristicSet.of(self.study.vehicle.characteristics):
+                    if member.name in cause.changes:
+                        rows.append((i, algorithm, run, index, j, member.name, member.unit, member.original, cause.changes[member.name],
+                                     cause.boundary[member.name], cause.alone[member.name], cause.fraction, cause.outcome,
+                                     cause.safety_degree, one.robustness.share, one.preventable, "; ".join(one.points)))
+        return pd.DataFrame(rows, columns=["failure", "algorithm", "run", "index", "cause", "characteristic", "unit", "original", "value",
+                                           "boundary", "alone", "fraction", "outcome", "safety_degree", "robustness", "whose", "points"])

@@ -1,0 +1,258 @@
+"""The answer that a study's summary leads with: the failures that matter, each with its minimal cause in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.analysis.criterion import Unsafe
+from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.explain.causes import MinimalCause, minimal_causes, number
+from safevar_sumo.analysis.explain.compute import REASONS
+from safevar_sumo.analysis.explain.failures import points_in_words, points_of, where
+from safevar_sumo.analysis.explain.necessity import Robustness, robustness, smallest_robust
+from safevar_sumo.analysis.preventability import Preventability, PreventableBy, preventability
+from safevar_sumo.analysis.words import ENDS, ask, changes, joined, number_of
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, unsafe_rows
+from safevar_sumo.scenarios import Point
+from safevar_sumo.scenarios.pre_crash import pre_crash_of
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.matrix import at_every_point, study_at, worst_points
+from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.workers.evaluation import Pool
+
+LIMIT = 4000
+"""Simulations, about, in which the smallest robust failure is looked for at the end of a study; `explain` takes more."""
+
+
+def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Pool, place: str) -> list[str]:
+    """What solutions of a study come to, in lines, and which command tells more: first a paragraph that a manager understands.
+
+    Unsafe is what `safevar_sumo.results.unsafe_rows` goes by.
+
+    Parameters
+    ----------
+    solutions
+        A frame as `safevar_sumo.results.solutions_frame` makes it.
+    original
+        The original vehicle's evaluation.
+    pool
+        Where subsets of their changes are simulated.
+    place
+        The directory of the results.
+    """
+    if original.collided[0]:
+        return ["The original vehicle itself collides: no change is needed."]
+    bench, degree = Bench(study, pool), float(original.f_safe[0])
+    unsafe = unsafe_rows(solutions, degree)
+    hits = bool((solutions["outcome"] == str(Outcome.COLLISION)).any())
+    means = Unsafe() if hits else Unsafe.half_of(degree)
+    if not unsafe.any():
+        return [f"Nothing unsafe found in {number_of(len(solutions), 'solution')}: no collision, no SD below half of the original's.",
+                f"How far each characteristic may go: {ask('tolerance', place)}"]
+    chosen = {reason: chosen_handle(solutions, degree, choice, study.name) for choice, reason in REASONS.items()}
+    rows = solutions.iloc[[position_of(solutions, handle) for handle in chosen.values()]]
+    settings = rows[list(bench.characteristics.names)].to_numpy(dtype=float)
+    found, (places, worst) = minimal_causes(bench, settings, means), _places(study, settings, means)
+    counted = f"{int(unsafe.sum())} of {number_of(len(solutions), 'vehicle')} found"
+    lines = [_paragraph(bench, solutions, unsafe, original, means, worst),
+             f"{counted} collide." if hits else f"No collision. {counted} keep less than half of the original's {degree:.2f} m."]
+    for (reason, handle), row, causes, fails in zip(chosen.items(), rows.to_dict("records"), found, places, strict=True):
+        size = f"{number_of(int(row['f_num_diff']), 'change')} of up to {row['f_diff']:.0%}"
+        end = f"{row['outcome']}, SD {row['f_safe']:.2f}"
+        lines.append(f"{reason.capitalize()}: {handle}, {end}, {size}. {_in_words(bench, causes)}{fails}")
+    at_worst = f"at the worst point of the first (without --point: at all {len(assemble(study).points)}, which takes long)"
+    return [*lines, f"Why, and how far{f', {at_worst}' if worst else ''}: {ask('explain', place, worst)}"]
+
+
+def _paragraph(bench: Bench, solutions: pd.DataFrame, is_unsafe: pd.Series[bool], original: Evaluations, unsafe: Unsafe, point: str) -> str:
+    """What the unsafe solutions come to, in short; in a matrix at the point that is named, by those that are unsafe there."""
+    names, every = bench.characteristics.names, handles(solutions)
+    kept = np.flatnonzero(is_unsafe.to_numpy() & ~solutions.duplicated(list(names)).to_numpy())
+    if point:
+        bench = bench.of(study_at(bench.study, point, point))
+        original = bench.original()
+    system = assemble(bench.study)
+    evaluations = bench.evaluate(solutions.iloc[kept][list(names)].to_numpy(dtype=float), "unsafe solutions")
+    preventable = preventability(bench, evaluations.settings[evaluations.collided])
+    failing = np.flatnonzero(unsafe.of(evaluations))
+    failures = evaluations.take(failing)
+    if not len(failures):
+        return in_short(system, original, None, None, preventable)
+    step = where(system, original.settings, original.settings[:0], unsafe)[1]
+    robust = smallest_robust(bench, failures, step, unsafe, LIMIT // len(system.points))
+    fewest = int(np.lexsort([getattr(failures, name) for name in reversed(CHOICES["fewest"])])[0])
+    rows = [fewest] if robust is None else [fewest, robust]
+    told, here = [], failures.take(rows)
+    causes, shares = minimal_causes(bench, here.settings, unsafe), robustness(bench, here.settings, step, unsafe)
+    for i, row in enumerate(rows):
+        changed = np.flatnonzero(bench.characteristics.changed(here.settings[i]))
+        changes = {names[column]: float(here.settings[i, column]) for column in changed}
+        told.append(Finding(str(every[kept[failing[row]]]), changes, str(here.outcome[i]), number(here.f_safe[i]), shares[i],
+                            len(causes[i][0].columns)))
+    return in_short(system, original, told[0], told[1] if len(told) > 1 else None, preventable)
+
+
+def _places(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple[list[str], str]:
+    """At which points of a matrix each setting fails, in words, and where the first comes off worst; nothing in a study without one."""
+    system = assemble(study)
+    if not system.matrix:
+        return [""] * len(settings), ""
+    found = at_every_point(system, settings)
+    told = [f" {points_in_words(points, len(system.matrix), most=3)}" for points in points_of(system, found, unsafe)]
+    return told, found[worst_points(found)[0]].point.name
+
+
+def _in_words(bench: Bench, causes: list[MinimalCause]) -> str:
+    """The first of a setting's minimal causes, and how many others there are."""
+    if not causes:
+        return "Simulated again it is not unsafe."
+    values = {bench.characteristics.names[column]: float(causes[0].setting[column]) for column in causes[0].columns}
+    more = len(causes) - 1
+    others = f" ({number_of(more, 'alternative set')} of the same size; see explain)" if more else ""
+    return f"These changes alone cause it: {changes(bench.characteristics, values)}{others}."
+
+
+KMH = 3.6
+"""km/h per m/s."""
+NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
+NAMED = 4
+"""Changes that are listed; of more the largest ones."""
+CONDITIONS = {"clear": "In clear weather", "wet": "On a wet road", "fog": "In fog", "night": "At night"}
+"""How a sentence tells of a weather; of others by name."""
+
+
+class Finding(NamedTuple):
+    """A failure as the paragraph tells of it.
+
+    Attributes
+    ----------
+    name
+        What it is called, such as a solution's handle.
+    changes
+        All of its changes, values by name in their units.
+    outcome, safety_degree
+        What they come to [m, or -m/s].
+    robustness
+        Of the failure.
+    needed
+        How many of the changes are unsafe by themselves: the size of its minimal causes.
+    """
+
+    name: str
+    changes: Mapping[str, float]
+    outcome: str
+    safety_degree: float | None
+    robustness: Robustness
+    needed: int
+
+
+def in_short(system: System, original: Evaluations, smallest: Finding | None, robust: Finding | None, preventable: Preventability) -> str:
+    """The paragraph.
+
+    Parameters
+    ----------
+    system
+        Of the study; of a study with a matrix at the point, or all points, that the evaluations are of.
+    original
+        The original vehicle's evaluation.
+    smallest
+        The failure with the fewest changes; None if nothing is unsafe.
+    robust
+        The smallest robust failure, None if there is none among those that were tried.
+    preventable
+        Who avoids the collisions found.
+    """
+    parts = [f"{_conditions(system)} the original vehicle {_end(system, original)}."]
+    if smallest is None:
+        return " ".join([*parts, "Nothing unsafe was found."])
+    members = CharacteristicSet(system.characteristics.members)
+    if not smallest.needed:
+        return " ".join([*parts, "No change is needed for it to be unsafe."])
+    parts.append(f"{_suffice(members, smallest)} ({_how_robust(smallest)}).")
+    if smallest.robustness.borderline:
+        parts.append("No robust failure was found among the smallest ones." if robust is None else
+                     f"The smallest robust failure ({robust.name}): {_lower(_suffice(members, robust))} ({_how_robust(robust)}).")
+    return " ".join([*parts, *_avoided(preventable)])
+
+
+def _conditions(system: System) -> str:
+    points = system.points
+    if len(points) > 1:
+        return f"At the worst of {len(points)} test points"
+    return f"At {points[0].name}," if system.matrix else f"{_weather(points[0])},"
+
+
+def _weather(point: Point) -> str:
+    name = point.weather.name.removeprefix("carla_").replace("_", " ")
+    return CONDITIONS.get(name, f"In {name}")
+
+
+def _end(system: System, original: Evaluations) -> str:
+    """How the original vehicle fares; short of whom, where the safety degree is the distance to a pedestrian's path."""
+    degree, outcome = float(original.f_safe[0]), Outcome(str(original.outcome[0]))
+    if outcome == Outcome.COLLISION:
+        return f"itself collides, at {_speed(degree)}"
+    is_pedestrian = all(pre_crash_of(point.scenario).startswith("pedestrian") for point in system.points)
+    if outcome == Outcome.STOPPED and is_pedestrian:
+        return f"stops {degree:.2f} m short of the pedestrian"
+    return f"{ENDS.get(outcome, outcome)}" + ("" if degree != degree else f" with a safety degree of {degree:.2f} m")
+
+
+def _suffice(members: CharacteristicSet, found: Finding) -> str:
+    number = len(found.changes)
+    suffice = "change suffices" if number == 1 else "changes suffice"
+    return f"{_count(number).capitalize()} {suffice} for {_outcome(found)}: {_changes(members, found.changes)}"
+
+
+def _count(number: int) -> str:
+    return NUMBERS[number] if number < len(NUMBERS) else str(number)
+
+
+def _outcome(found: Finding) -> str:
+    if found.safety_degree is None:
+        return found.outcome
+    if found.outcome == Outcome.COLLISION:
+        return f"a collision at {_speed(found.safety_degree)}"
+    return f"a safety degree of only {found.safety_degree:.2f} m"
+
+
+def _speed(degree: float) -> str:
+    """A collision's speed as one says it: whole km/h, below 3 km/h with a decimal."""
+    speed = -degree * KMH
+    return f"{speed:.{int(speed < 3)}f} km/h"
+
+
+def _changes(members: CharacteristicSet, values: Mapping[str, float]) -> str:
+    """Short names and changes relative to the original, the largest first."""
+    shares = {member.short_name: (values[member.name] - member.original) / abs(member.original) for member in members
+              if member.name in values}
+    largest = sorted(shares, key=lambda name: -abs(shares[name]))
+    parts = [f"{name} {100 * shares[name]:+.0f} %" for name in largest[:NAMED]]
+    return ", ".join(parts) + (f" and {len(shares) - NAMED} more" if len(shares) > NAMED else "")
+
+
+def _how_robust(found: Finding) -> str:
+    share = f"{100 * found.robustness.share:.0f} % of its neighbours are unsafe too"
+    alone = f"; {_count(found.needed)} of the changes would do" if found.needed < len(found.changes) else ""
+    return f"{'borderline: only ' if found.robustness.borderline else 'robust: '}{share}{alone}"
+
+
+def _avoided(preventable: Preventability) -> list[str]:
+    """Who avoids the collisions found, in a sentence; none without a collision."""
+    if not preventable.looked_at:
+        return []
+    words = {PreventableBy.COMPETENT_DRIVER: "a competent driver avoids {}", PreventableBy.FULL_BRAKING:
+             "full braking at the first possible moment {}", PreventableBy.NOBODY: "{} are physically unavoidable"}
+    parts = [text.format(f"{100 * (preventable.share(by) or 0.0):.0f} %") for by, text in words.items() if preventable.numbers.get(by)]
+    sample = "" if preventable.looked_at == preventable.collisions else f"{preventable.looked_at} drawn at random from "
+    return [f"In the same vehicle, of {sample}{preventable.collisions} collisions, {joined(parts)}."]
+
+
+def _lower(text: str) -> str:
+    return text[:1].lower() + text[1:]

@@ -1,0 +1,161 @@
+"""Preventability of collisions (ISO 34502, UN R157): would a reference driver have avoided them in the same vehicle?
+
+A collision that a competent driver avoids is the driving system's failure. One that not even full braking at the first
+possible moment avoids is the vehicle's.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from msgspec.structs import replace
+
+from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.risk.compute import interval_of
+from safevar_sumo.analysis.words import number_of
+from safevar_sumo.records import FloatArray
+from safevar_sumo.study import ModelTable, Study
+from safevar_sumo.sumo.matrix import at_every_point, simulate, study_at, worst_points
+from safevar_sumo.sumo.system import System, assemble
+
+CONFIDENCE = 0.95
+"""Of the interval of a sample's share."""
+LIMIT = 20_000
+"""Simulations, about, that a study's preventability may take; of more collisions a random sample is looked at."""
+
+TOGETHER = 20
+"""Settings that are simulated at all points of a matrix at once: enough to fill its simulations."""
+
+
+class PreventableBy(StrEnum):
+    """The least that it takes to avoid a collision in the same vehicle."""
+
+    COMPETENT_DRIVER = "preventable by a competent driver"
+    FULL_BRAKING = "preventable by full braking at the first possible moment"
+    NOBODY = "preventable by nobody"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Preventability:
+    """Who avoids the collisions of a study: all of them, or a random sample.
+
+    Attributes
+    ----------
+    numbers
+        How many of the collisions looked at each class has; the classes are disjoint.
+    collisions
+        How many different collisions there are.
+    """
+
+    numbers: Mapping[PreventableBy, int]
+    collisions: int
+
+    @property
+    def looked_at(self) -> int:
+        """How many collisions were simulated with the reference drivers."""
+        return sum(self.numbers.values())
+
+    def share(self, by: PreventableBy) -> float | None:
+        """The share of one class among the collisions looked at; None if there are none."""
+        return self.numbers.get(by, 0) / self.looked_at if self.looked_at else None
+
+    def interval(self, by: PreventableBy) -> tuple[float, float] | None:
+        """95 % interval of the share among all of the study's collisions; None if none were looked at.
+
+        Where all are looked at the share has no sampling error: the interval is the share itself. For a sample it is
+        Clopper and Pearson's, without the correction for a finite population, so it rather is too wide.
+        """
+        share = self.share(by)
+        if share is None or self.looked_at == self.collisions:
+            return None if share is None else (share, share)
+        return interval_of(self.numbers.get(by, 0), self.looked_at, CONFIDENCE)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As `explain --json` prints it; shares and interval are None without any collision."""
+        interval = self.interval(PreventableBy.COMPETENT_DRIVER)
+        return {**{by.name.lower(): self.share(by) for by in PreventableBy}, "looked_at": self.looked_at,
+                "interval_competent_driver": None if interval is None else list(interval)}
+
+    def __str__(self) -> str:
+        """One line; nothing without any collision."""
+        if not self.looked_at:
+            return ""
+        sample = "" if self.looked_at == self.collisions else f"{self.looked_at}, drawn at random, of "
+        parts = [f"{self.share(by):.0%} {by}" for by in PreventableBy if self.numbers.get(by)]
+        return f"Preventability in the same vehicle ({sample}{number_of(self.collisions, 'collision')}): {', '.join(parts)}."
+
+
+def preventability(bench: Bench, settings: FloatArray, limit: int = LIMIT) -> Preventability:
+    """Who avoids the collisions of these settings, shape (M, n); equal ones count once.
+
+    If that takes more than about `limit` simulations, a random sample is looked at, drawn with the study's seed.
+    A setting that cannot be simulated with a reference driver counts as not looked at.
+    """
+    unique = np.unique(settings, axis=0)
+    most = max(limit // (len(PreventableBy) - 1 + len(assemble(bench.study).matrix)), 1)
+    rows = np.random.default_rng(bench.study.search.seed).permutation(len(unique))[:most]
+    return Preventability(numbers=Counter(by for by in preventable_by(bench, unique[rows]) if by is not None), collisions=len(unique))
+
+
+def preventable_by(bench: Bench, settings: FloatArray) -> list[PreventableBy | None]:
+    """Who avoids each collision, settings of shape (M, n); in a matrix at the point where the setting comes off worst.
+
+    None where a setting cannot be simulated.
+    """
+    found: list[PreventableBy | None] = [None] * len(settings)
+    system = assemble(bench.study)
+    worst = _worst_points(bench, system, settings)
+    for k in np.unique(worst).tolist():
+        rows = np.flatnonzero(worst == k)
+        point = system.points[k]
+        here = bench.of(study_at(bench.study, point.name, point.name) if system.matrix else bench.study)
+        for row, by in zip(rows.tolist(), _at_one_point(here, system.at(point), settings[rows]), strict=True):
+            found[row] = by
+    return found
+
+
+def _worst_points(bench: Bench, system: System, settings: FloatArray) -> npt.NDArray[np.intp]:
+    """For every setting the number of the point where it comes off worst."""
+    worst = np.zeros(len(settings), dtype=np.intp)
+    if system.matrix:
+        for start in range(0, len(settings), TOGETHER):
+            bench.progress("worst points of the collisions", start, len(settings))
+            worst[start:start + TOGETHER] = worst_points(at_every_point(system, settings[start:start + TOGETHER]))
+    return worst
+
+
+def _at_one_point(bench: Bench, system: System, settings: FloatArray) -> list[PreventableBy | None]:
+    """Full braking is only tried where the competent driver collides: the classes are disjoint."""
+    parameters = approach(system)
+    drivers = {name: bench.of(_driven_by(bench.study, name, parameters)) for name in ("competent_driver", "full_braking")}
+    competent = drivers["competent_driver"].evaluate(settings, "a competent driver in the same vehicle")
+    left = np.flatnonzero(competent.collided)
+    braking = drivers["full_braking"].evaluate(settings[left], "full braking in the same vehicle")
+    found: list[PreventableBy | None] = [PreventableBy.COMPETENT_DRIVER if valid else None for valid in competent.valid]
+    for row, collided, valid in zip(left.tolist(), braking.collided, braking.valid, strict=True):
+        found[row] = None if not valid else PreventableBy.NOBODY if collided else PreventableBy.FULL_BRAKING
+    return found
+
+
+def approach(system: System) -> dict[str, Any]:
+    """How a reference driver approaches from rest: as the driving system does with the original vehicle.
+
+    It replays the throttle until the driving system first brakes or reaches its peak speed, and holds that speed. So both are
+    at the same place when the danger begins. Where the run begins at speed, that speed is held.
+    """
+    trace = simulate(system, system.characteristics.original[np.newaxis]).trace
+    speed, braked = trace.speed[:, 0], trace.brake[:, 0] > 0
+    if speed[0] > 0 or not speed.any():
+        return {}
+    ends = min(int(np.argmax(speed)), int(np.argmax(braked)) if braked.any() else len(speed))
+    return {"cruise_speed": float(speed.max()), "start_throttle": trace.throttle[:ends, 0].tolist()}
+
+
+def _driven_by(study: Study, driver: str, parameters: Mapping[str, Any]) -> Study:
+    return replace(study, ads=ModelTable(model=driver, parameters=dict(parameters)))

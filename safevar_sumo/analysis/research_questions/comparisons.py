@@ -1,0 +1,148 @@
+"""Two samples compared: Mann-Whitney U, and how large the difference is (method section 7)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import scipy
+from numpy.typing import ArrayLike
+
+from safevar_sumo.analysis.research_questions.case import NSGA2, Case, Unanswerable, values
+from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, indicators
+from safevar_sumo.errors import InputError
+
+ALPHA = 0.01
+"""Below it a p-value is called significant."""
+EXACT_UP_TO = 8
+"""Without ties, p is exact if a sample is no larger; else it is the normal approximation."""
+EXACT = "Mann-Whitney U, two-sided, exact"
+ASYMPTOTIC = "Mann-Whitney U, two-sided, normal approximation with corrections for ties and continuity"
+MAGNITUDES = ((0.714, "large"), (0.638, "medium"), (0.556, "small"))
+"""Kitchenham's: from which distance to either end an effect size is how large."""
+NOTABLE = ("medium", "large")
+
+
+class Comparison(NamedTuple):
+    """Two samples X and Y compared; None where one of them is empty.
+
+    `effect_size` is Vargha-Delaney's A12 = P(X > Y) + 0.5 P(X = Y), `n1` and `n2` the samples' sizes.
+    """
+
+    p_value: float | None
+    effect_size: float | None
+    magnitude: str | None
+    n1: int
+    n2: int
+    method: str | None
+
+    @property
+    def reversed_effect(self) -> float | None:
+        """A21 = 1 - A12."""
+        return None if self.effect_size is None else 1 - self.effect_size
+
+
+def compare(x: ArrayLike, y: ArrayLike) -> Comparison:
+    """Compare two samples by U test and effect size.
+
+    Raises
+    ------
+    InputError
+        If a value is NaN.
+    """
+    one, other = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    if np.isnan(one).any() or np.isnan(other).any():
+        raise InputError("Mann-Whitney U", "a value is NaN", "samples without undefined values")
+    if not one.size or not other.size:
+        return Comparison(None, None, None, one.size, other.size, None)
+    both = np.concatenate([one, other])
+    exact = min(one.size, other.size) <= EXACT_UP_TO and np.unique(both).size == both.size
+    test = scipy.stats.mannwhitneyu(one, other, alternative="two-sided", method="exact" if exact else "asymptotic")
+    a12 = float(test.statistic) / (one.size * other.size)
+    return Comparison(float(test.pvalue), a12, magnitude(a12), one.size, other.size, EXACT if exact else ASYMPTOTIC)
+
+
+def too_few(n1: int, n2: int) -> bool:
+    """Whether samples are so small that not even two which do not overlap differ significantly."""
+    return 2 / math.comb(n1 + n2, n1) >= ALPHA
+
+
+def magnitude(effect_size: float) -> str:
+    """How large an effect size is, by Kitchenham's intervals."""
+    distance = round(max(effect_size, 1 - effect_size), 12)
+    return next((name for least, name in MAGNITUDES if distance >= least), "negligible")
+
+
+RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", "effect_size", "magnitude", "n1", "n2", "method", "mean", "original"]
+
+
+def rq1(case: Case) -> pd.DataFrame:
+    """Every algorithm's solutions against the original's value, repeated to the sample's size, metric by metric.
+
+    Columns: `RQ1_COLUMNS`. `effect_size` is A12, turned so that a smaller one means that the algorithm's solutions are
+    more unsafe; `mean` is theirs, `original` the original's value. What is undefined is None.
+
+    Raises
+    ------
+    Unanswerable
+        If no run is finished.
+    """
+    if not case.algorithms:
+        raise Unanswerable(case.name, "has no finished run", "results with at least one finished run")
+    rows = []
+    for algorithm in case.algorithms:
+        solutions = case.solutions_of(algorithm)
+        for metric in case.scoring.metrics:
+            sample, original = values(solutions, metric), case.original[metric.name]
+            told = against(sample, original, metric.more_is_unsafe)
+            rows.append((case.name, algorithm, metric.name, *told, float(np.mean(sample)) if sample.size else None,
+                         None if np.isnan(original) else original))
+    return pd.DataFrame(rows, columns=RQ1_COLUMNS, dtype=object)
+
+
+def against(sample: np.ndarray, original: float, more_is_unsafe: bool) -> Comparison:
+    """A sample against one value, n1 the sample's size; the effect size is smaller for a more unsafe sample."""
+    told = compare(sample, np.full(0 if np.isnan(original) else len(sample), original))
+    return turned(told) if more_is_unsafe else told
+
+
+def turned(told: Comparison) -> Comparison:
+    """The same comparison with the effect size of the other sample."""
+    effect = told.reversed_effect
+    return told if effect is None else told._replace(effect_size=effect, magnitude=magnitude(effect))
+
+
+RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "effect_size", "magnitude", "n1", "n2", "method"]
+NO_RUNS = Comparison(None, None, None, 0, 0, None)
+
+
+def rq2(case: Case) -> pd.DataFrame:
+    """NSGA-II against every other algorithm: its runs' indicators, then its pooled solutions' metrics.
+
+    Columns: `RQ2_COLUMNS`. `effect_size` is A12, turned so that a higher one means that NSGA-II is better: a better front,
+    more unsafe solutions. `n1` counts NSGA-II's values, `n2` the baseline's. What is undefined is None, as are the
+    indicators of imported solutions, which belong to no run.
+
+    Raises
+    ------
+    Unanswerable
+        If NSGA-II or every other algorithm is missing.
+    """
+    own = case.solutions_of(NSGA2)
+    baselines = [name for name in case.algorithms if name != NSGA2]
+    if not baselines:
+        raise Unanswerable(case.name, f"has finished runs of {NSGA2} alone", "results of another algorithm to compare with, such as rs")
+    quality = indicators(case) if case.has_runs and len(case.solutions) else None
+    rows: list[tuple[object, ...]] = []
+    for baseline in baselines:
+        for indicator, more_is_better in MORE_IS_BETTER.items():
+            told = NO_RUNS
+            if quality is not None:
+                told = compare(*(quality.loc[quality["algorithm"] == name, indicator] for name in (NSGA2, baseline)))
+            rows.append((case.name, baseline, indicator, *(told if more_is_better else turned(told))))
+        for metric in case.scoring.metrics:
+            told = compare(values(own, metric), values(case.solutions_of(baseline), metric))
+            rows.append((case.name, baseline, metric.name, *(told if metric.more_is_unsafe else turned(told))))
+    return pd.DataFrame(rows, columns=RQ2_COLUMNS, dtype=object)

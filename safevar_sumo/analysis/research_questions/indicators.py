@@ -1,0 +1,156 @@
+"""How good a run's front is: IGD on the objectives as they are, IGD+ and hypervolume on normalised ones (method section 7)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import moocore
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import MetricFacts
+from safevar_sumo.records import FloatArray
+
+MORE_IS_BETTER = {"igd": False, "igd_plus": False, "hypervolume": True}
+INDICATOR_TITLES = {"igd": "IGD", "igd_plus": "IGD+", "hypervolume": "HV"}
+WORST = 1.1
+"""Each coordinate of hypervolume's reference point, on objectives normalised to 0..1: the nadir, a tenth further away."""
+
+
+def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
+    """What metrics and quality indicators are called in tables, by name."""
+    return {**INDICATOR_TITLES, **{metric.name: metric.title for metric in metrics}}
+
+
+def nondominated(points: FloatArray) -> FloatArray:
+    """The non-dominated points, each once; minimisation, shape (M, m)."""
+    return np.asarray(moocore.filter_dominated(_checked(points, "the set of points")))
+
+
+def igd(front: FloatArray, reference: FloatArray) -> float:
+    """Mean Euclidean distance from each point of the reference front to the nearest point of `front`."""
+    return float(moocore.igd(_checked(front, "the front"), ref=_checked(reference, "the reference front")))
+
+
+def igd_plus(front: FloatArray, reference: FloatArray) -> float:
+    """As IGD, of distances that only count where `front` is worse."""
+    return float(moocore.igd_plus(_checked(front, "the front"), ref=_checked(reference, "the reference front")))
+
+
+def hypervolume(front: FloatArray, worst: float = WORST) -> float:
+    """The volume between `front` and the point (worst, ..., worst)."""
+    points = _checked(front, "the front")
+    return float(moocore.hypervolume(points, ref=np.full(points.shape[1], worst)))
+
+
+class Scale(NamedTuple):
+    """Normalises objectives: `ideal` becomes 0, `ideal + width`, the nadir, becomes 1."""
+
+    ideal: FloatArray
+    width: FloatArray
+
+    @classmethod
+    def of(cls, reference: FloatArray) -> Scale:
+        """By a reference front's best and worst value of each objective; where those are equal the width is 1."""
+        ideal, nadir = reference.min(axis=0), reference.max(axis=0)
+        return cls(ideal, np.where(nadir > ideal, nadir - ideal, 1.0))
+
+    def normalised(self, points: FloatArray) -> FloatArray:
+        return np.asarray((points - self.ideal) / self.width)
+
+
+def objectives(case: Case, frame: pd.DataFrame) -> FloatArray:
+    """The objectives of the rows that have all of them, each to be minimised, shape (M, objectives)."""
+    points = _values(case, frame)
+    return np.asarray(points[np.isfinite(points).all(axis=1)])
+
+
+def _values(case: Case, frame: pd.DataFrame) -> FloatArray:
+    signs = [objective.sign for objective in case.scoring.objectives]
+    return np.asarray(frame[[objective.name for objective in case.scoring.objectives]].to_numpy(dtype=float) * signs)
+
+
+def reference_front(case: Case) -> FloatArray:
+    """The non-dominated union of the results of all runs of all algorithms.
+
+    Raises
+    ------
+    Unanswerable
+        If there is no solution.
+    """
+    points = objectives(case, case.solutions)
+    if not len(points):
+        raise Unanswerable(case.name, "has no solution", "results with at least one finished run")
+    return nondominated(points)
+
+
+def indicators(case: Case) -> pd.DataFrame:
+    """IGD, IGD+ and hypervolume of every finished run that has solutions; columns algorithm, run and theirs.
+
+    Raises
+    ------
+    Unanswerable
+        If there are no runs or no solutions.
+    """
+    rows = []
+    runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
+    if runs:
+        reference = reference_front(case)
+        scale = Scale.of(reference)
+        normal = scale.normalised(reference)
+    by_run = dict(list(case.solutions.groupby(["algorithm", "run"])))
+    for algorithm, run in runs:
+        front = objectives(case, by_run[algorithm, run]) if (algorithm, run) in by_run else np.zeros((0, 0))
+        if len(front):
+            found = scale.normalised(front)
+            rows.append((algorithm, run, igd(front, reference), igd_plus(found, normal), hypervolume(found)))
+    return pd.DataFrame(rows, columns=["algorithm", "run", *MORE_IS_BETTER])
+
+
+def convergence(case: Case, points: int = 50) -> pd.DataFrame:
+    """The hypervolume of what each run had found after so many evaluations; columns algorithm, run, evaluations, hypervolume.
+
+    A run that ended early keeps what it had; a hypervolume is 0 while everything found is beyond the reference point.
+
+    Raises
+    ------
+    Unanswerable
+        If there are no runs or no solutions.
+    """
+    keys = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
+    scale = Scale.of(reference_front(case))
+    budget = case.study.search.evaluations
+    grid = np.unique(np.linspace(min(case.study.search.population, budget), budget, points).astype(int))
+    by_run = dict(list(case.evaluations.groupby(["algorithm", "run"])))
+    parts = [pd.DataFrame({"algorithm": key[0], "run": key[1], "evaluations": grid, "hypervolume": _growth(case, by_run[key], scale, grid)})
+             for key in keys if key in by_run]
+    if not parts:
+        raise Unanswerable(case.name, "has no evaluations", "results with the journals of their runs")
+    return pd.concat(parts, ignore_index=True)
+
+
+def _growth(case: Case, evaluations: pd.DataFrame, scale: Scale, grid: np.ndarray) -> list[float]:
+    """Hypervolume of the first k evaluations for every k of the grid."""
+    found = scale.normalised(_values(case, evaluations))
+    defined = np.isfinite(found).all(axis=1)
+    found, places = found[defined], evaluations["evaluation"].to_numpy()[defined]
+    ends = np.searchsorted(places, grid, side="left")
+    front, grown = np.zeros((0, found.shape[1])), []
+    for start, end in zip([0, *ends[:-1]], ends, strict=True):
+        front = np.concatenate([front, found[start:end]])
+        front = nondominated(front) if len(front) else front
+        grown.append(hypervolume(front) if len(front) else 0.0)
+    return grown
+
+
+def _checked(points: FloatArray, what: str) -> FloatArray:
+    """Refuse what indicators would answer with their best value: no point, or undefined ones."""
+    found = np.asarray(points, dtype=float)
+    if found.ndim != 2 or not found.size:
+        raise InputError(what, "is empty", "at least one point, shape (M, m)")
+    if not np.isfinite(found).all():
+        raise InputError(what, "holds an undefined value", "points with finite objectives")
+    return found

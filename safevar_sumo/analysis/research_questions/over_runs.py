@@ -1,0 +1,187 @@
+"""RQ1 and RQ2 over runs: one mean for each run, so that the values of a test are independent; corrected for their number.
+
+The paper pools the solutions of all runs and repeats the original's value to the sample's size. Solutions of one run resemble each
+other, and a repeated value is no sample: p-values become too small. Here every run gives one value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import scipy
+
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, NSGA2, Case, Unanswerable, values
+from safevar_sumo.analysis.research_questions.comparisons import ALPHA, Comparison, compare, magnitude, rq1, rq2, turned
+from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, indicators, titles_of
+from safevar_sumo.metrics import MetricFacts
+from safevar_sumo.records import FloatArray
+
+RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", "p_holm", "effect_size", "magnitude", "runs", "method", "mean", "original"]
+RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2", "method"]
+EXACT_SIGNED = "Wilcoxon signed-rank, two-sided, exact"
+ASYMPTOTIC_SIGNED = "Wilcoxon signed-rank, two-sided, normal approximation with correction for continuity"
+EXACT_UP_TO = 50
+"""Without ties, the signed-rank test is exact for up to that many runs."""
+
+
+def rq1_runs(case: Case) -> pd.DataFrame:
+    """Every algorithm's run means against the original's value, metric by metric: Wilcoxon's signed-rank test.
+
+    Columns: `RQ1_COLUMNS`. `effect_size` is the share of runs whose mean is greater than the original's value, plus half of those that
+    are equal (A12 against one value), turned so that a smaller one means more unsafe runs. `mean` is the mean of the run means.
+    `p_holm` is `p_value` corrected by Holm's method for all tests of RQ1 and RQ2 of this setting. What is undefined is None.
+
+    Raises
+    ------
+    Unanswerable
+        If the solutions belong to no run, or no run is finished.
+    """
+    return _corrected(case)[0]
+
+
+def rq2_runs(case: Case) -> pd.DataFrame:
+    """NSGA-II's runs against those of every other algorithm: indicators and metrics' run means, Mann-Whitney U.
+
+    Columns: `RQ2_COLUMNS`. `effect_size` is A12, turned as in `rq2`; `n1` and `n2` count runs; `p_holm` as in `rq1_runs`.
+
+    Raises
+    ------
+    Unanswerable
+        If the solutions belong to no run, or NSGA-II or every other algorithm is missing.
+    """
+    own = _corrected(case)[1]
+    if own is None:
+        rq2(case)  # says why there is no answer
+        raise Unanswerable(case.name, "has no runs to compare", "results of nsga2 and another algorithm")
+    return own
+
+
+def holm(p_values: Sequence[float | None]) -> list[float | None]:
+    """P-values corrected by Holm's step-down method (Holm 1979); None stays None and is no test."""
+    order = sorted((p, place) for place, p in enumerate(p_values) if p is not None)
+    corrected, highest = list(p_values), 0.0
+    for rank, (p, place) in enumerate(order):
+        highest = max(highest, min(1.0, p * (len(order) - rank)))
+        corrected[place] = highest
+    return corrected
+
+
+def signed_rank(sample: FloatArray, value: float) -> Comparison:
+    """A sample of independent values against one value, shape (N,): Wilcoxon's test and the share of greater values (A12).
+
+    Values equal to `value` are dropped from the test (Wilcoxon's own way) and count half in the effect size.
+    """
+    if not sample.size or np.isnan(value):
+        return Comparison(None, None, None, len(sample), 0, None)
+    difference = sample - value
+    sizes = np.abs(difference[difference != 0])
+    effect = float(np.mean(difference > 0) + np.mean(difference == 0) / 2)
+    if not sizes.size:
+        return Comparison(1.0, effect, magnitude(effect), len(sample), 1, EXACT_SIGNED)
+    exact = np.unique(sizes).size == len(sample) <= EXACT_UP_TO
+    test = scipy.stats.wilcoxon(difference, alternative="two-sided", correction=not exact, method="exact" if exact else "approx")
+    return Comparison(float(test.pvalue), effect, magnitude(effect), len(sample), 1, EXACT_SIGNED if exact else ASYMPTOTIC_SIGNED)
+
+
+def fewest_runs(question: str) -> int:
+    """The least number of runs at which a test of this question can be significant at all, before any correction."""
+    return next(n for n in range(1, 100) if 2 / (2**n if question == "RQ1" else math.comb(2 * n, n)) < ALPHA)
+
+
+def difference_line(case: Case) -> str:
+    """Which tests are significant (p < ALPHA) in the paper's way and not over runs, or the other way round; one line.
+
+    Such as "... RQ2 SafeFuzzer TET loses its star (p 3.8e-4 to 0.059, 0.23 after Holm)".
+
+    Raises
+    ------
+    Unanswerable
+        As `rq1_runs`.
+    """
+    titles = titles_of(case.scoring.metrics)
+    first, second = _corrected(case)
+    sides = [("RQ1", "algorithm", rq1(case), first), *([] if second is None else [("RQ2", "baseline", rq2(case), second)])]
+    changes, number = [], 0
+    for question, who, paper, runs in sides:
+        for old, new in zip(paper.to_dict("records"), runs.to_dict("records"), strict=True):
+            before, after = old["p_value"], new["p_holm"]
+            number += after is not None
+            if before is None or after is None or (before < ALPHA) == (after < ALPHA):
+                continue
+            name = ALGORITHM_TITLES.get(old[who], old[who])
+            verb = "loses" if before < ALPHA else "gains"
+            changes.append(f"{question} {name} {titles[old['metric']]} {verb} its star (p {_p(before)} to {_p(new['p_value'])}, "
+                           f"{_p(after)} after Holm)")
+    told = "; ".join(changes) if changes else "the same tests are significant"
+    return f"One value for each run and Holm's correction for {number} tests, instead of the paper's pooled solutions: {told}."
+
+
+def _p(value: float) -> str:
+    return f"{value:.1e}".replace("e-0", "e-") if value < 0.001 else f"{value:.2g}"
+
+
+def _corrected(case: Case) -> tuple[pd.DataFrame, pd.DataFrame | None]:
+    """Both questions over runs, their p-values corrected as one family; without RQ2 where it cannot be asked."""
+    if not case.algorithms:
+        raise Unanswerable(case.name, "has no finished run", "results with at least one finished run")
+    first = _rq1_rows(case)
+    several = NSGA2 in case.algorithms and len(case.algorithms) > 1
+    second = _rq2_rows(case) if several else []
+    corrected = holm([row["p_value"] for row in [*first, *second]])
+    for row, p in zip([*first, *second], corrected, strict=True):
+        row["p_holm"] = p
+    return (pd.DataFrame(first, columns=RQ1_COLUMNS, dtype=object),
+            pd.DataFrame(second, columns=RQ2_COLUMNS, dtype=object) if several else None)
+
+
+def _rq1_rows(case: Case) -> list[dict[str, Any]]:
+    rows = []
+    for algorithm in case.algorithms:
+        for metric in case.scoring.metrics:
+            means, original = run_means(case, algorithm, metric), case.original[metric.name]
+            test = signed_rank(means, original)
+            rows.append({
+                "setting": case.name, "algorithm": algorithm, "metric": metric.name,
+                **_columns(turned(test) if metric.more_is_unsafe else test), "runs": len(means),
+                "mean": float(np.mean(means)) if means.size else None,
+                "original": None if np.isnan(original) else original})
+    return rows
+
+
+def _rq2_rows(case: Case) -> list[dict[str, Any]]:
+    quality = indicators(case) if len(case.solutions) else None
+    rows = []
+    for baseline in (name for name in case.algorithms if name != NSGA2):
+        for indicator, more_is_better in MORE_IS_BETTER.items():
+            sides = [np.zeros(0) if quality is None else quality.loc[quality["algorithm"] == name, indicator].to_numpy(dtype=float)
+                     for name in (NSGA2, baseline)]
+            rows.append({"setting": case.name, "baseline": baseline, "metric": indicator, **_sized(compare(*sides), not more_is_better)})
+        for metric in case.scoring.metrics:
+            test = compare(run_means(case, NSGA2, metric), run_means(case, baseline, metric))
+            rows.append({"setting": case.name, "baseline": baseline, "metric": metric.name, **_sized(test, not metric.more_is_unsafe)})
+    return rows
+
+
+def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
+    """The mean of a metric in every finished run that has a value of it, over the solutions where it counts; shape (runs,).
+
+    Raises
+    ------
+    Unanswerable
+        If the solutions belong to no run.
+    """
+    solutions = case.solutions_of(algorithm)
+    samples = [values(solutions[solutions["run"] == run], metric) for run in case.runs_of(algorithm)]
+    return np.array([float(np.mean(sample)) for sample in samples if sample.size])
+
+
+def _sized(test: Comparison, turn: bool) -> dict[str, Any]:
+    return {**_columns(turned(test) if turn else test), "n1": test.n1, "n2": test.n2}
+
+
+def _columns(test: Comparison) -> Mapping[str, Any]:
+    return {"p_value": test.p_value, "effect_size": test.effect_size, "magnitude": test.magnitude, "method": test.method}

@@ -1,0 +1,169 @@
+"""Answers as text, Markdown, LaTeX, CSV and JSON."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from itertools import accumulate
+from typing import Any
+
+import pandas as pd
+
+from safevar_sumo.analysis.research_questions.answer import Answer
+from safevar_sumo.analysis.research_questions.layout import LAYOUTS, Bold, Layouts, Table, lay_out
+from safevar_sumo.analysis.research_questions.paper import PAPER
+
+MINUS = "\N{MINUS SIGN}"
+_LATEX = {
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "%": r"\%", "_": r"\_",
+    "^": r"\textasciicircum{}",
+    "~": r"\textasciitilde{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", "[": "{[}", "]": "{]}", "*": "{*}",
+    '"': r"\textquotedbl{}", "'": r"\textquotesingle{}", "`": r"\textasciigrave{}",
+    "\N{DEGREE SIGN}": r"\textdegree{}", "\N{MICRO SIGN}": r"\textmu{}", "\N{GREEK SMALL LETTER MU}": r"\textmu{}",
+    "\N{SUPERSCRIPT TWO}": r"\textsuperscript{2}", "\N{SUPERSCRIPT THREE}": r"\textsuperscript{3}",
+    "\N{MIDDLE DOT}": r"\textperiodcentered{}", MINUS: r"\textminus{}"}
+"""How LaTeX has the characters that mean something to it, and some that units are made of."""
+_LAST_PLAIN = "\N{LATIN SMALL LETTER Z WITH CARON}"
+"""Up to here, LaTeX's T1 fonts have nearly every letter."""
+LATEX_NEEDS = r"% In the preamble: \usepackage[T1]{fontenc} \usepackage{textcomp} \usepackage{booktabs} \usepackage{graphicx}"
+
+
+def text(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
+    """For a terminal: columns aligned, bold cells with an asterisk."""
+    return "\n".join(_text(table) for answer in answers for table in lay_out(answer, layouts))
+
+
+def markdown(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
+    """Markdown tables; a heading over several columns stands in each of theirs."""
+    return "\n".join(_markdown(table) for answer in answers for table in lay_out(answer, layouts))
+
+
+def latex(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
+    r"""Booktabs tables for `\input`, each with a label: `tab:rq1`, and `tab:rq1-2` for the second of an answer."""
+    tables = [_latex(table, f"{answer.name}-{i}" if i > 1 else answer.name)
+              for answer in answers for i, table in enumerate(lay_out(answer, layouts), 1)]
+    return "\n".join([LATEX_NEEDS, *tables])
+
+
+def csv(answers: Sequence[Answer]) -> str:
+    """The tidy frame; several, each after a line with its name, with an empty line between."""
+    parts = []
+    for answer in answers:
+        frame = answer.frame
+        if "characteristics" in frame:
+            frame = frame.assign(characteristics=frame["characteristics"].map(" ".join))
+        head = f"# {answer.name}\n" if len(answers) > 1 else ""
+        parts.append(head + ("" if frame.empty else frame.to_csv(index=False, lineterminator="\n")))
+    return "\n".join(parts)
+
+
+def as_json(answers: Sequence[Answer]) -> str:
+    """One list of records; of several tables, each record tells its own under "table"."""
+    several = len(answers) > 1
+    found = [{"table": answer.name, **row} if several else row for answer in answers for row in records(answer.frame)]
+    return json.dumps(found, indent=2, allow_nan=False) + "\n"
+
+
+def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """A frame as plain values; what is undefined is None, a rank only stands where there is one."""
+    rows = [{str(name): _plain(value) for name, value in row.items()} for row in frame.to_dict("records")]
+    return [{name: value for name, value in row.items() if not (name == "rank" and value is None)} for row in rows]
+
+
+LAYOUTS_BY_NAME: Mapping[str, Layouts] = {"full": LAYOUTS, "paper": PAPER}
+LAID_OUT: Mapping[str, Callable[..., str]] = {"text": text, "markdown": markdown, "latex": latex}
+"""Formats for readers, whose functions take layouts; the others hold the frames."""
+FORMATS: Mapping[str, Callable[..., str]] = {**LAID_OUT, "csv": csv, "json": as_json}
+ENDINGS = {"text": "txt", "markdown": "md", "latex": "tex", "csv": "csv", "json": "json"}
+
+
+def _text(table: Table) -> str:
+    rows = [tuple(f"{cell}*" if isinstance(cell, Bold) else f"{cell} " if i >= table.labels else cell for i, cell in enumerate(row))
+            for row in table.rows]
+    heads = tuple(f"{head} " if i >= table.labels else head for i, head in enumerate(table.heads))
+    widths = [max(len(cell) for cell in column) for column in zip(heads, *rows, strict=True)]
+    for (span, number), start in zip(table.spans, _starts(table), strict=True):
+        lacking = len(span) - (sum(widths[start:start + number]) + 2 * (number - 1))
+        widths[start] += max(lacking, 0)
+    lines = [table.title, ""]
+    if table.spans:
+        blocks = [" " * (sum(widths[:table.labels]) + 2 * (table.labels - 1))]
+        blocks += [span.center(sum(widths[start:start + number]) + 2 * (number - 1), " ")
+                   for (span, number), start in zip(table.spans, _starts(table), strict=True)]
+        lines.append("  ".join(blocks).rstrip())
+    if heads:
+        lines += [_aligned(heads, widths, table.labels), "-" * (sum(widths) + 2 * (len(widths) - 1))]
+    lines += [_aligned(row, widths, table.labels) for row in rows]
+    return "\n".join([*lines, *([""] if heads and table.notes else []), *table.notes, ""])
+
+
+def _aligned(cells: Sequence[str], widths: Sequence[int], labels: int) -> str:
+    return "  ".join(cell.ljust(width) if i < labels else cell.rjust(width)
+                     for i, (cell, width) in enumerate(zip(cells, widths, strict=True))).rstrip()
+
+
+def _markdown(table: Table) -> str:
+    heads = list(table.heads)
+    for (span, number), start in zip(table.spans, _starts(table), strict=True):
+        if len(table.spans) > 1 or heads[start] in table.spans[0][0]:
+            heads[start:start + number] = [f"{span}: {head}" for head in heads[start:start + number]]
+    lines = [f"**{_marked(table.title)}**", ""]
+    if heads:
+        rule = [":---" if i < table.labels else "---:" for i in range(len(heads))]
+        cells = [[f"**{_marked(cell)}**" if isinstance(cell, Bold) else _marked(cell) for cell in row] for row in table.rows]
+        lines += [f"| {' | '.join(row)} |" for row in ([_marked(head) for head in heads], rule, *cells)] + [""]
+    return "\n".join([*lines, *(f"{_marked(note)}  " for note in table.notes), ""])
+
+
+def _marked(plain: str) -> str:
+    """Plain text as Markdown, whose own signs are taken for what they are."""
+    return re.sub(r"([\\`*_|<>\[\]~^#$])", r"\\\1", plain.replace("\n", " "))
+
+
+def _latex(table: Table, label: str) -> str:
+    lines = [r"\begin{table}[htbp]", r"\centering", rf"\caption{{{escaped(table.title)}}}", rf"\label{{tab:{label}}}"]
+    if table.heads:
+        lines += [r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%", *_tabular(table), "}"]
+    lines += [rf"\par\smallskip{{\footnotesize {' '.join(escaped(note) for note in table.notes)}\par}}"] if table.notes else []
+    return "\n".join([*lines, r"\end{table}", ""])
+
+
+def _tabular(table: Table) -> list[str]:
+    columns = "l" * table.labels + "r" * (len(table.heads) - table.labels)
+    lines = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule"]
+    if table.spans:
+        spans = [rf"\multicolumn{{{number}}}{{c}}{{{escaped(span)}}}" for span, number in table.spans]
+        rules = [rf"\cmidrule(lr){{{start + 1}-{start + number}}}" for (_, number), start in zip(table.spans, _starts(table), strict=True)]
+        lines += [" & ".join([""] * table.labels + spans).strip() + r" \\", "".join(rules)]
+    lines += [" & ".join(escaped(head) for head in table.heads) + r" \\", r"\midrule"]
+    lines += [" & ".join(rf"\textbf{{{escaped(cell)}}}" if isinstance(cell, Bold) else escaped(cell) for cell in row) + r" \\"
+              for row in table.rows]
+    return [*lines, r"\bottomrule", r"\end{tabular}%"]
+
+
+def escaped(plain: str) -> str:
+    """Plain text as LaTeX; a character that its fonts may lack becomes its code point."""
+    powers = re.split(r"\^(-?\d+)", re.sub(r"(?<![\w)^-])-(?=\.?\d)", MINUS, " ".join(plain.split())))
+    found = "".join(rf"\textsuperscript{{{''.join(map(_letter, part.replace('-', MINUS)))}}}" if i % 2 else "".join(map(_letter, part))
+                    for i, part in enumerate(powers))
+    return found.replace("--", "-{}-")
+
+
+def _letter(sign: str) -> str:
+    if sign in _LATEX:
+        return _LATEX[sign]
+    return sign if sign.isascii() or (sign.isalpha() and sign <= _LAST_PLAIN) else f"U+{ord(sign):04X}"
+
+
+def _starts(table: Table) -> list[int]:
+    """The first column under each heading over several."""
+    return [table.labels + before for before in accumulate([number for _, number in table.spans[:-1]], initial=0)] if table.spans else []
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, list | str) or value is None:
+        return value
+    if pd.isna(value):
+        return None
+    return value.item() if hasattr(value, "item") else value

@@ -1,0 +1,1 @@
+"""Rules in physical units that tell where settings are unsafe."""

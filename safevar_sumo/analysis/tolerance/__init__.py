@@ -1,0 +1,1 @@
+"""How far each characteristic may go: alone, in pairs, and all together."""

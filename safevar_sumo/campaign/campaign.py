@@ -1,0 +1,148 @@
+"""Many runs at once over one pool, each with its journal."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.campaign.batcher import BATCH, Gathering
+from safevar_sumo.campaign.isolation_check import Rechecking
+from safevar_sumo.campaign.keys import RunKey, search_of
+from safevar_sumo.campaign.run import Observer, Run
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import SAFEVAR, Scoring
+from safevar_sumo.records import Evaluations
+from safevar_sumo.results import ORIGINAL, Failure, JournalBusy, ResultsDirectory
+from safevar_sumo.search import Problem, Search
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.workers.evaluation import Pool, packed
+from safevar_sumo.workers.isolation import check_isolation
+from safevar_sumo.workers.local import first_of, result_of
+from safevar_sumo.workers.retrying import PersistentPool
+
+
+class Campaign(NamedTuple):
+    """What runs of a study found: the original vehicle's evaluation and the solutions of every finished run.
+
+    `failures` are settings that could not be simulated; `busy` runs are in the hands of another process; `scoring` is what
+    was measured and minimised; `collisions` counts the different settings of each finished run that collided, `invalid_tests` those
+    that left the tolerance of a test's speed.
+    """
+
+    original: Evaluations
+    solutions: dict[RunKey, Evaluations]
+    failures: list[Failure]
+    busy: list[RunKey]
+    collisions: dict[RunKey, int]
+    invalid_tests: dict[RunKey, int]
+    scoring: Scoring = SAFEVAR
+
+
+def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, pool: Pool, observer: Observer,
+              batch: int | None = None, *, retry_failed: bool = False) -> Campaign:
+    """Carry out runs of a study, or finish what of them is unfinished.
+
+    Parameters
+    ----------
+    keys
+        Which runs.
+    results
+        Where their journals are kept.
+    pool
+        Computes batches.
+    batch
+        Settings per SUMO simulation at the most, gathered from several runs.
+    retry_failed
+        Whether settings that could not be simulated before are tried again.
+
+    Raises
+    ------
+    SafevarError
+        If a journal cannot be written or the study itself is at fault.
+    """
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    persistent, work = PersistentPool(pool, study, results.note), packed(study, results.inputs)
+    original = _original(study, work, characteristics, results, persistent, observer)
+    if not original.valid[0]:
+        raise InputError(f"study {study.name!r}", "the original vehicle leaves the tolerance of a test's speed before the ADS acts "
+                         "(invalid-test): nothing can be compared with it", "tests whose speed the vehicle can hold")
+    if original.collided[0]:
+        observer.warned(f"study {study.name!r}: the original vehicle itself collides, no change is needed for that")
+    results.begin(original)
+    problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,
+                      population=study.search.population, scoring=results.scoring)
+    campaign = Campaign(original, {}, [], [], {}, {}, results.scoring)
+    waiting, runs = deque(keys), set[Run]()
+
+    def begun(key: RunKey) -> Search:
+        return search_of(key, study, problem, results.note)
+
+    gathering, rechecking = Gathering(persistent, work, batch or BATCH), Rechecking(study, results, persistent, begun)
+
+    def go_on(run: Run) -> None:
+        """Let a run go as far as it can, then ask for what it misses."""
+        if not run.advance():
+            gathering.ask(run, run.missing)
+        elif run.finished or not rechecking.ask(run):
+            finish(run)
+
+    def finish(run: Run) -> None:
+        run.finish()
+        campaign.solutions[run.key], campaign.collisions[run.key] = run.result, run.collisions
+        campaign.invalid_tests[run.key] = run.invalid_tests
+        campaign.failures.extend(run.failures)
+        runs.discard(run)
+        run.close()
+
+    try:
+        while waiting or runs:
+            while waiting and len(runs) < gathering.runs_wanted(study.search.population):
+                key = waiting.popleft()
+                try:
+                    journal = results.journal(str(key))
+                except JournalBusy:
+                    campaign.busy.append(key)
+                    continue
+                runs.add(run := Run(key, rechecking.search(key), journal, observer, study.search.evaluations, retry=retry_failed))
+                go_on(run)
+            gathering.send()
+            for future in first_of([*gathering.under_way, *rechecking.under_way]):
+                if future in rechecking.under_way:
+                    if ended := rechecking.take(future):
+                        finish(ended)
+                    continue
+                for run, evaluations in gathering.take(future):
+                    if run.take(evaluations):
+                        go_on(run)
+    finally:
+        for run in runs:
+            run.close()
+    return campaign._replace(solutions={key: campaign.solutions[key] for key in sorted(campaign.solutions)},
+                             failures=sorted(campaign.failures))
+
+
+def _original(study: Study, work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: PersistentPool,
+              observer: Observer) -> Evaluations:
+    """The original vehicle's evaluation, simulated once; where it fails, or models mix settings up, the study is at fault."""
+    def simulated() -> Evaluations:
+        return result_of(pool.submit(work, characteristics.original[np.newaxis], must_succeed=True))
+
+    try:
+        journal = results.journal(ORIGINAL)
+    except JournalBusy:  # another process, of a job array say, is about to write the same
+        return simulated()
+    try:
+        if journal.cut:
+            observer.warned(f"{journal.path}: the last {journal.cut} bytes were torn; what they held is simulated again")
+        if journal.content.evaluations is not None:
+            return journal.content.evaluations
+        evaluations = simulated()
+        check_isolation(study, characteristics, lambda settings: pool.submit(work, settings))
+        journal.append([0], evaluations)
+        return evaluations
+    finally:
+        journal.close()

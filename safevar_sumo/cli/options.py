@@ -1,0 +1,119 @@
+"""Files that a command is to write, refused before the work whose result they are to take."""
+
+from __future__ import annotations
+
+import math
+import re
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from safevar_sumo.errors import InputError, unknown
+from safevar_sumo.records import FloatArray
+from safevar_sumo.study import check_writable
+from safevar_sumo.vehicles import CharacteristicSet
+
+PICTURES = (".png", ".pdf", ".svg")
+
+
+def check_output(path: Path, flag: str, endings: tuple[str, ...]) -> None:
+    """Refuse a file of an unknown kind or one that cannot be written.
+
+    Raises
+    ------
+    InputError
+        Naming the flag and what is legal.
+    """
+    if path.suffix.lower() not in endings:
+        raise InputError(flag, str(path), f"a file that ends in {', '.join(endings)}")
+    check_writable(path, flag)
+
+
+def refuse_inputs(path: Path, flag: str, *inputs: str | Path) -> None:
+    """Refuse to write over what a command reads: a file, or a file of a results directory.
+
+    Raises
+    ------
+    InputError
+        Naming the flag and the file.
+    """
+    if not path.exists():
+        return
+    for one in map(Path, inputs):
+        read = [one, *one.glob("*.*"), *one.glob("runs/*")] if one.is_dir() else [one]
+        if any(place.exists() and path.samefile(place) for place in read if place.suffix not in PICTURES):
+            raise InputError(flag, f"{path} is what the command reads", "another file")
+
+
+class Within(click.FloatRange):
+    """A range of numbers: what is no number at all is outside of it, which comparisons with the bounds do not tell."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number, if it is one and within the range."""
+        found = super().convert(value, param, ctx)
+        if math.isnan(found):
+            self.fail(f"{value} is not in the range {self._describe_range()}.", param, ctx)
+        return found
+
+
+NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+SIGNED = re.compile(r"[+-](?:\d+\.?\d*|\.\d+)")
+SHARE = re.compile(rf"({SIGNED.pattern})%")
+SWEEP = re.compile(rf"({NUMBER})\.\.({NUMBER})(?::(\d{{1,6}}))?")
+SWEPT = 11
+"""Values of a sweep that does not say how many."""
+MOST = 10_000
+"""Settings of all sweeps together."""
+LEGAL = "NAME=VALUE in the characteristic's unit, NAME=+10% of the original, or NAME=FROM..TO, NAME=FROM..TO:NUMBER"
+
+
+def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, beyond: bool) -> dict[str, list[float]]:
+    """The values that each named characteristic is to take, one after the other.
+
+    Raises
+    ------
+    InputError
+        If a change has another form, a name is unknown or given twice, or a value is outside its domain.
+    """
+    found: dict[str, list[float]] = {}
+    for change in changes:
+        name, sign, text = (part.strip() for part in change.partition("="))
+        if not sign:
+            raise InputError("--set", repr(change), LEGAL)
+        if name in found:
+            raise InputError("--set", f"{name} is set twice", "each characteristic once")
+        if name not in characteristics.names:
+            raise unknown("--set", f"there is no characteristic {name!r}", name, characteristics.names)
+        member = characteristics.members[characteristics.names.index(name)]
+        found[name] = _values(change, text, member.original)
+        for value in found[name]:
+            share = f", or {name}={text}% of the original" if SIGNED.fullmatch(text) else ""
+            member.check(value, "--set", beyond=beyond, otherwise=share, switch="--beyond")
+    if np.prod([len(values) for values in found.values()], dtype=float) > MOST:
+        raise InputError("--set", f"{' '.join(changes)}: more than {MOST} settings", "shorter sweeps, FROM..TO:NUMBER")
+    return found
+
+
+def settings_of(changes: dict[str, list[float]], base: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
+    """Every combination of the values, over a setting of shape (n,); shape (M, n)."""
+    columns = [characteristics.names.index(name) for name in changes]
+    rows = []
+    for values in product(*changes.values()):
+        row = base.copy()
+        row[columns] = values
+        rows.append(row)
+    return np.array(rows)
+
+
+def _values(change: str, text: str, original: float) -> list[float]:
+    if share := SHARE.fullmatch(text):
+        return [original + abs(original) * float(share[1]) / 100]
+    if sweep := SWEEP.fullmatch(text):
+        return np.linspace(float(sweep[1]), float(sweep[2]), max(1, int(sweep[3] or SWEPT))).tolist()  # type: ignore[no-any-return]
+    try:
+        return [float(text)]
+    except ValueError:
+        raise InputError("--set", repr(change), LEGAL) from None

@@ -1,0 +1,162 @@
+"""The moments of a drive that tell its story: braking, nearest, end; and when two drives part."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safevar_sumo.records import STANDSTILL, Drives, Evaluations, FloatArray, Outcome
+from safevar_sumo.results import UNKNOWN
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.batch import score
+from safevar_sumo.sumo.film import Film, film
+from safevar_sumo.sumo.matrix import at_worst
+from safevar_sumo.sumo.system import System
+from safevar_sumo.vehicles import CharacteristicSet
+
+APART = 0.1
+"""Two vehicles have parted when their speeds differ by more [m/s]."""
+
+
+class Moments(NamedTuple):
+    """Samples of a drive; None where there is no such moment.
+
+    `brake` is where the brake is first commanded while it moves, `nearest` where the obstacle is nearest (the impact on
+    a collision), `end` the drive's last sample.
+    """
+
+    brake: int | None
+    nearest: int | None
+    end: int
+
+
+def moments(drives: Drives, row: int) -> Moments:
+    """The moments of one of N drives."""
+    trace = drives.trace
+    active = trace.active[:, row]
+    end = int(np.flatnonzero(active)[-1])
+    moving = np.logical_or.accumulate(trace.speed[:, row] > STANDSTILL)
+    braking = np.flatnonzero(active & moving & (trace.brake[:, row] > 0))
+    brake = int(braking[0]) if braking.size else None
+    if not np.isnan(drives.collision_speed[row]):
+        return Moments(brake, end, end)
+    near = np.where(active & drives.encounter.in_conflict[:, row], drives.encounter.separation[:, row], np.inf)
+    return Moments(brake, int(np.argmin(near)) if np.isfinite(near).any() else None, end)
+
+
+def divergence(drives: Drives, one: int = 0, other: int = 1) -> int | None:
+    """The first sample at which the speeds of two of N drives have parted, None if they never do."""
+    trace = drives.trace
+    both = trace.active[:, one] & trace.active[:, other]
+    apart = np.flatnonzero(both & (np.abs(trace.speed[:, one] - trace.speed[:, other]) > APART))
+    return int(apart[0]) if apart.size else None
+
+
+ORIGINAL, CHANGED = 0, 1
+"""Rows of a comparison."""
+WORDS = {Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is still driving at the end",
+         Outcome.NEVER_MOVED: "never moves", Outcome.SIMULATOR_ERROR: "cannot be simulated",
+         Outcome.INVALID_TEST: "leaves the test's speed"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Drives of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is changed).
+
+    `title` is the study's, `evaluations` and `film` have one row for each vehicle.
+    """
+
+    title: str
+    characteristics: CharacteristicSet
+    ttc_threshold: float
+    evaluations: Evaluations
+    film: Film
+
+    @property
+    def rows(self) -> range:
+        return range(len(self.evaluations))
+
+    def name(self, row: int) -> str:
+        return "original" if row == ORIGINAL else "changed"
+
+    @property
+    def changes(self) -> list[str]:
+        """Every change in words, with its unit and share."""
+        if len(self.evaluations) == 1:
+            return []
+        return changes_in_words(self.characteristics, self.evaluations.settings[CHANGED])
+
+    def verdict(self, row: int) -> str:
+        """How a drive ended, in words: hits at 3.9 m/s, or stops with 2.22 m to spare."""
+        drives = self.film.drives
+        if not math.isnan(drives.collision_speed[row]):
+            return f"hits at {drives.collision_speed[row]:.1f} m/s"
+        nearest = moments(drives, row).nearest
+        word = WORDS[Outcome(str(drives.outcome[row]))]
+        if nearest is None or drives.outcome[row] != Outcome.STOPPED:
+            return word
+        return f"{word} with {drives.trace.gap[nearest, row]:.2f} m to spare"
+
+
+def changes_in_words(characteristics: CharacteristicSet, setting: FloatArray) -> list[str]:
+    """What differs from the original: `tireFric 3.5 → 1.1 (-69 %)`."""
+    return [f"{member.name} {number(member.original)} → {number(value)}{spaced(member.unit)} "
+            f"({(value - member.original) / abs(member.original) * 100:+.0f}\N{NO-BREAK SPACE}%)"
+            for member, value in zip(characteristics, setting.tolist(), strict=True) if value != member.original]
+
+
+def number(value: float) -> str:
+    """Four digits that matter, and all of a larger number's."""
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:.4g}"
+
+
+def spaced(unit: str) -> str:
+    """A unit as it follows a number, its powers raised; nothing for a pure number."""
+    return "" if unit == "-" else " " + raised(unit)
+
+
+def raised(text: str) -> str:
+    """A text with units such as m/s^2 as they are printed: m/s²."""
+    return text.replace("^2", "²").replace("^3", "³")
+
+
+def compare(study: Study, system: System, setting: FloatArray) -> Comparison:
+    """Simulate a filtered setting, shape (n,), beside the original vehicle; in a matrix, where the setting comes off worst.
+
+    Raises
+    ------
+    SimulationError, InputError
+        As `simulation.simulate`.
+    """
+    original = system.characteristics.original
+    settings = np.stack([original]) if np.array_equal(original, setting) else np.stack([original, setting])
+    there = at_worst(system, settings)
+    where = [f" ({point.name})" for point in system.matrix if (point.scenario, point.weather) == (there.scenario, there.weather)]
+    taken = film(there, settings)
+    return Comparison(title=study.title + "".join(where[:1]), characteristics=system.characteristics,
+                      ttc_threshold=system.metrics.ttc_threshold, evaluations=score(there, settings, taken.drives),
+                      film=replace(taken, drives=_up_to_impacts(taken.drives)))
+
+
+def _up_to_impacts(drives: Drives) -> Drives:
+    """Drives with the pedals that were in force at an impact: those of the sample before, a command after it moves nothing any more."""
+    trace = drives.trace
+    throttle, brake = trace.throttle.copy(), trace.brake.copy()
+    for row in np.flatnonzero(~np.isnan(drives.collision_speed)).tolist():
+        end = moments(drives, row).end
+        for pedal in (throttle, brake):
+            pedal[end, row] = pedal[max(end - 1, 0), row]
+    return replace(drives, trace=replace(trace, throttle=throttle, brake=brake))
+
+
+def differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:
+    """Where the only row of a replay differs from its row of solutions.csv: each with both values."""
+    told = [f"{name} is {recorded[name]:.6g} there and {replayed.metrics[name][0]:.6g} here" for name in replayed.metrics
+            if name in recorded and not np.array_equal(float(recorded[name]), float(replayed.metrics[name][0]), equal_nan=True)]
+    if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):
+        told.insert(0, f"the outcome is {recorded['outcome']} there and {replayed.outcome[0]} here")
+    return told

@@ -1,0 +1,172 @@
+"""The original and a changed vehicle in one figure: speed, gap, pedals and time to collision over time."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import time_to_collision
+from safevar_sumo.records import STANDSTILL, Drives, FloatArray
+from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison, divergence, moments
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = {ORIGINAL: "#0072b2", CHANGED: "#d55e00"}
+"""Okabe and Ito's blue and vermillion."""
+DASHES: Mapping[int, Literal["-", "--"]] = {ORIGINAL: "-", CHANGED: "--"}
+BRAKING, NEAREST, IMPACT = "v", "o", "X"
+SHOWN_TTC = 6.0
+"""Longer times to collision are not of interest [s]."""
+FONT = 9
+DPI = 200
+LINE = 118
+"""Letters in a line of the heading."""
+
+
+def draw_comparison(comparison: Comparison) -> Figure:
+    """Draw a comparison; the figure belongs to no window."""
+    import matplotlib.style
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT, "axes.labelsize": FONT}]):
+        figure = Figure(figsize=(9.6, 6.2), layout=ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.08))
+        axes = figure.subplots(2, 2, sharex=True).ravel()
+    ttc = time_to_collision(comparison.film.drives)
+    for row in comparison.rows:
+        _speed(axes[0], comparison, row)
+        _gap(axes[1], comparison, row)
+        _pedals(axes[2], comparison, row)
+        _line(axes[3], comparison, row, np.where(ttc[:, row] <= SHOWN_TTC, ttc[:, row], np.nan))
+    axes[0].set_ylabel("speed [m/s]")
+    axes[1].set_ylabel("gap to the obstacle [m]")
+    axes[2].set_ylabel("brake     |     throttle")
+    axes[3].set_ylabel("time to collision [s]")
+    axes[1].axhline(0, color="black", linewidth=0.8)
+    axes[0].margins(y=0.1)
+    axes[1].set_ylim(-0.22 * axes[1].get_ylim()[1], None)
+    axes[2].set_ylim(-1.08, 1.08)
+    axes[2].set_yticks([-1, -0.5, 0, 0.5, 1], ["1", "0.5", "0", "0.5", "1"])
+    axes[3].set_ylim(0, None)
+    axes[3].set_xlim(right=_over(comparison) * 1.25)
+    axes[3].axhline(comparison.ttc_threshold, color="0.4", linewidth=0.9, linestyle=":")
+    for axis in axes[2:]:
+        axis.set_xlabel("time [s]")
+    if len(comparison.rows) > 1:
+        _mark_divergence(axes, comparison)
+    _heading(figure, comparison)
+    _legend(figure, comparison)
+    return figure
+
+
+def _over(comparison: Comparison) -> float:
+    """When the last vehicle has come to its end or to rest, and its story with it [s]."""
+    drives = comparison.film.drives
+    ends = [when for row in comparison.rows for when in (moments(drives, row).nearest, _comes_to_rest(drives, row)) if when is not None]
+    return float(drives.trace.time[min(max(ends) + 1, len(drives.trace.time) - 1)])
+
+
+def _comes_to_rest(drives: Drives, row: int) -> int:
+    """The last sample of a drive at which its vehicle moves, its first one if it never does."""
+    return int(np.flatnonzero(drives.trace.active[:, row] & (drives.trace.speed[:, row] > STANDSTILL)).max(initial=0))
+
+
+def write_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as its file's ending says; the same figure gives the same bytes.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    import matplotlib
+
+    undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+    try:
+        with matplotlib.rc_context({"svg.hashsalt": "safevar_sumo"}):
+            figure.savefig(path, dpi=DPI, metadata=undated.get(path.suffix.lower().lstrip("."), {}))
+    except OSError as error:
+        raise InputError("plot", f"cannot write {path}: {error.strerror or error}", "a file in a directory that exists") from None
+
+
+def _legend(figure: Figure, comparison: Comparison) -> None:
+    """Who is who, and what the marks mean."""
+    from matplotlib.lines import Line2D
+
+    hit = bool(np.isfinite(comparison.film.drives.collision_speed).any())
+    marks = {"begins to brake": BRAKING, "nearest": NEAREST, **({"impact": IMPACT} if hit else {})}
+    entries = [Line2D([], [], color=COLOURS[row], linestyle=DASHES[row], label=f"{comparison.name(row)} vehicle: {comparison.verdict(row)}")
+               for row in comparison.rows]
+    entries += [Line2D([], [], color="0.35", marker=mark, linestyle="", markersize=7, label=label) for label, mark in marks.items()]
+    entries.append(Line2D([], [], color="0.35", linestyle="-.", linewidth=0.9, label="their speeds part (by 0.1 m/s)"))
+    entries.append(Line2D([], [], color="0.4", linestyle=":", linewidth=0.9,
+                          label=f"TTC* = {comparison.ttc_threshold:g} s: critical below"))
+    figure.legend(entries, [str(entry.get_label()) for entry in entries], loc="outside lower center", ncols=3, frameon=False)
+
+
+def _line(axis: Axes, comparison: Comparison, row: int, values: FloatArray) -> None:
+    """A quantity of one drive as far as it goes."""
+    end = moments(comparison.film.drives, row).end + 1
+    time = comparison.film.drives.trace.time[:end]
+    axis.plot(time, values[:end], color=COLOURS[row], linestyle=DASHES[row], linewidth=1.6, zorder=3 + row)
+
+
+def _mark(axis: Axes, row: int, place: tuple[float, float], mark: str, text: str = "", *, is_speed: bool = False) -> None:
+    """A mark on a line, the original's larger, so that it is seen below the other's, its text below the other's."""
+    axis.plot(*place, marker=mark, color=COLOURS[row], markersize=12 - 4 * row + 2 * (mark == IMPACT), linestyle="", zorder=6 + row,
+              markeredgecolor="white")
+    offset, side = ((3, 7), "left") if is_speed else ((0, 9 if row == ORIGINAL else -17), "center")
+    axis.annotate(text, place, xytext=offset, textcoords="offset points", color=COLOURS[row], fontweight="bold", ha=side)
+
+
+def _speed(axis: Axes, comparison: Comparison, row: int) -> None:
+    trace, when = comparison.film.drives.trace, moments(comparison.film.drives, row)
+    _line(axis, comparison, row, trace.speed[:, row])
+    if when.brake is not None:
+        _mark(axis, row, (trace.time[when.brake], trace.speed[when.brake, row]), BRAKING)
+    hit = float(comparison.film.drives.collision_speed[row])
+    if not np.isnan(hit):
+        _mark(axis, row, (trace.time[when.end], hit), IMPACT, f"{hit:.1f} m/s", is_speed=True)
+
+
+def _gap(axis: Axes, comparison: Comparison, row: int) -> None:
+    drives = comparison.film.drives
+    gap, when = np.where(np.isfinite(drives.trace.gap[:, row]), drives.trace.gap[:, row], np.nan), moments(drives, row)
+    _line(axis, comparison, row, gap)
+    if when.nearest is not None and not np.isnan(gap[when.nearest]):
+        hit = not np.isnan(drives.collision_speed[row])
+        text = "impact" if hit else f"{gap[when.nearest]:.2f} m"
+        _mark(axis, row, (drives.trace.time[when.nearest], gap[when.nearest]), IMPACT if hit else NEAREST, text)
+
+
+def _pedals(axis: Axes, comparison: Comparison, row: int) -> None:
+    trace = comparison.film.drives.trace
+    _line(axis, comparison, row, trace.throttle[:, row] - trace.brake[:, row])
+
+
+def _mark_divergence(axes: np.ndarray, comparison: Comparison) -> None:
+    apart = divergence(comparison.film.drives)
+    if apart is not None:
+        for axis in axes:
+            axis.axvline(comparison.film.drives.trace.time[apart], color="0.35", linewidth=0.9, linestyle="-.", zorder=1)
+
+
+def _heading(figure: Figure, comparison: Comparison) -> None:
+    """The study's title, and below it what is changed; no change is torn apart."""
+    lines = textwrap.wrap(comparison.title, LINE)
+    line = "changed:" if comparison.changes else "the original vehicle"
+    for i, change in enumerate(comparison.changes):
+        part = f" {change}{',' if i < len(comparison.changes) - 1 else ''}"
+        if len(line) + len(part) > LINE:
+            lines.append(line)
+            line = part.strip()
+        else:
+            line += part
+    figure.suptitle("\n".join([*lines, line]).replace("$", r"\$"), fontsize=FONT + 1)

@@ -1,0 +1,126 @@
+"""A scene as a piece of HTML that plays without anything else, and what its template is told."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from safevar_sumo.records import FloatArray
+from safevar_sumo.replay.comparison import CHANGED, ORIGINAL
+from safevar_sumo.replay.raster import SEAM_WIDTH
+from safevar_sumo.replay.scene import TEN, Body, Scene
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+WEB = Path(__file__).parent / "web"
+LETTERS = 65
+"""So many heights of a letter the scene is wide."""
+CENTIMETRES = 2
+"""Decimals of a place [m]; a heading has one [degrees]."""
+
+
+@cache
+def player_parts() -> dict[str, str]:
+    """The style sheet and the script of the player, as they stand in a page."""
+    from markupsafe import Markup
+
+    return {name: Markup((WEB / f"player.{name}").read_text(encoding="utf-8")) for name in ("css", "js")}
+
+
+def environment(*folders: Path) -> Environment:
+    """Templates of these folders and of the player; everything from outside them is escaped."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    return Environment(loader=FileSystemLoader([*folders, WEB]), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+                       lstrip_blocks=True)
+
+
+def animation_page(scene: Scene) -> str:
+    """A page that shows one scene, whole in itself."""
+    template = environment().get_template("animation.html.j2")
+    comparison = scene.comparison
+    return template.render(title=comparison.title, changes=comparison.changes, data=player_data(scene), **player_parts())
+
+
+def player_data(scene: Scene) -> dict[str, Any]:
+    """What the template `player` is told: the still picture, and under `played` what the script plays. y points down."""
+    view, key = scene.view, scene.key_sample
+    drives = [_drive(scene, row) for row in scene.comparison.rows]
+    bodies = sorted(scene.bodies, key=lambda body: (body.is_vut, body.row))
+    left = _numbers(view.left)
+    box = {"left": left, "top": round(-view.bottom - view.height, CENTIMETRES), "width": round(view.width, CENTIMETRES),
+           "height": round(view.height, CENTIMETRES)}
+    shared = {"step": scene.step, "length": scene.length, "key": key, "view": box, "drives": drives}
+    return {
+        **shared,
+        "told": _told(scene), "moments": _moments(scene), "bottom": round(-view.bottom, CENTIMETRES),
+        "letters": round(view.width / LETTERS, CENTIMETRES),
+        "road": [_lane(lane) for kind in ("area", "path", "road", "crossing") for lane in scene.road if lane.kind == kind],
+        "ticks": list(range(int(np.floor(view.left.min() / TEN)) * TEN, int(view.left.max() + view.width) + TEN, TEN)),
+        "bodies": [_still(body, scene) for body in bodies],
+        "played": {**shared, "bodies": [_moving(body) for body in bodies]}}
+
+
+def _told(scene: Scene) -> str:
+    """The picture in words."""
+    comparison = scene.comparison
+    who = " and ".join(f"the {comparison.name(row)} vehicle, which {comparison.verdict(row)}" for row in comparison.rows)
+    return f"Seen from above after {scene.key_sample * scene.step:.2f} s: {who}"
+
+
+def _moments(scene: Scene) -> list[dict[str, Any]]:
+    """Where one may jump to."""
+    told = []
+    for row, one in enumerate(scene.moments):
+        name = scene.comparison.name(row)
+        if one.brake is not None:
+            told.append({"name": f"{name} brakes", "sample": one.brake})
+        if one.nearest is not None:
+            hit = not np.isnan(scene.comparison.film.drives.collision_speed[row])
+            told.append({"name": f"{name} {'hits' if hit else 'is nearest'}", "sample": one.nearest})
+    return sorted(told, key=lambda moment: moment["sample"])
+
+
+def _drive(scene: Scene, row: int) -> dict[str, Any]:
+    trace, told = scene.comparison.film.drives.trace, scene.moments[row]
+    shown = slice(0, told.end + 1)
+    return {"name": scene.comparison.name(row), "verdict": scene.comparison.verdict(row), "end": told.end,
+            "nearest": told.end if told.nearest is None else told.nearest, "speed": _list(trace.speed[shown, row]),
+            "gap": _list(trace.gap[shown, row]), "brakes": (trace.brake[shown, row] > 0).astype(int).tolist()}
+
+
+def _lane(lane: Any) -> dict[str, Any]:
+    return {"kind": lane.kind, "width": round(lane.width, 3), "inside": round(lane.width - SEAM_WIDTH, 3),
+            "points": " ".join(f"{x:.2f},{-y:.2f}" for x, y in lane.line.tolist())}
+
+
+def _moving(body: Body) -> dict[str, Any]:
+    degrees = -np.rad2deg(np.unwrap(body.heading)) if np.isfinite(body.heading).all() else -np.rad2deg(body.heading)
+    return {"drive": body.row if body.is_vut else None, "x": _numbers(body.x), "y": _numbers(-body.y), "heading": _numbers(degrees, 1)}
+
+
+def _still(body: Body, scene: Scene) -> dict[str, Any]:
+    """One body at the key moment."""
+    key = scene.key_sample
+    x, y, heading = (_list(values[key:key + 1])[0] for values in (body.x, -body.y, -np.rad2deg(body.heading)))
+    look = {ORIGINAL: "original", CHANGED: "changed"}[body.row] if body.is_vut else "other"
+    brake = scene.comparison.film.drives.trace.brake[min(key, scene.moments[body.row].end), body.row]
+    return {"name": body.name, "person": body.is_person, "length": body.length, "width": body.width, "look": look,
+            "title": f"{scene.comparison.name(body.row)} vehicle" if body.is_vut else body.name,
+            "radius": max(body.length, body.width) / 2, "drive": body.row if body.is_vut else None,
+            "brakes_key": body.is_vut and brake > 0, "x_key": x, "y_key": y, "heading_key": heading}
+
+
+def _list(values: FloatArray, decimals: int = CENTIMETRES) -> list[float | None]:
+    """Numbers as JSON has them; what is undefined is null."""
+    return [round(value, decimals) + 0.0 if np.isfinite(value) else None for value in values.tolist()]
+
+
+def _numbers(values: FloatArray, decimals: int = CENTIMETRES) -> list[float | None] | float | None:
+    """One number where all are the same."""
+    found = _list(values, decimals)
+    return found[0] if len(set(found)) == 1 else found

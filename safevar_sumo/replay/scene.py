@@ -1,0 +1,137 @@
+"""A comparison as a flat scene: the road turned so that the vehicle under test sets off to the right, everything in metres."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.records import FloatArray
+from safevar_sumo.replay.comparison import CHANGED, Comparison, Moments, moments
+from safevar_sumo.scenarios import VUT
+from safevar_sumo.sumo.film import Film, Lane, Track
+
+MARGIN = 4.0
+"""What is shown around everybody [m]."""
+LEAST_HEIGHT = 11.0
+WIDEST = 75.0
+"""A scene up to this long is shown whole; in a longer one the camera follows the vehicles [m]."""
+FOLLOWED = 48.0
+"""Length of road that a following camera shows [m]."""
+NEAR = 30.0
+"""Actors that never come nearer to the vehicle under test are not shown [m]."""
+TEN = 10
+"""Distance of two marks beside the road [m]."""
+SAME = 0.05
+"""Two copies of an actor whose places differ by less are one [m]."""
+
+
+class Body(NamedTuple):
+    """An actor of one drive: front bumper or person's middle, x to the right and y up [m], heading [rad from x]; shape (T,)."""
+
+    name: str
+    row: int
+    is_vut: bool
+    is_person: bool
+    length: float
+    width: float
+    x: FloatArray
+    y: FloatArray
+    heading: FloatArray
+
+    def corners(self, sample: int) -> FloatArray:
+        """The outline of a vehicle, shape (4, 2): front left, front right, rear right, rear left."""
+        along = np.array([np.cos(self.heading[sample]), np.sin(self.heading[sample])])
+        side, front = np.array([-along[1], along[0]]) * self.width / 2, np.array([self.x[sample], self.y[sample]])
+        rear = front - along * self.length
+        return np.array([front + side, front - side, rear - side, rear + side])
+
+
+class View(NamedTuple):
+    """The part of the road that is shown: its left end at every sample, shape (T,), its lower end, and its size [m]."""
+
+    left: FloatArray
+    bottom: float
+    width: float
+    height: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """What there is to see of a comparison; `length` samples, `step` seconds apart."""
+
+    comparison: Comparison
+    step: float
+    length: int
+    road: tuple[Lane, ...]
+    bodies: tuple[Body, ...]
+    moments: tuple[Moments, ...]
+    view: View
+
+    @property
+    def key_sample(self) -> int:
+        """The sample that a still picture shows: where the changed vehicle, or else the original, is nearest."""
+        told = self.moments[-1]
+        return told.nearest if told.nearest is not None else told.end
+
+    def tens(self, sample: int) -> list[int]:
+        """The tens of metres from the start that are in view."""
+        left = float(self.view.left[sample])
+        return list(range(math.ceil(left / TEN) * TEN, math.floor(left + self.view.width) + 1, TEN))
+
+
+def scene_of(comparison: Comparison) -> Scene:
+    """Lay a comparison out as a scene."""
+    film = comparison.film
+    vut = film.tracks[VUT]
+    turn = np.deg2rad(90 - vut.angle[0, 0])
+    to_scene = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    start = np.array([vut.x[0, 0], vut.y[0, 0]])
+    told = tuple(moments(film.drives, row) for row in comparison.rows)
+    length = max(one.end for one in told) + 1
+    bodies = tuple(_body(name, track, row, told[row].end, length, to_scene, start, turn)
+                   for name, track in film.tracks.items() for row in comparison.rows
+                   if name == VUT or (_shown(film, name, row) and not _seen_already(comparison, name, row)))
+    road = tuple(lane._replace(line=(lane.line - start) @ to_scene.T) for lane in film.road)
+    return Scene(comparison=comparison, step=film.drives.trace.step, length=length, road=road, bodies=bodies, moments=told,
+                 view=_view(bodies, length))
+
+
+def _body(name: str, track: Track, row: int, end: int, length: int, to_scene: FloatArray, start: FloatArray, turn: float) -> Body:
+    """An actor as long as its drive lasts; afterwards it stays where it was."""
+    until = np.minimum(np.arange(length), end)
+    x, y = to_scene @ (np.stack([track.x[until, row], track.y[until, row]]) - start[:, np.newaxis])
+    return Body(name, row, name == VUT, track.is_person, track.length, track.width, x, y,
+                np.deg2rad(90 - track.angle[until, row]) - turn)
+
+
+def _shown(film: Film, name: str, row: int) -> bool:
+    """Whether an actor ever comes near."""
+    track, vut, end = film.tracks[name], film.tracks[VUT], film.last[row] + 1
+    distance = np.hypot(track.x[:end, row] - vut.x[:end, row], track.y[:end, row] - vut.y[:end, row])
+    return bool(np.any(distance < NEAR + track.length))
+
+
+def _seen_already(comparison: Comparison, name: str, row: int) -> bool:
+    """Whether the changed vehicle's copy of an actor stands for the original's."""
+    if row == CHANGED or len(comparison.rows) == 1:
+        return False
+    track, end = comparison.film.tracks[name], int(comparison.film.last.min()) + 1
+    apart = np.hypot(track.x[:end, 0] - track.x[:end, CHANGED], track.y[:end, 0] - track.y[:end, CHANGED])
+    return _shown(comparison.film, name, CHANGED) and bool(np.all((apart < SAME) | np.isnan(apart)))
+
+
+def _view(bodies: tuple[Body, ...], length: int) -> View:
+    """All of it, or where that is too long, what a camera shows that follows the vehicles."""
+    low = min(float(np.nanmin(body.x)) - body.length for body in bodies) - MARGIN / 2
+    high = max(float(np.nanmax(body.x)) + (0 if body.is_vut else body.length) for body in bodies) + MARGIN
+    sides = [side for body in bodies for side in (np.nanmin(body.y) - body.width / 2, np.nanmax(body.y) + body.width / 2)]
+    bottom, top = float(min(sides)) - MARGIN / 2, float(max(sides)) + MARGIN / 2
+    missing = max(0.0, LEAST_HEIGHT - (top - bottom)) / 2
+    if high - low <= WIDEST:
+        return View(np.full(length, low), bottom - missing, high - low, top - bottom + 2 * missing)
+    front = np.mean([body.x for body in bodies if body.is_vut], axis=0)
+    left = np.clip(front - FOLLOWED * 0.45, low, max(low, high - FOLLOWED))
+    return View(left, bottom - missing, FOLLOWED, top - bottom + 2 * missing)

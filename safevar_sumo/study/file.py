@@ -1,0 +1,200 @@
+"""Study files read strictly, with what they extend."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import tomli_w
+
+from safevar_sumo.errors import InputError, refuse_other_than_file
+from safevar_sumo.shipped import STUDIES
+from safevar_sumo.study.schema import NAME, Origin, SearchTable, Study, StudyLike, is_file, study_path, tables_of
+from safevar_sumo.study.validation import converted, implausible, refuse, unusable
+
+REPLACED = ("calibration", "published", "repeatability")
+"""Tables that a study does not inherit in part from the one that it extends."""
+OF_ONE_SYSTEM = ("title", "published", "repeatability")
+"""What holds for one vehicle, ADS, scenario (its network too), weather and matrix alone: with another one it is not inherited."""
+LARGEST_FILE = 10_000_000
+"""Bytes."""
+
+
+class _Raw(NamedTuple):
+    """A study's tables before they are checked, and where they come from."""
+
+    source: object
+    tables: dict[str, Any]
+    origin: Origin = Origin()
+
+
+def load_study(study: StudyLike, **changes: Any) -> Study:
+    """Read a study strictly.
+
+    Parameters
+    ----------
+    study
+        Its name, the path of its file, its tables as they would stand in a file, or a study that is to be changed.
+    changes
+        Keys that override the study's, table by table as in a file that extends it:
+        `weather="fog"`, `search={"runs": 2}`.
+
+    Raises
+    ------
+    InputError
+        Naming file, key, value and what is legal.
+    """
+    given = _given(study)
+    return _checked(_overridden(given, changes, given.source) if changes else given)
+
+
+def _given(study: StudyLike) -> _Raw:
+    if isinstance(study, Study):
+        return _Raw(f"study {study.name!r}", without_nothing(tables_of(study)), study.origin)
+    if isinstance(study, Mapping):
+        return _extended(_Raw("study", dict(study)), Path("."), ())
+    return _read(study_path(str(study)), seen=())
+
+
+def _checked(raw: _Raw) -> Study:
+    if "origin" in raw.tables:
+        raise InputError(raw.source, "origin: there is no such key")
+    refuse(unusable(raw.source, raw.tables))
+    study = converted(raw.source, _with_algorithms(raw.tables), Study)
+    refuse(implausible(raw.source, study))
+    return msgspec.structs.replace(study, origin=raw.origin)
+
+
+def _with_algorithms(raw: dict[str, Any]) -> dict[str, Any]:
+    """The tables of algorithms, such as [search.nsga2], put where the schema has them."""
+    search = raw.get("search")
+    if not isinstance(search, dict) or not isinstance(search.get("parameters", {}), dict):
+        return raw
+    own = {key: value for key, value in search.items() if isinstance(value, dict) and key not in SearchTable.__struct_fields__}
+    rest = {key: value for key, value in search.items() if key not in own}
+    return {**raw, "search": {**rest, "parameters": {**rest.get("parameters", {}), **own}}} if own else raw
+
+
+def _read(path: Path, seen: tuple[Path, ...]) -> _Raw:
+    """Read a TOML file; what it `extends` comes first, its own keys override table by table."""
+    if path in seen:
+        raise InputError(path, f"extends = {path.stem!r} leads back to this file", "a study that does not extend this one")
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise InputError(path, f"has {path.stat().st_size} bytes", f"a study file of up to {LARGEST_FILE} bytes")
+        tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(path, f"is not TOML: {error}") from None
+    except (RecursionError, OverflowError):
+        raise InputError(path, "is nested too deeply", "a study as in studies/") from None
+    except UnicodeDecodeError as error:
+        raise InputError(path, f"is not UTF-8 text: {error}") from None
+    except ValueError as error:  # an integer of too many digits
+        raise InputError(path, f"cannot be read: {error}") from None
+    except OSError as error:
+        raise InputError(path, f"cannot be read: {error.strerror}") from None
+    places = () if path.parent == STUDIES else (str(path.resolve().parent),)
+    return _extended(_Raw(path, tables, Origin(called=str(path) if places else "", places=places)), path, seen)
+
+
+def _extended(raw: _Raw, path: Path, seen: tuple[Path, ...]) -> _Raw:
+    """The tables of the study that `raw` extends, overridden by its own; and the folders of both."""
+    tables = dict(raw.tables)
+    base = tables.pop("extends", None)
+    if base is None:
+        return raw
+    if not isinstance(base, str):
+        raise InputError(raw.source, f"extends = {base!r}", "the name or path of a study")
+    if "name" not in tables and re.fullmatch(NAME, path.stem):
+        tables["name"] = path.stem
+    beside = path.parent / base
+    extended = _read(beside if is_file(beside) else study_path(base), (*seen, path))
+    over = _overridden(extended, tables, raw.source)
+    places = tuple(dict.fromkeys((*raw.origin.places, *extended.origin.places)))
+    remarks = () if path.parent == STUDIES else over.origin.remarks  # who made a study of ours knew what it leaves out
+    return over._replace(origin=msgspec.structs.replace(over.origin, called=raw.origin.called, places=places, remarks=remarks))
+
+
+def _overridden(base: _Raw, over: Mapping[str, Any], source: object) -> _Raw:
+    """Override a study's tables by others; with another system what holds for the old one alone is left out."""
+    tables = _merged(base.tables, over)
+    other = [key for key in ("weather", "vehicle", "ads", "scenario", "matrix") if _kind(tables.get(key)) != _kind(base.tables.get(key))]
+    remarks = base.origin.remarks
+    if other:
+        lost = [key for key in OF_ONE_SYSTEM[:2] if key in base.tables and key not in over]
+        tables = {**{key: value for key, value in tables.items() if key not in OF_ONE_SYSTEM}, "title": tables.get("name", ""),
+                  **{key: over[key] for key in OF_ONE_SYSTEM if key in over}}
+        if lost:
+            remarks = (*remarks, f"{source}: has another {' and another '.join(other)} than study {base.tables.get('name')!r}, whose "
+                                 f"{' and '.join(lost)} it does not inherit")
+    return _Raw(source, tables, msgspec.structs.replace(base.origin, remarks=remarks))
+
+
+def _kind(table: object) -> object:
+    """Which model on which network, or which weather or matrix, a table stands for."""
+    if not isinstance(table, dict):
+        return table
+    parameters = table.get("parameters")
+    return table.get("model", table), parameters.get("network") if isinstance(parameters, dict) else None
+
+
+def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Override `base` by `over`; another `model` or `distribution`, and what may be calibrated, replace the whole table."""
+    result = dict(base)
+    for key, value in over.items():
+        result[key] = _merged(base[key], value) if _refines(key, base.get(key), value) else value
+    return result
+
+
+def _refines(key: str, old: object, new: object) -> bool:
+    """Whether a new table changes single keys of the old one."""
+    if key in REPLACED or not (isinstance(old, dict) and isinstance(new, dict)):
+        return False
+    return all(new.get(kind, old.get(kind)) == old.get(kind) for kind in ("model", "distribution"))
+
+
+def without_nothing(raw: Any) -> Any:
+    """TOML has no null: what is not given is left out."""
+    return {key: without_nothing(value) for key, value in raw.items() if value is not None} if isinstance(raw, dict) else raw
+
+
+def write_study(path: Path, study: Study, comment: str) -> None:
+    """Write a complete study file that begins with a comment; the study is called as the file, as far as that is a name.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    if re.fullmatch(NAME, path.stem):
+        study = msgspec.structs.replace(study, name=path.stem)
+    tables = {name: value for name, value in without_nothing(tables_of(study)).items() if value != {}}
+    printable = ("".join(character if character.isprintable() else "?" for character in line) for line in comment.splitlines())
+    text = "".join(f"# {line}".rstrip() + "\n" for line in printable) + "\n" + tomli_w.dumps(tables)
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError("out", f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None
+
+
+def check_writable(path: Path, source: str = "out") -> None:
+    """Refuse a file that cannot be written before the work whose result it is to take.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    try:
+        refuse_other_than_file(path, source, streams=True)
+        is_new = not path.exists()
+        with path.open("a"):
+            pass
+        if is_new:
+            path.unlink()
+    except OSError as error:
+        raise InputError(source, f"cannot write {path}: {error.strerror}", "a file in a directory that exists") from None

@@ -1,0 +1,229 @@
+"""Many settings in one SUMO simulation: the kernel of everything."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.plugins import undisturbed
+from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Drives, Evaluations, FloatArray, Outcome, Trace
+from safevar_sumo.scenarios import VUT, Lane, Point
+from safevar_sumo.scenarios.frame import Frame
+from safevar_sumo.sumo.contact import Contacts
+from safevar_sumo.sumo.driving_robot import DrivingRobot
+from safevar_sumo.sumo.engine import Engine, world_on
+from safevar_sumo.sumo.perception import Parts
+from safevar_sumo.sumo.staging import staged
+from safevar_sumo.sumo.system import System
+from safevar_sumo.sumo.traci_controller import TraciController
+from safevar_sumo.sumo.world import SumoWorld
+from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, at_start, slope_of
+
+SURE_BRAKES = 9.0
+"""SUMO puts nobody onto the road who might not stop before what is ahead; there everybody brakes so hard at least [m/s^2]."""
+Watcher = Callable[[SumoWorld], None]
+
+
+@np.errstate(all="ignore")
+def score(system: System, settings: FloatArray, run: Drives) -> Evaluations:
+    """Metrics and objectives of simulated settings."""
+    metrics = {name: metric(run, system.metrics) for name, metric in system.measuring.metrics.items()}
+    invalid = run.outcome == Outcome.INVALID_TEST
+    if invalid.any():
+        metrics = {name: np.where(invalid, np.nan, values) for name, values in metrics.items()}
+    return Evaluations(
+        settings=settings,
+        outcome=run.outcome,
+        collision_speed=run.collision_speed,
+        metrics={**metrics,
+                 **{name: change.function(settings, system.characteristics) for name, change in system.measuring.changes.items()}},
+        f_diff=system.characteristics.largest_change(settings),
+        f_num_diff=system.characteristics.number_changed(settings))
+
+
+def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = (),
+             watch: Watcher | None = None) -> Drives:
+    """Drive every setting, shape (N, n), at every one of the points, which share a network; `watch` is shown the world at every sample.
+
+    The drives at the first point come first, then those at the second, and so on.
+
+    Raises
+    ------
+    SimulationError
+        If SUMO fails.
+    InputError
+        If a user's ADS fails.
+    """
+    options = (*step_options(system), *options)
+    first, *others = [staged(point.scenario) for point in system.points]
+    with world_on(first, len(settings), engine, options, others) as world:
+        return drive(system, np.tile(settings, (len(system.points), 1)), world, watch)
+
+
+def step_options(system: System) -> tuple[str, ...]:
+    """SUMO's options for the time step that the study asks for."""
+    return () if system.step_length is None else ("--step-length", repr(system.step_length))
+
+
+@np.errstate(all="ignore")
+def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher | None = None) -> Drives:
+    """Drive the vehicles of an open world that nobody has stepped yet; see `drive_all`.
+
+    With several points the k-th part of the settings is in the k-th of them.
+    """
+    guards = [member.guard for member in system.members if member.guard is not None]
+    with undisturbed(guards[0].source if guards else "", [guard.name for guard in guards]):
+        return _driven(system, settings, world, watch)
+
+
+def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher | None) -> Drives:
+    vehicle, step, n = system.vehicle, world.step_length, len(settings)
+    characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
+    prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_surface(system.points, n))
+    types = vehicle.sumo_type(prepared)
+    world.set_types(types._replace(decel=np.maximum(types.decel, SURE_BRAKES)))
+    world.depart()
+    world.set_decelerations(types.decel)
+    length, way = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
+
+    state = at_start(vehicle, prepared, world.speeds())
+    if isinstance(system.ads, TraciController):  # any other is given what is sensed
+        world.sensors = _sensors(system, prepared, n)
+    driver = system.ads.start(n, system.nominal, step)
+    try:
+        parts = Parts(system.points, world, n, own_reactions=_own_reactions(system))
+    except world.api.TraCIException as error:
+        raise InputError("scenario.parameters.network", f"the scenario does not find what it looks for: {str(error).strip()}",
+                         "a network and traffic with the ids that the scenario names") from None
+    log = _Log(n, int(parts.last.max()) + 1, way)
+    verdict, robot = _Verdict(n), DrivingRobot(system.points, vehicle, prepared, state, step)
+    contacts = Contacts(n, robot.tested)
+    for sample in range(log.length):
+        if watch is not None:
+            watch(world)
+        speed = world.speeds()
+        scene = parts.scene()
+        active = verdict.judge(speed, scene.over, contacts.collisions(world, verdict.open, scene), last=sample >= parts.last)
+        seen = parts.seen(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
+        seen, state = vehicle.sense(prepared, state, seen)
+        command, driver = system.ads.drive(seen, driver)
+        command, state = robot.drive(parts.braked(command), state, verdict.open)
+        log.write(sample, place=world.vehicle_positions(VUT), speed=speed, gap=scene.gap, lateral=scene.lateral,
+                  lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active,
+                  obstacle_speed=scene.obstacle_speed, pedal=state.brake)
+        if not verdict.open.any():
+            break
+        if watch is None:
+            world.leave(verdict.ended)
+        state = vehicle.advance(prepared, state, command)
+        _refuse_no_number(state.speed, settings, system.characteristics)
+        world.advance(np.where(verdict.open, state.speed, 0.0))
+    trace = log.trace(sample + 1, step, length)
+    return Drives(trace=trace, encounter=parts.encounter(trace), outcome=np.where(robot.invalid, Outcome.INVALID_TEST, verdict.outcome()),
+                  collision_speed=np.where(robot.invalid, np.nan, verdict.collision_speed), contact=contacts.contact(),
+                  test_speed_error=robot.error)
+
+
+def _refuse_no_number(speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet) -> None:
+    """SUMO takes a speed that is no number for 0: a vehicle whose physics have broken down would pass for a careful one.
+
+    It stands for numpy's warnings of overflows, which tell neither characteristic nor value.
+    """
+    if np.count_nonzero(np.isfinite(speed)) < len(speed):
+        copy = np.flatnonzero(~np.isfinite(speed))[0]
+        values = ", ".join(f"{one.name} = {value:g}" for one, value in zip(characteristics, settings[copy], strict=True)
+                           if value != one.original) or "the original's values"
+        raise InputError("vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with")
+
+
+def _road_friction(points: Sequence[Point], n: int) -> Any:
+    """Factor on the tyres' friction: a number, or shape (n,) where the points differ."""
+    factors = [point.weather.road_friction for point in points]
+    return factors[0] if len(set(factors)) == 1 else np.repeat(factors, n // len(points))
+
+
+def _surface(points: Sequence[Point], n: int) -> list[Any]:
+    """Slope and wetness of the points' roads, each for its part of the vehicles.
+
+    Nothing where all are level and dry: not every vehicle takes them.
+    """
+    grades, wet = [getattr(point.scenario, "grade", 0.0) for point in points], [point.weather.wet for point in points]
+    slope = slope_of(np.repeat(grades, n // len(points))) if any(grades) else LEVEL
+    return [slope, np.repeat(wet, n // len(points))] if any(wet) else [slope] if any(grades) else []
+
+
+def _sensors(system: System, prepared: Any, n: int) -> Sensors:
+    """The vehicles' sensors in the weathers of their points, where it takes longer to recognise somebody and one does not see so far."""
+    of_vehicle = getattr(system.vehicle, "sensors", None)
+    own = (None if of_vehicle is None else of_vehicle(prepared)) or Sensors.perfect(n)
+    weathers = [point.weather.without_reactions if _own_reactions(system) else point.weather for point in system.points]
+    delay = np.repeat([weather.recognition_delay for weather in weathers], n // len(weathers))
+    visibility = np.repeat([weather.visibility for weather in weathers], n // len(weathers))
+    return Sensors(own.latency + delay, own.reach * visibility, own.scale)
+
+
+def _own_reactions(system: System) -> bool:
+    """Whether the ADS has reactions of its own, so that the weather's do not act on it."""
+    return bool(getattr(system.ads, "own_reactions", False))
+
+
+class _Log:
+    """Samples of a run in arrays of shape (T, N), and where the vehicles were on SUMO's plane, shape (T, N, 2)."""
+
+    _COLUMNS = ("speed", "gap", "lateral", "lateral_speed", "throttle", "brake", "gear", "active", "obstacle_speed",
+                "pedal")
+
+    def __init__(self, n: int, length: int, way: Frame) -> None:
+        self.length, self._way = length, way
+        self._rows = {name: np.zeros((length, n), dtype=bool if name == "active" else float) for name in self._COLUMNS}
+        self._places = np.zeros((length, n, 2))
+
+    def write(self, sample: int, place: FloatArray, **columns: FloatArray | BoolArray) -> None:
+        self._places[sample] = place
+        for name, values in columns.items():
+            self._rows[name][sample] = values
+
+    def trace(self, length: int, step: float, vehicle_length: float) -> Trace:
+        rows = {name: values[:length] for name, values in self._rows.items()}
+        rows["position"] = self._way.along(self._places[:length].reshape(-1, 2)).reshape(length, -1)
+        return Trace(step=step, vehicle_length=vehicle_length, time=np.round(np.arange(length) * step, TIME_DECIMALS), **rows)
+
+
+class _Verdict:
+    """How N simulations end; `open` where the outcome can still change, `ended` those that ended last. Method section 4."""
+
+    def __init__(self, n: int) -> None:
+        self.open = np.ones(n, dtype=bool)
+        self.ended: list[int] = []
+        self.collision_speed = np.full(n, np.nan)
+        self._moved = np.zeros(n, dtype=bool)
+        self._stood = np.zeros(n, dtype=bool)
+        self._over = np.zeros(n, dtype=bool)
+
+    def judge(self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: BoolArray | bool) -> BoolArray:
+        """Take in one sample; returns for which vehicles it still belongs to the run."""
+        before, active = self.open.copy(), self.open & ~over
+        for copy, collision_speed in collisions.items():
+            if self.open[copy]:
+                self.collision_speed[copy] = collision_speed
+                active[copy], self.open[copy] = True, False
+        standing = speed <= STANDSTILL
+        self._stood |= self.open & self._moved & standing
+        self._moved |= self.open & ~standing
+        self._over |= self.open & over
+        self.open &= ~over & ~np.asarray(last)
+        self.ended = (before & ~self.open).nonzero()[0].tolist()
+        return active
+
+    def outcome(self) -> npt.NDArray[np.str_]:
+        """The outcome of every simulation, once none is open."""
+        outcome = np.full(len(self.open), Outcome.TIMEOUT.value, dtype="U16")
+        outcome[self._over] = Outcome.PASSED
+        outcome[self._stood] = Outcome.STOPPED
+        outcome[~self._moved] = Outcome.NEVER_MOVED
+        outcome[~np.isnan(self.collision_speed)] = Outcome.COLLISION
+        return outcome

@@ -1,0 +1,262 @@
+"""Where a traffic file puts people: places that are on the road, and a road under the vehicle under test that is as it drives on it."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.scenarios import VUT
+from safevar_sumo.sumo.copies import DEMAND, seconds
+
+LEVEL = 0.005
+"""So much may a road climb that counts as level, a part of its length."""
+
+Lanes = dict[str, list[ElementTree.Element]]
+"""By edge."""
+
+
+def check_places(root: ElementTree.Element, file: Path, roads: ElementTree.Element) -> None:
+    """Refuse places beyond the end of a lane, and a way of the vehicle under test that climbs or is slippery.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the element and its attribute, or the lane.
+    """
+    lanes = {edge.get("id", ""): list(edge.iter("lane")) for edge in roads.iter("edge")}
+    routes = {route.get("id", ""): route for route in root.findall("route")}
+    for actor in root:
+        way = _way(actor, routes)
+        if way:
+            _check_on(actor, ("departPos",), way[0], lanes, file)
+        if actor.get("id") == VUT and actor.tag in ("vehicle", "trip"):
+            for edge in way:
+                _check_surface(lanes[edge], file)
+    for stop in root.iter("stop"):
+        _check_on(stop, ("startPos", "endPos"), stop.get("edge") or stop.get("lane", "").rpartition("_")[0], lanes, file)
+
+
+def way_of_vut(root: ElementTree.Element) -> list[str]:
+    """The edges on which the vehicle under test drives, as far as the traffic file says so."""
+    routes = {route.get("id", ""): route for route in root.findall("route")}
+    return [edge for actor in root if actor.get("id") == VUT and actor.tag in ("vehicle", "trip") for edge in _way(actor, routes)]
+
+
+def _way(actor: ElementTree.Element, routes: dict[str, ElementTree.Element]) -> list[str]:
+    """The edges on which an actor sets off and, as far as the file says so, goes on."""
+    for part in (actor.find("route"), routes.get(actor.get("route", "")), actor, actor.find("walk"), actor.find("personTrip")):
+        if part is not None:
+            found = " ".join(part.get(name, "") for name in ("edges", "from", "via", "to")).split()
+            if found:
+                return found
+    return []
+
+
+def _check_on(element: ElementTree.Element, names: tuple[str, ...], edge: str, lanes: Lanes, file: Path) -> None:
+    length = max((float(lane.get("length", 0)) for lane in lanes.get(edge, [])), default=float("inf"))
+    for name in names:
+        value = element.get(name, "0")
+        if is_number(value) and not abs(float(value)) <= length:
+            called = f"{element.tag} {element.get('id')!r}" if "id" in element.attrib else element.tag
+            raise InputError(file, f"{called}: {name} = {value} is not on {edge!r}", f"at most its length, {length:g} m")
+
+
+def _check_surface(lanes: list[ElementTree.Element], file: Path) -> None:
+    for lane in lanes:
+        heights = [float((*point.split(","), "0")[2]) for point in lane.get("shape", "").split()]
+        climb = max(heights, default=0.0) - min(heights, default=0.0)
+        if climb > LEVEL * float(lane.get("length", 0)):
+            raise InputError(file, f"vehicle {VUT!r} is to drive on lane {lane.get('id')!r}, which climbs {climb:.2f} m",
+                             "a level road, and a scenario's grade; netconvert's option flatten makes one")
+        if float(lane.get("friction", 1)) != 1:
+            raise InputError(file, f"vehicle {VUT!r} is to drive on lane {lane.get('id')!r} of friction {lane.get('friction')}",
+                             "1, and road_friction of the study's [weather]")
+
+
+def is_number(text: str) -> bool:
+    """Whether an attribute is a number, not a word or a distribution."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+_ACTORS = ("vehicle", "trip", "flow", "person", "personFlow")
+_RIDING, _WALKING = ("route", "stop", "param"), ("walk", "personTrip", "stop", "param")
+CHILDREN: Mapping[str, tuple[str, ...]] = {
+    "routes": ("vType", "route", *_ACTORS), "vType": ("param",), "route": ("stop", "param"), "vehicle": _RIDING,
+    "trip": ("stop", "param"), "flow": _RIDING, "person": _WALKING, "personFlow": _WALKING, "walk": ("param",), "personTrip": ("param",),
+    "stop": ("param",), "param": (),
+}
+"""What may be in an element of a traffic file."""
+ELSEWHERE = frozenset({
+    "fromTaz", "toTaz", "fromJunction", "toJunction", "busStop", "trainStop", "containerStop", "chargingStation",
+    "parkingArea", "overheadWireSegment", "lines", "line", "group", "departEdge", "arrivalEdge", "imgFile", "osgFile"})
+"""Attributes that name what no traffic file holds."""
+DEVICES = re.compile(r"(has\.|device\.).*")
+"""Parameters of devices, which write files or draw at random."""
+RANDOM = frozenset({"lcSigma", "jmIgnoreFoeProb", "jmIgnoreJunctionFoeProb", "jmSigmaMinor", "probability"})
+"""Attributes that make something random, unless 0."""
+SIGMA = frozenset({"Krauss", "KraussOrig1", "KraussPS"})
+STEADY = frozenset({"IDM", "IDMM", "ACC", "CACC"})
+"""Models of following that draw at random as far as sigma is not 0, and never."""
+
+SET_BY_SETTINGS = ("mass", "accel", "decel", "emergencyDecel", "apparentDecel", "maxSpeed", "tau")
+"""Attributes of the type of the vehicle under test in whose place its model puts the setting's."""
+OF_SUMOS_DRIVER = re.compile("carFollowModel|speedFactor|speedDev|sigma.*|desiredMaxSpeed|impatience|laneChangeModel|lc[A-Z].*|jm[A-Z].*"
+                             "|actionStepLength|startupDelay|delta|stepping|minGapLat|maxSpeedLat|latAlignment")
+"""Attributes that say how SUMO's own driver drives."""
+
+
+def check_demand(root: ElementTree.Element, file: Path, roads: ElementTree.Element, options: Mapping[str, str]) -> None:
+    """Refuse traffic that cannot be copied, or not in the same way, or that is not on the roads of the built network.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the element and its attribute.
+    """
+    if root.tag != "routes":
+        raise InputError(file, f"is a {root.tag!r}", "the traffic of a network, <routes>")
+    for parent in root.iter():
+        for element in parent:
+            if element.tag not in CHILDREN[parent.tag]:
+                raise InputError(file, f"{_called(parent)} has a {element.tag!r}", one_of(CHILDREN[parent.tag]) or "nothing")
+            _check_element(element, file)
+    _check_ids(root, file, roads)
+    _check_vut(root, file)
+    _check_chance(root, file, options)
+    check_places(root, file, roads)
+
+
+def _called(element: ElementTree.Element) -> str:
+    return f"{element.tag} {element.get('id')!r}" if "id" in element.attrib else element.tag
+
+
+def _check_element(element: ElementTree.Element, file: Path) -> None:
+    for name, value in element.attrib.items():
+        if name in ELSEWHERE:
+            raise InputError(file, f"{_called(element)}: {name} = {value!r}", "edges and lanes of the network; no other file is read")
+        chosen = name.startswith(("depart", "arrival")) and value.startswith("random")
+        if chosen or (name == "period" and value.startswith("exp")) or (name in RANDOM and not _zero(value)):
+            raise InputError(file, f"{_called(element)}: {name} = {value!r} draws at random", "the same in every copy of the network")
+    if element.tag == "param" and DEVICES.fullmatch(element.get("key", "")):
+        raise InputError(file, f"param {element.get('key')!r} gives a device", "no devices: they write files, or draw at random")
+    if element.tag in _ACTORS and seconds(element.get("depart", element.get("begin", "0"))) is None:
+        raise InputError(file, f"{_called(element)}: depart = {element.get('depart', element.get('begin'))!r}", "a time [s]")
+    if element.tag in _ACTORS and not is_number(element.get("speedFactor", "1")):
+        raise InputError(file, f"{_called(element)}: speedFactor = {element.get('speedFactor')!r}", "a number")
+
+
+def _check_ids(root: ElementTree.Element, file: Path, roads: ElementTree.Element) -> None:
+    types, routes = (_unique(root, kinds, file) for kinds in (("vType",), ("route",)))
+    for kinds in (("vehicle", "trip", "flow"), ("person", "personFlow")):
+        _unique(root, kinds, file)
+    edges = {edge.get("id", "") for edge in roads.iter("edge")}
+    known = {"type": types, "vTypes": types, "route": routes, "edges": edges, "from": edges, "to": edges, "via": edges, "edge": edges,
+             "lane": {lane.get("id", "") for lane in roads.iter("lane")}}
+    for element in root.iter():
+        for name in DEMAND.get(element.tag, ()):
+            for one in element.get(name, "").split():
+                if name in known and one not in known[name]:
+                    raise InputError(file, f"{_called(element)}: {name} = {one!r} is not there", _some_of(known[name]))
+
+
+def _some_of(names: set[str]) -> str:
+    shown = sorted(name for name in names if not name.startswith(":"))
+    return f"one of {', '.join(shown[:12])}{', ...' if len(shown) > 12 else ''}" if shown else "one that is defined"
+
+
+def _unique(root: ElementTree.Element, kinds: tuple[str, ...], file: Path) -> set[str]:
+    found: set[str] = set()
+    for element in root:
+        if element.tag in kinds:
+            name = element.get("id", "")
+            if not name or name in found or name.split() != [name]:
+                raise InputError(file, f"{element.tag} has the id {name!r}", "an id of its own, without spaces")
+            found.add(name)
+    return found
+
+
+def _check_vut(root: ElementTree.Element, file: Path) -> None:
+    """There is one vehicle under test, of a type that is its alone, from the beginning on."""
+    vut = next((one for one in root if one.tag in ("vehicle", "trip") and one.get("id") == VUT), None)
+    if vut is None:
+        raise InputError(file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>, the vehicle under test')
+    if vut.get("type") != VUT:
+        raise InputError(file, f"vehicle {VUT!r}: type = {vut.get('type')!r}", f"{VUT!r}, a vType that becomes what a setting says")
+    if seconds(vut.get("depart", "")) != 0:
+        raise InputError(file, f"vehicle {VUT!r}: depart = {vut.get('depart')!r}", "0")
+    routes = [route for route in root if route.tag == "route" and route.get("id") == vut.get("route")]
+    if any(part.find(".//stop") is not None for part in (vut, *routes)):
+        raise InputError(file, f"vehicle {VUT!r} has a stop", "none: its ADS drives it")
+    for element in root:
+        if element is not vut and element.get("type") == VUT:
+            raise InputError(file, f"{_called(element)}: type = {VUT!r}, which changes with every setting", "a vType of its own")
+
+
+def _check_chance(root: ElementTree.Element, file: Path, options: Mapping[str, str]) -> None:
+    """What SUMO draws at random differs from copy to copy, so that a result would depend on its batch."""
+    types = {kind.get("id", ""): kind for kind in root if kind.tag == "vType"}
+    for actor in root:
+        if actor.tag in _ACTORS and actor.get("id") != VUT:
+            if actor.get("type", "") not in types:
+                raise InputError(file, f"{_called(actor)} has no type, and SUMO's default draws at random",
+                                 'a vType with speedDev="0" and sigma="0"')
+            for problem, legal in _chances(types[actor.get("type", "")], actor, options):
+                raise InputError(file, f"vType {actor.get('type')!r} of {_called(actor)} draws at random: {problem}", legal)
+    walks = root.find("person") is not None or root.find("personFlow") is not None
+    if walks and options.get("pedestrian.model") != "nonInteracting" and not _zero(options.get("pedestrian.striping.dawdling", "0.2")):
+        raise InputError(file.with_name("scenario.sumocfg"), "persons dawdle at random: pedestrian.striping.dawdling = "
+                         f"{options.get('pedestrian.striping.dawdling', 'SUMO default 0.2')}", "0")
+
+
+def _chances(kind: ElementTree.Element, actor: ElementTree.Element, options: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    deviation = kind.get("speedDev", options.get("default.speeddev"))
+    if not is_number(kind.get("speedFactor", "1")):
+        yield f"speedFactor = {kind.get('speedFactor')!r}", "a number"
+    if not is_number(actor.get("speedFactor", "")) and not _zero(deviation or "0.1"):
+        yield f"speedDev = {deviation or 'SUMO default 0.1'}", 'speedDev="0"'
+    if actor.tag in ("person", "personFlow"):
+        return
+    model = kind.get("carFollowModel", options.get("default.carfollowmodel", "Krauss"))
+    if model in SIGMA and not _zero(kind.get("sigma", "0.5")):
+        yield f"sigma = {kind.get('sigma', 'SUMO default 0.5')}", 'sigma="0"'
+    elif model not in SIGMA | STEADY:
+        yield f"carFollowModel = {model!r}", one_of(SIGMA | STEADY)
+
+
+def _zero(text: str) -> bool:
+    return is_number(text) and float(text) == 0
+
+
+def unused(root: ElementTree.Element, roads: ElementTree.Element, fastest: float, *, sumo_drives: bool) -> list[str]:
+    """What a network says of the vehicle under test and the simulation does not use.
+
+    Parameters
+    ----------
+    fastest
+        How fast the original vehicle can drive; a higher speed limit limits nothing [m/s].
+    sumo_drives
+        Whether SUMO's own driver has a say, as beside a controller written for TraCI.
+    """
+    mentioned = []
+    for element in (one for one in root if one.get("id") == VUT):
+        for name, value in element.attrib.items():
+            if name in SET_BY_SETTINGS or (OF_SUMOS_DRIVER.fullmatch(name) and not sumo_drives and not _says_nothing(name, value)):
+                mentioned.append(f"{name} = {value}")
+    slow = [] if sumo_drives else [lane for edge in way_of_vut(root) for lane in roads.findall(f"edge[@id='{edge}']/lane")
+                                   if float(lane.get("speed", "inf")) < fastest]
+    if slow:
+        mentioned.append(f"the speed limit of lane {slow[0].get('id')!r} ({float(slow[0].get('speed', 'nan')):g} m/s)"
+                         f"{f' and of {len(slow) - 1} more' if len(slow) > 1 else ''}")
+    driver = "the study's vehicle and ADS say how it drives"
+    return [f"not used of vehicle {VUT!r}: {', '.join(dict.fromkeys(mentioned))}; {driver}"] if mentioned else []
+
+
+def _says_nothing(name: str, value: str) -> bool:
+    return (name in ("sigma", "speedDev") and _zero(value)) or (name == "speedFactor" and is_number(value) and float(value) == 1)

@@ -1,0 +1,118 @@
+"""A simulation as it looks from above: where everybody was at every step, and the road that they were on."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.records import Drives, FloatArray
+from safevar_sumo.sumo.copies import copy_and_name
+from safevar_sumo.sumo.matrix import at_worst, simulate
+from safevar_sumo.sumo.network import built_network
+from safevar_sumo.sumo.system import System
+from safevar_sumo.sumo.world import SumoWorld
+
+
+class Lane(NamedTuple):
+    """A lane as SUMO has it: its middle line, shape (P, 2), and width [m]; an area's `line` goes round it and has no width.
+
+    `kind` is road, path (for persons alone), crossing or area (for persons, between paths).
+    """
+
+    kind: str
+    line: FloatArray
+    width: float
+
+
+class Track(NamedTuple):
+    """Where one actor was: front bumper of a vehicle or middle of a person [m], heading clockwise from north [degrees].
+
+    Arrays of shape (T, N), NaN while it was not there; `length` and `width` in m.
+    """
+
+    is_person: bool
+    length: float
+    width: float
+    x: FloatArray
+    y: FloatArray
+    angle: FloatArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Film:
+    """N drives seen from above.
+
+    `tracks` are everybody's by name, each drive with its own; `last` is every drive's last sample, shape (N,): what
+    comes after it is whatever SUMO did with the rest of the batch.
+    """
+
+    drives: Drives
+    tracks: Mapping[str, Track]
+    road: tuple[Lane, ...]
+
+    @property
+    def last(self) -> np.ndarray:
+        active = self.drives.trace.active
+        return np.asarray(len(active) - 1 - np.argmax(active[::-1], axis=0))
+
+
+def film(system: System, settings: FloatArray) -> Film:
+    """Simulate settings, shape (N, n), as `simulate` does, and keep where everybody was.
+
+    In a matrix all of them are at the one point in which the last of them comes off worst.
+
+    Raises
+    ------
+    SimulationError, InputError
+        As `simulate`.
+    """
+    camera, system = _Camera(len(settings)), at_worst(system, settings)
+    drives = simulate(system, settings, watch=camera.take)
+    return Film(drives=drives, tracks=camera.tracks(), road=road_of(system.scenario.network))
+
+
+class _Camera:
+    """Takes down where everybody is in N copies at every sample."""
+
+    def __init__(self, n: int) -> None:
+        self._n = n
+        self._frames: list[dict[str, tuple[float, float, float]]] = []
+        self._measures: dict[str, tuple[bool, float, float]] = {}
+
+    def take(self, world: SumoWorld) -> None:
+        frame = world.whereabouts()
+        for name in frame.keys() - self._measures.keys():
+            self._measures[name] = world.measures(name)
+        self._frames.append(frame)
+
+    def tracks(self) -> dict[str, Track]:
+        """What was taken down, in alphabetical order."""
+        found: dict[str, Track] = {}
+        for copied in sorted(self._measures):
+            copy, name = copy_and_name(copied)
+            if name not in found:
+                found[name] = Track(*self._measures[copied], *(np.full((len(self._frames), self._n), np.nan) for _ in range(3)))
+            for sample, frame in enumerate(self._frames):
+                if copied in frame:
+                    for row, value in zip(found[name][3:], frame[copied], strict=True):
+                        row[sample, copy] = value
+        return found
+
+
+def road_of(network: str) -> tuple[Lane, ...]:
+    """The lanes of a network, as netconvert built one copy of it."""
+    root = ElementTree.parse(built_network(network)).getroot()
+    return tuple(_lane(edge.get("function", ""), lane) for edge in root.iter("edge") for lane in edge.iter("lane"))
+
+
+def _lane(function: str, lane: ElementTree.Element) -> Lane:
+    line = np.array([[float(number) for number in point.split(",")[:2]] for point in lane.attrib["shape"].split()])
+    if function == "walkingarea":
+        return Lane("area", line, 0.0)
+    for_persons = lane.get("allow", "").split() == ["pedestrian"]
+    kind = "crossing" if function == "crossing" else "path" if for_persons else "road"
+    return Lane(kind, line, float(lane.get("width", 3.2)))  # SUMO's default width

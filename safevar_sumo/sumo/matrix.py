@@ -1,0 +1,230 @@
+"""Settings at the points of a study: at its one scenario, or at all of a matrix, where the worst point counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
+from difflib import SequenceMatcher
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from msgspec.structs import replace as replace_in
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import Contact, Drives, Encounter, Evaluations, FloatArray, Outcome, Trace
+from safevar_sumo.scenarios import Point
+from safevar_sumo.scenarios.euro_ncap import KMH
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.batch import Watcher, drive_all, score
+from safevar_sumo.sumo.engine import Engine, standing_network
+from safevar_sumo.sumo.network import empty_fingerprint, lanes_of
+from safevar_sumo.sumo.staging import staged
+from safevar_sumo.sumo.system import System, assemble
+
+LARGEST_WORLD = 200
+"""Copies of a network in one simulation; more cost more each, as SUMO then works beyond the processor's caches."""
+LARGEST_ROADS = 100_000
+"""Lanes of all copies in one simulation: beyond, loading takes minutes and gigabytes."""
+NEAREST = 4
+"""Points that are told to who names one that there is not."""
+
+
+class AtPoint(NamedTuple):
+    """N settings at one point of a study."""
+
+    point: Point
+    evaluations: Evaluations
+    drives: Drives
+
+
+def point_record(found: AtPoint, row: int = 0) -> dict[str, Any]:
+    """One setting at one point as plain values: where that is, how it ended, speeds of the impact [m/s], the worst deviation from the
+    test's speed before the system acted [km/h], who was touched where [%]; undefined is None.
+    """
+    evaluations, relative = found.evaluations, found.drives.relative_speed
+    numbers = {"impact_speed": evaluations.collision_speed[row], "relative_impact_speed": relative[row],
+               "safety_degree": evaluations.f_safe[row],
+               "test_speed_error": np.broadcast_to(found.drives.test_speed_error, relative.shape)[row] / KMH}
+    side, place = (np.broadcast_to(values, relative.shape)[row] for values in found.drives.contact)
+    return {"point": found.point.name, **dict(found.point.place), "outcome": str(evaluations.outcome[row]),
+            **{name: None if np.isnan(value) else float(value) for name, value in numbers.items()},
+            **({"contact": {"side": str(side), "place": float(place)}} if side else {})}
+
+
+def remarks_of(scenario: Any) -> list[str]:
+    """What a user should know of a scenario's parameters."""
+    remarks = getattr(scenario, "remarks", None)
+    return [] if remarks is None else remarks()
+
+
+def vehicle_remarks(system: System) -> list[str]:
+    """What a user should know of a vehicle that is tested faster than what it was fitted to."""
+    fitted = getattr(system.vehicle, "FITTED_UP_TO", None)
+    speeds = [getattr(point.scenario, "test_speed", None) or 0.0 for point in system.points]
+    if fitted is None or max(speeds) <= fitted:
+        return []
+    tables = system.nominal.tables()
+    fastest = min(max(speeds), float(tables.speeds[-1]))
+    drag = float(np.interp(fastest, tables.speeds, tables.coasting))
+    return [f"the vehicle was fitted to drives of up to {fitted / KMH:.0f} km/h, and is tested at up to {max(speeds) / KMH:.0f} km/h: "
+            f"what it does above is its equations alone, such as losing {drag:.1f} m/s^2 at {fastest / KMH:.0f} km/h with the "
+            "accelerator released"]
+
+
+def evaluate(system: System, settings: FloatArray) -> Evaluations:
+    """Simulate filtered settings, shape (N, n), in one batch and score them.
+
+    A pure function: row i of the result depends on row i of `settings` alone, to the bit. In a matrix a setting's row is that
+    of the point in which it comes off worst.
+    """
+    most = _most_copies(system)
+    parts = [settings[first:first + most] for first in range(0, len(settings), most)] or [settings]
+    found = [aggregated(system, at_every_point(system, part)) if system.matrix else score(system, part, simulate(system, part))
+             for part in parts]
+    return found[0] if len(found) == 1 else Evaluations.concatenate(found)
+
+
+def _most_copies(system: System) -> int:
+    """How many copies of the largest of the networks one simulation may have."""
+    lanes = max(lanes_of(network) for network in {point.scenario.network for point in system.points})
+    return max(LARGEST_ROADS // max(lanes, 1), 1)
+
+
+def aggregated(system: System, found: Sequence[AtPoint]) -> Evaluations:
+    """What settings that were simulated at every point are worth."""
+    settings = found[0].evaluations.settings
+    row_of, columns = worst_points(found), np.arange(len(settings))
+    every = Evaluations.concatenate([one.evaluations for one in found])
+    return every.take(row_of * len(settings) + columns)
+
+
+def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = (),
+             watch: Watcher | None = None) -> Drives:
+    """Run the scenario once for every setting; shape (N, n). `watch` is shown the world at every sample.
+
+    In a matrix a setting's drive is that of the point in which it comes off worst; who watches sees all settings at the
+    point in which the last of them does.
+
+    Raises
+    ------
+    SimulationError
+        If SUMO fails.
+    InputError
+        If a user's ADS fails.
+    """
+    if not system.matrix:
+        return drive_all(system, settings, engine, options, watch)
+    if watch is not None or engine is Engine.GUI:
+        return drive_all(at_worst(system, settings), settings, engine, options, watch)
+    found = at_every_point(system, settings, engine, options)
+    return _picked([one.drives for one in found], worst_points(found))
+
+
+def at_every_point(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = ()) -> list[AtPoint]:
+    """Settings, shape (N, n), at every point, in the points' order; raises as `simulate`."""
+    n, found = len(settings), dict[str, AtPoint]()
+    for points in _together(system.points, max(min(LARGEST_WORLD, _most_copies(system)) // max(n, 1), 1)):
+        drives = drive_all(replace(system, matrix=points), settings, engine, options)
+        evaluations = score(system, np.tile(settings, (len(points), 1)), drives)
+        for k, point in enumerate(points):
+            rows = slice(k * n, (k + 1) * n)
+            found[point.name] = AtPoint(point, evaluations.take(np.arange(rows.start, rows.stop)), drives.of(rows))
+    return [found[point.name] for point in system.points]
+
+
+def at_worst(system: System, settings: FloatArray) -> System:
+    """The system at the one point in which the last of the settings comes off worst."""
+    if not system.matrix:
+        return system
+    return system.at(system.points[worst_points(at_every_point(system, settings[-1:]))[0]])
+
+
+def named_point(system: System, name: str, source: object) -> System:
+    """The system at the point of a matrix that is named.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name.
+    """
+    for point in system.matrix:
+        if point.name == name:
+            return system.at(point)
+    raise InputError(source, repr(name), _nearest(name, [point.name for point in system.matrix]))
+
+
+def _nearest(name: str, names: Sequence[str]) -> str:
+    """What is legal in the place of a name: those that have most of its parts, the most alike first."""
+    if not names:
+        return "a study with a matrix"
+    asked = {part.strip() for part in name.split(",")}
+    order = sorted(names, key=lambda one: (-len(asked & set(one.split(", "))), -SequenceMatcher(None, one, name).ratio()))
+    told = "; ".join(order[:NEAREST])
+    return told if len(names) <= NEAREST else f"one of {len(names)} points, the nearest of them: {told}"
+
+
+def study_at(study: Study, name: str, source: object) -> Study:
+    """A study with the one point of its matrix that is named; raises as `named_point`."""
+    system = assemble(study)
+    named_point(system, name, source)
+    assert study.matrix is not None
+    place = dict(next(point for point in system.matrix if point.name == name).place)
+    title, weather = place.pop("test"), place.pop("weather")
+    test = next(one for one in study.matrix.tests
+                if one.name == title and one.over.keys() == place.keys() and all(value in one.over[key] for key, value in place.items()))
+    only = replace_in(test, over={key: [value] for key, value in place.items()}, weathers=[weather] if test.weathers else [])
+    return replace_in(study, matrix=replace_in(study.matrix, tests=[only]))
+
+
+def _together(points: Sequence[Point], most: int) -> Iterator[tuple[Point, ...]]:
+    """Points that share a network, as many as one simulation may have; first those on the network that is loaded already."""
+    groups: dict[str, list[Point]] = {}
+    for point in points:
+        groups.setdefault(empty_fingerprint(staged(point.scenario)), []).append(point)
+    standing = standing_network()
+    for network in sorted(groups, key=lambda one: one != standing):
+        group = groups[network]
+        for start in range(0, len(group), most):
+            yield tuple(group[start:start + most])
+
+
+def worst_points(found: Sequence[AtPoint]) -> npt.NDArray[np.intp]:
+    """For every setting the number of the point with the least safety degree; among equals the first by name.
+
+    A collision at a valid point stands, whatever the others are. Without one, a single invalid test makes it unknown whether the
+    setting is safe: then that point counts.
+    """
+    order = sorted(range(len(found)), key=lambda k: found[k].point.name)
+    degrees = np.stack([found[k].evaluations.f_safe for k in order])
+    degrees = np.where(np.isnan(degrees), np.inf, degrees)
+    invalid = np.stack([found[k].evaluations.outcome == Outcome.INVALID_TEST for k in order])
+    if invalid.any():
+        collided = np.stack([found[k].evaluations.collided for k in order]).any(axis=0)
+        degrees = np.where(invalid & ~collided, -np.inf, degrees)
+    return np.asarray(np.array(order)[np.argmin(degrees, axis=0)])
+
+
+def _picked(drives: Sequence[Drives], number: npt.NDArray[np.intp]) -> Drives:
+    """For every vehicle its drive among several; shorter ones stay at their last sample, where nothing counts any more."""
+    length, columns = max(len(one.trace.time) for one in drives), np.arange(len(number))
+
+    def picked(values: list[np.ndarray]) -> np.ndarray:
+        whole = [np.concatenate([one, np.repeat(one[-1:], length - len(one), axis=0)]) for one in values]
+        return np.stack(whole)[number, :, columns].T
+
+    longest = max((one.trace for one in drives), key=lambda trace: len(trace.time))
+    def of_each(values: list[np.ndarray]) -> np.ndarray:
+        return np.stack([np.broadcast_to(one, number.shape) for one in values])[number, columns]
+
+    names = [one.name for one in fields(Trace) if np.ndim(getattr(longest, one.name)) == 2]
+    columns_of: dict[str, Any] = {name: picked([getattr(one.trace, name) for one in drives]) for name in names}
+    trace = replace(longest, **columns_of)
+    ended = np.array([len(one.trace.time) for one in drives])[number]
+    active = trace.active & (np.arange(length)[:, np.newaxis] < ended)
+    encounters = zip(*(one.encounter for one in drives), strict=True)
+    return Drives(
+        trace=replace(trace, active=active), encounter=Encounter._make(picked(list(values)) for values in encounters),
+        outcome=of_each([one.outcome for one in drives]), collision_speed=of_each([one.collision_speed for one in drives]),
+        contact=Contact._make(of_each(list(values)) for values in zip(*(one.contact for one in drives), strict=True)),
+        test_speed_error=of_each([one.test_speed_error for one in drives]))

@@ -1,0 +1,316 @@
+"""What a study measures and minimises: names turned into records."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
+from safevar_sumo.errors import InputError, one_of, unknown
+from safevar_sumo.metrics import F_SAFE, METRICS, Metric, Objective, Scoring, foreign_metric
+from safevar_sumo.plugins import Guard, Lookup, Member, OwnModules, check_parameters, made, undisturbed
+from safevar_sumo.records import Nominal
+from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, weather_of
+from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, foreign_names
+from safevar_sumo.sumo.network import check_network, network_remarks
+from safevar_sumo.sumo.sources import is_network, is_shipped
+from safevar_sumo.sumo.traci_controller import TraciController
+from safevar_sumo.sumo.traci_module import importable
+from safevar_sumo.vehicles import (
+    CHANGES,
+    VEHICLE_CONTRACT,
+    VEHICLES,
+    Change,
+    CharacteristicSet,
+    GuardedVehicle,
+    Vehicle,
+    calibration_drive,
+    foreign_change,
+)
+
+TAKEN = ("algorithm", "run", "evaluation", "outcome", "handle", "collision", "collision_speed", "setting", "f_safe", "f_diff", "f_num_diff")
+"""Columns of results that no characteristic and no metric may be called."""
+OBJECTIVES = "search.objectives"
+
+
+class Measuring(NamedTuple):
+    """The metrics and further measures of change by their columns, the objectives, and what of it comes from outside."""
+
+    metrics: Mapping[str, Metric]
+    changes: Mapping[str, Change]
+    scoring: Scoring
+    members: tuple[Member, ...]
+
+
+def measuring_of(study: Study, lookup: Lookup) -> Measuring:
+    """Look up the metrics and objectives that a study names.
+
+    Raises
+    ------
+    InputError
+        If there is no such record, it is wrong, or its name is taken.
+    """
+    metrics, found = dict(METRICS), list[Member]()
+    changes = {name: change for name, change in CHANGES.items() if name not in TAKEN}
+    by_name: dict[str, Metric | Change] = {}
+
+    def taken_in(name: str, key: str) -> Metric | Change:
+        if name in by_name:
+            return by_name[name]
+        member = lookup.find({**METRICS, **CHANGES} if key == OBJECTIVES else METRICS, name, key)
+        if member.guard is None:
+            return member.what  # type: ignore[no-any-return]
+        found.append(member)
+        foreign = isinstance(member.what, Change) and key == OBJECTIVES
+        record = foreign_change(member.what, member.guard) if foreign else foreign_metric(member.what, member.guard)
+        if record.name in (*TAKEN, *metrics, *changes, *study.vehicle.characteristics):
+            raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a name of its own")
+        if isinstance(record, Change):
+            changes[record.name] = record
+        else:
+            metrics[record.name] = record
+        by_name[name] = by_name[record.name] = record
+        return record
+
+    for name in study.metrics.also:
+        taken_in(name, "metrics.also")
+    objectives = [F_SAFE if name == F_SAFE.name else _objective(taken_in(name, OBJECTIVES)) for name in study.search.objectives]
+    _refuse_twice(objectives, lookup.source)
+    scoring = Scoring(metrics=tuple(metric.facts for metric in metrics.values()), objectives=tuple(objectives))
+    return Measuring(metrics, changes, scoring, tuple(found))
+
+
+def _objective(record: Metric | Change) -> Objective:
+    if isinstance(record, Metric):
+        return Objective.of(record)
+    return Objective(name=record.name, title=record.title, unit=record.unit)
+
+
+def _refuse_twice(objectives: Iterable[Objective], source: str) -> None:
+    names = [objective.name for objective in objectives]
+    if len(set(names)) < len(names):
+        raise InputError(source, f"search.objectives: one of {', '.join(names)} is named twice", one_of([*METRICS, *CHANGES]))
+
+
+STEP = "a function step(traci, vehicle_id), or a class with that method"
+"""What a controller written for TraCI is."""
+
+
+class Models(NamedTuple):
+    """A study's models with their parameters, and how they were found."""
+
+    vehicle: Vehicle
+    ads: Ads
+    scenario: Scenario
+    weather: Weather
+    members: tuple[Member, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class System:
+    """What a simulation is made of.
+
+    `step_length` [s] is None where the network's own counts; `metrics` are thresholds, `measuring` is what is computed
+    with them; `members` are how everything was found.
+    """
+
+    characteristics: CharacteristicSet
+    vehicle: Vehicle
+    ads: Ads
+    scenario: Scenario
+    weather: Weather
+    metrics: MetricsTable
+    nominal: Nominal
+    members: tuple[Member, ...]
+    measuring: Measuring
+    step_length: float | None = None
+    matrix: tuple[Point, ...] = ()
+
+    @property
+    def points(self) -> tuple[Point, ...]:
+        """Where a setting is simulated: the matrix, or the study's one scenario."""
+        return self.matrix or (Point(self.scenario, self.weather),)
+
+    def at(self, point: Point) -> System:
+        """The same at one point alone."""
+        return replace(self, scenario=point.scenario, weather=point.weather, matrix=())
+
+    @property
+    def remarks(self) -> list[str]:
+        """What of the networks and the weathers is not used."""
+        in_traci = isinstance(self.ads, TraciController)
+        networks = dict.fromkeys(point.scenario.network for point in self.points)
+        found = [remark for network in networks for remark in network_remarks(network, self.nominal.max_speed, sumo_drives=in_traci)]
+        hazy = {point.weather.name: point.weather.visibility for point in self.points if point.weather.visibility != 1}
+        if in_traci and not self._sees_a_limited_way():
+            found += [f"weather {name!r}: visibility = {value:g} does nothing: the vehicle has no sensor range, and a controller written "
+                      "for TraCI sees as far" for name, value in hazy.items()]
+        return found
+
+    def _sees_a_limited_way(self) -> bool:
+        sensors = getattr(self.vehicle, "sensors", None)
+        original = dict(zip(self.characteristics.names, self.characteristics.original[:, np.newaxis], strict=True))
+        own = None if sensors is None else sensors(self.vehicle.prepare(original, 1.0, 0.1))
+        return own is not None and bool(np.isfinite(own.reach).all())
+
+
+def assemble(study: Study, source: str = "") -> System:
+    """Look the study's models up and give them their parameters; `source` is how errors call the study.
+
+    Raises
+    ------
+    InputError
+        Naming the study, the key, the value and what is legal.
+    """
+    source = source or f"study {study.name!r}"
+    with undisturbed(source, foreign_names(study)):
+        return _assembled(study, source)
+
+
+def _assembled(study: Study, source: str) -> System:
+    models = models_of(study, source)
+    _check_units(study, models.vehicle, models.members[0].guard is None, source)
+    measuring = measuring_of(study, Lookup(source, study.origin.places))
+    for name in study.published:
+        if name not in measuring.metrics:
+            raise unknown(source, f"published.{name} is no metric", name, measuring.metrics)
+    matrix = _matrix(study, source)
+    for network in dict.fromkeys(scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))):
+        check_network(network)
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    nominal = calibration_drive(models.vehicle, characteristics)
+    if isinstance(models.ads, TraciController) and isinstance(models.vehicle, GuardedVehicle):
+        ends = np.stack([characteristics.original, characteristics.lower, characteristics.upper])
+        models.vehicle.refuse_unknown_sensors(dict(zip(characteristics.names, np.ascontiguousarray(ends.T), strict=True)))
+    if models.members[0].guard is not None:
+        nominal.tables()  # what is wrong with a vehicle from outside shows here, whoever drives it
+    return System(
+        characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
+        metrics=study.metrics, nominal=nominal, members=(*models.members, *measuring.members), measuring=measuring,
+        step_length=study.step_length, matrix=matrix)
+
+
+def models_of(study: Study, source: str) -> Models:
+    """The study's models with their parameters; raises as `assemble`."""
+    lookup = Lookup(source, study.origin.places)
+    vehicle, ads, scenario = _vehicle(study.vehicle, lookup), _ads(study.ads, lookup), _scenario(study.scenario, lookup)
+    return Models(vehicle[0], ads[0], scenario[0], weather_of(study.weather, source), (vehicle[1], ads[1], scenario[1]))
+
+
+def _traci(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
+    """A function `step(traci, vehicle_id)` or a class with that method, written for SUMO."""
+    name = f"ads.model = {choice.model!r}"
+    with importable():
+        member = lookup.find({}, choice.model, "ads.model")
+        what, parameters = member.what, lookup.with_paths(member, choice.parameters, "ads.parameters")
+        if not callable(getattr(what, "step", None) if inspect.isclass(what) else what):
+            raise InputError(lookup.source, f"{name} has no step", STEP)
+        if not inspect.isclass(what):
+            check_parameters(what, (None, None), parameters, name, "ads.parameters", lookup.source)
+
+        def controller_of(what: Any) -> Any:
+            """A controller for one vehicle, from what the module that it has for itself says."""
+            if not inspect.isclass(what):
+                return partial(what, **parameters)
+            return made(member._replace(what=what), parameters, name, "ads.parameters", lookup.source)
+
+        controller_of(what)
+    places, attribute = [*lookup.places, os.getcwd()], choice.model.partition(":")[2]
+    modules = partial(OwnModules, member, attribute, places, set())
+    guard, own_reactions = member.guard or Guard(lookup.source, name), bool(getattr(member.what, "own_reactions", False))
+    return TraciController(modules, controller_of, guard, own_reactions=own_reactions), member
+
+
+def _matrix(study: Study, source: str) -> tuple[Point, ...]:
+    """The points of a study's matrix, each by a name of its own."""
+    points = [] if study.matrix is None else [point for test in study.matrix.tests for point in _points_of(test, study, source)]
+    named = Counter(point.name for point in points)
+    for name, number in named.items():
+        if number > 1:
+            raise InputError(source, f"matrix.tests: {number} points are {name!r}", "a name of its own for each test, and values once")
+    return tuple(points)
+
+
+def _points_of(test: MatrixTest, study: Study, source: str) -> Iterator[Point]:
+    same = test.model in ("", study.scenario.model)
+    base = {**(study.scenario.parameters if same else {}), **test.parameters}
+    lookup = Lookup(f"{source}: test {test.name!r}", study.origin.places)
+    weathers: list[str | Weather] = list(test.weathers) or [study.weather]
+    for values in product(*test.over.values()):
+        over = dict(zip(test.over, values, strict=True))
+        scenario, _ = _scenario(ModelTable(model=test.model or study.scenario.model, parameters={**base, **over}), lookup)
+        for choice in weathers:
+            weather = weather_of(choice, lookup.source)
+            place = {"test": test.name, **over, "weather": weather.name}
+            name = ", ".join([test.name, *(f"{key} {value}" for key, value in over.items()), weather.name])
+            yield Point(scenario, weather, name, tuple(place.items()))
+
+
+def _with_network(scenario: Any, places: Sequence[str]) -> Any:
+    """The scenario on the folder beside the study, if it names one that lies there and is none of ours.
+
+    One with sources comes first: beside a results directory a study's results have its name, as its network may.
+    """
+    folder = scenario.network
+    there = [path for place in places if is_network(path := Path(place, folder))]
+    found = str(next((path for path in there if path.is_file() or any(path.glob("*.xml"))), there[0] if there else folder))
+    if found == folder or is_shipped(folder):
+        return scenario
+    if isinstance(scenario, msgspec.Struct):
+        return msgspec.structs.replace(scenario, network=found)
+    scenario.network = found
+    return scenario
+
+
+def _check_units(study: Study, vehicle: Vehicle, ours: bool, source: str) -> None:
+    given, known = study.vehicle.characteristics, vehicle.UNITS
+    for name in given:
+        if name in TAKEN:
+            raise InputError(source, f"vehicle.characteristics.{name}: the name is a column of results", f"none of {', '.join(TAKEN)}")
+        if name not in known:
+            raise unknown(source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", name, known)
+        if given[name].unit != known[name]:
+            raise InputError(source, f"vehicle.characteristics.{name}.unit = {given[name].unit!r}", repr(known[name]))
+        if ours and given[name].lower <= 0:
+            raise InputError(source, f"vehicle.characteristics.{name}.lower = {given[name].lower}", "a value above 0")
+    for name in known:
+        if name not in given:
+            raise InputError(source, f"vehicle.characteristics.{name} is missing", f"all of {', '.join(known)}")
+
+
+def _vehicle(choice: VehicleTable, lookup: Lookup) -> tuple[Vehicle, Member]:
+    member = lookup.class_of(VEHICLES, choice.model, "vehicle.model", VEHICLE_CONTRACT)
+    parameters = lookup.with_paths(member, choice.parameters, "vehicle.parameters")
+    vehicle = made(member, parameters, f"vehicle.model = {choice.model!r}", "vehicle.parameters", lookup.source)
+    return (vehicle if member.guard is None else GuardedVehicle(vehicle, member.guard)), member
+
+
+def _scenario(choice: ModelTable, lookup: Lookup) -> tuple[Scenario, Member]:
+    member = lookup.class_of(SCENARIOS, choice.model, "scenario.model", SCENARIO_CONTRACT)
+    parameters = lookup.with_paths(member, choice.parameters, "scenario.parameters")
+    scenario = made(member, parameters, f"scenario.model = {choice.model!r}", "scenario.parameters", lookup.source)
+    return _with_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.places), member
+
+
+def _ads(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
+    if choice.kind == "traci":
+        return _traci(choice, lookup)
+    member = lookup.class_of(ADS, choice.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT,
+                             otherwise=f'with ads.kind = "traci" {STEP}')
+    name = f"ads.model = {choice.model!r}"
+    make = partial(made, member, lookup.with_paths(member, choice.parameters, "ads.parameters"), name, "ads.parameters", lookup.source)
+    driver = make()
+    if issubclass(member.what, ScalarAds):
+        guard = member.guard or Guard(lookup.source, name)
+        return PerVehicle(make, guard, driver.own_reactions), member
+    return (driver if member.guard is None else GuardedAds(driver, member.guard)), member

@@ -1,0 +1,96 @@
+"""A controller that was written for SUMO: it reads the running simulation through TraCI's functions, and what it commands is a wish.
+
+Its `step(traci, vehicle_id)` sees its own copy of the network under the traffic file's ids, and others as the vehicle's sensors
+tell of them. What it asks of the vehicle's type is answered with the original's. A speed or an acceleration that it commands goes
+through pedals to the plant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safevar_sumo.ads.pedals import Trim, pedals, trim
+from safevar_sumo.plugins import Guard, OwnModules
+from safevar_sumo.records import Command, Nominal, Observation
+from safevar_sumo.scenarios import VUT
+from safevar_sumo.sumo.sensing import Sensing
+from safevar_sumo.sumo.traci_module import Subscriptions, driving, importable, traci_module
+from safevar_sumo.sumo.traci_view import TraciView
+from safevar_sumo.sumo.world import present_world
+from safevar_sumo.vehicles import SumoType
+
+
+class TraciController:
+    """Drives every vehicle with a controller of its own, a function `step(traci, vehicle_id)` or a class with `start` and `step`.
+
+    Parameters
+    ----------
+    modules
+        Makes the user's modules once more for one vehicle, so that nothing which they keep passes from one to another.
+    controller_of
+        The controller, of what those modules call it.
+    own_reactions
+        Whether it has a reaction time of its own, as for any ADS.
+    """
+
+    def __init__(self, modules: Callable[[], OwnModules], controller_of: Callable[[Any], Any], guard: Guard, *,
+                 own_reactions: bool = False) -> None:
+        self._modules, self._controller_of, self._guard, self.own_reactions = modules, controller_of, guard, own_reactions
+
+    def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
+        world = present_world()
+        world.set_types(SumoType(*(np.full(n, getattr(nominal, name)) for name in SumoType._fields)))
+        names, sensing = world.names(), Sensing(world, step)
+        views = [TraciView(world, copy, names, sensing, nominal, step) for copy in range(n)]
+        sensing.look()
+        with importable():
+            drivers = [_Driver(view, self._modules(), self._controller_of, self._guard) for view in views]
+        return _Memory(nominal, sensing, drivers, None)
+
+    def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
+        trimmed = trim(memory.nominal, seen) if memory.trimmed is None else memory.trimmed
+        wanted = np.zeros(len(memory.drivers))
+        if memory.trimmed is not None:  # the first look around was at the start
+            memory.sensing.look()
+        with importable():
+            for i, driver in enumerate(memory.drivers):
+                if driver.view.on_the_road:
+                    wanted[i] = driver.step(seen.time, float(seen.speed[i]))
+        return pedals(memory.nominal, seen.speed, wanted, trimmed), memory._replace(trimmed=trimmed)
+
+
+class _Memory(NamedTuple):
+    """The original vehicle, what the vehicles sense, a driver for each vehicle, and the pedals' trim of the first look."""
+
+    nominal: Nominal
+    sensing: Sensing
+    drivers: list[_Driver]
+    trimmed: Trim | None
+
+
+class _Driver:
+    """The controller of one vehicle, with modules of its own."""
+
+    def __init__(self, view: TraciView, modules: OwnModules, controller_of: Callable[[Any], Any], guard: Guard) -> None:
+        self.view, self._modules, self._guard = view, modules, guard
+        self._subscriptions = Subscriptions(view)
+        with modules.inside():
+            self._controller = controller_of(guard.call("import", modules.load))
+        self._step = getattr(self._controller, "step", self._controller)
+        if hasattr(self._controller, "start"):
+            self._call("start", self._controller.start)
+
+    def step(self, time: float, speed: float) -> float:
+        """The acceleration that the vehicle is to have [m/s^2]."""
+        self.view.time = time
+        self._call("step", self._step)
+        return self.view.wish.acceleration(speed, time, self.view.speed_of_sumo(speed))
+
+    def _call(self, method: str, function: Callable[..., Any]) -> None:
+        with self._modules.inside(), driving(self.view, self._subscriptions):
+            self._guard.call(method, function, traci_module(), VUT)
+        if self.view.refused is not None:  # and the controller went on, as if nothing were wrong
+            raise self._guard.failed(method, self.view.refused)

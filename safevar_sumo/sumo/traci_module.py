@@ -1,0 +1,192 @@
+"""TraCI as controllers import it: `import traci`, in whatever module, talks for the vehicle that is being driven; and subscriptions."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from types import ModuleType
+from typing import Any
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.sumo.engine import Engine, engine_api
+from safevar_sumo.sumo.traci_view import TraciView, positional, real_traci, traci_exception
+
+VARIABLES: Mapping[str, str] = {
+    "TRACI_ID_LIST": "getIDList", "ID_COUNT": "getIDCount", "VAR_POSITION": "getPosition", "VAR_POSITION3D": "getPosition3D",
+    "VAR_SPEED": "getSpeed", "VAR_ANGLE": "getAngle", "VAR_ROAD_ID": "getRoadID", "VAR_LANE_ID": "getLaneID",
+    "VAR_LANE_INDEX": "getLaneIndex", "VAR_LANEPOSITION": "getLanePosition", "VAR_LANEPOSITION_LAT": "getLateralLanePosition",
+    "VAR_SPEED_LAT": "getLateralSpeed", "VAR_ACCELERATION": "getAcceleration", "VAR_SIGNALS": "getSignals", "VAR_LEADER": "getLeader",
+    "VAR_DISTANCE": "getDistance", "VAR_LENGTH": "getLength", "VAR_WIDTH": "getWidth", "VAR_HEIGHT": "getHeight", "VAR_TYPE": "getTypeID",
+    "VAR_VEHICLECLASS": "getVehicleClass", "VAR_MINGAP": "getMinGap", "VAR_ALLOWED_SPEED": "getAllowedSpeed",
+    "VAR_MAXSPEED": "getMaxSpeed", "VAR_ACCEL": "getAccel", "VAR_DECEL": "getDecel", "VAR_TAU": "getTau", "VAR_ROUTE_ID": "getRouteID",
+    "VAR_WAITING_TIME": "getWaitingTime", "VAR_TIME": "getTime", "VAR_DELTA_T": "getDeltaT",
+}
+"""TraCI's variables that can be subscribed to, and the functions that tell the same."""
+AROUND = {"CMD_GET_VEHICLE_VARIABLE": "vehicle", "CMD_GET_PERSON_VARIABLE": "person"}
+DEFAULT = ("VAR_ROAD_ID", "VAR_LANEPOSITION")
+
+
+class Subscriptions:
+    """What a controller subscribes to; results are what those functions tell that stand for the variables, through the sensors."""
+
+    def __init__(self, view: TraciView) -> None:
+        self._view = view
+        self._of: dict[tuple[str, str], dict[int, tuple[Any, ...]]] = {}
+        self._around: dict[tuple[str, str], tuple[str, float, dict[int, tuple[Any, ...]]]] = {}
+
+    def call(self, domain: str, name: str, arguments: tuple[Any, ...], named: Mapping[str, Any]) -> Any:
+        """A function of a domain that subscribes, or tells what was subscribed to."""
+        if name.startswith("get"):
+            every, context = name.startswith("getAll"), "Context" in name
+            found = self._contexts(domain) if context else self._results(domain)
+            key = "" if domain == "simulation" else str(next(iter((*arguments, *named.values())), ""))
+            return found if every else found.get(key, {})
+        functions: dict[str, Callable[..., None]] = {
+            "subscribe": self._subscribe, "subscribeLeader": self._subscribe_to_leader, "unsubscribe": self._unsubscribe,
+            "subscribeContext": self._subscribe_around, "unsubscribeContext": self._unsubscribe_around}
+        if name not in functions:
+            raise InputError(f"traci.{domain}.{name}", "is not for a controller", "subscribe, subscribeContext, and a choice of one's own")
+        given = positional(domain, name, arguments, named)
+        functions[name](domain, *(("", *given) if domain == "simulation" else given))
+        return None
+
+    def _subscribe(self, domain: str, one: str, variables: Any = None, begin: float = 0, end: float = 0, parameters: Any = None) -> None:
+        self._of[domain, one] = _variables(domain, variables, parameters)
+
+    def _subscribe_to_leader(self, domain: str, one: str, dist: float = 0.0, begin: float = 0, end: float = 0) -> None:
+        self._of[domain, one] = {_constant("VAR_LEADER"): (dist,)}
+
+    def _subscribe_around(self, domain: str, one: str, around: int, dist: float, variables: Any = None, begin: float = 0, end: float = 0,
+                          parameters: Any = None) -> None:
+        kinds = {_constant(name): kind for name, kind in AROUND.items()}
+        if domain != "vehicle" or around not in kinds:
+            raise InputError(f"traci.{domain}.subscribeContext", f"around {one!r}, domain = {around!r}",
+                             f"vehicles or persons around a vehicle: {', '.join(AROUND)}")
+        self._around[domain, one] = kinds[around], dist, _variables(kinds[around], variables, parameters)
+
+    def _unsubscribe(self, domain: str, one: str = "") -> None:
+        self._of.pop((domain, one), None)
+
+    def _unsubscribe_around(self, domain: str, one: str, around: int = 0, dist: float = 0.0) -> None:
+        self._around.pop((domain, one), None)
+
+    def _results(self, domain: str) -> dict[str, dict[int, Any]]:
+        present = self._view.call(domain, "getIDList", (), {}) if domain in AROUND.values() else None
+        return {one: self._values(domain, one, variables) for (kind, one), variables in self._of.items()
+                if kind == domain and (present is None or one in present)}
+
+    def _contexts(self, domain: str) -> dict[str, dict[str, dict[int, Any]]]:
+        found = {}
+        for (of, one), (kind, dist, variables) in self._around.items():
+            if of == domain and one in self._view.call(of, "getIDList", (), {}):
+                found[one] = {other: self._values(kind, other, variables) for other in self._view.call(kind, "getIDList", (), {})
+                              if self._distance(of, one, kind, other) <= dist}
+        return found
+
+    def _distance(self, of: str, one: str, kind: str, other: str) -> float:
+        here, there = (self._view.call(domain, "getPosition", (name,), {}) for domain, name in ((of, one), (kind, other)))
+        return float(((here[0] - there[0]) ** 2 + (here[1] - there[1]) ** 2) ** 0.5)
+
+    def _values(self, domain: str, one: str, variables: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
+        functions = {_constant(name): function for name, function in VARIABLES.items()}
+        return {variable: self._view.call(domain, functions[variable], (*((one,) if one else ()), *more), {})
+                for variable, more in variables.items()}
+
+
+def _variables(domain: str, given: Any, parameters: Any) -> dict[int, tuple[Any, ...]]:
+    """What is asked of the functions that stand for variables."""
+    known = {_constant(name): name for name in VARIABLES}
+    default = ("VAR_TIME",) if domain == "simulation" else DEFAULT
+    chosen = [*map(_constant, default)] if given is None else list(given)
+    for one in chosen:
+        if one not in known:
+            raise InputError(f"traci.{domain}.subscribe", f"variable {one!r}", f"traci.constants.{', '.join(VARIABLES)}")
+    more = {variable: value[1:] if isinstance(value, tuple) else (value,) for variable, value in (parameters or {}).items()}
+    return {variable: more.get(variable, ()) for variable in chosen}
+
+
+def _constant(name: str) -> int:
+    return int(getattr(real_traci().constants, name))
+
+
+_driven: list[tuple[TraciView, Subscriptions]] = []
+"""For whom TraCI is asked at the moment, innermost last."""
+
+
+@contextmanager
+def driving(view: TraciView, subscriptions: Subscriptions) -> Iterator[None]:
+    """Within, TraCI speaks for this vehicle."""
+    _driven.append((view, subscriptions))
+    try:
+        yield
+    finally:
+        _driven.pop()
+
+
+@contextmanager
+def importable() -> Iterator[None]:
+    """Within, `import traci` and `import libsumo` give TraCI as controllers have it."""
+    real_traci()
+    before = {name: sys.modules.get(name) for name in ("traci", "libsumo")}
+    sys.modules.update({name: traci_module(name) for name in before})
+    try:
+        yield
+    finally:
+        for name, module in before.items():
+            if module is None:
+                del sys.modules[name]
+            else:
+                sys.modules[name] = module
+
+
+@cache
+def traci_module(name: str = "traci") -> ModuleType:
+    """TraCI as a module."""
+    return _Module(engine_api(Engine(name)))
+
+
+class _Module(ModuleType):
+    """Stands for traci or libsumo: constants and classes are theirs, functions are those of the vehicle that is driven."""
+
+    def __init__(self, real: ModuleType) -> None:
+        super().__init__(real.__name__, real.__doc__)
+        self.__path__, self.__file__, self.__spec__, self._real = real.__path__, real.__file__, real.__spec__, real
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("getConnection", "getLabel"):
+            return lambda *_: self if name == "getConnection" else "default"
+        if name == "TraCIException":
+            return traci_exception()
+        real = getattr(self._real, name)
+        if hasattr(real, "subscribe") or name in ("simulation", "gui"):
+            return _Domain(name, real)
+        return real if isinstance(real, type | ModuleType) or not callable(real) else _function("", name)
+
+
+class _Domain:
+    """A domain of TraCI, such as `traci.vehicle`."""
+
+    def __init__(self, name: str, real: Any) -> None:
+        self._name, self._real = name, real
+
+    def __getattr__(self, name: str) -> Any:
+        member = getattr(self._real, name)
+        return _function(self._name, name) if callable(member) and not isinstance(member, type) else member
+
+
+@cache
+def _function(domain: str, name: str) -> Callable[..., Any]:
+    def function(*arguments: Any, **named: Any) -> Any:
+        if not _driven:
+            raise InputError(f"traci.{domain}.{name}".replace("..", "."), "is called while no vehicle is driven",
+                             "calls within start and step, not where a module is imported")
+        view, subscriptions = _driven[-1]
+        if domain and "subscri" in name.lower():
+            with view.noting():
+                return subscriptions.call(domain, name, arguments, named)
+        return view.call(domain, name, arguments, named)
+
+    function.__name__ = name
+    return function

@@ -1,0 +1,126 @@
+"""A recorded film in sumo-gui's window: SUMO's own vehicles and persons on its network, put where they were."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from safevar_sumo.errors import SimulationError
+from safevar_sumo.sumo.engine import Engine, binary, engine_api, start_engine, stop_engine
+from safevar_sumo.sumo.network import copied_network
+
+BRAKE_LIGHT = 8
+"""Signal of a vehicle (TraCI, "change vehicle state": bit 3)."""
+ANYWHERE = 2
+"""Keep no route: a place beside every road is one too (TraCI, "move to XY")."""
+VIEW = "View #0"
+LETTERS = 85
+SETTINGS = """<viewsettings>
+    <scheme name="safevar">
+        <opengl antialiase="1" dither="0"/>
+        <background backgroundColor="238,240,236" showGrid="0"/>
+        <edges laneEdgeMode="0" laneShowBorders="1" showLinkDecals="1">
+            <colorScheme name="uniform"><entry color="154,161,169" name="road"/><entry color="207,211,207" name="sidewalk"/></colorScheme>
+        </edges>
+        <junctions junctionMode="0" drawShape="1" drawCrossingsAndWalkingareas="1">
+            <colorScheme name="uniform"><entry color="154,161,169"/><entry color="154,161,169" name="waterway"/></colorScheme>
+        </junctions>
+        <vehicles vehicleMode="0" vehicleQuality="2" showBlinker="1" vehicle_minSize="1.00" vehicle_exaggeration="1.00"/>
+        <persons personMode="0" personQuality="2" person_minSize="1.00" person_exaggeration="1.00"/>
+        <pois poiTextParam="words" poi_minSize="0.00" poi_exaggeration="0.01" poiText_show="1" poiText_size="{letters}"
+              poiText_color="29,35,41" poiText_bgColor="255,255,255,0" poiText_constantSize="1"/>
+    </scheme>
+</viewsettings>
+"""
+Colour = tuple[int, int, int, int]
+Points = Sequence[tuple[float, float]]
+
+
+class Place(NamedTuple):
+    """Where somebody is: front bumper or person [m], heading clockwise from north [degrees], and whether it brakes."""
+
+    name: str
+    x: float
+    y: float
+    angle: float
+    brakes: bool
+
+
+class Window:
+    """sumo-gui under our hands; made by `open_window`. Everybody is a vehicle to it, persons by their shape alone."""
+
+    def __init__(self, api: Any) -> None:
+        self._api = api
+        lane = next(lane for lane in api.lane.getIDList() if not lane.startswith(":") and "passenger" not in api.lane.getDisallowed(lane))
+        api.route.add("route", [api.lane.getEdgeID(lane)])
+
+    def add(self, name: str, is_person: bool, length: float, width: float, colour: Colour) -> None:
+        """Somebody of that size [m] who will be put somewhere."""
+        self._api.vehicletype.copy("DEFAULT_VEHTYPE", name)
+        self._api.vehicletype.setShapeClass(name, "pedestrian" if is_person else "evehicle")
+        self._api.vehicletype.setLength(name, max(length, width) if is_person else length)
+        self._api.vehicletype.setWidth(name, max(length, width) if is_person else width)
+        self._api.vehicletype.setColor(name, colour)
+        self._api.vehicletype.setMinGap(name, 0)
+        self._api.vehicle.add(name, "route", name)
+        self._api.vehicle.setSpeedMode(name, 0)
+        self._api.vehicle.setLaneChangeMode(name, 0)
+
+    def paint(self, name: str, points: Points, colour: Colour, layer: int) -> None:
+        """An area of that colour."""
+        self._api.polygon.add(name, list(points), colour, fill=True, layer=layer)
+
+    def write(self, name: str, x: float, y: float, words: str) -> None:
+        """Words at a place; again: other words or another place."""
+        if name in self._api.poi.getIDList():
+            self._api.poi.setPosition(name, x, y)
+        else:
+            self._api.poi.add(name, x, y, (0, 0, 0, 0), layer=200)
+        self._api.poi.setParameter(name, "words", words)
+
+    def look(self, left: float, bottom: float, right: float, top: float) -> None:
+        """Show this part of the plane [m]."""
+        self._api.gui.setBoundary(VIEW, left, bottom, right, top)
+
+    def show(self, places: Sequence[Place]) -> None:
+        """Everybody where they are now."""
+        for one in places:
+            self._api.vehicle.moveToXY(one.name, "", 0, one.x, one.y, one.angle, keepRoute=ANYWHERE)
+            self._api.vehicle.setSignals(one.name, BRAKE_LIGHT if one.brakes else 0)
+        self._api.simulationStep()
+
+    def picture(self, path: Path) -> None:
+        """Write what the window shows, with the next step."""
+        self._api.gui.screenshot(VIEW, str(path))
+        self._api.simulationStep()
+
+
+@contextmanager
+def open_window(network: str, step: float, width: int = 1200, height: int = 700) -> Iterator[Window]:
+    """A window on one copy of a network without traffic, `width` times `height` pixels.
+
+    Raises
+    ------
+    InputError
+        If there is no display.
+    SimulationError
+        If SUMO cannot load the network, or its window was closed before the end.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        settings = Path(folder) / "view.xml"
+        settings.write_text(SETTINGS.format(letters=LETTERS), encoding="utf-8")
+        api = engine_api(Engine.GUI)
+        command = ["-n", str(copied_network(network, 1).network), "--step-length", repr(step), "--collision.action", "none",
+                   "--gui-settings-file", str(settings), "--start", "true", "--quit-on-end", "true", "--no-step-log", "true",
+                   "--no-warnings", "true", "--window-size", f"{width},{height}", "--time-to-teleport", "-1",
+                   "--xml-validation", "never", "--xml-validation.net", "never"]
+        try:
+            start_engine(api, Engine.GUI, [binary(Engine.GUI), *command])
+            yield Window(api)
+        except (api.TraCIException, api.FatalTraCIError) as error:
+            raise SimulationError(f"sumo-gui failed: {str(error).strip() or 'its window was closed'}") from None
+        finally:
+            stop_engine(api)

@@ -1,0 +1,266 @@
+"""N copies of a network under simulation, and what is asked of SUMO about the actors on them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from itertools import chain
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safevar_sumo.errors import SimulationError
+from safevar_sumo.records import FloatArray
+from safevar_sumo.scenarios import VUT, Lane
+from safevar_sumo.scenarios.base import lane_through
+from safevar_sumo.sumo.copies import copied_id, copy_and_name
+from safevar_sumo.sumo.reusable import StandingSumo
+from safevar_sumo.vehicles import Sensors, SumoType
+
+# Speed mode: SUMO obeys every speed that is set and yields to nobody on a junction (TraCI "set speed mode", bit 5).
+OBEY = 32
+# Lane change mode: none at all (TraCI "set lane change mode").
+KEEP_LANE = 0
+
+
+class Body(NamedTuple):
+    """A vehicle or a person as a rectangle: its middle and direction, a unit vector, shape (2,); m, m, m/s."""
+
+    middle: FloatArray
+    along: FloatArray
+    length: float
+    width: float
+    speed: float
+
+    @classmethod
+    def behind(cls, front: FloatArray, along: FloatArray, length: float, width: float, speed: float) -> Body:
+        """From the middle of its front."""
+        return cls(front - along * (length / 2), along, length, width, speed)
+
+
+class SumoWorld:
+    """N copies of a network under simulation; made by `open_world`. Shapes: (N,) or (N, 2)."""
+
+    def __init__(self, api: Any, n: int, *, first: int = 0, watched: bool = False, standing: StandingSumo | None = None,
+                 whole: SumoWorld | None = None) -> None:
+        self._api, self.n, self._first, self._standing = api, n, first, standing
+        self._set_speed, self._get_speed = _direct(api, "vehicle", "setSpeed"), _direct(api, "vehicle", "getSpeed")
+        self._vehicle_position, self._person_position = _direct(api, "vehicle", "getPosition"), _direct(api, "person", "getPosition")
+        self._parts, self._whole = list[SumoWorld](), whole
+        self._last_speeds, self._last_positions = np.zeros(n), np.zeros((n, 2))
+        """Speeds and positions of vehicles under test that have left the road."""
+        self._speeds_now: FloatArray | None = None
+        self._struck: dict[int, str] = {}
+        """By copy, whom the vehicles under test were reported to collide with last."""
+        self._ids: dict[str, list[str]] = {}
+        self._positions: dict[str, FloatArray] = {}
+        self._copy_of = {name: copy for copy, name in enumerate(self.ids(VUT))}
+        self._driving, self._rows = dict(self._copy_of), np.arange(len(self._copy_of))
+        """Copies whose vehicle under test is on the road."""
+        self._told = np.full(len(self._rows), np.nan)
+        """Speeds that the vehicles under test were last told to reach."""
+        self.step_length: float = api.simulation.getDeltaT()
+        self._pause = self.step_length if watched else 0.0
+        self.sensors = Sensors.perfect(n)
+        """Through which the ADSs see it that read it themselves, weather included."""
+
+    def ids(self, name: str) -> list[str]:
+        """The ids of an actor in its copies."""
+        if name not in self._ids:
+            self._ids[name] = [copied_id(copy, name) for copy in range(self._first, self._first + self.n)]
+        return self._ids[name]
+
+    def set_types(self, types: SumoType) -> None:
+        """Make the vehicles under test the SUMO vehicle types that their settings say."""
+        vehicletype = self._api.vehicletype
+        columns = (values.tolist() for values in (types.mass, types.accel, types.max_speed, types.tau))
+        for name, mass, accel, max_speed, tau in zip(self.ids(VUT), *columns, strict=True):
+            vehicletype.setMass(name, mass)
+            vehicletype.setAccel(name, accel)
+            vehicletype.setMaxSpeed(name, max_speed)
+            vehicletype.setTau(name, tau)
+        self.set_decelerations(types.decel)
+
+    def set_decelerations(self, decel: FloatArray) -> None:
+        """What their brakes can do at the most, in an emergency too [m/s^2]."""
+        for name, value in zip(self.ids(VUT), decel.tolist(), strict=True):
+            self._api.vehicletype.setDecel(name, value)
+            self._api.vehicletype.setEmergencyDecel(name, value)
+
+    def depart(self) -> None:
+        """Insert everybody, and take the vehicles under test into our hands.
+
+        Raises
+        ------
+        SimulationError
+            If a vehicle under test found no place.
+        """
+        global _present
+        _present = self
+        if self._standing is not None:
+            self._standing.enter()
+        self._api.simulationStep()
+        if self._standing is not None:
+            self._standing.shift()
+        departed = set(self._api.vehicle.getIDList())
+        for name in self.ids(VUT):
+            if name not in departed:
+                raise SimulationError(f"SUMO found no place for vehicle {name!r}: look at the network's traffic file")
+            self._api.vehicle.setSpeedMode(name, OBEY)
+            self._api.vehicle.setLaneChangeMode(name, KEEP_LANE)
+
+    def advance(self, speeds: FloatArray) -> None:
+        """One simulation step in which the vehicles under test reach `speeds` [m/s]."""
+        set_speed, names = self._set_speed, self.ids(VUT)
+        changed = self._rows[(speeds != self._told)[self._rows]]
+        for copy, speed in zip(changed.tolist(), speeds[changed].tolist(), strict=True):
+            set_speed(names[copy], speed)
+        self._told = speeds
+        self._api.simulationStep()
+        for world in (self, *self._parts):
+            world._positions.clear()
+            world._speeds_now = None
+        if self._pause:
+            time.sleep(self._pause)
+
+    def collisions(self) -> dict[int, float]:
+        """Copies whose vehicle under test collides in this step, and its speed [m/s]."""
+        reported = [one for one in self._api.simulation.getCollisions() if one.collider in self._copy_of]
+        self._struck = {self._copy_of[one.collider]: one.victim for one in reported}
+        return {self._copy_of[one.collider]: one.colliderSpeed for one in reported}
+
+    def bodies(self, copy: int) -> tuple[Body, Body]:
+        """A vehicle under test that collides in this step, and whom it collides with."""
+        return self._body_of(self.ids(VUT)[copy]), self._body_of(self._struck[copy])
+
+    def _body_of(self, name: str) -> Body:
+        kind = self._api.person if name in self._api.person.getIDList() else self._api.vehicle
+        return Body.behind(np.array(kind.getPosition(name)), direction_of(kind.getAngle(name)), kind.getLength(name),
+                           kind.getWidth(name), kind.getSpeed(name))
+
+    def leave(self, copies: Sequence[int]) -> None:
+        """Take vehicles under test off the road whose runs are over: they are told to be as they were, and cost nothing."""
+        if not copies:
+            return
+        self._last_speeds[copies], self._last_positions[copies] = self.speeds()[copies], self.vehicle_positions(VUT)[copies]
+        for name in [self.ids(VUT)[copy] for copy in copies]:
+            self._api.vehicle.remove(name)
+            del self._driving[name]
+        self._rows = np.array([*self._driving.values()], dtype=np.intp)
+
+    def speeds(self) -> FloatArray:
+        """Speeds of the vehicles under test as SUMO has them in this step [m/s]; whoever asks again gets the same array."""
+        if self._whole is not None:
+            return self._whole.speeds()[self._first:self._first + self.n]
+        if self._speeds_now is None:
+            self._speeds_now = self._last_speeds.copy()
+            self._speeds_now[self._rows] = [*map(self._get_speed, self._driving)]
+        return self._speeds_now
+
+    def vehicle_positions(self, actor: str) -> FloatArray:
+        return self._looked_up(actor, self._vehicle_position)
+
+    def person_positions(self, actor: str) -> FloatArray:
+        return self._looked_up(actor, self._person_position)
+
+    def _looked_up(self, actor: str, position: Callable[[str], tuple[float, float]]) -> FloatArray:
+        """Positions in this step; whoever asks again gets the same array."""
+        if self._whole is not None and actor == VUT:
+            return self._whole.vehicle_positions(VUT)[self._first:self._first + self.n]
+        if actor not in self._positions:
+            names = self._driving if actor == VUT else self.ids(actor)
+            found = np.fromiter(chain.from_iterable(map(position, names)), float, 2 * len(names)).reshape(-1, 2)
+            if len(names) < self.n:
+                found, on_the_road = self._last_positions.copy(), found
+                found[self._rows] = on_the_road
+            self._positions[actor] = found
+        return self._positions[actor]
+
+    @property
+    def api(self) -> Any:
+        """libsumo, or traci."""
+        return self._api
+
+    def has_left(self, name: str) -> bool:
+        """Whether a vehicle under test is off the road for good."""
+        return name not in self._driving
+
+    def names(self) -> frozenset[str]:
+        """What vehicles, persons, roads and types are called in the originals of the copies."""
+        api = self._api
+        kinds = (api.vehicle, api.person, api.edge, api.lane, api.route, api.vehicletype, api.junction)
+        return frozenset(name.removeprefix(":").partition(".")[2] for kind in kinds for name in kind.getIDList())
+
+    def whereabouts(self) -> dict[str, tuple[float, float, float]]:
+        """Where everybody is who is on the road, by id: front bumper or person [m], heading clockwise from north [degrees]."""
+        kinds = (self._api.vehicle, self._api.person)
+        return {name: (*kind.getPosition(name), kind.getAngle(name)) for kind in kinds for name in kind.getIDList()}
+
+    def measures(self, name: str) -> tuple[bool, float, float]:
+        """Whether the one of this id is a person, and its length and width [m]."""
+        is_person = name in self._api.person.getIDList()
+        kind = self._api.person if is_person else self._api.vehicle
+        return is_person, kind.getLength(name), kind.getWidth(name)
+
+    def vehicle_length(self, actor: str) -> float:
+        return float(self._api.vehicle.getLength(self.ids(actor)[0]))
+
+    def vehicle_width(self, actor: str) -> float:
+        return float(self._api.vehicle.getWidth(self.ids(actor)[0]))
+
+    def lane(self, lane: str) -> Lane:
+        return lane_through(lane, self._api.lane.getShape(copied_id(0, lane)))
+
+    def lane_of(self, vehicle: str) -> Lane:
+        return self.lane(copy_and_name(self._api.vehicle.getLaneID(self.ids(vehicle)[0]))[1])
+
+    def lane_start(self, lane: str) -> tuple[float, float]:
+        x, y = self._api.lane.getShape(copied_id(0, lane))[0]
+        return x, y
+
+    def person_width(self, actor: str) -> float:
+        return float(self._api.person.getWidth(self.ids(actor)[0]))
+
+    def walk(self, person: str, speed: float) -> None:
+        for name in self.ids(person):
+            self._api.person.setSpeed(name, speed)
+
+    def drive(self, vehicle: str, speed: float) -> None:
+        for name in self.ids(vehicle):
+            self._api.vehicle.setSpeedMode(name, OBEY)
+            self._api.vehicle.setSpeed(name, speed)
+
+    def part(self, first: int, n: int) -> SumoWorld:
+        """The world of `n` copies alone, from the `first`."""
+        part = SumoWorld(self._api, n, first=first, whole=self)
+        self._parts.append(part)
+        return part
+
+    def turn_back(self, person: str) -> None:
+        api = self._api.person
+        for name in self.ids(person):
+            back = [api.getRoadID(name), api.getEdges(name)[0]]
+            api.appendWalkingStage(name, back, 0.0, speed=api.getSpeed(name))
+            api.removeStage(name, 0)
+
+
+_present: SumoWorld | None = None
+"""The world that is being driven in this process: SUMO is one a process, too."""
+
+
+def present_world() -> SumoWorld:
+    """The world that is being driven."""
+    assert _present is not None
+    return _present
+
+
+def direction_of(angle: float) -> FloatArray:
+    """Unit vector of SUMO's angle: degrees clockwise from north."""
+    return np.array([math.sin(math.radians(angle)), math.cos(math.radians(angle))])
+
+
+def _direct(api: Any, domain: str, name: str) -> Callable[..., Any]:
+    """A function of SUMO's without libsumo's Python wrapper, which costs as much as the call; traci has none."""
+    compiled = getattr(api, "_libsumo", None)
+    return getattr(getattr(api, domain), name) if compiled is None else getattr(compiled, f"{domain}_{name}")  # type: ignore[no-any-return]

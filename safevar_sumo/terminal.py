@@ -1,0 +1,69 @@
+"""Text of a user's as it is: no markup, no control characters; and tables in which nothing is cut off."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.measure import Measurement
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from safevar_sumo.vehicles import Characteristic
+
+
+class WholeTable(Table):
+    """A table whose first column keeps its words, the names; what else does not fit goes on in the next line."""
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for column in self.columns:
+            column.overflow = "fold"
+        wide = options.update(width=1_000_000)
+        excess = Measurement.get(console, wide, self).maximum - options.max_width
+        if excess > 0:
+            first = self.columns[0]
+            cells = [Measurement.get(console, wide, cell) for cell in (first.header, *first.cells)]
+            words, natural = (max(sizes) for sizes in zip(*cells, strict=True))
+            first.width = max(words, natural - excess)
+        yield from super().__rich_console__(console, options)
+
+
+def plain(text: object, style: str = "") -> Text:
+    """For a rich table or line; what cannot be printed becomes a question mark, or a space if it is one."""
+    return Text("".join(sign if sign.isprintable() else " " if sign.isspace() else "?" for sign in str(text)), style)
+
+
+def print_meanings(console: Console, members: Iterable[Characteristic]) -> None:
+    """What characteristics are, a line for each that the study has words for."""
+    table = Table.grid(padding=(0, 2))
+    for member in members:
+        if member.words:
+            table.add_row(plain(member.name), plain(member.words))
+    if table.row_count:
+        console.print(table)
+
+
+SECONDS_BETWEEN_LINES = 30.0
+
+
+@contextmanager
+def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
+    """A bar on a terminal, a line now and then elsewhere; yields what to call with the stage, what is done and how much there is."""
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=20), MofNCompleteColumn(), TimeRemainingColumn())
+    spoke = time.monotonic()
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("starting", total=None)
+
+        def done(stage: str, number: int, total: int) -> None:
+            nonlocal spoke
+            if number == 0:
+                bar.reset(task, description=stage, total=total)
+            bar.update(task, completed=number)
+            if not console.is_terminal and time.monotonic() - spoke >= SECONDS_BETWEEN_LINES:
+                spoke = time.monotonic()
+                console.print(f"{stage}: {number} of {total}", markup=False, highlight=False, soft_wrap=True)
+
+        yield done

@@ -1,0 +1,133 @@
+"""Batches computed by the workers of a Dask scheduler (extra `cluster`)."""
+
+from __future__ import annotations
+
+import faulthandler
+import logging
+import os
+import re
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from functools import cache
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from safevar_sumo.errors import InputError, told
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import RESULTS
+from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, evaluate_batch
+from safevar_sumo.workers.local import interrupts_noted
+
+ADDRESS = re.compile(r"[a-z]+://[^\s/]+:\d+/?")
+CERTIFICATES = "for tls:// certificates in Dask's configuration: distributed.comm.tls.ca-file and .client.cert, .client.key"
+CONNECT_TIMEOUT = 10.0
+"""How long an address may take to answer [s]."""
+SECONDS_BETWEEN_COUNTS = 5.0
+VERSIONED = ("safevar_sumo", "libsumo", "numpy")
+"""What results depend on: the same version here and on every worker."""
+_one_at_a_time = threading.Lock()
+
+
+@contextmanager
+def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
+    """Connect to a scheduler.
+
+    Parameters
+    ----------
+    address
+        Of the scheduler.
+    time_limit
+        The worker of a batch that takes longer is stopped [s].
+
+    Raises
+    ------
+    InputError
+        If the extra is not installed or nobody answers at the address.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError("cluster", "Dask is not installed", "pip install 'safevar_sumo[cluster]'") from None
+    legal = "the address of a Dask scheduler, such as tcp://host:8786"
+    if not ADDRESS.fullmatch(address):
+        raise InputError("cluster", repr(address), legal)
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is told by us
+    try:
+        client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise InputError("cluster", f"nobody answers at {address!r}: {error}", legal) from None
+    except (TypeError, RuntimeError) as error:
+        raise InputError("cluster", f"{address!r}: {told(error)}", CERTIFICATES) from None
+    with interrupts_noted():
+        try:
+            yield ClusterPool(client, time_limit)
+        finally:
+            client.close()
+
+
+class ClusterPool:
+    """Computes batches on a Dask cluster, which itself tries a batch again when a worker dies."""
+
+    def __init__(self, client: Any, time_limit: float) -> None:
+        self._executor = client.get_executor(pure=False)
+        self._client, self._time_limit = client, time_limit
+        self._workers, self._counted = 1, -np.inf
+
+    @property
+    def workers(self) -> int:
+        """Processes, whatever their threads: each computes one batch at a time. They come and go; the scheduler is asked now and then."""
+        now = time.monotonic()
+        if now - self._counted > SECONDS_BETWEEN_COUNTS:
+            try:
+                self._workers = max(1, len(self._client.nthreads()))
+            except (OSError, TimeoutError) as error:
+                raise PoolLostError(f"the cluster does not answer any more: {error}") from None
+            self._counted = now
+        return self._workers
+
+    def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
+        outer: Future[Evaluations] = Future()
+        try:
+            inner = self._executor.submit(_evaluate_within, self._time_limit, _versions(), study, settings)
+        except RuntimeError as error:
+            raise PoolLostError(f"the cluster does not answer any more: {error}") from None
+        inner.add_done_callback(lambda done: _hand_on(done, outer))
+        return outer
+
+
+def _evaluate_within(time_limit: float, versions: dict[str, str], study: bytes, settings: FloatArray) -> Evaluations:
+    """What a worker of the cluster does: one batch at a time, for libsumo exists once in a process; if it hangs, the worker ends."""
+    if _versions() != versions:
+        raise PoolLostError(f"a worker of the cluster has other versions: {_versions()} there, {versions} here")
+    with _one_at_a_time, open(os.devnull, "w") as nowhere:
+        faulthandler.dump_traceback_later(time_limit, exit=True, file=nowhere)
+        try:
+            return evaluate_batch(study, settings)
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+
+
+@cache
+def _versions() -> dict[str, str]:
+    return {**{name: version(name) for name in VERSIONED}, "results": str(RESULTS)}
+
+
+def _hand_on(done: Future[Evaluations], outer: Future[Evaluations]) -> None:
+    from distributed import KilledWorker
+
+    if done.cancelled():
+        outer.set_exception(PoolLostError("the cluster does not answer any more"))
+        return
+    error = done.exception()
+    if isinstance(error, KilledWorker):
+        outer.set_exception(WorkerLostError(f"workers of the cluster died: {error}"))
+    elif error is not None:
+        outer.set_exception(error)
+    else:
+        outer.set_result(done.result())

@@ -1,0 +1,258 @@
+"""Ctrl-C while a pool works: noted at once, raised where the main thread waits for a result, never while a lock is held.
+
+An interrupt anywhere inside `concurrent.futures` may leave a lock behind that a worker's thread then waits for, for ever,
+and one while a pool is closed would leave workers behind.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
+from multiprocessing import connection
+from types import ModuleType
+from typing import Any
+
+from safevar_sumo.errors import EnvironmentFault, SafevarError, told
+from safevar_sumo.plugins import inherit_reachable, reachable
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, evaluate_batch
+
+SECONDS_BETWEEN_LOOKS = 0.2
+"""How long Ctrl-C may go unnoticed at the most."""
+_pressed = threading.Event()
+
+
+@contextmanager
+def interrupts_noted() -> Iterator[None]:
+    """Within, Ctrl-C is raised by `first_of` and `result_of` alone; what nobody has waited for is raised at the end."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    _pressed.clear()
+    before = signal.signal(signal.SIGINT, lambda *_: _pressed.set())
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)
+    _raise_if_pressed()
+
+
+def first_of(futures: Iterable[Future[Evaluations]]) -> set[Future[Evaluations]]:
+    """The futures that are done, as soon as there is one, or none if there are no futures."""
+    while True:
+        done, not_done = wait(futures, timeout=SECONDS_BETWEEN_LOOKS, return_when=FIRST_COMPLETED)
+        _raise_if_pressed()
+        if done or not not_done:
+            return done
+
+
+def result_of(future: Future[Evaluations]) -> Evaluations:
+    """A future's result, waited for; raises what it failed with."""
+    first_of([future])
+    return future.result()
+
+
+def _raise_if_pressed() -> None:
+    if _pressed.is_set():
+        _pressed.clear()
+        raise KeyboardInterrupt
+
+
+START_LIMIT = 120.0
+"""How long a worker process may take until it is ready for its first batch [s]."""
+_starting = threading.Lock()
+STARTS = 5
+"""How many workers in a row may die before they are ready; no batch is to blame for that."""
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def local_pool(jobs: int, time_limit: float) -> Iterator[LocalPool]:
+    """Worker processes, started when they are needed first. They end with the block.
+
+    Parameters
+    ----------
+    jobs
+        How many worker processes.
+    time_limit
+        A batch that takes longer is stopped [s].
+    """
+    with interrupts_noted():
+        pool = LocalPool(jobs, time_limit)
+        try:
+            yield pool
+        finally:
+            pool.close()
+
+
+class LocalPool:
+    """Computes batches in processes, each with a thread of this process that waits for it.
+
+    Workers share nothing, no queue and no lock: so one may die or be killed at any moment without harm to another.
+    """
+
+    def __init__(self, jobs: int, time_limit: float) -> None:
+        self.workers, self._time_limit = jobs, time_limit
+        self._threads = ThreadPoolExecutor(jobs, thread_name_prefix="worker", initializer=_leave_interrupts_to_the_caller)
+        self._of_thread = threading.local()
+        self._living: set[_Worker] = set()
+        self._closed = False
+
+    def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
+        try:
+            return self._threads.submit(self._compute, study, settings)
+        except RuntimeError:
+            raise PoolLostError("the worker processes are closed down") from None
+
+    def close(self) -> None:
+        """Drop what is not computed yet and end all workers."""
+        self._closed = True
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        while self._living:
+            for worker in list(self._living):
+                self._end(worker)
+        self._threads.shutdown()
+
+    def _compute(self, study: bytes, settings: FloatArray) -> Evaluations:
+        worker: _Worker | None = getattr(self._of_thread, "worker", None)
+        if worker is None or not worker.alive:
+            worker = self._of_thread.worker = self._started()
+        try:
+            return worker.compute(study, settings, self._time_limit)
+        except WorkerLostError:
+            self._end(worker)
+            self._of_thread.worker = None
+            raise
+
+    def _started(self) -> _Worker:
+        for _ in range(STARTS):
+            if self._closed:
+                raise PoolLostError("the worker processes are closed down")
+            worker = _Worker()
+            self._living.add(worker)
+            if self._closed:
+                worker.end()
+            try:
+                worker.wait_until_ready()
+            except WorkerLostError as error:
+                self._end(worker)
+                lost = error
+            else:
+                return worker
+        raise PoolLostError(f"no worker process starts: {lost}")
+
+    def _end(self, worker: _Worker) -> None:
+        worker.end()
+        self._living.discard(worker)
+
+
+class _Worker:
+    """A process and the pipe to it. It is spawned: libsumo must not be forked."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        try:
+            self._pipe, theirs = context.Pipe()
+            self._process = context.Process(target=_serve, args=(theirs, reachable()), daemon=True)
+            with _without_main():
+                self._process.start()
+        except OSError as error:
+            raise PoolLostError(f"no worker process can be started: {error.strerror}") from None
+        theirs.close()
+
+    @property
+    def alive(self) -> bool:
+        return self._process.is_alive()
+
+    def wait_until_ready(self) -> None:
+        """Raises WorkerLostError if that never comes."""
+        self._receive(START_LIMIT, "start")
+
+    def compute(self, study: bytes, settings: FloatArray, time_limit: float) -> Evaluations:
+        """Have a batch computed; raises what it raised, or WorkerLostError."""
+        with suppress(OSError):  # a dead worker is told by the answer that does not come
+            self._pipe.send((study, settings))
+        answer = self._receive(time_limit, "simulation")
+        if isinstance(answer, Exception):
+            raise answer
+        return answer  # type: ignore[no-any-return]
+
+    def _receive(self, time_limit: float, what: str) -> Any:
+        ready = connection.wait([self._pipe, self._process.sentinel], time_limit)
+        if not ready:
+            raise WorkerLostError(f"the {what} took longer than {time_limit:g} s")
+        with suppress(EOFError, OSError):
+            if self._pipe in ready:
+                return self._pipe.recv()
+        self._process.join()
+        raise WorkerLostError(f"the worker process died (exit code {self._process.exitcode})")
+
+    def end(self) -> None:
+        """Kill the process; whoever waits for its answer learns that it died."""
+        self._process.kill()
+        self._process.join()
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """A spawned process runs the caller's main module again: a script would need `if __name__ == "__main__"`. Ours needs no main module."""
+    with _starting:
+        main = sys.modules["__main__"]
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = main
+
+
+def _serve(pipe: connection.Connection[Any, Any], folders: list[str]) -> None:
+    """What a worker process does: answer batches until the other end of the pipe is closed."""
+    inherit_reachable(folders)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_the_caller, daemon=True).start()
+    try:
+        pipe.send(None)
+        while True:
+            pipe.send(_answer(*pipe.recv()))
+    except (EOFError, OSError):
+        return
+
+
+def _answer(study: bytes, settings: FloatArray) -> Evaluations | Exception:
+    try:
+        return evaluate_batch(study, settings)
+    except SafevarError as error:
+        return error
+    except (OSError, MemoryError) as error:
+        return EnvironmentFault(f"a batch cannot be computed: {told(error)}")
+    except Exception:
+        return RuntimeError(f"in a worker process\n{traceback.format_exc()}")  # not every exception survives the pipe
+
+
+def _end_with_the_caller() -> None:
+    """A worker that hangs in a simulation would outlive a killed caller."""
+    caller = multiprocessing.parent_process()
+    assert caller is not None
+    caller.join()
+    os._exit(1)
+
+
+def _leave_interrupts_to_the_caller() -> None:
+    """Ctrl-C reaches all processes of a terminal: block it in this thread, whose processes then never see it, however young."""
+    if sys.platform == "win32":  # there are no signal masks: a process ignores interrupts once it serves
+        return
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # its start would unblock interrupts
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -1,0 +1,195 @@
+"""A pool that does not give up because a worker did: again, then in ever smaller parts, then without the setting that is left.
+
+Only what SUMO itself refuses, dies of or hangs on becomes an outcome, `simulator-error`: a setting that fails alone, again
+and again, while the original vehicle is simulated in between. What the surroundings are at fault for (disk, network
+files, memory) and what a user's own code does is an error that ends the study; the same command later goes on from there.
+"""
+
+from __future__ import annotations
+
+import shlex
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from functools import partial
+
+import numpy as np
+
+from safevar_sumo.errors import EnvironmentFault, ForeignError, SafevarError, SimulationError
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.study import Study, foreign_names
+from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.workers.evaluation import Pool, PoolLostError, WorkerLostError
+
+Then = Callable[[Evaluations | None, BaseException | None], None]
+"""Is told what became of a batch: its evaluations, or its error."""
+ATTEMPTS = 2
+"""How often a batch is tried as a whole, and a setting alone: somebody else may have killed the worker."""
+PARTS = 8
+"""Into how many parts a failing batch is split: of 200 settings, one that takes a worker with it costs five workers' time limits."""
+FAILURES_IN_A_ROW = 20
+"""So many settings that fail one after the other are a fault of the study, not of the settings."""
+
+
+class PersistentPool:
+    """Settings that fail alone are evaluated as `simulator-error`; too many of them in a row are an error.
+
+    Parameters
+    ----------
+    pool
+        Computes batches.
+    study
+        What is computed.
+    note
+        Is told of files that other people's code reads and that the study did not begin with; may refuse them.
+    """
+
+    def __init__(self, pool: Pool, study: Study, note: Callable[[Mapping[str, str]], None] = lambda files: None) -> None:
+        self._pool, self._study, self._note, self._in_a_row = pool, study, note, 0
+        self._characteristics, self._foreign = CharacteristicSet.of(study.vehicle.characteristics), foreign_names(study)
+
+    @property
+    def workers(self) -> int:
+        """How many batches are computed at the same time."""
+        return self._pool.workers
+
+    def submit(self, study: bytes, settings: FloatArray, *, must_succeed: bool = False) -> Future[Evaluations]:
+        """Evaluate filtered settings, shape (k, n); with `must_succeed` a failure is an error, not an outcome."""
+        result: Future[Evaluations] = Future()
+        alone = len(settings) == 1 and not must_succeed
+        self._attempt(study, settings, 2 * ATTEMPTS if alone else ATTEMPTS, result, must_succeed)
+        return result
+
+    def _attempt(self, study: bytes, settings: FloatArray, attempts: int, into: Future[Evaluations], must_succeed: bool) -> None:
+        def done(evaluations: Evaluations | None, error: BaseException | None) -> None:
+            if evaluations is not None:
+                self._in_a_row = 0
+                into.set_result(evaluations)
+            elif isinstance(error, ForeignError):
+                self._locate(study, settings, error, into)
+            elif not isinstance(error, SimulationError | WorkerLostError | EnvironmentFault):
+                into.set_exception(error)
+            elif attempts > 1:
+                self._attempt(study, settings, attempts - 1, into, must_succeed)
+            elif isinstance(error, EnvironmentFault):
+                into.set_exception(error)
+            elif len(settings) > 1:
+                self._in_parts(study, settings, into)
+            elif self._foreign and isinstance(error, WorkerLostError):
+                into.set_exception(self._told(self._blamed(error), settings))
+            elif must_succeed:
+                into.set_exception(error)
+            else:
+                self._give_up(study, settings, error, into)
+
+        self._computed(study, settings, done)
+
+    def _computed(self, study: bytes, settings: FloatArray, then: Then) -> None:
+        """Have a batch computed; `then` is told its evaluations or its error."""
+        def done(attempt: Future[Evaluations]) -> None:
+            error = PoolLostError("the batch was cancelled") if attempt.cancelled() else attempt.exception()
+            if error is None and attempt.result().files:
+                try:
+                    self._note(attempt.result().files)
+                except SafevarError as refused:
+                    error = refused
+            then(attempt.result() if error is None else None, error)
+
+        try:
+            attempt = self._pool.submit(study, settings)
+        except PoolLostError as error:
+            then(None, error)
+        else:
+            attempt.add_done_callback(done)
+
+    def _in_parts(self, study: bytes, settings: FloatArray, into: Future[Evaluations]) -> None:
+        """Part a batch that fails, and the parts that fail again: the others cost what they would have."""
+        parts = np.array_split(settings, min(PARTS, len(settings)))
+        found: dict[int, Evaluations] = {}
+        lock = threading.Lock()
+
+        def done(number: int, part: Future[Evaluations]) -> None:
+            with lock:
+                if into.done():
+                    return
+                if part.exception() is not None:
+                    into.set_exception(part.exception())
+                    return
+                found[number] = part.result()
+                if len(found) == len(parts):
+                    into.set_result(Evaluations.concatenate([found[number] for number in range(len(parts))]))
+
+        for number, rows in enumerate(parts):
+            if not into.done():
+                part: Future[Evaluations] = Future()
+                part.add_done_callback(partial(done, number))
+                self._attempt(study, rows, ATTEMPTS if len(rows) == 1 else 1, part, must_succeed=False)
+
+    def _give_up(self, study: bytes, setting: FloatArray, error: SafevarError, into: Future[Evaluations]) -> None:
+        """Blame the setting if the original vehicle can be simulated and the setting then still cannot."""
+        def then_again(evaluations: Evaluations | None, again: BaseException | None) -> None:
+            if evaluations is not None:
+                into.set_result(evaluations)
+            elif isinstance(again, SimulationError | WorkerLostError):
+                self._in_a_row += 1
+                if self._in_a_row >= FAILURES_IN_A_ROW:
+                    into.set_exception(again)
+                else:
+                    into.set_result(self._failed(setting, again))
+            else:
+                into.set_exception(again)
+
+        def original_done(evaluations: Evaluations | None, fault: BaseException | None) -> None:
+            if evaluations is not None:
+                self._computed(study, setting, then_again)
+            else:
+                into.set_exception(EnvironmentFault(f"{error}; the original vehicle cannot be simulated either: {fault}")
+                                   if isinstance(fault, SimulationError | WorkerLostError) else fault)
+
+        self._computed(study, self._characteristics.original[np.newaxis], original_done)
+
+    def _failed(self, setting: FloatArray, error: SafevarError) -> Evaluations:
+        undefined = np.full(1, np.nan)
+        return Evaluations(
+            settings=setting, outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"), collision_speed=undefined,
+            metrics=dict.fromkeys(METRICS, undefined), f_diff=self._characteristics.largest_change(setting),
+            f_num_diff=self._characteristics.number_changed(setting), reasons={setting[0].tobytes(): " ".join(str(error).split())})
+
+    def _locate(self, study: bytes, settings: FloatArray, error: ForeignError, into: Future[Evaluations]) -> None:
+        """Find the setting that the failure of a user's code belongs to, half by half, and tell how to have it again."""
+        if len(settings) == 1:
+            into.set_exception(self._told(error, settings))
+            return
+        halves = settings[:len(settings) // 2], settings[len(settings) // 2:]
+
+        def second_done(_: Evaluations | None, again: BaseException | None) -> None:
+            if isinstance(again, ForeignError):
+                self._locate(study, halves[1], again, into)
+            else:
+                into.set_exception(error)
+
+        def first_done(_: Evaluations | None, again: BaseException | None) -> None:
+            if isinstance(again, ForeignError):
+                self._locate(study, halves[0], again, into)
+            else:
+                self._computed(study, halves[1], second_done)
+
+        self._computed(study, halves[0], first_done)
+
+    def _blamed(self, error: WorkerLostError) -> ForeignError:
+        """A process that ends or hangs with a user's code in it is that code's fault, as far as anybody can tell."""
+        problem = f"{error}, again and again, with {' and '.join(self._foreign)} in it; a process that is gone cannot tell file and line"
+        return ForeignError(f"study {self._study.name!r}", problem)
+
+    def _told(self, error: ForeignError, setting: FloatArray) -> ForeignError:
+        """The error with a command that reproduces it."""
+        return ForeignError(error.source, f"{error.problem}; again by: {reproducing(self._study, setting[0])}", error.legal)
+
+
+def reproducing(study: Study, setting: FloatArray) -> str:
+    """The command that simulates a setting, shape (n,), again."""
+    changes = [f"--set {member.name}={value!r}"
+               for member, value in zip(CharacteristicSet.of(study.vehicle.characteristics), setting.tolist(), strict=True)
+               if value != member.original]
+    return " ".join(["python -m safevar_sumo simulate", shlex.quote(study.origin.called or study.name), *changes])

@@ -1,0 +1,79 @@
+"""Studies made up for tests: characteristics from 0 to 10 around an original of 5, and a plant whose unsafe region is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future
+
+import msgspec
+import numpy as np
+
+from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.study import CharacteristicTable, Study, load_study
+from safevar_sumo.vehicles import CharacteristicSet
+
+ORIGINAL, LOWER, UPPER = 5.0, 0.0, 10.0
+Region = Callable[[FloatArray], BoolArray]
+
+
+def made_up_study(n: int) -> Study:
+    smoke = load_study("smoke")
+    rows = {name: CharacteristicTable(unit="N m", original=ORIGINAL, lower=LOWER, upper=UPPER) for name in "abcdefgh"[:n]}
+    return msgspec.structs.replace(smoke, name="made-up", vehicle=msgspec.structs.replace(smoke.vehicle, characteristics=rows))
+
+
+class Plant:
+    """A pool in which settings of a region collide at 1 m/s, those of `failing` fail, and all others keep the distance of `degree`."""
+
+    workers = 1
+
+    def __init__(self, study: Study, region: Region, degree: Callable[[FloatArray], FloatArray] | None = None,
+                 failing: Region | None = None):
+        self._characteristics, self._region = CharacteristicSet.of(study.vehicle.characteristics), region
+        self._degree = degree or (lambda settings: np.full(len(settings), 2.0))
+        self._failing = failing or nowhere
+        self.seen: set[bytes] = set()
+
+    def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
+        collides = np.asarray(self._region(settings), dtype=bool)
+        fails = self._failing(settings)
+        collides &= ~fails
+        degree = np.where(fails, np.nan, np.where(collides, -1.0, self._degree(settings)))
+        self.seen |= {row.tobytes() for row in settings}
+        future: Future[Evaluations] = Future()
+        future.set_result(Evaluations(
+            settings=settings, outcome=np.where(fails, "simulator-error", np.where(collides, "collision", "stopped")).astype("U16"),
+            collision_speed=np.where(collides, 1.0, np.nan),
+            metrics={name: degree if name == "safety_degree" else np.full(len(settings), np.nan) for name in METRICS},
+            f_diff=self._characteristics.largest_change(settings), f_num_diff=self._characteristics.number_changed(settings)))
+        return future
+
+
+def made_up_bench(n: int, region: Region) -> Bench:
+    study = made_up_study(n)
+    return Bench(study, Plant(study, region))
+
+
+def nowhere(settings: FloatArray) -> BoolArray:
+    return np.zeros(len(settings), dtype=bool)
+
+
+def everywhere(settings: FloatArray) -> BoolArray:
+    return np.ones(len(settings), dtype=bool)
+
+
+def box(settings: FloatArray) -> BoolArray:
+    """a above 7 and b below 3: 9 % of two domains."""
+    return np.asarray((settings[:, 0] > 7) & (settings[:, 1] < 3))
+
+
+def two_islands(settings: FloatArray) -> BoolArray:
+    """a from 6.5 to 7, and a above 9: 15 % of its domain."""
+    return np.asarray(((settings[:, 0] > 6.5) & (settings[:, 0] < 7)) | (settings[:, 0] > 9))
+
+
+def diagonal_band(settings: FloatArray) -> BoolArray:
+    """Where a - b is from 6 to 8: (16 - 4) / 2 = 6 of 100, none on an axis through the original."""
+    return np.asarray((settings[:, 0] - settings[:, 1] >= 6) & (settings[:, 0] - settings[:, 1] <= 8))

@@ -1,0 +1,87 @@
+"""Preventability: the driving system's failure if a competent driver avoids it in the same vehicle; the vehicle's if nobody does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+import scipy
+from in_process import Here
+
+from safevar_sumo.ads.competent_driver import CompetentDriver
+from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.preventability import PreventableBy, approach, preventability, preventable_by
+from safevar_sumo.records import FloatArray
+from safevar_sumo.study import ModelTable, load_study
+from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.system import assemble
+
+STUDY = load_study("euro_ncap_pedestrian")
+BLIND = ModelTable(model="aeb", parameters={"reach": 3.0})
+NAMES = list(STUDY.vehicle.characteristics)
+ORIGINAL = np.array([one.original for one in STUDY.vehicle.characteristics.values()])
+
+
+def bench(**parameters: object) -> Bench:
+    """A short-sighted driving system in one scenario."""
+    scenario = ModelTable(model="crossing", parameters=parameters)
+    return Bench(msgspec.structs.replace(STUDY, matrix=None, ads=BLIND, scenario=scenario), Here())
+
+
+def vehicle(brakes: float = 1.0, max_rpm: float = 1.0) -> FloatArray:
+    """The original vehicle with these shares of its brakes (and engine drag) and of its maximum speed of the engine."""
+    factors = {"maxBrakeTorque": brakes, "dampRateZeroT_CE": brakes, "max_rpm": max_rpm}
+    return ORIGINAL * [factors.get(name, 1.0) for name in NAMES]
+
+
+def test_a_competent_driver_avoids_what_a_short_sighted_system_does_not_and_nobody_stops_without_brakes() -> None:
+    both = np.stack([vehicle(), vehicle(brakes=0.1)])
+    assert preventable_by(bench(test="CPFA", speed=30), both) == [PreventableBy.COMPETENT_DRIVER, PreventableBy.NOBODY]
+
+
+def test_a_child_that_comes_out_late_is_avoided_by_full_braking_alone() -> None:
+    assert preventable_by(bench(test="CPNCO", speed=40), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
+
+
+def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
+    """Of 60 collisions, the 40 of the lowest engine speeds are the brakeless ones: those that come first when settings are sorted."""
+    collisions = np.stack([vehicle(0.1, 1 - (60 - k) / 1e6) for k in range(40)] + [vehicle(1.0, 1 - k / 1e6) for k in range(20)])
+    here = bench(test="CPFA", speed=30)
+    whole = preventability(here, np.concatenate([collisions, collisions])).to_dict()
+    assert whole == {"competent_driver": pytest.approx(1 / 3), "full_braking": 0, "nobody": pytest.approx(2 / 3), "looked_at": 60,
+                     "interval_competent_driver": [pytest.approx(1 / 3)] * 2}
+    sample = preventability(here, collisions, limit=60).to_dict()
+    assert sample["looked_at"] == 30
+    assert sample == preventability(here, collisions[::-1], limit=60).to_dict()
+    hits = round(sample["competent_driver"] * 30)
+    expected = scipy.stats.beta.ppf(0.025, hits, 31 - hits), scipy.stats.beta.ppf(0.975, hits + 1, 30 - hits)
+    assert sample["interval_competent_driver"] == pytest.approx(expected)
+    assert expected[0] < 1 / 3 < expected[1]
+
+
+def test_reference_drivers_approach_as_the_driving_system_does() -> None:
+    """A competent driver sees no danger before the time to collision is 2 s: until then both are at the same place."""
+    rain = assemble(load_study("rain"))
+    original = rain.characteristics.original[np.newaxis]
+    driver = msgspec.convert(approach(rain), CompetentDriver)
+    theirs, his = (simulate(one, original).trace for one in (rain, replace(rain, ads=driver)))
+    danger = int(np.argmax(theirs.gap[:, 0] < 2 * theirs.speed[:, 0]))
+    assert theirs.speed[danger, 0] > 4
+    assert np.array_equal(theirs.position[:danger + 1], his.position[:danger + 1])
+    assert approach(assemble(bench(test="CPFA", speed=30).study)) == {}
+
+
+def test_in_a_matrix_the_worst_point_counts() -> None:
+    """The child that comes out late is hit at twice the speed: full braking avoids it, a competent driver does not."""
+    speeds = {"CPFA": 20, "CPNCO": 40}
+    tests = [msgspec.structs.replace(one, over={}, parameters={**one.parameters, "speed": speeds[one.name]}, weathers=[])
+             for one in STUDY.matrix.tests if one.name in speeds]
+    study = msgspec.structs.replace(STUDY, ads=BLIND, matrix=msgspec.structs.replace(STUDY.matrix, tests=tests))
+    assert preventable_by(Bench(study, Here()), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
+
+
+def test_without_a_collision_shares_are_undefined() -> None:
+    told = preventability(bench(test="CPFA", speed=30), np.zeros((0, len(NAMES))))
+    assert (told.to_dict()["competent_driver"], told.to_dict()["looked_at"], str(told)) == (None, 0, "")

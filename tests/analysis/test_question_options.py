@@ -1,0 +1,71 @@
+"""One set of options: what a record says of a default, flags, Python functions, the report's calls and printed commands follow."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from safevar_sumo.analysis.explain.options import ExplainOptions
+from safevar_sumo.analysis.options import Options
+from safevar_sumo.analysis.risk.options import RiskOptions
+from safevar_sumo.analysis.rules.options import RulesOptions
+from safevar_sumo.analysis.tolerance.options import ToleranceOptions
+from safevar_sumo.cli.program import commands
+from safevar_sumo.errors import InputError
+
+OTHER_DEFAULT = """
+import inspect, pathlib, sys, types
+from importlib.util import find_spec
+source = pathlib.Path(find_spec("safevar_sumo.analysis.explain.options").origin).read_text()
+assert source.count("top: int = option(8,") == 1
+module = sys.modules["safevar_sumo.analysis.explain.options"] = types.ModuleType("safevar_sumo.analysis.explain.options")
+exec(source.replace("top: int = option(8,", "top: int = option(5,"), module.__dict__)
+
+import pandas as pd
+import safevar_sumo as sv
+from safevar_sumo.analysis.explain.compute import explain_failures
+from safevar_sumo.cli.questions import explain
+from safevar_sumo.report.input import Material
+
+flag = next(one.default for one in explain.params if one.name == "top")
+signatures = [inspect.signature(one).parameters["top"].default for one in (sv.explain, explain_failures)]
+case = types.SimpleNamespace(solutions=pd.DataFrame())
+asked = Material(number=1, place="it", case=case, manifest={}, system=None).options["explain"]
+print(flag, *signatures, asked.top, "--top" in asked.command_line("it"), "--top 8" in module.ExplainOptions(top=8).command_line("it"))
+"""
+
+
+def test_a_default_that_changes_changes_everywhere() -> None:
+    done = subprocess.run([sys.executable, "-c", OTHER_DEFAULT], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["5"] * 4 + ["False", "True"]
+
+
+@pytest.mark.parametrize("options", [
+    ExplainOptions(), ExplainOptions(solutions=("nsga2:3:0", "rs:1:2"), unsafe="below=0.5", top=3, limit=12_000),
+    ToleranceOptions(unsafe="collision", characteristics=("mass", "tireFric"), pairs=True), RiskOptions(samples=4000, width=0.01),
+    RulesOptions(samples=4000, unsafe="collision")])
+def test_a_printed_command_asks_for_the_same_options(options: Options) -> None:
+    """The command, parsed by its own flags, makes the record that printed it."""
+    typed = shlex.split(options.command_line("its results", "CPNA, night"))
+    assert typed[:5] == ["python", "-m", "safevar_sumo", options.question, "its results"]
+    command: Any = commands.get_command(None, options.question)  # type: ignore[arg-type]
+    given = command.make_context(options.question, typed[4:]).params
+    assert given["point"] == "CPNA, night"
+    assert type(options)(**{name: given[name] for name in options.described()}) == options
+    assert len(typed) == 7 + sum(len(value) * 2 if name == "solutions" else 1 if value is True else 2
+                                 for name, value in options.keywords().items() if value != getattr(type(options), name))
+
+
+@pytest.mark.parametrize(("typed", "legal"), [
+    ({"samples": 0}, "at least 1 "), ({"samples": 10.5}, "whole number"), ({"confidence": 1.0}, "below 1"),
+    ({"confidence": float("nan")}, "above 0"), ({"width": True}, "a number")])
+def test_python_and_the_command_refuse_the_same_values(typed: dict[str, Any], legal: str) -> None:
+    with pytest.raises(InputError, match=legal):
+        RiskOptions(**typed)
+    ((name, value),) = typed.items()
+    assert CliRunner().invoke(commands, ["risk", "smoke", f"--{name}", str(value)]).exit_code == 2

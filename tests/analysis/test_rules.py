@@ -1,0 +1,77 @@
+"""Rules against regions that are known."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
+
+from safevar_sumo.analysis.rules.compute import Rules
+from safevar_sumo.analysis.rules.compute import find_rules as rules
+from safevar_sumo.analysis.words import rule_in_words
+from safevar_sumo.vehicles import CharacteristicSet
+
+
+def of(region: Region, n: int = 4, **options: Any) -> Rules:
+    study = made_up_study(n)
+    return rules(study, unsafe="collision", pool=Plant(study, region), **options)
+
+
+def test_a_box_is_one_rule_of_its_two_conditions() -> None:
+    told = of(box)
+    (rule,) = told.rules
+    assert rule.limits == {"a": (pytest.approx(7, abs=0.02), None), "b": (None, pytest.approx(3, abs=0.02))}
+    assert rule.density == pytest.approx(1, abs=0.02)
+    assert rule.coverage == pytest.approx(1, abs=0.02)
+    assert told.unsafe_share == pytest.approx(0.09, abs=0.005)
+    assert rule.density_interval is not None
+    assert rule.density_interval[0] <= rule.density <= rule.density_interval[1]
+
+
+def test_two_islands_are_two_rules() -> None:
+    first, second = sorted((rule.limits["a"] for rule in of(two_islands).rules), key=lambda ends: ends[0] or 0)
+    assert first == (pytest.approx(6.5, abs=0.02), pytest.approx(7, abs=0.02))
+    assert second == (pytest.approx(9, abs=0.02), None)
+
+
+def test_a_region_that_is_no_box_is_covered_with_honest_densities() -> None:
+    told = of(diagonal_band, n=2)
+    fresh = np.random.default_rng(5).uniform(0, 10, (20_000, 2))
+    assert told.rules
+    for rule in told.rules:
+        inside = np.ones(len(fresh), dtype=bool)
+        for name, (low, high) in rule.limits.items():
+            values = fresh[:, "ab".index(name)]
+            inside &= (values >= (low or 0)) & (values <= (10 if high is None else high))
+        assert rule.density_interval is not None
+        assert rule.density_interval[0] - 0.1 <= diagonal_band(fresh)[inside].mean() <= rule.density_interval[1] + 0.1
+
+
+def test_a_rare_box_of_four_characteristics_is_found() -> None:
+    told = of(lambda settings: (settings[:, :4] > 7.8).all(axis=1), n=8)
+    assert told.unsafe_share == pytest.approx(0.22**4, abs=0.001)
+    assert set(told.rules[0].limits) <= set("abcd")
+    assert (told.rules[0].density or 0) > 0.4
+
+
+def test_nothing_everything_and_too_little() -> None:
+    assert of(nowhere).records() == []
+    (rule,) = of(everywhere).rules
+    assert (dict(rule.limits), rule.density, rule.coverage) == ({}, 1.0, 1.0)
+    few = of(lambda settings: (settings > 9.5).all(axis=1), n=2, samples=400)
+    assert few.rules == []
+    assert "--samples" in few.remark
+
+
+def test_the_promised_record_the_same_again_and_in_words() -> None:
+    first, again = (of(box), of(box))
+    assert json.dumps(first.records(), allow_nan=False) == json.dumps(again.records(), allow_nan=False)
+    assert repr(first).endswith("settings, 1 rules>")
+    (record,) = first.records()
+    assert list(record) == ["conditions", "density", "coverage", "density_interval", "coverage_interval"]
+    assert [list(condition) for condition in record["conditions"]] == [["characteristic", "at_least", "at_most"]] * 2
+    told = rule_in_words(first.rules[0], CharacteristicSet.of(first.study.vehicle.characteristics), first.unsafe)
+    assert told.startswith("a above 7 N m and b below 3 N m: collides in 100% (")

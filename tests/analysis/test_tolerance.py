@@ -1,0 +1,176 @@
+"""Intervals, planes and joint factors against regions that are known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+import pytest
+import scipy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
+
+from safevar_sumo.analysis.criterion import Unsafe
+from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.tolerance import safe_box
+from safevar_sumo.analysis.tolerance.compute import Tolerance
+from safevar_sumo.analysis.tolerance.compute import find_tolerances as tolerance
+from safevar_sumo.errors import InputError
+
+
+def of(n: int, region: Region, pairs: bool = False, unsafe: str | None = "collision", failing: Region = nowhere,
+       characteristics: Sequence[str] | None = None) -> Tolerance:
+    study = made_up_study(n)
+    return tolerance(study, unsafe=unsafe, pairs=pairs, characteristics=characteristics,
+                     pool=Plant(study, region, lambda rows: 8 - np.abs(rows[:, 0] - 5), failing))
+
+
+def test_islands_and_the_safe_interval_around_the_original() -> None:
+    first, second = of(2, two_islands).alone
+    assert first.safe == (0.0, pytest.approx(6.5, abs=1e-4))
+    assert first.safe[1] <= 6.5
+    assert [pytest.approx(interval, abs=1e-4) for interval in [(6.5, 7.0), (9.0, 10.0)]] == first.unsafe
+    assert first.margins == (pytest.approx(3.0), pytest.approx(6.5, abs=1e-3))
+    assert (second.safe, second.unsafe) == ((0.0, 10.0), [])
+    assert len(first.profile) > 201
+
+
+@settings(max_examples=30)
+@given(ends=st.lists(st.floats(0, 10), min_size=2, max_size=2).map(sorted))
+def test_any_interval_is_found_that_is_as_wide_as_two_values_are_apart(ends: list[float]) -> None:
+    low, high = ends
+    (alone,) = of(1, lambda rows: (rows[:, 0] >= low) & (rows[:, 0] <= high)).alone
+    if high - low > 0.05:
+        assert alone.unsafe == [(pytest.approx(low, abs=1e-4), pytest.approx(high, abs=1e-4))]
+    if low <= 5 <= high:
+        assert alone.safe is None
+    elif high - low > 0.05:
+        assert alone.safe == ((0.0, pytest.approx(low, abs=1e-4)) if low > 5 else (pytest.approx(high, abs=1e-4), 10.0))
+
+
+def test_a_plane_with_a_box_in_its_corner() -> None:
+    told = of(3, box, pairs=True)
+    assert told.pairs is not None
+    shares = {tuple(member.name for member in pair.characteristics): pair.unsafe_share for pair in told.pairs}
+    assert shares == {("a", "b"): pytest.approx(0.09, abs=0.02), ("a", "c"): 0, ("b", "c"): 0}
+    first = told.pairs[0]
+    assert first.nearest == (pytest.approx(7, abs=0.5), pytest.approx(3, abs=0.5))
+    assert box(np.array([first.nearest]))[0]
+    assert told.pairs[1].nearest is None
+    assert told.verdict == "No single characteristic makes it unsafe, but 1 of 3 pairs: a with b."
+
+
+def test_a_diagonal_band_is_nearest_where_it_is_nearest() -> None:
+    told = of(2, diagonal_band, pairs=True)
+    assert told.pairs is not None
+    assert told.pairs[0].unsafe_share == pytest.approx(0.06, abs=0.03)
+    assert told.pairs[0].nearest == (pytest.approx(8, abs=0.01), pytest.approx(2, abs=0.01))
+    assert told.joint.factor == pytest.approx(3 / 5, rel=0.02)
+
+
+@pytest.mark.parametrize(("region", "n", "factor"), [
+    (box, 2, 0.4), (two_islands, 3, 0.3), (nowhere, 4, 1.0), (everywhere, 2, 0.0),
+    (lambda rows: np.sum(rows - 5, axis=1) > 12, 4, 0.6)])  # a corner of all four, which no pair reaches
+def test_the_joint_factor_ends_before_what_is_unsafe(region: Region, n: int, factor: float) -> None:
+    told = of(n, region).joint
+    assert told.factor == pytest.approx(factor, rel=0.02)
+    assert told.factor <= factor
+    if factor:
+        error = 0.05 / 2**told.attempts
+        assert told.unsafe_at_most == pytest.approx(1 - error ** (1 / told.samples))
+        assert told.unsafe_at_most <= 0.003
+
+
+def test_the_nearest_unsafe_pair_lies_off_the_ray_through_the_nearest_of_the_grid() -> None:
+    """Beyond the line 2 a + b = 7, from the original: the nearest place is (2.8, 1.4); (3, 1) is the grid's, on the line itself."""
+    (pair,) = of(2, lambda rows: (rows - 5) @ [2, 1] >= 7, pairs=True).pairs or []
+    assert pair.nearest is not None
+    first, second = pair.nearest[0] - 5, pair.nearest[1] - 5
+    assert np.hypot(first, second) == pytest.approx(7 / 5**0.5, abs=0.003)
+    assert 2 * first + second >= 7
+
+
+def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
+    told = of(2, two_islands, pairs=True, failing=lambda rows: (rows[:, 0] > 5.75) & (rows[:, 0] < 6.75))
+    first = told.alone[0]
+    assert first.safe == (0.0, pytest.approx(5.75, abs=1e-4))
+    assert first.not_simulated == [(pytest.approx(5.75, abs=1e-4), pytest.approx(6.75, abs=1e-4))]
+    assert first.unsafe == [(pytest.approx(6.75, abs=1e-4), pytest.approx(7, abs=1e-4)), (pytest.approx(9, abs=1e-4), 10.0)]
+    assert first.record()["not_simulated"] == [list(first.not_simulated[0])]
+    assert told.pairs is not None
+    assert told.pairs[0].not_simulated_share == pytest.approx(0.1, abs=0.026)
+    assert told.pairs[0].unsafe_share == pytest.approx(1.25 / 9, abs=0.06)
+    box = told.joint
+    assert box.factor == pytest.approx(0.35, rel=0.02), "3.25 to 6.75, of which 1 could not be simulated"
+    assert box.failed / box.samples == pytest.approx(1 / 3.5, abs=0.03)
+    exact = scipy.stats.binomtest(box.failed, box.samples, alternative="less").proportion_ci(1 - 0.05 / 2**box.attempts, method="exact")
+    assert box.unsafe_at_most == pytest.approx(exact.high)
+
+
+def test_the_box_varies_the_characteristics_that_are_asked_for() -> None:
+    region = lambda rows: (rows[:, 0] > 9) | (rows[:, 2] > 6)  # noqa: E731
+    assert of(3, region).joint.factor == pytest.approx(0.2, rel=0.02)
+    told = of(3, region, characteristics=["a", "b"]).joint
+    assert told.factor == pytest.approx(0.8, rel=0.02)
+    assert told.characteristics == ("a", "b")
+
+
+def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unsafe: where digits of the logarithm of a change are below q. The share is q in every box: any box with a bound below q is wrong.
+
+    Boxes that are drawn anew until a sample of one has no unsafe setting would all be wrong. The search is switched off: it would
+    find that out before the tests do.
+    """
+    for name, value in (("PROBE", 1), ("SEARCHED", 1), ("SMALLEST", 1e-3), ("UNSAFE_AT_MOST", 0.03)):
+        monkeypatch.setattr(safe_box, name, value)
+    q, wrong, seeds, study = 0.031, 0, 100, made_up_study(2)
+    for seed in range(seeds):
+        seeded = msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, seed=seed))
+        bench = Bench(seeded, Plant(seeded, lambda rows: np.log(np.abs(rows[:, 0] - 5) + 1e-99) * 1e6 % 1 < q))
+        told = safe_box.safe_box(bench, [0, 1], Unsafe(), np.zeros((0, 2)))
+        wrong += told.unsafe_at_most < q
+    assert 0 < wrong <= 0.05 * seeds
+
+
+def test_nothing_and_everything() -> None:
+    safe, unsafe = of(2, nowhere, pairs=True), of(2, everywhere, pairs=True)
+    assert safe.verdict == "No single characteristic and no pair makes it unsafe."
+    assert unsafe.verdict == "The original vehicle itself is unsafe."
+    assert unsafe.alone[0].safe is None
+    assert unsafe.alone[0].unsafe == [(0.0, 10.0)]
+    assert unsafe.pairs is not None
+    assert unsafe.pairs[0].unsafe_share == pytest.approx(1)
+
+
+def test_where_nothing_collides_half_of_the_original_is_the_limit() -> None:
+    told = of(1, nowhere, unsafe=None)
+    assert str(told.unsafe) == "below=4.0"
+    assert told.alone[0].safe == (pytest.approx(1.0, abs=1e-4), pytest.approx(9.0, abs=1e-4))
+
+
+def test_it_is_shown_in_a_line() -> None:
+    told = of(2, two_islands)
+    assert repr(told) == f"<Tolerance of {told.study.name}, unsafe collision: Unsafe alone: a.>"
+
+
+def test_the_promised_record() -> None:
+    record = json.loads(json.dumps(of(2, two_islands, pairs=True).record(), allow_nan=False))
+    assert list(record) == ["study", "unsafe", "alone", "pairs", "joint"]
+    assert list(record["alone"][0]) == ["characteristic", "unit", "original", "safe", "unsafe", "not_simulated"]
+    assert list(record["pairs"][0]) == ["characteristics", "unsafe_share", "not_simulated_share", "nearest"]
+    assert list(record["pairs"][0]["nearest"]) == ["a", "b"]
+    assert list(record["joint"]) == [
+        "factor", "confidence", "samples", "failed", "attempts", "unsafe_at_most", "characteristics"]
+
+
+def test_one_characteristic_has_no_pair() -> None:
+    assert of(1, nowhere, pairs=True).pairs == []
+
+
+def test_an_unknown_characteristic_is_refused() -> None:
+    study = made_up_study(2)
+    with pytest.raises(InputError, match="'wings'"):
+        tolerance(study, characteristics=["wings"], pool=Plant(study, nowhere))

@@ -1,0 +1,140 @@
+"""Animations: what they show is where everybody was, true to scale; small, the same twice, and text stays text."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from safevar_sumo.analysis.research_questions.case import load_cases
+from safevar_sumo.errors import InputError
+from safevar_sumo.replay.animation import animate, check_animation
+from safevar_sumo.replay.comparison import Comparison, compare
+from safevar_sumo.replay.page import animation_page
+from safevar_sumo.replay.raster import PANEL, VEHICLES, WIDTH, pictures
+from safevar_sumo.replay.scene import scene_of
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo.system import assemble
+
+
+@pytest.fixture(scope="module")
+def crash(slippery: Path) -> Comparison:
+    (case,) = load_cases([slippery])
+    return compare(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
+
+
+@pytest.fixture(scope="module")
+def long_drive() -> Comparison:
+    study = load_study("lgsvl")
+    system = assemble(study)
+    return compare(study, system, system.characteristics.setting({"maxBrakeTorque": 2500.0, "mass": 2400.0}, "test"))
+
+
+def where(picture: Image.Image, colour: str) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the pixels of a colour, below the words."""
+    pixels = np.asarray(picture.convert("RGB")).astype(int)[PANEL:]
+    wanted = [int(colour[i:i + 2], 16) for i in (1, 3, 5)]
+    return np.nonzero(np.abs(pixels - wanted).max(axis=2) < 26)
+
+
+def test_both_vehicles_are_where_they_were_to_scale(crash: Comparison) -> None:
+    scene = scene_of(crash)
+    picture = next(pictures(scene, scene.length))  # the start: the changed vehicle stands on the original's place
+    scale = WIDTH / scene.view.width
+    rows, columns = where(picture, VEHICLES[0])
+    vut = next(body for body in scene.bodies if body.is_vut)
+    assert columns.max() - columns.min() == pytest.approx(vut.length * scale, abs=4)
+    assert rows.max() - rows.min() == pytest.approx(vut.width * scale, abs=4)
+    end = list(pictures(scene, scene.length))[-1]
+    for row, body in enumerate(one for one in scene.bodies if one.is_vut):
+        _, columns = where(end, VEHICLES[row])
+        assert columns.max() == pytest.approx((body.x[-1] - scene.view.left[-1]) * scale, abs=4)
+
+
+def test_the_scene_ends_where_the_drives_end(crash: Comparison) -> None:
+    scene = scene_of(crash)
+    assert scene.length == crash.film.last.max() + 1
+    changed = [body for body in scene.bodies if body.is_vut][1]
+    assert np.all(changed.x[crash.film.last[1]:] == changed.x[-1])
+    assert [body.name for body in scene.bodies].count("pedestrian") == 1, "both drives meet the same one"
+    assert changed.y[0] == pytest.approx(0)
+    assert changed.heading[0] == pytest.approx(0)
+
+
+def test_a_long_road_is_followed_by_the_camera(long_drive: Comparison) -> None:
+    scene = scene_of(long_drive)
+    assert scene.view.left[-1] > scene.view.left[0] + 20
+    for body in scene.bodies:
+        if body.is_vut:
+            assert np.all(body.x - body.length > scene.view.left - 1e-9)
+            assert np.all(body.x < scene.view.left + scene.view.width)
+
+
+@pytest.mark.parametrize("angle", [37.0, 180.0, 271.0])
+def test_a_road_in_any_direction_looks_the_same(angle: float, crash: Comparison) -> None:
+    turn = np.deg2rad(angle)
+    rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])  # clockwise, as SUMO's headings
+
+    def turned(track):  # type: ignore[no-untyped-def]
+        x, y = rotation @ np.stack([track.x.ravel(), track.y.ravel()]) + [[100.0], [-7.0]]
+        return track._replace(x=x.reshape(track.x.shape), y=y.reshape(track.y.shape), angle=track.angle + angle)
+
+    film = dataclasses.replace(crash.film, tracks={name: turned(track) for name, track in crash.film.tracks.items()})
+    straight, rotated = scene_of(crash), scene_of(dataclasses.replace(crash, film=film))
+    for one, other in zip(straight.bodies, rotated.bodies, strict=True):
+        assert np.allclose(one.x, other.x)
+        assert np.allclose(one.y, other.y)
+        assert np.allclose(np.cos(one.heading - other.heading), 1)
+
+
+def test_gifs_are_small_and_last_as_long_as_the_drive(crash: Comparison, long_drive: Comparison, tmp_path: Path) -> None:
+    for name, comparison in (("crash", crash), ("long", long_drive)):
+        animate(comparison, tmp_path / f"{name}.gif")
+        assert (tmp_path / f"{name}.gif").stat().st_size <= 1_000_000
+        with Image.open(tmp_path / f"{name}.gif") as image:
+            durations = []
+            for frame in range(image.n_frames):
+                image.seek(frame)
+                durations.append(image.info["duration"])
+        seconds = scene_of(comparison).length * comparison.film.drives.trace.step
+        assert sum(durations[:-1]) / 1000 == pytest.approx(seconds, abs=0.3)
+
+
+@pytest.mark.parametrize("kind", ["gif", "html", pytest.param("mp4", marks=pytest.mark.slow)])
+def test_the_same_bytes_twice(kind: str, crash: Comparison, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        animate(crash, tmp_path / f"{name}.{kind}")
+    assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
+    assert (tmp_path / f"a.{kind}").stat().st_size < 1_000_000
+    if kind == "mp4":
+        assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_the_page_holds_every_place_to_the_centimetre(crash: Comparison) -> None:
+    page, scene = animation_page(scene_of(crash)), scene_of(crash)
+    data = json.loads(re.search(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)[1])  # type: ignore[index]
+    assert data["step"] == scene.step
+    vuts = [body for body in data["bodies"] if body["drive"] is not None]
+    for shown, body in zip(vuts, [one for one in scene.bodies if one.is_vut], strict=True):
+        assert np.allclose(shown["x"], body.x, atol=0.0051)
+    assert [drive["end"] for drive in data["drives"]] == crash.film.last.tolist()
+
+
+def test_text_of_a_study_stays_text(crash: Comparison) -> None:
+    page = animation_page(scene_of(dataclasses.replace(crash, title="<script>alert(1)</script></title>")))
+    assert "<script>alert" not in page
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+    assert "http" not in page.replace("http-equiv", ""), "nothing is fetched from elsewhere"
+
+
+def test_without_ffmpeg_a_film_is_refused_before_anything_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "/nowhere")
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(InputError, match="ffmpeg"):
+        check_animation(tmp_path / "it.mp4")

@@ -1,0 +1,131 @@
+"""IGD, IGD+ and hypervolume against closed forms and their definitions; what has no value is refused."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import moocore
+import numpy as np
+import pytest
+from made_up import made_up, row
+
+from safevar_sumo.analysis.research_questions.case import Unanswerable
+from safevar_sumo.analysis.research_questions.indicators import (
+    Scale,
+    convergence,
+    hypervolume,
+    igd,
+    igd_plus,
+    indicators,
+    nondominated,
+    objectives,
+    reference_front,
+)
+from safevar_sumo.errors import InputError
+
+FRONT = np.array([[0.0, 1, 2], [1, 0, 1], [2, 2, 0]])
+
+
+def test_a_front_is_at_no_distance_from_itself() -> None:
+    assert igd(FRONT, FRONT) == 0
+    assert igd_plus(FRONT, FRONT) == 0
+
+
+def test_igd_is_the_mean_distance_to_the_nearest_point() -> None:
+    rng = np.random.default_rng(5)
+    front, reference = rng.normal(size=(7, 3)), rng.normal(size=(11, 3))
+    between = np.linalg.norm(reference[:, None] - front[None], axis=2)
+    assert igd(front, reference) == pytest.approx(between.min(axis=1).mean())
+    worse = np.linalg.norm(np.maximum(front[None] - reference[:, None], 0), axis=2)
+    assert igd_plus(front, reference) == pytest.approx(worse.min(axis=1).mean())
+
+
+def test_igd_plus_does_not_count_what_is_better() -> None:
+    assert igd(FRONT - 1, FRONT) > 0
+    assert igd_plus(FRONT - 1, FRONT) == 0
+    assert igd_plus(FRONT + np.array([0, 0.25, 0]), FRONT) == pytest.approx(0.25)
+
+
+def test_hypervolume_of_boxes() -> None:
+    assert hypervolume(np.zeros((1, 3))) == pytest.approx(1.1**3)
+    assert hypervolume(np.array([[0.0, 1], [1, 0]])) == pytest.approx(2 * 1.1 * 0.1 - 0.1**2)
+    assert hypervolume(np.full((1, 3), 1.2)) == 0
+
+
+@pytest.mark.parametrize("indicator", [lambda front: igd(front, FRONT), lambda front: igd_plus(front, FRONT), hypervolume, nondominated,
+                                       lambda front: igd(FRONT, front)])
+@pytest.mark.parametrize("front", [np.zeros((0, 3)), np.array([[math.nan, 0, 0]]), np.array([[math.inf, 0, 0]])])
+def test_no_indicator_of_an_empty_or_undefined_front(indicator: Any, front: np.ndarray) -> None:
+    with pytest.raises(InputError, match=r"empty|undefined"):
+        indicator(front)
+
+
+def test_nondominated_points_are_those_that_none_dominates() -> None:
+    points = np.random.default_rng(7).integers(0, 5, size=(60, 3)).astype(float)
+    kept = {tuple(one) for one in points if not any((other <= one).all() and (other < one).any() for other in points)}
+    found = nondominated(points)
+    assert {tuple(one) for one in found} == kept
+    assert len(found) == len(kept)
+
+
+def test_scale_maps_ideal_to_0_and_nadir_to_1() -> None:
+    scale = Scale.of(FRONT)
+    assert scale.normalised(FRONT).min() == 0
+    assert scale.normalised(FRONT).max() == 1
+    flat = Scale.of(np.array([[1.0, 5, 3], [2, 4, 3]]))
+    assert np.isfinite(flat.normalised(np.array([[1.0, 5, 7]]))).all()
+
+
+def test_the_reference_front_is_of_all_runs_of_all_algorithms() -> None:
+    case = made_up(row(sd=1, f_diff=0.5), row("rs", sd=0.5, f_diff=0.7), row("rs", run=1, sd=1, f_diff=0.6))
+    assert sorted(reference_front(case).tolist()) == [[0.5, 0.7, 0], [1, 0.5, 0]]
+
+
+def test_indicators_are_those_of_each_runs_own_front() -> None:
+    case = made_up(row(sd=1, f_diff=0.5), row("rs", sd=0.5, f_diff=0.7), row("rs", run=1, sd=1, f_diff=0.6))
+    found = indicators(case).set_index(["algorithm", "run"])
+    apart = math.hypot(0.5, 0.2)
+    assert found.loc[("nsga2", 0), "igd"] == pytest.approx(apart / 2)
+    assert found.loc[("rs", 1), "igd"] == pytest.approx((0.1 + math.hypot(0.5, 0.1)) / 2)
+    assert found.loc[("nsga2", 0), "igd_plus"] == pytest.approx(0.5), "normalised: a whole width of f_safe away from one of two"
+    assert found.loc[("rs", 0), "hypervolume"] == pytest.approx(1.1 * 0.1 * 1.1)
+
+
+def test_a_finished_run_without_solutions_has_no_indicators() -> None:
+    case = made_up(row(), finished=[("nsga2", 0), ("nsga2", 1)])
+    assert indicators(case)["run"].tolist() == [0]
+
+
+def test_imported_solutions_have_no_indicators() -> None:
+    with pytest.raises(Unanswerable, match="imported"):
+        indicators(made_up(row(), has_runs=False))
+
+
+def test_a_solution_without_safety_degree_is_on_no_front() -> None:
+    case = made_up(row(sd=math.nan), row(sd=1.5))
+    assert objectives(case, case.solutions).tolist() == [[1.5, 0, 0]]
+
+
+def test_convergence_grows_to_the_hypervolume_of_all() -> None:
+    rng = np.random.default_rng(1)
+    evaluations = [{**row("nsga2", run, sd=sd, f_diff=diff), "evaluation": i}
+                   for run in (0, 1) for i, (sd, diff) in enumerate(rng.uniform(0.1, 1, size=(100 if run else 40, 2)))]
+    case = made_up(row(sd=0.1, f_diff=1), row(run=1, sd=1, f_diff=0.1), evaluations=evaluations)
+    grown = convergence(case)
+    assert set(grown["evaluations"]) >= {10, 100}
+    for run, of_it in grown.groupby("run"):
+        assert (np.diff(of_it["hypervolume"]) >= 0).all()
+        seen = case.evaluations[case.evaluations["run"] == run]
+        normal = Scale.of(reference_front(case)).normalised(objectives(case, seen))
+        assert of_it["hypervolume"].iloc[-1] == pytest.approx(moocore.hypervolume(normal, ref=[1.1] * 3))
+    early = grown[grown["run"] == 0]
+    assert early.loc[early["evaluations"] >= 40, "hypervolume"].nunique() == 1, "a run that ended early keeps what it had"
+
+
+def test_nothing_is_counted_before_it_is_evaluated() -> None:
+    evaluations = [{**row(sd=1, f_diff=0.5), "evaluation": 0}, {**row(sd=0.5, f_diff=0.2), "evaluation": 50}]
+    grown = convergence(made_up(row(sd=0.5, f_diff=0.2), row(sd=0.4, f_diff=0.9), evaluations=evaluations)).set_index("evaluations")
+    before, after = grown[grown.index <= 50]["hypervolume"], grown[grown.index > 50]["hypervolume"]
+    assert before.nunique() == 1
+    assert (after > before.max()).all()

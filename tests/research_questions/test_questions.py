@@ -1,0 +1,287 @@
+"""RQ1, RQ2, RQ3 and the discussion on made-up solutions with values that one can count by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import msgspec
+import pandas as pd
+import pytest
+import scipy
+from made_up import CHARACTERISTICS, ORIGINAL, UNCHANGED, made_up, made_up_study, row
+
+from safevar_sumo.analysis.research_questions.answer import answer
+from safevar_sumo.analysis.research_questions.brief import brief
+from safevar_sumo.analysis.research_questions.case import Unanswerable
+from safevar_sumo.analysis.research_questions.changes import critical, rq31, rq32, rq33, rq33_safety
+from safevar_sumo.analysis.research_questions.comparisons import ALPHA, rq1, rq2
+from safevar_sumo.analysis.research_questions.discussion import collisions, combinations, effects, weather, weather_pairs
+from safevar_sumo.analysis.research_questions.over_runs import difference_line, holm, rq1_runs, rq2_runs
+from safevar_sumo.errors import InputError
+from safevar_sumo.study import CharacteristicTable
+
+HEAVY, GRIPLESS, BOTH = (1100.0, 2.0, 0.1), (1000.0, 1.0, 0.1), (1200.0, 1.5, 0.1)
+
+
+def only(frame: pd.DataFrame, **wanted: Any) -> dict[str, Any]:
+    """The one row with these values."""
+    found = frame[(frame[list(wanted)] == pd.Series(wanted)).all(axis=1)]
+    assert len(found) == 1
+    return dict(found.iloc[0])
+
+
+def test_rq1_is_small_where_solutions_are_more_unsafe() -> None:
+    case = made_up(*(row(sd=1 + i / 10, tet=2, tit=1, ave_dece=3) for i in range(5)))
+    frame = rq1(case)
+    assert frame["metric"].tolist() == ["safety_degree", "tet", "tit", "ave_dece"]
+    assert frame["effect_size"].tolist() == [0, 0, 0, 0]
+    assert set(frame["magnitude"]) == {"large"}
+    assert (frame["n1"] == 5).all()
+    assert (frame["n2"] == 5).all()
+    safer = rq1(made_up(*(row(sd=3, tet=0.5, tit=0.1, ave_dece=7) for _ in range(5))))
+    assert safer["effect_size"].tolist() == [1, 1, 1, 1]
+
+
+def test_rq1_counts_ties_by_half() -> None:
+    frame = rq1(made_up(row(sd=1), row(sd=2), row(sd=2), row(sd=3)))
+    assert only(frame, metric="safety_degree")["effect_size"] == 0.5
+    assert only(frame, metric="safety_degree")["mean"] == 2
+
+
+def test_tet_and_tit_do_not_count_collisions_and_the_others_do() -> None:
+    frame = rq1(made_up(row(sd=-3, ave_dece=2), row(sd=1, tet=1.4, tit=0.7, ave_dece=4)))
+    assert frame["n1"].tolist() == [2, 1, 1, 2]
+    assert frame["mean"].tolist() == [-1, 1.4, 0.7, 3]
+
+
+def test_a_tet_that_stands_at_a_collision_is_not_counted() -> None:
+    case = made_up({**row(sd=-3), "tet": 0.0, "tit": 0.0}, row(sd=1, tet=1.4, tit=0.7), {**row("rs", sd=-3), "tet": 9.0, "tit": 9.0},
+                      row("rs", sd=1, tet=1.3, tit=0.6))
+    assert only(rq1(case), algorithm="nsga2", metric="tet")["mean"] == 1.4
+    assert only(rq2(case), metric="tet")["effect_size"] == 1
+    assert only(rq33_safety(case), quantity="TIT", j="any")["value"] == pytest.approx(0.2)
+
+
+def test_rq1_of_collisions_alone_has_no_tet() -> None:
+    frame = rq1(made_up(row(sd=-1), row(sd=-2)))
+    assert only(frame, metric="tet")["p_value"] is None
+    assert only(frame, metric="tet")["n1"] == 0
+
+
+def test_rq1_says_which_values_are_undefined() -> None:
+    told = answer([made_up(row(tet=None), row(sd=-1), row(), original={**ORIGINAL, "tit": None})], "rq1")[0]
+    assert only(told.frame, metric="tet")["n1"] == 1
+    assert only(told.frame, metric="tit")["p_value"] is None
+    assert any("tet is undefined in 1 of 2 solutions" in note for note in told.notes)
+    assert any("the original vehicle's tit is undefined" in note for note in told.notes)
+
+
+def test_rq2_is_high_where_nsga2_is_better() -> None:
+    rows = [*(row(run=run, sd=0.5 - run / 10, tet=2, tit=1, ave_dece=3, f_diff=0.1) for run in (0, 1, 2)),
+            *(row("rs", run=run, sd=1.5 + run / 10, f_diff=0.6) for run in (0, 1, 2))]
+    frame = rq2(made_up(*rows))
+    assert frame["metric"].tolist() == ["igd", "igd_plus", "hypervolume", "safety_degree", "tet", "tit", "ave_dece"]
+    assert frame["effect_size"].tolist() == [1] * 7
+    assert set(frame["baseline"]) == {"rs"}
+    exchanged = [{**one, "algorithm": {"rs": "nsga2", "nsga2": "rs"}[one["algorithm"]]} for one in rows]
+    assert rq2(made_up(*exchanged))["effect_size"].tolist() == [0] * 7
+
+
+def test_rq2_compares_runs_by_front_and_pooled_solutions_by_metric() -> None:
+    frame = rq2(made_up(row(), row(), row(run=1), row("rs"), row("rs", run=1), row("rs", run=1), row("rs", run=1)))
+    assert (only(frame, metric="igd")["n1"], only(frame, metric="igd")["n2"]) == (2, 2)
+    assert (only(frame, metric="tet")["n1"], only(frame, metric="tet")["n2"]) == (3, 4)
+
+
+def test_rq2_of_imported_solutions_leaves_the_fronts_open() -> None:
+    told = answer([made_up(row(sd=1), row("rs", sd=2), has_runs=False)], "rq2")[0]
+    assert only(told.frame, metric="igd")["p_value"] is None
+    assert only(told.frame, metric="igd")["n1"] == 0
+    assert only(told.frame, metric="safety_degree")["effect_size"] == 1
+    assert any("need runs" in note for note in told.notes)
+
+
+@pytest.mark.parametrize(("rows", "told"), [([row("rs")], "no finished run of nsga2"), ([row()], "nsga2 alone"), ([], "no finished run")])
+def test_rq2_without_an_algorithm_is_refused(rows: list[dict[str, Any]], told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        answer([made_up(*rows)], "rq2")
+
+
+def test_a_finished_run_that_found_nothing_is_told_of() -> None:
+    told = answer([made_up(row(), row("rs"), finished=[("nsga2", 0), ("nsga2", 1), ("rs", 0)])], "rq2")[0]
+    assert only(told.frame, metric="igd")["n1"] == 1
+    assert any("1 finished runs found no solution" in note for note in told.notes)
+
+
+def test_critical_solutions_are_strictly_below_the_original() -> None:
+    case = made_up(row(sd=2.0), row(sd=1.999), row(sd=-1), row("rs", sd=1), row(sd=math.nan))
+    assert critical(case)["safety_degree"].tolist() == [1.999, -1]
+    with pytest.raises(Unanswerable, match="safety degree"):
+        critical(made_up(row(), original={}))
+
+
+def test_rq31_counts_runs_without_any() -> None:
+    case = made_up(row(values=HEAVY), row(values=GRIPLESS), row(values=BOTH), finished=[("nsga2", 0), ("nsga2", 1)])
+    counts = {(one.run, one.j): one.count_ for one in rq31(case).rename(columns={"count": "count_"}).itertuples()}
+    assert counts == {(0, "1"): 2, (0, "2"): 1, (0, "3"): 0, (1, "1"): 0, (1, "2"): 0, (1, "3"): 0}
+
+
+def test_rq31_needs_runs() -> None:
+    with pytest.raises(InputError, match="imported"):
+        answer([made_up(row(), has_runs=False)], "rq3.1")
+
+
+def test_rq32_shares_and_ranks() -> None:
+    frame = rq32(made_up(row(values=HEAVY), row(values=GRIPLESS), row(values=BOTH), row(values=HEAVY)))
+    assert only(frame, characteristic="mass", j="1")["percent"] == pytest.approx(200 / 3)
+    assert only(frame, characteristic="mass", j="2")["percent"] == 100
+    assert only(frame, characteristic="mass", j="any")["percent"] == 75
+    assert only(frame, characteristic="lag", j="any")["percent"] == 0
+    assert only(frame, characteristic="mass", j="3")["percent"] is None
+    assert frame[frame["j"] == "any"]["rank"].tolist() == [1, 2, 3]
+
+
+def test_ties_share_the_better_rank_and_the_next_is_skipped() -> None:
+    frame = rq32(made_up(row(values=BOTH), row(values=BOTH), row(values=(1000, 2, 0.2))))
+    assert frame[frame["j"] == "any"]["rank"].tolist() == [1, 1, 3]
+
+
+def test_rq3_without_critical_solutions_is_empty_not_zero() -> None:
+    case = made_up(row(sd=5, values=HEAVY))
+    assert rq32(case)["percent"].isna().all()
+    assert rq32(case)["rank"].isna().all()
+    assert (rq33(case)["n"] == 0).all()
+    assert rq33_safety(case)["value"].isna().all()
+    assert rq31(case)["count"].sum() == 0
+
+
+def test_rq33_tells_increases_from_decreases() -> None:
+    frame = rq33(made_up(row(values=HEAVY), row(values=(1300, 2, 0.1)), row(values=(900, 2, 0.1)), row(values=BOTH)))
+    up = only(frame, characteristic="mass", direction="increase", j="1")
+    assert (up["pc"], up["delta"], up["n"]) == (pytest.approx(0.2), 200, 2)
+    down = only(frame, characteristic="mass", direction="decrease", j="any")
+    assert (down["pc"], down["delta"], down["n"]) == (pytest.approx(0.1), -100, 1)
+    assert only(frame, characteristic="mass", direction="increase", j="any")["delta"] == 200
+    assert only(frame, characteristic="grip", direction="decrease", j="2")["pc"] == 0.25
+    assert only(frame, characteristic="lag", direction="increase", j="any")["pc"] is None
+
+
+def test_the_footer_of_rq33() -> None:
+    frame = rq33_safety(made_up(row(values=HEAVY, sd=1.5, tet=1.5, tit=0.6, ave_dece=5),
+                                row(values=HEAVY, sd=0.5, tet=2, tit=1, ave_dece=4),
+                                row(values=HEAVY, sd=-3, ave_dece=3)))
+    expected = {"avgSD_mD": (1, 50, 2), "avgSD_cS": (3, None, 1), "TET": (0.75, 75, 2), "TIT": (0.3, 60, 2), "aveDece": (2, 100 / 3, 3)}
+    for quantity, (value, percent, n) in expected.items():
+        told = only(frame, quantity=quantity, j="1")
+        assert (told["value"], told["n"]) == (pytest.approx(value), n)
+        assert told["percent"] == (None if percent is None else pytest.approx(percent))
+    assert only(frame, quantity="avgSD_cS", j="2")["value"] is None
+
+
+def test_collisions_and_their_share() -> None:
+    frame = collisions(made_up(row(sd=-1), row(sd=0), row(sd=1), row("rs")))
+    assert only(frame, algorithm="nsga2") == {"setting": "made-up", "algorithm": "nsga2", "solutions": 3, "collisions": 2,
+                                              "share": pytest.approx(2 / 3)}
+    assert only(frame, algorithm="rs")["share"] == 0
+
+
+def test_combinations_of_exactly_four() -> None:
+    tables = {name: CharacteristicTable(unit="-", original=1, lower=0.5, upper=2) for name in "abcdef"}
+    study = made_up_study()
+    study = msgspec.structs.replace(study, vehicle=msgspec.structs.replace(study.vehicle, characteristics=tables))
+
+    def changed(names: str) -> dict[str, Any]:
+        return {**{name: one for name, one in row().items() if name not in CHARACTERISTICS},
+                **{name: 2.0 if name in names else 1.0 for name in tables}}
+
+    case = made_up(study=study, finished=[("nsga2", 0)])
+    solutions = pd.DataFrame([changed(names) for names in ("abcd", "bcde", "abcd", "cdef", "abcf", "abcde", "abc")])
+    found = combinations(dataclasses.replace(case, solutions=solutions))
+    assert found["characteristics"].tolist() == [list("abcd"), list("abcf"), list("bcde")]
+    assert found["percent"].tolist() == [40, 20, 20]
+    assert found["rank"].tolist() == [1, 2, 2]
+
+
+def test_without_four_changed_there_is_no_combination() -> None:
+    told = answer([made_up(row(values=BOTH))], "combinations")[0]
+    assert told.frame.empty
+    assert any("no critical solution has exactly four" in note for note in told.notes)
+
+
+def test_weather_compares_settings_that_differ_in_it_alone() -> None:
+    clear = made_up(row(values=HEAVY), row(values=GRIPLESS))
+    wet = made_up(row(values=BOTH), study=made_up_study(name="wet", weather="hard_rain"))
+    other = made_up(row(values=BOTH), study=made_up_study(name="other", weather="hard_rain", metrics=made_up_study().metrics.__class__(
+        ttc_threshold=9)))
+    assert [(one.name, two.name) for one, two in weather_pairs([wet, other, clear])] == [("made-up", "wet")]
+    told = only(weather(clear, wet), characteristic="mass")
+    assert (told["percent"], told["percent_other"], told["difference"]) == (50, 100, 50)
+    assert (told["increase"], told["increase_other"], told["decrease"]) == (100, 200, None)
+    assert (told["rank"], told["rank_other"]) == (1, 1)
+    with pytest.raises(InputError, match="differ in the weather alone"):
+        answer([clear, other], "weather")
+
+
+def test_effects_are_all_changes_of_all_critical_solutions() -> None:
+    frame = effects(made_up(row(values=BOTH), row(values=HEAVY), row(values=GRIPLESS, sd=9), row(values=UNCHANGED)))
+    assert sorted(zip(frame["characteristic"], frame["change"], strict=True)) == [("grip", -0.5), ("mass", 100), ("mass", 200)]
+
+
+def test_every_question_at_once_tells_what_is_lacking() -> None:
+    told = {one.name: one for one in answer([made_up(row(values=HEAVY))])}
+    assert not told["rq1"].frame.empty
+    assert told["rq2"].frame.empty
+    assert "nsga2 alone" in told["rq2"].notes[0]
+    assert told["weather"].frame.empty
+    with pytest.raises(InputError, match="no finished run"):
+        answer([made_up()])
+    with pytest.raises(InputError, match="rq9"):
+        answer([made_up(row())], "rq9")
+
+
+def test_several_settings_stand_in_one_frame_and_the_refused_in_the_notes() -> None:
+    good = made_up(row(), row("rs"))
+    alone = made_up(row(), study=made_up_study(name="alone"))
+    told = answer([good, alone], "rq2")[0]
+    assert set(told.frame["setting"]) == {"made-up"}
+    assert any(note.startswith("alone: ") for note in told.notes)
+
+
+def test_unfinished_campaigns_say_so() -> None:
+    case = made_up(row(), row("rs"), row("rs", run=1))
+    assert any("unfinished, nsga2 1 of 2 runs" in note for note in answer([case], "rq1")[0].notes)
+    finished = made_up(row(), row(run=1), row("rs"), row("rs", run=1))
+    assert not finished.remarks
+
+
+def test_the_brief_lines_say_what_the_data_allows() -> None:
+    five = made_up(*(row(name, run=run, sd=sd + run / 10) for name, sd in (("nsga2", 1.0), ("rs", 2.5)) for run in range(5)))
+    lines = brief(five)
+    assert any("NSGA-II: SD 0.00, " in line and line.endswith("too few runs for a test (8 are needed)") for line in lines)
+    assert any("RS: IGD " in line and "too few" not in line for line in lines), "five runs against five can differ significantly"
+    assert any("RQ2: has finished runs of nsga2 alone" in line for line in brief(made_up(row())))
+
+
+def test_holms_correction_of_a_worked_example() -> None:
+    corrected = holm([0.01, None, 0.04, 0.03, 0.005])
+    assert [p and round(p, 12) for p in corrected] == [0.03, None, 0.06, 0.06, 0.02]
+
+
+def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
+    """Runs of 40 copies each: pooled, rank tests see 320 against 320 values; over runs they see the 8 against 8 that there are."""
+    ours, theirs = [1.0, 1.1, 1.2, 1.3, 1.4, 1.6, 1.7, 2.2], [1.5, 1.8, 1.9, 2.3, 2.4, 2.5, 2.6, 2.7]
+    rows = [row(name, run=run, sd=sd, values=(1100.0 + run, 2.0, 0.1))
+            for name, degrees in (("nsga2", ours), ("rs", theirs)) for run, sd in enumerate(degrees) for _ in range(40)]
+    case = made_up(*rows)
+    (paper,), (runs,) = (frame[frame["metric"] == "safety_degree"].to_dict("records") for frame in (rq2(case), rq2_runs(case)))
+    assert paper["p_value"] < 1e-30
+    assert (runs["n1"], runs["n2"]) == (8, 8)
+    assert runs["effect_size"] == 1 - (0 + 0 + 0 + 0 + 0 + 1 + 1 + 3) / 64
+    assert runs["p_value"] == scipy.stats.mannwhitneyu(ours, theirs, method="exact").pvalue > ALPHA / 10
+    assert "RQ2 RS SD loses its star" in difference_line(case)
+    (original,) = (one for one in rq1_runs(case).to_dict("records") if (one["algorithm"], one["metric"]) == ("nsga2", "safety_degree"))
+    assert original["p_value"] == 2 * 2 / 2**8, "signed ranks of which all but the smallest are negative: the second of 2^8 orders"
+    assert original["effect_size"] == 1 / 8
+    assert original["p_holm"] >= original["p_value"] * 2

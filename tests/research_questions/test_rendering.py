@@ -1,0 +1,192 @@
+"""Answers rendered: the same numbers in every format, LaTeX that compiles, names with any characters."""
+
+from __future__ import annotations
+
+import csv as csv_files
+import io
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pandas as pd
+import pytest
+from latex_syntax import mistakes
+from made_up import made_up, made_up_study, row
+
+from safevar_sumo.analysis.research_questions.answer import Answer, answer
+from safevar_sumo.analysis.research_questions.case import Case
+from safevar_sumo.analysis.research_questions.layout import LAYOUTS, Layouts
+from safevar_sumo.analysis.research_questions.paper import PAPER
+from safevar_sumo.analysis.research_questions.tables import FORMATS, as_json, csv, escaped, latex, markdown, text
+from safevar_sumo.study import CharacteristicTable
+
+NASTY = ['a&b',
+         "50%_of $x$", "#1 {brace}", r"back\slash", "~tilde^2", "[option]", "*star", "<less|more>", "quo\"te'`", "ä µ ° ² Δ 車", "--"]
+
+
+def rich_setting(**changes: Any) -> Case:
+    """Two algorithms, two runs, changes of one to three characteristics, a collision."""
+    values = [(1000 + 50 * i, 2 - 0.1 * (i % 3), 0.1 if i % 2 else 0.2) for i in range(8)]
+    rows = [row(algorithm, run, values=value, sd=1 - 0.3 * i + 0.1 * run + (0.5 if algorithm == "rs" else 0), tet=1 + i / 10)
+            for algorithm in ("nsga2", "rs") for run in (0, 1) for i, value in enumerate(values)]
+    return made_up(*rows, study=made_up_study(**changes) if changes else None)
+
+
+def nasty_setting() -> Case:
+    study = made_up_study()
+    tables = {name: CharacteristicTable(unit=name, original=1, lower=0.5, upper=2) for name in NASTY}
+    study = msgspec.structs.replace(study, vehicle=msgspec.structs.replace(study.vehicle, characteristics=tables))
+    case = made_up(row(), row("rs"), study=study)
+    changed = {name: 1.5 if i < 4 else 1.0 for i, name in enumerate(NASTY)}
+    solutions = case.solutions.drop(columns=["mass", "grip", "lag"]).assign(**changed)
+    object.__setattr__(case, "solutions", solutions)
+    object.__setattr__(case, "name", "_".join(NASTY))
+    return case
+
+
+@pytest.fixture(params=["one", "two", "nasty"])
+def cases(request: pytest.FixtureRequest) -> list[Case]:
+    return {"one": [rich_setting()], "two": [rich_setting(), rich_setting(name="wet", weather="hard_rain")], "nasty": [nasty_setting()]}[
+        request.param]
+
+
+DOCUMENT = r"""\documentclass{article}
+\usepackage[T1]{fontenc}
+\usepackage[utf8]{inputenc}
+\usepackage{textcomp}
+\usepackage{booktabs}
+\usepackage{graphicx}
+\begin{document}
+%s
+\end{document}
+"""
+
+
+@pytest.mark.parametrize("layouts", [LAYOUTS, PAPER])
+def test_latex_has_no_mistakes(cases: list[Case], layouts: Layouts) -> None:
+    document = latex(answer(cases), layouts)
+    labels = re.findall(r"\\label\{(.*?)\}", document)
+    assert len(set(labels)) == len(labels) == document.count(r"\caption")
+    assert {"tab:rq1", "tab:rq2", "tab:rq3.1"} <= set(labels)
+    assert r"\documentclass" not in document
+    assert mistakes(document) == []
+    assert document.count(r"\toprule") == document.count(r"\bottomrule") > 5
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX here, as there is in CI")
+def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
+    document = DOCUMENT % (latex(answer(cases)) + latex(answer(cases), PAPER).replace("tab:", "tab:paper-"))
+    (tmp_path / "tables.tex").write_text(document, encoding="utf-8")
+    done = subprocess.run(["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "tables.tex"], cwd=tmp_path, capture_output=True,
+                          text=True, errors="replace", check=False)
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert (tmp_path / "tables.pdf").stat().st_size > 1000
+
+
+def test_the_syntax_check_finds_mistakes() -> None:
+    good = latex(answer([rich_setting()]))
+    for spoilt in (good.replace(r"\end{tabular}", "", 1), good.replace("&", "", 1), good.replace("{", "", 1),
+                   good.replace("RQ1", "RQ_1", 1), good.replace("NSGA-II", "Δ", 1), good.replace("\nNSGA-II", "\n[NSGA-II", 1)):
+        assert mistakes(spoilt)
+
+
+@pytest.mark.parametrize(("plain", "latex_form"), [
+    ("a_b", r"a\_b"), ("50 %", r"50 \%"), ("m/s^2", r"m/s\textsuperscript{2}"), ("^", r"\textasciicircum{}"), ("[x]", "{[}x{]}"),
+    ("-0.5", r"\textminus{}0.5"), ("2-3", "2-3"), ("(-1)", r"(\textminus{}1)"), ("s^-1", r"s\textsuperscript{\textminus{}1}"),
+    ("NSGA-2", "NSGA-2"), ("v''", r"v\textquotesingle{}\textquotesingle{}"), ("two\nlines", "two lines"),
+    ("é", "é"), ("Δ", "U+0394"), ("--", "-{}-"),
+    ("\\", r"\textbackslash{}")])
+def test_special_characters_are_escaped(plain: str, latex_form: str) -> None:
+    assert escaped(plain) == latex_form
+
+
+def test_markdown_rows_are_as_wide_as_their_heads(cases: list[Case]) -> None:
+    for block in markdown(answer(cases)).split("\n\n"):
+        lines = [line.replace(r"\|", "") for line in block.splitlines() if line.startswith("|")]
+        assert len({line.count("|") for line in lines}) <= 1
+
+
+def test_text_columns_stand_under_their_heads(cases: list[Case]) -> None:
+    printed = text(answer(cases))
+    assert "nan" not in printed.lower().replace("magnan", "")
+    blocks = printed.split("\n\n")
+    ruled = [block.splitlines() for block in blocks if any(set(line) == {"-"} for line in block.splitlines())]
+    assert len(ruled) > 5
+    for lines in ruled:
+        rule = next(i for i, line in enumerate(lines) if set(line) == {"-"} and len(line) > 1)
+        assert max(len(line) for line in lines[rule - 1:]) <= len(lines[rule]) + 1
+
+
+def test_json_is_one_list_of_plain_records(cases: list[Case]) -> None:
+    for question in ("rq1", "rq2", "rq3.1", "rq3.2", "rq3.3", "collisions"):
+        records = json.loads(as_json(answer(cases, question)[:1]))
+        assert isinstance(records, list)
+        assert all(isinstance(one["setting"], str) for one in records)
+
+
+@pytest.mark.parametrize(("question", "keys"), [
+    ("rq1", {"setting", "algorithm", "metric", "p_value", "effect_size", "magnitude", "n1", "n2"}),
+    ("rq2", {"setting", "baseline", "metric", "p_value", "effect_size", "magnitude", "n1", "n2"}),
+    ("rq3.2", {"setting", "characteristic", "j", "percent"}),
+    ("rq3.3", {"setting", "characteristic", "direction", "j", "pc", "delta", "n"}),
+    ("collisions", {"setting", "algorithm", "solutions", "collisions", "share"})])
+def test_json_records_have_the_promised_keys(question: str, keys: set[str]) -> None:
+    records = json.loads(as_json(answer([rich_setting()], question)[:1]))
+    extra = {"rq1": {"method", "mean", "original"}, "rq2": {"method"}}.get(question, set())
+    for one in records:
+        assert set(one) == keys | extra | ({"rank"} if one.get("j") == "any" and question == "rq3.2" else set())
+        assert all(isinstance(one[name], int) for name in ("n1", "n2", "n", "rank", "solutions", "collisions") if name in one)
+
+
+def test_several_tables_in_one_json_tell_which_they_are() -> None:
+    records = json.loads(as_json(answer([rich_setting()])))
+    assert {one["table"] for one in records} == {
+        "rq1", "rq2", "rq1-runs", "rq2-runs", "rq3.1", "rq3.2", "rq3.3", "rq3.3-safety", "collisions"}
+
+
+def test_csv_holds_the_numbers_of_the_json() -> None:
+    told = answer([rich_setting()], "rq1")
+    rows = list(csv_files.DictReader(io.StringIO(csv(told))))
+    for row_, one in zip(rows, json.loads(as_json(told)), strict=True):
+        assert row_["metric"] == one["metric"]
+        assert float(row_["effect_size"]) == one["effect_size"]
+
+
+def test_significant_and_notable_cells_stand_out() -> None:
+    cases = [made_up(*(row(sd=1 - i / 100) for i in range(30)))]
+    told = answer(cases, "rq1")
+    assert "<0.001*  0.000*" in text(told)
+    assert r"\textbf{\textless{}0.001} & \textbf{0.000}" in latex(told)
+    assert r"**\<0.001** | **0.000**" in markdown(told)
+    even = text(answer([made_up(row(sd=1), row(sd=3))], "rq1")).splitlines()
+    assert next(line for line in even if " SD " in line).count("*") == 0
+
+
+@pytest.mark.parametrize("kind", list(FORMATS))
+def test_what_cannot_be_told_is_never_a_nan(kind: str) -> None:
+    cases = [made_up(row(sd=-1), row("rs", tet=None, ave_dece=None), original={"safety_degree": 0.5})]
+    assert "nan" not in FORMATS[kind](answer(cases)).lower()
+
+
+def test_the_papers_layout_has_cases_by_metrics_and_cells_of_p_and_a12() -> None:
+    cases = [made_up(*(row(sd=1 - i / 100) for i in range(30))), rich_setting(name="wet", weather="hard_rain")]
+    told = text(answer(cases, "rq1"), PAPER)
+    head = next(line for line in told.splitlines() if line.startswith("case"))
+    assert head.split() == ["case", "algorithm", "SD", "TET", "TIT", "aveDece"]
+    assert "<0.001 / 0.000*" in told
+    for one in answer(cases, "rq1")[0].frame.to_dict("records"):
+        if one["p_value"] is not None and one["p_value"] >= 0.001:
+            assert f"{one['p_value']:.3f} / {one['effect_size']:.3f}" in told
+
+
+def test_the_papers_layout_marks_what_is_part_of_a_combination() -> None:
+    frame = pd.DataFrame({"setting": ["sun", "sun", "rain"], "rank": [1, 2, 1], "characteristics": [["a", "b"], ["b", "c"], ["c", "a"]],
+                          "percent": [50.0, 25.0, 100.0]})
+    (table,) = PAPER["combinations"](Answer("combinations", frame, ()))
+    assert table.heads == ("characteristic", "#1", "#2", "#1")
+    assert table.spans == (("sun", 2), ("rain", 1))
+    assert table.rows == [("a", "x", "", "x"), ("b", "x", "x", ""), ("c", "", "x", "x"), ("% of solutions", "50.0", "25.0", "100.0")]

@@ -1,0 +1,254 @@
+"""A user's own network is the one that is simulated: its recipe, types, traffic lights, or a `.net.xml` alone; else it is refused."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sumo
+from msgspec import structs
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo import matrix
+from safevar_sumo.sumo.matrix import evaluate, simulate
+from safevar_sumo.sumo.network import built_network, check_network, copied_network, lanes_of, network_fingerprint
+from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.traffic import repeatable_traffic
+
+NETCONVERT = str(Path(sumo.SUMO_HOME) / "bin" / "netconvert")
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    """A user's copy of a network with a crossing."""
+    shutil.copytree(NETWORKS / "pedestrian_crossing", tmp_path / "mine")
+    return tmp_path / "mine"
+
+
+def rewritten(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
+def on(study: str, network: Path) -> System:
+    return assemble(load_study(study, scenario={"parameters": {"network": str(network)}}))
+
+
+def roads(network: Path, n: int = 1) -> ElementTree.Element:
+    return ElementTree.parse(copied_network(str(network), n).network).getroot()
+
+
+def test_results_of_the_networks_name_do_not_hide_it(mine: Path) -> None:
+    (mine.parent / "results" / "mine").mkdir(parents=True)
+    study = load_study("sun", scenario={"parameters": {"network": "mine"}})
+    places = (str(mine.parent / "results"), str(mine.parent))
+    system = assemble(structs.replace(study, origin=structs.replace(study.origin, places=places)))
+    assert system.scenario.network == str(mine)
+
+
+def test_edge_types_of_a_file_of_their_own_count(mine: Path) -> None:
+    before = network_fingerprint(str(mine))
+    (mine / "network.typ.xml").write_text('<types><type id="slow" speed="7" numLanes="1" width="3" disallow="pedestrian"/></types>')
+    with pytest.raises(InputError, match=r"network\.typ\.xml: is not used: network\.netccfg does not name it"):
+        check_network(str(mine))
+    rewritten(mine / "network.netccfg", "</input>", '<type-files value="network.typ.xml"/></input>')
+    rewritten(mine / "network.edg.xml", 'id="departure" from="crossing" to="east" numLanes="1" width="4" speed="70" disallow="pedestrian"',
+              'id="departure" from="crossing" to="east" type="slow"')
+    check_network(str(mine))
+    lane = roads(mine).find(".//lane[@id='0.departure_0']")
+    assert lane is not None
+    assert [float(lane.attrib[name]) for name in ("speed", "width")] == [7, 3]
+    assert network_fingerprint(str(mine)) != before
+    first = copied_network(str(mine), 1).network
+    rewritten(mine / "network.typ.xml", 'speed="7"', 'speed="8"')
+    assert copied_network(str(mine), 1).network != first
+
+
+def test_traffic_lights_are_copied_with_their_programmes(mine: Path) -> None:
+    rewritten(mine / "network.nod.xml", 'type="priority"', 'type="traffic_light"')
+    subprocess.run([NETCONVERT, "-n", "network.nod.xml", "-e", "network.edg.xml", "-x", "network.con.xml", "--tls.cycle.time", "77",
+                    "--plain-output-prefix", "network"], cwd=mine, check=True, capture_output=True)
+    rewritten(mine / "network.tll.xml", "duration=", 'name="my own" duration=')
+    check_network(str(mine))
+    copies = roads(mine, 2)
+    lights = copies.findall("tlLogic")
+    assert [light.attrib["id"] for light in lights] == ["0.crossing", "1.crossing"]
+    assert all(phase.attrib["name"] == "my own" for light in lights for phase in light.iter("phase"))
+    controlled = [one for one in copies.findall("connection") if "tl" in one.attrib]
+    assert controlled
+    assert all(one.attrib["tl"].partition(".")[0] == one.attrib["from"].removeprefix(":").partition(".")[0] for one in controlled)
+    assert repeatable_traffic(str(mine)) is None, "a world with traffic lights is loaded afresh"
+
+
+def test_options_of_the_recipe_count(mine: Path) -> None:
+    first = copied_network(str(mine), 1).network
+    rewritten(mine / "network.netccfg", "</configuration>", '<junctions><junctions.corner-detail value="3"/></junctions></configuration>')
+    assert ElementTree.parse(copied_network(str(mine), 1).network).getroot().attrib["junctionCornerDetail"] == "3"
+    assert copied_network(str(mine), 1).network != first
+
+
+@pytest.mark.parametrize(("line", "told"), [
+    ('<plain-output-prefix value="/tmp/x"/>', "sets netconvert's option 'plain-output-prefix'"), ('<log value="x"/>', "option 'log'"),
+    ('<junctions.join-output value="x"/>', "option 'junctions.join-output'"), ('<save-configuration value="x"/>', "save-configuration"),
+    ('<keep-edges.input-file value="x"/>', "keep-edges.input-file"), ('<unheard-of value="1"/>', "option 'unheard-of'"),
+    ('<type-files value="../types.xml"/>', "type-files = '../types.xml' is in another folder"), ('<no-turnarounds/>', "without value="),
+    ('<type-files value="none.typ.xml"/>', "type-files: none.typ.xml is missing"), ('<precision value="2"/>', "sets 'precision' twice")])
+def test_a_recipe_that_writes_or_reads_elsewhere_is_refused(mine: Path, line: str, told: str) -> None:
+    rewritten(mine / "network.netccfg", "</configuration>", f"{line}</configuration>")
+    with pytest.raises(InputError, match=r"network\.netccfg: ") as caught:
+        check_network(str(mine))
+    assert told in str(caught.value)
+
+
+def test_sources_may_be_called_as_their_recipe_says(mine: Path) -> None:
+    (mine / "network.nod.xml").rename(mine / "my.nod.xml")
+    with pytest.raises(InputError, match=r"node-files: network\.nod\.xml is missing"):
+        check_network(str(mine))
+    rewritten(mine / "network.netccfg", "network.nod.xml", "my.nod.xml")
+    check_network(str(mine))
+
+
+def test_a_built_network_alone_is_simulated_as_its_sources_are(mine: Path) -> None:
+    settings = np.vstack([original := load_original("smoke"), original * 1.01])
+    expected = simulate(on("smoke", mine), settings).trace.gap
+    for name in ("network.nod.xml", "network.edg.xml", "network.con.xml", "network.netccfg"):
+        (mine / name).unlink()
+    assert np.array_equal(simulate(on("smoke", mine), settings).trace.gap, expected)
+    (mine / "network.net.xml").rename(mine / "town.net.xml")
+    for network in (mine, mine / "town.net.xml"):
+        assert np.array_equal(simulate(on("smoke", network), settings).trace.gap, expected)
+    shutil.copy(mine / "town.net.xml", mine / "village.net.xml")
+    with pytest.raises(InputError, match=r"has town\.net\.xml and village\.net\.xml"):
+        on("smoke", mine)
+    before = network_fingerprint(str(mine / "town.net.xml"))
+    rewritten(mine / "town.net.xml", "<location", "<!-- --><location")
+    assert network_fingerprint(str(mine / "town.net.xml")) != before
+
+
+def load_original(study: str) -> np.ndarray:
+    return assemble(load_study(study)).characteristics.original[np.newaxis]
+
+
+def test_a_network_that_netedit_saved_after_its_sources_is_refused(mine: Path) -> None:
+    net = mine / "network.net.xml"
+    net.write_text(net.read_text().replace("SUMO netconvert", "SUMO netedit").replace('speed="70.0000"', 'speed="60.0000"'))
+    os.utime(net, (2e9, 2e9))
+    with pytest.raises(InputError, match=r"network\.net\.xml: was saved by netedit after network\.nod\.xml"):
+        check_network(str(mine))
+
+
+@pytest.mark.parametrize(("old", "new", "told"), [
+    ('net-file value="network', 'net-file value="../network', "net-file = '../network.net.xml' is in another folder"),
+    ("traffic.rou.xml", "traffic.rou.xml,more.rou.xml", "route-files = 'traffic.rou.xml,more.rou.xml'"),
+    ('pedestrian.striping.dawdling value="0"', 'pedestrian.striping.dawdling value="0.2"', "persons dawdle at random"),
+    ('<pedestrian.striping.dawdling value="0"/>', "", "persons dawdle at random")])
+def test_options_of_sumo_that_are_not_honoured_are_refused(mine: Path, old: str, new: str, told: str) -> None:
+    rewritten(mine / "scenario.sumocfg", old, new)
+    with pytest.raises(InputError, match=r"scenario\.sumocfg: ") as caught:
+        check_network(str(mine))
+    assert told in str(caught.value)
+
+
+@pytest.mark.parametrize(("old", "new", "told"), [
+    ("</net>", '<tlLogic id="t" type="static"><condition id="c" value="1"/></tlLogic></net>', "has a 'condition'"),
+    ("</net>", '<tlLogic id="t" type="actuated"><param key="file" value="x.xml"/></tlLogic></net>', "has the parameter 'file'"),
+    ("</net>", '<busStop id="b" lane="approach_0"/></net>', "has a 'busStop'"),
+    ("<location", "<include href='a.xml'/><location", "includes another file")])
+def test_what_cannot_be_copied_of_a_built_network_is_refused(mine: Path, old: str, new: str, told: str) -> None:
+    shutil.copy(mine / "network.net.xml", mine / "town.net.xml")
+    rewritten(mine / "town.net.xml", old, new)
+    with pytest.raises(InputError, match=r"town\.net\.xml: ") as caught:
+        check_network(str(mine / "town.net.xml"))
+    assert told in str(caught.value)
+
+
+@pytest.mark.parametrize(("file", "old", "new", "told"), [
+    ("network.nod.xml", 'x="80" y="0"', 'x="80" y="0" z="4"', "lane 'departure_0', which climbs"),
+    ("network.edg.xml", 'id="approach"', 'id="approach" friction="0.3"', "lane 'approach_0' of friction 0.3")])
+def test_a_road_that_the_vehicle_would_not_feel_is_refused(mine: Path, file: str, old: str, new: str, told: str) -> None:
+    rewritten(mine / file, old, new)
+    with pytest.raises(InputError, match=r"traffic\.rou\.xml: vehicle 'vut' is to drive on ") as caught:
+        check_network(str(mine))
+    assert told in str(caught.value)
+
+
+@pytest.mark.parametrize(("file", "old", "new", "problem"), [
+    ("scenario.sumocfg", r'step-length value="[^"]*"', 'step-length value="0"', "scenario.sumocfg: step-length = '0'"),
+    ("traffic.rou.xml", r'id="vut"(.*) length="[^"]*"', r'id="vut"\1 length="-4"', "traffic.rou.xml: vType 'vut': length = '-4'"),
+    ("network.edg.xml", r'id="approach"', r'id="approach" length="-20"', "network.edg.xml: edge 'approach': length = '-20'"),
+    ("scenario.sumocfg", r'collision.action value="[^"]*"', 'collision.action value="stop"', "Invalid collision.action 'stop'")])
+def test_numbers_that_nothing_can_have_are_refused(mine: Path, file: str, old: str, new: str, problem: str) -> None:
+    text, replaced = re.subn(old, new, (mine / file).read_text(), count=1)
+    assert replaced
+    (mine / file).write_text(text)
+    with pytest.raises(InputError) as caught:
+        check_network(str(mine))
+    assert problem in str(caught.value)
+
+
+def test_what_a_network_says_of_the_vehicle_and_is_not_used_is_mentioned(mine: Path) -> None:
+    assert on("sun", mine).remarks == []
+    rewritten(mine / "network.edg.xml", 'id="approach" from="west" to="crossing" numLanes="1" width="4" speed="70"',
+              'id="approach" from="west" to="crossing" numLanes="1" width="4" speed="8.33"')
+    rewritten(mine / "traffic.rou.xml", '<vType id="vut"', '<vType id="vut" carFollowModel="IDM" speedFactor="0.8" accel="3"')
+    (remark,) = on("sun", mine).remarks
+    assert remark.startswith(f"{mine / 'traffic.rou.xml'}: not used of vehicle 'vut': carFollowModel = IDM, speedFactor = 0.8, accel = 3, "
+                             "the speed limit of lane 'approach_0' (8.33 m/s)")
+
+
+@pytest.mark.parametrize(("file", "old", "new", "told"), [
+    ("traffic.rou.xml", 'person id="pedestrian"', 'person id="walker"', "Person '0.pedestrian' is not known"),
+    ("network.con.xml", "<crossing node", "<!--", "Lane ':0.crossing_c0_0' is not known")])
+def test_what_a_scenario_does_not_find_is_told(mine: Path, file: str, old: str, new: str, told: str) -> None:
+    rewritten(mine / file, old, new)
+    if file == "network.con.xml":
+        rewritten(mine / file, 'width="0.65"/>', "-->")
+    with pytest.raises(InputError, match="the scenario does not find what it looks for") as caught:
+        simulate(on("smoke", mine), load_original("smoke"))
+    assert told in str(caught.value)
+
+
+def test_a_built_network_that_sumo_dies_of_is_refused(mine: Path) -> None:
+    for name in ("network.nod.xml", "network.edg.xml", "network.con.xml", "network.netccfg"):
+        (mine / name).unlink()
+    rewritten(mine / "network.net.xml", ' via=":crossing_0_0"', "")
+    with pytest.raises(InputError, match=r"network\.net\.xml: SUMO cannot load it: it dies"):
+        check_network(str(mine))
+
+
+def test_every_id_of_a_built_network_is_its_copys_alone(tmp_path: Path) -> None:
+    """Roundabouts, opposite lanes, rails, traffic lights, walking areas: no id of the original is left, no copy shares one."""
+    netgenerate = str(Path(sumo.SUMO_HOME) / "bin" / "netgenerate")
+    subprocess.run([netgenerate, "--grid", "--grid.number", "3", "--default.lanenumber", "1", "--sidewalks.guess", "--crossings.guess",
+                    "--tls.guess", "--tls.default-type", "actuated", "--opposites.guess", "-o", str(tmp_path / "town.net.xml")],
+                   check=True, capture_output=True)
+    for name in ("traffic.rou.xml", "scenario.sumocfg"):
+        shutil.copy(NETWORKS / "along" / name, tmp_path / name)
+    root = roads(tmp_path / "town.net.xml", 2)
+    plain = ElementTree.parse(built_network(str(tmp_path / "town.net.xml"))).getroot()
+    originals = {one.attrib["id"] for one in plain.iter() if one.tag in ("edge", "lane", "junction", "tlLogic")}
+    numbers = ("index", "fromLane", "toLane", "linkIndex", "linkIndex2", "name", "type")
+    kept = {value for child in root if child.tag not in ("location", "type") for element in child.iter() if element.tag != "param"
+            for name, text in element.attrib.items() if name not in numbers for value in text.split()}
+    assert originals
+    assert not originals & kept
+    assert len(root.findall("edge")) == 2 * len(plain.findall("edge"))
+
+
+def test_a_network_of_many_lanes_is_simulated_in_parts(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    system = on("smoke", mine)
+    settings = np.vstack([system.characteristics.original * (1 + 0.01 * i) for i in range(5)])
+    whole = evaluate(system, settings)
+    monkeypatch.setattr(matrix, "LARGEST_ROADS", 2 * lanes_of(str(mine)))
+    parts = evaluate(system, settings)
+    assert parts.outcome.tolist() == whole.outcome.tolist()
+    assert all(np.array_equal(values, parts.metrics[name], equal_nan=True) for name, values in whole.metrics.items())

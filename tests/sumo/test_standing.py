@@ -1,0 +1,234 @@
+"""Worlds that live on give the results of fresh ones to the last bit, and end where they could not."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import libsumo
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from safevar_sumo.errors import SimulationError
+from safevar_sumo.records import Command, Drives, Nominal, Observation
+from safevar_sumo.scenarios.car_to_car import CarToCar
+from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.study import load_study, study_names
+from safevar_sumo.sumo import reusable as standing
+from safevar_sumo.sumo.batch import drive
+from safevar_sumo.sumo.engine import open_world
+from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.network import copied_network
+from safevar_sumo.sumo.staging import staged
+from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.traffic import repeatable_traffic
+
+SYSTEMS = {name: assemble(load_study(name)) for name in study_names() if load_study(name).matrix is None}
+SYSTEMS["nearer than SUMO would put it"] = replace(SYSTEMS["sun"], scenario=CarToCar(test="CCRs", speed=60, headway=0.5))
+
+
+class _FullThrottle:
+    """Drives into whatever is there."""
+
+    def start(self, n: int, nominal: Nominal, step: float) -> None:
+        return None
+
+    def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
+        return Command(np.ones_like(seen.speed), np.zeros_like(seen.speed)), memory
+
+
+class _Failing(_FullThrottle):
+    """Breaks down on the way."""
+
+    def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
+        if seen.time > 1:
+            raise SimulationError("the engine is on fire")
+        return super().drive(seen, memory)
+
+
+@pytest.fixture(autouse=True)
+def loadings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Every network that libsumo loads, by file."""
+    loaded: list[str] = []
+    start = libsumo.start
+
+    def counting(command: list[str], *arguments: Any) -> Any:
+        loaded.append(command[command.index("-n") + 1])
+        return start(command, *arguments)
+
+    monkeypatch.setattr(libsumo, "start", counting)
+    return loaded
+
+
+def fresh(system: System, population: np.ndarray) -> Drives:
+    n = len(population)
+    with open_world(copied_network(staged(system.scenario), n), n) as world:
+        return drive(system, population, world)
+
+
+def bits(drives: Drives) -> dict[str, bytes]:
+    """Everything that is told of simulations."""
+    trace = drives.trace
+    told = {"outcome": drives.outcome.tobytes(), "collision speed": drives.collision_speed.tobytes()}
+    for field in fields(trace):
+        values = getattr(trace, field.name)
+        if isinstance(values, np.ndarray):
+            told[field.name] = (np.where(trace.active, values, 0) if values.ndim == 2 else values).tobytes()
+    return told
+
+
+def drawn(system: System, n: int, seed: int) -> np.ndarray:
+    characteristics = system.characteristics
+    rng = np.random.default_rng(seed)
+    return characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (n, len(characteristics))))
+
+
+def changed_network(folder: Path, network: str, **changes: tuple[str, str]) -> str:
+    """A copy of a shipped network with some text of its files replaced; keyword: the file's first word."""
+    mine = folder / network
+    shutil.copytree(NETWORKS / network, mine)
+    for word, (old, new) in changes.items():
+        (file,) = (one for one in mine.glob(f"*{word}*") if "net.xml" not in one.name)
+        text = file.read_text()
+        assert old in text
+        file.write_text(text.replace(old, new))
+    return str(mine)
+
+
+def on_network(name: str, network: str) -> System:
+    system = SYSTEMS[name]
+    return replace(system, scenario=msgspec.structs.replace(system.scenario, network=network))
+
+
+@settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(batches=st.lists(st.tuples(st.sampled_from(sorted(SYSTEMS)), st.integers(1, 12), st.booleans()), min_size=2, max_size=5),
+       seed=st.integers(0, 2**32 - 1))
+def test_whatever_was_driven_before_leaves_no_trace(batches: list[tuple[str, int, bool]], seed: int) -> None:
+    """Studies, sizes and drivers in any order; half of the batches end in collisions."""
+    asked = [(replace(SYSTEMS[name], ads=_FullThrottle()) if crashes else SYSTEMS[name], drawn(SYSTEMS[name], n, seed + i))
+             for i, (name, n, crashes) in enumerate(batches)]
+    for here, (system, population) in zip([simulate(*one) for one in asked], asked, strict=True):
+        assert bits(here) == bits(fresh(system, population))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(SYSTEMS))
+def test_many_batches_later_nothing_has_crept_in(name: str) -> None:
+    system, rng = SYSTEMS[name], np.random.default_rng(3)
+    asked = [drawn(system, int(n), i) for i, n in enumerate(rng.integers(1, 30, 150))]
+    here = [simulate(system, population) for population in asked]
+    for i in (0, 1, 70, 148, 149):
+        assert bits(here[i]) == bits(fresh(system, asked[i]))
+
+
+def test_the_network_is_loaded_once_for_batches_that_fit(loadings: list[str]) -> None:
+    system = SYSTEMS["rain"]
+    with pytest.raises(SimulationError):
+        simulate(replace(system, ads=_Failing()), drawn(system, 2, 1))
+    loadings.clear()
+    for n in (7, 3, 10, 1):
+        simulate(system, drawn(system, n, n))
+    assert len(loadings) == 1
+    simulate(system, drawn(system, 11, 1))
+    assert len(loadings) == 2
+
+
+def test_it_is_loaded_anew_every_so_many_batches(loadings: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(standing, "BATCHES_PER_LOADING", 3)
+    system = SYSTEMS["native"]
+    simulate(SYSTEMS["rain"], drawn(SYSTEMS["rain"], 1, 1))
+    loadings.clear()
+    for _ in range(7):
+        simulate(system, drawn(system, 1, 1))
+    assert len(loadings) == 3
+
+
+def test_after_a_failure_it_starts_afresh(loadings: list[str]) -> None:
+    system = SYSTEMS["native"]
+    population = drawn(system, 5, 2)
+    expected = bits(simulate(system, population))
+    with pytest.raises(SimulationError, match="on fire"):
+        simulate(replace(system, ads=_Failing()), population)
+    loadings.clear()
+    assert bits(simulate(system, population)) == expected
+    assert len(loadings) == 1
+
+
+OTHERS = """
+    <vehicle id="leaves" type="parked" depart="0" departLane="1" departPos="{end}" departSpeed="10"><route edges="road"/></vehicle>
+    <vehicle id="waits" type="parked" depart="0" departLane="1" departPos="60" departSpeed="0" color="1,0,0"><route edges="road"/></vehicle>
+    <vehicle id="beside" type="parked" depart="0" departLane="0" departPos="40" departSpeed="0">
+        <route edges="road"/><stop lane="road_0" startPos="35" endPos="40" duration="3" parking="true"/>
+    </vehicle>
+    <vehicle id="vut\""""
+
+
+def test_actors_that_arrived_or_were_teleported_come_back(tmp_path: Path, loadings: list[str]) -> None:
+    """One leaves the road, one is taken off it after a wait behind the parked one, one parks for a while beside it."""
+    network = changed_network(
+        tmp_path, "lead_vehicle_stopped", traffic=('\n    <vehicle id="vut"', OTHERS.format(end=100)),
+        scenario=("<processing>", '<processing><time-to-teleport value="4"/>'))
+    system = on_network("lgsvl", network)
+    assert repeatable_traffic(network) is not None
+    asked = [drawn(system, n, n) for n in (7, 4, 10)]
+    here = [simulate(system, population) for population in asked]
+    assert len(loadings) == 1
+    for one, population in zip(here, asked, strict=True):
+        assert bits(one) == bits(fresh(system, population))
+
+
+def test_a_vehicle_that_starts_in_motion_does_so_again(tmp_path: Path) -> None:
+    start = 'departPos="28.196" departSpeed="0"'
+    network = changed_network(tmp_path, "pedestrian_crossing", traffic=(start, 'departPos="8" departSpeed="7.5"'))
+    system = on_network("sun", network)
+    asked = [drawn(system, n, n) for n in (3, 5)]
+    for one, population in zip([simulate(system, population) for population in asked], asked, strict=True):
+        assert one.trace.speed[0, 0] == 7.5
+        assert bits(one) == bits(fresh(system, population))
+
+
+UNREPEATABLE: dict[str, dict[str, tuple[str, str]]] = {
+    "a flow": {"traffic": ("</routes>", '<flow id="f" type="parked" from="road" to="road" begin="0" end="9" number="2"/></routes>')},
+    "a trip": {"traffic": ("</routes>", '<trip id="t" type="parked" from="road" to="road" depart="0"/></routes>')},
+    "a late departure": {"traffic": ('depart="0"', 'depart="2"')},
+    "a stop until a time": {"traffic": ('duration="100000"', 'until="5"')},
+    "a random place": {"traffic": ('departPos="20"', 'departPos="random"')},
+    "random speeds": {"traffic": ('speedDev="0"', 'speedDev="0.1"')},
+    "random driving": {"traffic": ('sigma="0"', 'sigma="0.5"')},
+    "no word of sigma": {"traffic": (' sigma="0"', "")},
+    "a device that reroutes": {"scenario": ("<processing>", '<processing><device.rerouting.probability value="1"/>')},
+}
+
+
+@pytest.mark.parametrize("what", sorted(UNREPEATABLE))
+def test_what_cannot_be_put_back_is_not(tmp_path: Path, what: str) -> None:
+    assert repeatable_traffic(changed_network(tmp_path, "lead_vehicle_stopped", **UNREPEATABLE[what])) is None
+
+
+@pytest.mark.parametrize("changes", [
+    {"scenario": ('<pedestrian.striping.dawdling value="0"/>', "")},
+    {"nod": ('type="priority"', 'type="traffic_light"')}], ids=["a pedestrian dawdles at random", "a traffic light"])
+def test_nor_is_a_pedestrian(tmp_path: Path, changes: dict[str, tuple[str, str]]) -> None:
+    assert repeatable_traffic(changed_network(tmp_path, "pedestrian_crossing", **changes)) is None
+
+
+@pytest.mark.parametrize("changes", [
+    UNREPEATABLE["random driving"],
+    {"traffic": ('departPos="20"', 'departPos="20" insertionChecks="none"')}], ids=["random", "checked in part"])
+def test_what_cannot_be_put_back_is_loaded_every_time(tmp_path: Path, loadings: list[str], changes: dict[str, tuple[str, str]]) -> None:
+    network = changed_network(tmp_path, "lead_vehicle_stopped", **changes)
+    system = on_network("native", network)
+    population = drawn(system, 3, 1)
+    first, second = simulate(system, population), simulate(system, population)
+    assert bits(first) == bits(second)
+    assert len(loadings) == 2
+
+
+@pytest.mark.parametrize("network", sorted({path.name for path in NETWORKS.iterdir() if path.is_dir()}))
+def test_the_shipped_networks_are_repeatable(network: str) -> None:
+    assert repeatable_traffic(network)

@@ -1,0 +1,317 @@
+"""A script as SUMO users write it drives the vehicle under test: it reads SUMO, and what it commands goes through the plant."""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import Outcome
+from safevar_sumo.shipped import STUDIES
+from safevar_sumo.study import ModelTable, load_study
+from safevar_sumo.sumo.engine import Engine
+from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.system import System, assemble
+
+SCRIPT = '''
+def step(traci, vehicle_id):
+    traci.vehicle.setSpeedMode(vehicle_id, 0)
+    speed = traci.vehicle.getSpeed(vehicle_id)
+    leader = traci.vehicle.getLeader(vehicle_id, 100)
+    decel = traci.vehicle.getDecel(vehicle_id)
+    if leader and leader[0] == "parked_ahead" and leader[1] < 3 + speed * 0.5 + speed ** 2 / (2 * 0.6 * decel):
+        traci.vehicle.slowDown(vehicle_id, 0, max(speed / (0.6 * decel), 0.1))
+    else:
+        traci.vehicle.setSpeed(vehicle_id, 12)
+
+
+def idle(traci, vehicle_id):
+    assert traci.vehicle.getIDList() and set(traci.vehicle.getIDList()) == {"parked_ahead", "parked_beside", vehicle_id}
+    assert traci.simulation.getTime() < 17
+
+
+def jumps(traci, vehicle_id):
+    traci.vehicle.moveTo(vehicle_id, "road_0", 50)
+
+
+class Harsh:
+    def start(self, traci, vehicle_id):
+        traci.vehicle.setSpeedMode(vehicle_id, 32)
+
+    def step(self, traci, vehicle_id):
+        time = traci.simulation.getTime()
+        traci.vehicle.setAcceleration(vehicle_id, 2.0 if time < 3 else -100.0, 1.0)
+'''
+
+HELPER = """
+import libsumo as ls
+import traci
+import traci.constants as tc
+from traci import vehicle
+from traci.exceptions import TraCIException
+
+get_speed, looked = traci.vehicle.getSpeed, []
+
+
+def cruise(vehicle_id):
+    looked.append(traci.simulation.getTime())
+    assert len(looked) == round(traci.simulation.getTime() / 0.1) + 1, "one call a step: nobody else's"
+    assert get_speed(vehicle_id) == ls.vehicle.getSpeed(vehID=vehicle_id) == vehicle.getSpeed(vehicle_id)
+    try:
+        traci.person.getPosition("nobody")
+    except TraCIException as error:
+        assert "nobody" in str(error)
+    traci.vehicle.slowDown(vehicle_id, duration=1.0, speed=5.0)
+"""
+USES_HELPER = """
+calls = 0
+
+
+def step(traci, vehicle_id):
+    global calls
+    import helper
+    calls += 1
+    assert calls == len(helper.looked) + 1
+    helper.cruise(vehicle_id)
+"""
+
+
+def system(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch, script: str = SCRIPT, **tables: object) -> System:
+    (folder / "my_controller.py").write_text(script)
+    monkeypatch.chdir(folder)
+    study = load_study("native", **tables)
+    return assemble(msgspec.structs.replace(study, ads=ModelTable(model=f"my_controller:{name}", kind="traci")))
+
+
+def changed(of: System, **values: float) -> np.ndarray:
+    return of.characteristics.setting(values, "test")[np.newaxis]
+
+
+def test_a_module_that_imports_traci_talks_to_the_simulation_and_keeps_its_state_for_one_vehicle(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "helper.py").write_text(HELPER)
+    found = system("step", tmp_path, monkeypatch, USES_HELPER)
+    simulate(found, changed(found))
+    real = {name: sys.modules.get(name) for name in ("traci", "libsumo")}
+    run = simulate(found, np.repeat(changed(found), 3, axis=0))
+    assert run.trace.speed.max() == pytest.approx(5, abs=0.7)
+    assert {name: sys.modules.get(name) for name in real} == real, "the import is for controllers alone"
+
+
+LOOKS = """
+from pathlib import Path
+
+
+def step(traci, vehicle_id):
+    traci.vehicle.setSpeedMode(vehicle_id, 0)
+    traci.vehicle.setSpeed(vehicle_id, 12)
+    leader = traci.vehicle.getLeader(vehicle_id, dist=200)
+    x = traci.vehicle.getPosition("parked_ahead")[0]
+    row = (leader[1] if leader else -1, x, traci.vehicle.getIDCount(), "parked_ahead" in traci.vehicle.getIDList())
+    with Path("looks.csv").open("a") as file:
+        print(*map(float, row), sep=",", file=file)
+"""
+
+
+def test_what_a_controller_reads_of_others_has_passed_the_sensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The leader that it is told of is the trace's gap, linear between two steps, a reaction time and a recognition delay ago."""
+    weather = {"name": "haze", "road_friction": 1.0, "visibility": 0.5, "recognition_delay": 0.1, "hesitation": 0.0, "light": "day"}
+    found = system("step", tmp_path, monkeypatch, LOOKS, weather=weather)
+    trace = simulate(found, changed(found, reactionTime=0.25, sensorRange=80)).trace
+    leader, x, number, listed = np.loadtxt(tmp_path / "looks.csv", delimiter=",")[:len(trace.time)].T
+    gap = np.concatenate([np.repeat(trace.gap[0, :], 4), trace.gap[:, 0]])
+    late = (gap[1:len(leader) + 1] + gap[:len(leader)]) / 2  # 3.5 steps
+    near = late <= 40
+    assert 0 < near.sum() < len(near)
+    assert leader[near] == pytest.approx(late[near], abs=1e-6)
+    assert np.all(leader[~near] == -1)
+    assert np.all((x == 85)[near])
+    assert np.all((x == -1073741824)[~near])
+    assert np.array_equal(listed.astype(bool), near)
+    assert set(number[near]) <= {2, 3}
+
+
+@pytest.mark.parametrize(("values", "weather"), [
+    ({"sensorRange": 20.0}, None), ({"reactionTime": 0.8}, None),
+    ({}, {"visibility": 0.2}), ({}, {"recognition_delay": 1.0})], ids=["range", "reaction", "visibility", "recognition"])
+def test_worse_sensors_make_a_controller_brake_too_late(values: dict[str, float], weather: dict[str, float] | None, tmp_path: Path,
+                                                     monkeypatch: pytest.MonkeyPatch) -> None:
+    clear = {"name": "clear", "road_friction": 1.0, "visibility": 1.0, "recognition_delay": 0.0, "hesitation": 0.0, "light": "day"}
+    found = system("step", tmp_path, monkeypatch, weather={**clear, **(weather or {})})
+    assert simulate(found, changed(found, **values)).outcome[0] == Outcome.COLLISION
+    best = system("step", tmp_path, monkeypatch, weather=clear)
+    assert simulate(best, changed(best)).outcome[0] == Outcome.STOPPED
+
+
+def test_a_visibility_that_does_nothing_is_mentioned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_controller.py").write_text(SCRIPT)
+    monkeypatch.chdir(tmp_path)
+    table = ModelTable(model="my_controller:step", kind="traci")
+    far, near = (assemble(msgspec.structs.replace(load_study(name, weather="fog"), ads=table)) for name in ("sun", "native"))
+    assert far.remarks == ["weather 'fog': visibility = 0.6 does nothing: the vehicle has no sensor range, and a controller written for "
+                           "TraCI sees as far"]
+    assert near.remarks == []
+
+
+SUBSCRIBES = """
+import traci.constants as tc
+
+
+class Reads:
+    def start(self, traci, vehicle_id):
+        traci.vehicle.subscribe(vehicle_id, [tc.VAR_LANE_ID, tc.VAR_LEADER], parameters={tc.VAR_LEADER: ("d", 200.0)})
+        traci.vehicle.subscribeContext(vehicle_id, tc.CMD_GET_VEHICLE_VARIABLE, 70.0, [tc.VAR_ROAD_ID])
+
+    def step(self, traci, vehicle_id):
+        found = traci.vehicle.getAllSubscriptionResults()
+        assert found == {vehicle_id: traci.vehicle.getSubscriptionResults(vehicle_id)}, found
+        assert found[vehicle_id][tc.VAR_LANE_ID] == "road_0" and found[vehicle_id][tc.VAR_LEADER][0] == "parked_ahead"
+        around = traci.vehicle.getContextSubscriptionResults(vehicle_id)
+        assert around[vehicle_id] == {tc.VAR_ROAD_ID: "road"} and set(around) <= {vehicle_id, "parked_ahead", "parked_beside"}
+        assert ("parked_ahead" in around) == (85 - traci.vehicle.getPosition(vehicle_id)[0] <= 70)
+        assert traci.simulation.findRoute("road", "road").edges == ("road",)
+        assert traci.vehicle.getIDCount() == traci.simulation.getMinExpectedNumber() == 3
+        assert traci.edge.getIDCount() == 1 and traci.vehicle.getRoute(vehicle_id) == ("road",)
+        assert set(traci.lane.getLastStepVehicleIDs("road_0")) == {vehicle_id, "parked_ahead"}
+        assert "0." not in traci.vehicle.getRouteID(vehicle_id)
+"""
+
+
+def test_no_function_shows_that_there_are_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = system("Reads", tmp_path, monkeypatch, SUBSCRIBES)
+    simulate(found, np.repeat(changed(found, sensorRange=120, reactionTime=0.1), 3, axis=0))
+
+
+REFUSED = [
+    ("traci.simulationStep()", "traci.simulationStep: safevar advances the simulation; remove this call"),
+    ("traci.simulation.step()", "safevar advances the simulation; remove this call"),
+    ("traci.simulation.executeMove()", "safevar advances the simulation; remove this call"),
+    ("traci.executeMove()", "safevar advances the simulation; remove this call"),
+    ("traci.close()", "traci.close: safevar starts and ends the simulation; remove this call"),
+    ("traci.vehicle.setSpeed('parked_ahead', 3)", "traci.vehicle.setSpeed: vehID = 'parked_ahead' is not the vehicle under test"),
+    ("traci.vehicle.setSpeed(v, speed=float('nan'))", "traci.vehicle.setSpeed: speed = nan"),
+    ("traci.vehicle.setSpeed(v, -0.5)", "traci.vehicle.setSpeed: speed = -0.5"),
+    ("traci.vehicle.setMaxSpeed(v, float('inf'))", "traci.vehicle.setMaxSpeed: speed = inf"),
+    ("traci.vehicle.setAccel(v, -1)", "traci.vehicle.setAccel: accel = -1"),
+    ("traci.vehicle.setDecel(v, decel=-1)", "traci.vehicle.setDecel: decel = -1"),
+    ("traci.vehicle.setAcceleration(v, float('-inf'), 1)", "traci.vehicle.setAcceleration: acceleration = -inf"),
+    ("traci.vehicle.setSpeedMode(v, 1.5)", "traci.vehicle.setSpeedMode: mode = 1.5"),
+    ("traci.vehicle.getNeighbors(v, 1)", "traci.vehicle.getNeighbors: tells of others what no sensor of the vehicle does"),
+    ("traci.vehicle.moveTo(v, 'road_0', 50)", "traci.vehicle.moveTo: is not for a controller of 'vut'"),
+]
+
+
+@pytest.mark.parametrize(("line", "problem"), REFUSED)
+def test_calls_that_are_not_a_controllers_are_refused_even_if_it_goes_on(line: str, problem: str, tmp_path: Path,
+                                                                      monkeypatch: pytest.MonkeyPatch) -> None:
+    script = f"def step(traci, v):\n    try:\n        {line}\n    except Exception:\n        pass\n"
+    found = system("step", tmp_path, monkeypatch, script)
+    with pytest.raises(InputError) as caught:
+        simulate(found, changed(found))
+    assert problem in str(caught.value)
+    assert "my_controller.py:3" in str(caught.value)
+
+
+def test_minus_one_gives_control_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = ("def step(traci, v):\n    traci.vehicle.setSpeed(v, 3 if traci.simulation.getTime() < 5 else -1)\n"
+              "def free(traci, v):\n    traci.vehicle.setSpeed(v, 3) if traci.simulation.getTime() < 5 else None\n")
+    systems = [system(name, tmp_path, monkeypatch, script) for name in ("step", "free")]
+    speeds = [simulate(one, changed(one)).trace.speed.max() for one in systems]
+    assert speeds[0] > 6
+    assert speeds[1] < 4
+
+
+SENSES = """
+from safevar_sumo.vehicles import SumoVehicle, Lgsvl
+
+
+class Dim:
+    def __init__(self):
+        self._base = SumoVehicle()
+        self.UNITS = self._base.UNITS
+
+    def __getattr__(self, name):
+        if name == "sensors" or name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self._base, name)
+
+    prepare = lambda self, c, f, s: self._base.prepare(c, f, s)
+    sumo_type = lambda self, p: self._base.sumo_type(p)
+    at_rest = lambda self, p: self._base.at_rest(p)
+    sense = lambda self, p, s, seen: self._base.sense(p, s, seen)
+    advance = lambda self, p, s, c: self._base.advance(p, s, c)
+"""
+
+
+def test_a_vehicle_whose_sensors_would_not_act_is_refused_before_anything_is_simulated(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_vehicle.py").write_text(SENSES)
+    native = tomllib.loads((STUDIES / "native.toml").read_text())
+    with pytest.raises(InputError, match=r"vehicle.model = 'my_vehicle:Dim' changes gap in sense") as caught:
+        system("step", tmp_path, monkeypatch, vehicle={"model": "my_vehicle:Dim", "characteristics": native["vehicle"]["characteristics"]})
+    assert "sensors(prepared)" in caught.value.legal
+
+
+def test_a_script_stops_the_original_and_not_a_vehicle_that_has_lost_its_brakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = system("step", tmp_path, monkeypatch)
+    weak = found.characteristics.original.copy()
+    weak[found.characteristics.names.index("decel")] = 4.5
+    weak[found.characteristics.names.index("brakeGain")] = 0.6
+    both = np.stack([found.characteristics.original, weak])
+    run = simulate(found, both)
+    assert run.outcome.tolist() == [Outcome.STOPPED, Outcome.COLLISION]
+    alone = simulate(found, both[1:])
+    length = len(alone.trace.time)
+    assert alone.trace.speed[:, 0].tobytes() == np.ascontiguousarray(run.trace.speed[:length, 1]).tobytes()
+    assert run.trace.speed.max() == pytest.approx(12, abs=0.7)
+
+
+def test_through_a_socket_it_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = system("step", tmp_path, monkeypatch)
+    one = found.characteristics.original[np.newaxis]
+    here, socket = (simulate(found, one, engine) for engine in (Engine.LIBSUMO, Engine.TRACI))
+    assert here.trace.speed.tobytes() == socket.trace.speed.tobytes()
+
+
+def test_without_a_command_sumos_own_driver_drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = system("idle", tmp_path, monkeypatch)
+    run = simulate(found, np.repeat(found.characteristics.original[np.newaxis], 2, axis=0))
+    assert run.trace.speed.max() > 5
+    assert run.trace.brake.max() > 0.5, "for the parked vehicle"
+
+
+def test_a_wish_is_what_the_plant_makes_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = system("Harsh", tmp_path, monkeypatch)
+    run = simulate(found, found.characteristics.original[np.newaxis])
+    hardest = -np.diff(run.trace.speed[:, 0]).min() / run.trace.step
+    assert 7 < hardest < 9.0
+    assert run.outcome[0] == Outcome.STOPPED
+
+
+@pytest.mark.parametrize(("name", "told"), [("jumps", "moveTo"), ("nothing", "has no 'nothing'")])
+def test_what_it_may_not_do_is_told(name: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def drive() -> None:
+        found = system(name, tmp_path, monkeypatch)
+        simulate(found, found.characteristics.original[np.newaxis])
+
+    with pytest.raises(InputError, match=told):
+        drive()
+
+
+@pytest.mark.parametrize(("table", "told"), [
+    ({"model": "my_controller:Hrash", "kind": "traci"}, r"has no 'Hrash'\nlegal: package.module:Name$"),
+    ({"model": "my_controller:Harsh", "kind": "traci", "parameters": {"margin": 2}}, r"^mine: ads.model = .* does not take ads.parameters"),
+    ({"model": "my_controller:step", "kind": "traci", "parameters": {"margin": 2}}, r"^mine: ads.model = .* does not take ads.parameters"),
+    ({"model": "my_controller:step"}, r'not a class\nlegal: .*; or with ads.kind = "traci" a function step\('),
+])
+def test_a_table_that_cannot_be_used_is_told_before_anything_is_simulated(
+        table: dict[str, object], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_controller.py").write_text(SCRIPT)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=told):
+        assemble(msgspec.structs.replace(load_study("native"), ads=msgspec.convert(table, ModelTable)), "mine")
