@@ -25,7 +25,7 @@ import psutil
 from evaluation import bare
 from measuring import Record, clock_seconds, processor_seconds, told
 
-from safevar_sumo.campaign import BATCH, RunKey, all_runs, carry_out
+from safevar_sumo.campaign import BATCH, RunKey, all_runs, run_campaign
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, load_study
@@ -98,7 +98,7 @@ def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
             future.result()
         recording = Recording(pool)
         before = processors()
-        clock = clock_seconds(lambda: carry_out(study, all_runs(study), ResultsDirectory(Path(folder), study), recording, Silent()))
+        clock = clock_seconds(lambda: run_campaign(study, all_runs(study), ResultsDirectory(Path(folder), study), recording, Silent()))
         return Cost(clock, processors() - before, recording.batches)
 
 

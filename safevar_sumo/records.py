@@ -181,7 +181,7 @@ for _array in (*NO_CONTACT, UNDEFINED):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drives:
+class SimulationRuns:
     """N simulations as they went; `outcome` holds values of `Outcome`, `collision_speed` is NaN without one [m/s].
 
     `test_speed_error` is the worst deviation from a test's speed before the system acted, NaN where there is none to hold [m/s].
@@ -194,12 +194,12 @@ class Drives:
     contact: Contact = NO_CONTACT
     test_speed_error: FloatArray = field(default_factory=lambda: UNDEFINED)
 
-    def of(self, vehicles: slice) -> Drives:
+    def of(self, vehicles: slice) -> SimulationRuns:
         """The drives of some of the vehicles."""
         def some(values: np.ndarray) -> np.ndarray:
             return values[vehicles] if values.ndim else values
 
-        return Drives(
+        return SimulationRuns(
             trace=self.trace.of(vehicles), encounter=Encounter._make(values[:, vehicles] for values in self.encounter),
             outcome=self.outcome[vehicles], collision_speed=self.collision_speed[vehicles],
             contact=Contact._make(map(some, self.contact)), test_speed_error=some(self.test_speed_error))

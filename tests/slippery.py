@@ -6,7 +6,7 @@ from pathlib import Path
 
 from in_process import Here, Silent
 
-from safevar_sumo.campaign import all_runs, carry_out
+from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
@@ -35,6 +35,6 @@ def make_results(out: Path, title: str = "Crossing on wet leaves") -> Path:
     (out / "slippery.toml").write_text(STUDY.format(title=title))
     study = load_study(str(out / "slippery.toml"))
     results = ResultsDirectory(out / "results", study, identity_of(study, assemble(study)))
-    campaign = carry_out(study, all_runs(study), results, Here(), Silent())
+    campaign = run_campaign(study, all_runs(study), results, Here(), Silent())
     results.finish(campaign.solutions)
     return results.path

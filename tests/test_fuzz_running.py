@@ -77,7 +77,7 @@ def tried(*arguments: str) -> None:
 
 
 def test_study_takes_or_refuses_its_flags(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(safevar_sumo.cli.study, "a_pool", no_pool)
+    monkeypatch.setattr(safevar_sumo.cli.study, "open_pool", no_pool)
     FEW(given(STUDY)(searched))()
 
 
@@ -87,7 +87,7 @@ def searched(flags: list[tuple[str, ...]]) -> None:
 
 @pytest.mark.slow
 def test_study_takes_or_refuses_many_flags(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(safevar_sumo.cli.study, "a_pool", no_pool)
+    monkeypatch.setattr(safevar_sumo.cli.study, "open_pool", no_pool)
     MANY(given(STUDY)(searched))()
 
 

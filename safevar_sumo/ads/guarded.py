@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.ads.base import Ads, ScalarAds
-from safevar_sumo.plugins import Contract, Guard, lent
+from safevar_sumo.plugins import Contract, Guard, read_only_copy
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
 ADS_CONTRACT = Contract.of(Ads, "an ADS")
@@ -24,10 +24,10 @@ class GuardedAds:
         self.own_reactions = bool(getattr(ads, "own_reactions", False))
 
     def start(self, n: int, nominal: Nominal, step: float) -> Any:
-        return self._guard.call("start", self._ads.start, n, lent(nominal), step)
+        return self._guard.call("start", self._ads.start, n, read_only_copy(nominal), step)
 
     def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
-        given = self._guard.call("drive", self._ads.drive, lent(seen), memory)
+        given = self._guard.call("drive", self._ads.drive, read_only_copy(seen), memory)
         command, memory = self._guard.parts("drive", given, "(Command(throttle, brake), memory)")
         throttle, brake = self._guard.parts("drive", command, "(Command(throttle, brake), memory)")
         return Command(self._pedal("throttle", throttle, seen), self._pedal("brake", brake, seen)), memory
@@ -45,7 +45,7 @@ class PerVehicle:
     def start(self, n: int, nominal: Nominal, step: float) -> list[ScalarAds]:
         drivers = [self._guard.call("__init__", self._make) for _ in range(n)]
         for driver in drivers:
-            self._guard.call("start", driver.start, lent(nominal), step)
+            self._guard.call("start", driver.start, read_only_copy(nominal), step)
         return drivers
 
     def drive(self, seen: Observation, memory: list[ScalarAds]) -> tuple[Command, list[ScalarAds]]:

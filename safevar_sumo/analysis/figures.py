@@ -11,7 +11,7 @@ import numpy as np
 from safevar_sumo.analysis.explain.result import Explained
 from safevar_sumo.analysis.risk.compute import Risk
 from safevar_sumo.analysis.tolerance.compute import Tolerance
-from safevar_sumo.analysis.tolerance.one_at_a_time import Alone
+from safevar_sumo.analysis.tolerance.one_at_a_time import OneAtATimeScan
 from safevar_sumo.analysis.tolerance.pairs import Pair
 from safevar_sumo.errors import InputError
 
@@ -65,7 +65,7 @@ def profiles_figure(told: Tolerance) -> Figure:
     return figure
 
 
-def _profile(axis: Axes, one: Alone) -> None:
+def _profile(axis: Axes, one: OneAtATimeScan) -> None:
     member, profile = one.characteristic, one.profile
     axis.plot(profile["value"], profile["safety_degree"], color=NECESSARY, linewidth=1.2)
     for low, high in one.unsafe:

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from safevar_sumo.api.results import Results, load
 from safevar_sumo.api.simulation import assembled
-from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, carry_out, read_by_algorithms
+from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, read_by_algorithms, run_campaign
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.results import ResultsDirectory
@@ -60,8 +60,8 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     keys = all_runs(chosen) if only is None else [RunKey(*key) for key in only]
     directory = Path(out) if out is not None else Path("results") / chosen.name
     bars: Any = CampaignProgress(Console(stderr=True), chosen, keys, quiet=False)
-    showing = bars if progress is True else nullcontext(progress or Unheard())
-    with a_pool(chosen, jobs, cluster) as pool, showing as observer:
+    showing = bars if progress is True else nullcontext(progress or NullObserver())
+    with open_pool(chosen, jobs, cluster) as pool, showing as observer:
         carried_out(chosen, system, keys, directory, pool, observer, batch, retry_failed=retry_failed)
     return load(directory)
 
@@ -82,16 +82,16 @@ def prepared(study: StudyLike, source: str = "") -> tuple[Study, System]:
 
 def carried_out(study: Study, system: System, keys: list[RunKey], directory: Path, pool: Pool, observer: Observer,
                 batch: int | None, *, retry_failed: bool = False) -> Campaign:
-    """Carry out runs of a study in a directory; with all of them finished, its solutions are written. See `carry_out`.
+    """Carry out runs of a study in a directory; with all of them finished, its solutions are written. See `run_campaign`.
 
     Raises
     ------
     SafevarError
-        If another process works on one of the runs, or as `carry_out`.
+        If another process works on one of the runs, or as `run_campaign`.
     """
     sources = {**sources_of(study, pool), **read_by_algorithms(study)}
     results = ResultsDirectory(directory, study, identity_of(study, system, sources), system.measuring.scoring)
-    campaign = carry_out(study, keys, results, pool, observer, batch, retry_failed=retry_failed)
+    campaign = run_campaign(study, keys, results, pool, observer, batch, retry_failed=retry_failed)
     if campaign.busy:
         raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: the same again later finishes the study")
     if keys == all_runs(study):
@@ -99,13 +99,13 @@ def carried_out(study: Study, system: System, keys: list[RunKey], directory: Pat
     return campaign
 
 
-def a_pool(study: Study, jobs: int | None = None, cluster: str | None = None) -> AbstractContextManager[Pool]:
+def open_pool(study: Study, jobs: int | None = None, cluster: str | None = None) -> AbstractContextManager[Pool]:
     """Where batches of a study are computed: worker processes, or the workers of a cluster."""
     limit = study.search.time_limit
     return cluster_pool(cluster, limit) if cluster is not None else local_pool(jobs or available_cores(), limit)
 
 
-class Unheard:
+class NullObserver:
     """Nobody looks on; warnings alone are told."""
 
     def evaluated(self, *_: object) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.metrics import Scoring, time_to_collision
-from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Command, Drives, Evaluations, FloatArray, Nominal, Observation, Outcome
+from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns
 from safevar_sumo.results import record
 from safevar_sumo.study import Study, StudyLike, load_study
 from safevar_sumo.sumo.batch import score
@@ -28,7 +28,7 @@ SEEN = {"speed": "seen speed [m/s]", "gap": "seen gap [m]", "closing_speed": "se
         "lateral_speed": "seen lateral speed [m/s]"}
 
 
-class Witness:
+class RecordingAds:
     """An ADS whose observations of its only vehicle are kept."""
 
     def __init__(self, ads: Ads) -> None:
@@ -44,7 +44,7 @@ class Witness:
         return self._ads.drive(seen, memory)
 
 
-def trace_frame(drives: Drives, witness: Witness) -> pd.DataFrame:
+def trace_frame(drives: SimulationRuns, witness: RecordingAds) -> pd.DataFrame:
     """One row per step of the only vehicle while its simulation counts.
 
     Where the obstacle was (`gap` along the vehicle's path, `lateral` from the middle of its lane) and what the ADS saw of
@@ -97,9 +97,9 @@ class Simulation:
     setting: Mapping[str, float]
     put_back: Mapping[str, float]
     evaluation: Evaluations
-    drives: Drives
+    drives: SimulationRuns
     scoring: Scoring
-    _seen: Witness
+    _seen: RecordingAds
     _original: Simulation | None = None
 
     @property
@@ -202,7 +202,7 @@ def assembled(study: StudyLike, source: str = "") -> tuple[Study, System]:
 
 
 def _simulated(study: Study, system: System, asked: FloatArray, setting: FloatArray, engine: Engine = Engine.LIBSUMO) -> Simulation:
-    seen = Witness(system.ads)
+    seen = RecordingAds(system.ads)
     rows = setting[np.newaxis]
     drives = drive(replace(system, ads=seen), rows, engine)
     return Simulation(

@@ -6,10 +6,22 @@ batches for a pool: a lost worker costs a batch, and no result depends on who co
 """
 
 from safevar_sumo.campaign.batcher import BATCH
-from safevar_sumo.campaign.campaign import Campaign, carry_out
+from safevar_sumo.campaign.campaign import Campaign, run_campaign
 from safevar_sumo.campaign.forecast import Forecast, forecast
 from safevar_sumo.campaign.keys import RunKey, algorithm_member, algorithm_of, all_runs, read_by_algorithms, run_generator
 from safevar_sumo.campaign.run import Observer
 
-__all__ = ["BATCH", "Campaign", "Forecast", "Observer", "RunKey", "algorithm_member", "algorithm_of", "all_runs", "carry_out", "forecast",
-           "read_by_algorithms", "run_generator"]
+__all__ = [
+           "BATCH",
+           "Campaign",
+           "Forecast",
+           "Observer",
+           "RunKey",
+           "algorithm_member",
+           "algorithm_of",
+           "all_runs",
+           "forecast",
+           "read_by_algorithms",
+           "run_campaign",
+           "run_generator",
+]

@@ -11,7 +11,7 @@ import numpy as np
 
 from safevar_sumo.campaign.run import Run
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.workers.retrying import PersistentPool
+from safevar_sumo.workers.retrying import RetryingPool
 
 BATCH = 200
 """Settings per SUMO simulation where there are enough: an evaluation costs half of one among 50, beyond it nothing is gained."""
@@ -23,7 +23,7 @@ MOST_RUNS = 256
 """Runs under way at the most: each keeps a file open."""
 
 
-class Gathering:
+class Batcher:
     """Settings that runs ask for, in the order in which they asked, and batches of them under way.
 
     Parameters
@@ -34,7 +34,7 @@ class Gathering:
         Settings per batch at the most.
     """
 
-    def __init__(self, pool: PersistentPool, work: bytes, size: int) -> None:
+    def __init__(self, pool: RetryingPool, work: bytes, size: int) -> None:
         self._pool, self._work, self._size = pool, work, size
         self._asked: deque[tuple[Run, FloatArray]] = deque()
         self.under_way: dict[Future[Evaluations], list[Run]] = {}

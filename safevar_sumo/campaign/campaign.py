@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.campaign.batcher import BATCH, Gathering
-from safevar_sumo.campaign.isolation_check import Rechecking
+from safevar_sumo.campaign.batcher import BATCH, Batcher
+from safevar_sumo.campaign.isolation_check import IsolationCheck
 from safevar_sumo.campaign.keys import RunKey, search_of
 from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.errors import InputError
@@ -22,7 +22,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.isolation import check_isolation
 from safevar_sumo.workers.local import first_of, result_of
-from safevar_sumo.workers.retrying import PersistentPool
+from safevar_sumo.workers.retrying import RetryingPool
 
 
 class Campaign(NamedTuple):
@@ -42,7 +42,7 @@ class Campaign(NamedTuple):
     scoring: Scoring = SAFEVAR
 
 
-def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, pool: Pool, observer: Observer,
+def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, pool: Pool, observer: Observer,
               batch: int | None = None, *, retry_failed: bool = False) -> Campaign:
     """Carry out runs of a study, or finish what of them is unfinished.
 
@@ -65,7 +65,7 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
         If a journal cannot be written or the study itself is at fault.
     """
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    persistent, work = PersistentPool(pool, study, results.note), packed(study, results.inputs)
+    persistent, work = RetryingPool(pool, study, results.note), packed(study, results.inputs)
     original = _original(study, work, characteristics, results, persistent, observer)
     if not original.valid[0]:
         raise InputError(f"study {study.name!r}", "the original vehicle leaves the tolerance of a test's speed before the ADS acts "
@@ -81,7 +81,7 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
     def begun(key: RunKey) -> Search:
         return search_of(key, study, problem, results.note)
 
-    gathering, rechecking = Gathering(persistent, work, batch or BATCH), Rechecking(study, results, persistent, begun)
+    gathering, rechecking = Batcher(persistent, work, batch or BATCH), IsolationCheck(study, results, persistent, begun)
 
     def go_on(run: Run) -> None:
         """Let a run go as far as it can, then ask for what it misses."""
@@ -125,7 +125,7 @@ def carry_out(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, p
                              failures=sorted(campaign.failures))
 
 
-def _original(study: Study, work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: PersistentPool,
+def _original(study: Study, work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: RetryingPool,
               observer: Observer) -> Evaluations:
     """The original vehicle's evaluation, simulated once; where it fails, or models mix settings up, the study is at fault."""
     def simulated() -> Evaluations:

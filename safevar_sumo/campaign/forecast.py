@@ -13,7 +13,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.local import result_of
-from safevar_sumo.workers.retrying import PersistentPool
+from safevar_sumo.workers.retrying import RetryingPool
 
 PROBE_BATCHES = 4
 """Batches on every worker that a forecast is measured with."""
@@ -33,7 +33,7 @@ class Forecast(NamedTuple):
 def forecast(study: Study, runs: int, pool: Pool, batch: int | None = None) -> Forecast:
     """What carrying out `runs` runs takes at the most, after a short probe of the pool that will do it."""
     characteristics, size = CharacteristicSet.of(study.vehicle.characteristics), batch or min(BATCH, max(runs, 1) * study.search.population)
-    persistent, work, rng = PersistentPool(pool, study), packed(study), np.random.default_rng(study.search.seed)
+    persistent, work, rng = RetryingPool(pool, study), packed(study), np.random.default_rng(study.search.seed)
 
     def probe(number: int) -> float:
         """Seconds that `number` batches on every worker take."""

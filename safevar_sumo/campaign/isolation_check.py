@@ -17,13 +17,13 @@ from safevar_sumo.search import Search
 from safevar_sumo.study import Study, foreign_names
 from safevar_sumo.workers.evaluation import packed
 from safevar_sumo.workers.isolation import refuse_difference
-from safevar_sumo.workers.retrying import PersistentPool, reproducing
+from safevar_sumo.workers.retrying import RetryingPool, reproducing
 
 LEGAL = ("what a run asks for depends on its problem, its evaluations and `rng` alone: nothing kept in a class or a module between runs, "
          "no clock, no random numbers of its own")
 
 
-class Rechecking:
+class IsolationCheck:
     """Runs that have ended, and settings of theirs under way, each alone and with other people's models loaded afresh.
 
     Attributes
@@ -32,7 +32,7 @@ class Rechecking:
         By what computes it, a run and what it holds of a setting.
     """
 
-    def __init__(self, study: Study, results: ResultsDirectory, pool: PersistentPool, begun: Callable[[RunKey], Search]) -> None:
+    def __init__(self, study: Study, results: ResultsDirectory, pool: RetryingPool, begun: Callable[[RunKey], Search]) -> None:
         self._study, self._pool, self._begun = study, pool, begun
         self._work = packed(study, results.inputs, afresh=True) if foreign_names(study) else None
         self._begun_twice: set[str] = set()

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, unknown
-from safevar_sumo.plugins import Files, Lookup, Member, digests, forget_foreign, made, noted_reading, undisturbed
+from safevar_sumo.plugins import Files, Lookup, Member, digests, forget_foreign, guard_process_state, made, noted_reading
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm, Problem, Search
 from safevar_sumo.study import SearchTable, Study
 
@@ -46,7 +46,7 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
             legal = [*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels]
             raise unknown(source, f"search.{stray}: there is no such key and no such algorithm", stray, legal)
     member = algorithm_member(name, study)
-    with undisturbed(source, [name] if member.guard else []):
+    with guard_process_state(source, [name] if member.guard else []):
         parameters = Lookup(source, study.origin.places).with_paths(member, search.parameters.get(label, {}), key)
         algorithm = made(member, parameters, f"search.algorithms: {name!r}", key, source)
     return algorithm if member.guard is None else GuardedAlgorithm(algorithm, member.guard)

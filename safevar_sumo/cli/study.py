@@ -9,7 +9,7 @@ import click
 import msgspec
 from rich.console import Console
 
-from safevar_sumo.api.running import a_pool, carried_out, prepared
+from safevar_sumo.api.running import carried_out, open_pool, prepared
 from safevar_sumo.campaign import BATCH, RunKey, all_runs, forecast
 from safevar_sumo.cli.completion import complete_study
 from safevar_sumo.cli.display.campaign import print_forecast, print_summary
@@ -43,7 +43,7 @@ def study(study: str, batch: int | None, out: Path | None, jobs: int | None, clu
     tell_remarks(chosen, [*system.remarks, *vehicle_remarks(system)])
     keys = _selected(all_runs(chosen), only, shard)
     directory = out or Path("results") / chosen.name
-    with a_pool(chosen, jobs, cluster) as pool:
+    with open_pool(chosen, jobs, cluster) as pool:
         if dry_run:
             print_forecast(Console(), chosen, len(keys), forecast(chosen, len(keys), pool, batch))
             return

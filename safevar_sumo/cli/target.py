@@ -14,7 +14,7 @@ from safevar_sumo.analysis.options import Option, Options
 from safevar_sumo.cli.options import Within
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
-from safevar_sumo.results import Handle, chosen_handle, position_of
+from safevar_sumo.results import SolutionId, chosen_handle, position_of
 from safevar_sumo.results.imported import UNKNOWN
 from safevar_sumo.study import Study, study_names
 
@@ -30,7 +30,7 @@ class Target(NamedTuple):
 
     study: Study
     source: str
-    handle: Handle | None = None
+    handle: SolutionId | None = None
     setting: FloatArray | None = None
     recorded: dict[str, Any] | None = None
 
@@ -67,7 +67,7 @@ def target_of(place: str, solution: str | None, choice: str | None) -> Target:
     if isinstance(case, Study):
         (case,) = load_cases([place])
     if solution is not None:
-        handle = Handle.parse(solution)
+        handle = SolutionId.parse(solution)
     else:
         handle = chosen_handle(case.solutions, case.original["safety_degree"], str(choice), place)
     row = case.solutions.iloc[position_of(case.solutions, handle)]

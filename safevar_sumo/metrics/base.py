@@ -10,8 +10,8 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import Guard, lent
-from safevar_sumo.records import Drives, FloatArray
+from safevar_sumo.plugins import Guard, read_only_copy
+from safevar_sumo.records import FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 
 ROUNDING = 1e-6
@@ -41,7 +41,7 @@ def total(samples: FloatArray) -> FloatArray:
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
 Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]{1,200}\Z")]
-Function = Callable[[Drives, MetricsTable], FloatArray]
+Function = Callable[[SimulationRuns, MetricsTable], FloatArray]
 
 
 class MetricFacts(Struct, frozen=True, kw_only=True):
@@ -85,7 +85,7 @@ class Metric(MetricFacts, frozen=True, kw_only=True):
 
     function: Function
 
-    def __call__(self, drives: Drives, thresholds: MetricsTable) -> FloatArray:
+    def __call__(self, drives: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
         return self.function(drives, thresholds)
 
     @property
@@ -112,8 +112,8 @@ def foreign_metric(metric: Any, guard: Guard) -> Metric:
     except (msgspec.ValidationError, TypeError) as error:
         raise InputError(guard.source, f"{guard.name}: {error}", legal) from None
 
-    def checked(drives: Drives, thresholds: MetricsTable) -> FloatArray:
-        given = guard.call(facts.name, metric.function, lent(drives), thresholds)
+    def checked(drives: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+        given = guard.call(facts.name, metric.function, read_only_copy(drives), thresholds)
         return guard.numbers(facts.name, "values", np.asarray(given) if isinstance(given, list) else given, (len(drives.outcome),),
                              undefined=True)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from safevar_sumo.metrics.base import Metric, every, total
-from safevar_sumo.records import STANDSTILL, Drives, FloatArray
+from safevar_sumo.records import STANDSTILL, FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 
 
-def average_deceleration(drives: Drives, thresholds: MetricsTable) -> FloatArray:
+def average_deceleration(drives: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Mean loss of speed per time over the samples in which the brake is commanded and the vehicle moves.
 
     In m/s^2, positive when slowing down; shape (N,); NaN for a vehicle that never braked.

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from safevar_sumo.metrics.base import Metric
-from safevar_sumo.records import Drives, FloatArray
+from safevar_sumo.records import FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 
 
-def safety_degree(drives: Drives, thresholds: MetricsTable) -> FloatArray:
+def safety_degree(drives: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Least separation during the encounter [m, > 0], or minus the speed of the collision [m/s, <= 0].
 
     Shape (N,); NaN where there was neither an encounter nor a collision.

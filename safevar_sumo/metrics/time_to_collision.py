@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from safevar_sumo.metrics.base import Metric, every, total
-from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Drives, FloatArray
+from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 
 
-def time_to_collision(drives: Drives) -> FloatArray:
+def time_to_collision(drives: SimulationRuns) -> FloatArray:
     """TTC(t) = L_s / v_L, distance projected over closing speed [s]; shape (T, N).
 
     Infinite while not closing, out of the encounter, and after the vehicle first stood still again.
@@ -21,21 +21,21 @@ def time_to_collision(drives: Drives) -> FloatArray:
     return np.divide(distance, closing, out=np.full_like(distance, np.inf), where=counts)
 
 
-def time_exposed(drives: Drives, thresholds: MetricsTable) -> FloatArray:
+def time_exposed(drives: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s]; shape (N,), NaN on a collision."""
     critical, interval = _critical(drives, thresholds)
     exposed = np.round(np.count_nonzero(np.isfinite(critical), axis=0) * interval, TIME_DECIMALS)
     return np.where(np.isnan(drives.collision_speed), exposed, np.nan)
 
 
-def time_integrated(drives: Drives, thresholds: MetricsTable) -> FloatArray:
+def time_integrated(drives: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """TIT* = sum of (TTC* - TTC(t)) dt over the same samples [s^2]; shape (N,), NaN on a collision."""
     critical, interval = _critical(drives, thresholds)
     deficit = np.where(np.isfinite(critical), thresholds.ttc_threshold - critical, 0.0)
     return np.where(np.isnan(drives.collision_speed), total(deficit) * interval, np.nan)
 
 
-def _critical(drives: Drives, thresholds: MetricsTable) -> tuple[FloatArray, float]:
+def _critical(drives: SimulationRuns, thresholds: MetricsTable) -> tuple[FloatArray, float]:
     """TTC where it is critical, infinite elsewhere, at the samples; and the time between two samples."""
     stride = every(drives.trace.step, thresholds.sampling_interval)
     ttc = time_to_collision(drives)[::stride]

@@ -18,20 +18,20 @@ from safevar_sumo.plugins.reading import watch
 from safevar_sumo.records import BoolArray, FloatArray
 
 
-def lent(value: Any) -> Any:
+def read_only_copy(value: Any) -> Any:
     """A copy of a record and of the records in it, in which every array is a read-only copy."""
     if isinstance(value, np.ndarray):
         copy = value.copy()
         copy.flags.writeable = False
         return copy
     if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return type(value)(*map(lent, value))
+        return type(value)(*map(read_only_copy, value))
     if type(value) is tuple:
-        return tuple(map(lent, value))
+        return tuple(map(read_only_copy, value))
     if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{field.name: lent(getattr(value, field.name)) for field in fields(value)})
+        return replace(value, **{field.name: read_only_copy(getattr(value, field.name)) for field in fields(value)})
     if isinstance(value, Mapping):
-        return MappingProxyType({key: lent(inner) for key, inner in value.items()})
+        return MappingProxyType({key: read_only_copy(inner) for key, inner in value.items()})
     return value
 
 

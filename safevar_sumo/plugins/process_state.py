@@ -18,7 +18,7 @@ LEGAL = "code that leaves what others import as it is: a function of its own, or
 
 
 @contextmanager
-def undisturbed(source: str, names: Sequence[str]) -> Iterator[None]:
+def guard_process_state(source: str, names: Sequence[str]) -> Iterator[None]:
     """Within, plug-ins of such names may run, as the study `source` calls them; without any, nothing is done.
 
     Working directory, environment, numpy's error state and the recursion limit are put back at the end. `os._exit`, which

@@ -21,7 +21,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import BATCH, evaluate_all
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.local import result_of
-from safevar_sumo.workers.retrying import PersistentPool
+from safevar_sumo.workers.retrying import RetryingPool
 from safevar_sumo.workers.sources import inputs_of
 
 EDGE = 0.01
@@ -164,7 +164,7 @@ class _Trial:
         self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
         self._inputs = inputs_of(study, pool)
         self._lower, self._upper = np.array([(row.lower, row.upper) for row in study.calibration.values()]).T
-        self._pool = PersistentPool(pool, study)
+        self._pool = RetryingPool(pool, study)
         settings = [self._characteristics.original[np.newaxis], *(data.settings for data in references.values())]
         self._settings, self._row_of = np.unique(np.concatenate(settings), axis=0, return_inverse=True)
         self.alone = self._may_be_alone(pool)

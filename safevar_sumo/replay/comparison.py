@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.records import STANDSTILL, Drives, Evaluations, FloatArray, Outcome
+from safevar_sumo.records import STANDSTILL, Evaluations, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.batch import score
@@ -34,7 +34,7 @@ class Moments(NamedTuple):
     end: int
 
 
-def moments(drives: Drives, row: int) -> Moments:
+def moments(drives: SimulationRuns, row: int) -> Moments:
     """The moments of one of N drives."""
     trace = drives.trace
     active = trace.active[:, row]
@@ -48,7 +48,7 @@ def moments(drives: Drives, row: int) -> Moments:
     return Moments(brake, int(np.argmin(near)) if np.isfinite(near).any() else None, end)
 
 
-def divergence(drives: Drives, one: int = 0, other: int = 1) -> int | None:
+def divergence(drives: SimulationRuns, one: int = 0, other: int = 1) -> int | None:
     """The first sample at which the speeds of two of N drives have parted, None if they never do."""
     trace = drives.trace
     both = trace.active[:, one] & trace.active[:, other]
@@ -65,7 +65,7 @@ WORDS = {Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "i
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Drives of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is changed).
+    """Runs of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is changed).
 
     `title` is the study's, `evaluations` and `film` have one row for each vehicle.
     """
@@ -142,8 +142,8 @@ def compare(study: Study, system: System, setting: FloatArray) -> Comparison:
                       film=replace(taken, drives=_up_to_impacts(taken.drives)))
 
 
-def _up_to_impacts(drives: Drives) -> Drives:
-    """Drives with the pedals that were in force at an impact: those of the sample before, a command after it moves nothing any more."""
+def _up_to_impacts(drives: SimulationRuns) -> SimulationRuns:
+    """Runs with the pedals in force at an impact: those of the sample before; a command after it moves nothing any more."""
     trace = drives.trace
     throttle, brake = trace.throttle.copy(), trace.brake.copy()
     for row in np.flatnonzero(~np.isnan(drives.collision_speed)).tolist():

@@ -11,7 +11,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import time_to_collision
-from safevar_sumo.records import STANDSTILL, Drives, FloatArray
+from safevar_sumo.records import STANDSTILL, FloatArray, SimulationRuns
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison, divergence, moments
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def _over(comparison: Comparison) -> float:
     return float(drives.trace.time[min(max(ends) + 1, len(drives.trace.time) - 1)])
 
 
-def _comes_to_rest(drives: Drives, row: int) -> int:
+def _comes_to_rest(drives: SimulationRuns, row: int) -> int:
     """The last sample of a drive at which its vehicle moves, its first one if it never does."""
     return int(np.flatnonzero(drives.trace.active[:, row] & (drives.trace.speed[:, row] > STANDSTILL)).max(initial=0))
 

@@ -12,9 +12,9 @@ from safevar_sumo.analysis.explain.compute import explain_failures as explain
 from safevar_sumo.analysis.explain.necessity import is_borderline
 from safevar_sumo.analysis.research_questions.indicators import nondominated
 from safevar_sumo.replay.comparison import differences, number, raised, spaced
-from safevar_sumo.report.input import Material, stored
+from safevar_sumo.report.input import ReportInput, stored
 from safevar_sumo.report.svg import Bar, rows
-from safevar_sumo.results import Handle, chosen_handle, unsafe_rows
+from safevar_sumo.results import SolutionId, chosen_handle, unsafe_rows
 
 Found = list[dict[str, Any]]
 """What `explain --json` prints."""
@@ -27,7 +27,7 @@ FIRST = ("fewest", "smallest", "most_severe")
 OBJECTIVES = ["f_safe", "f_diff", "f_num_diff"]
 
 
-def explanations(material: Material, jobs: int | None, progress: Progress) -> Found:
+def explanations(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
     """The failures that matter, explained; computed once for these results."""
     def compute() -> Found:
         return explain(material.case, **material.options["explain"].keywords(), jobs=jobs,
@@ -36,7 +36,7 @@ def explanations(material: Material, jobs: int | None, progress: Progress) -> Fo
     return list(stored(material, "explain", compute))
 
 
-def necessity(found: Found, material: Material) -> Markup | None:
+def necessity(found: Found, material: ReportInput) -> Markup | None:
     """How often each characteristic is changed in a failure, and how often it is needed."""
     shares: dict[str, dict[str, Any]] = next((one["summary"] for one in found if "summary" in one), {})
     names = [name for name in shares.get("necessary", {}) if shares["changed"].get(name)]
@@ -57,7 +57,7 @@ def _interval(low: float, high: float) -> str:
     return f" ({low:.0%} to {high:.0%})" if low < high else ""
 
 
-def causes(found: Found, material: Material) -> list[dict[str, Any]]:
+def causes(found: Found, material: ReportInput) -> list[dict[str, Any]]:
     """The distinct minimal causes, the one of the fewest and smallest changes first, each with its replay at the boundary."""
     distinct: dict[tuple[str, ...], dict[str, Any]] = {}
     for failure in found:
@@ -82,12 +82,12 @@ def handle_of(failure: dict[str, Any]) -> str:
     return "" if failure["algorithm"] is None else f"{failure['algorithm']}:{failure['run']}:{failure['index']}"
 
 
-def _size(material: Material, cause: dict[str, Any]) -> tuple[int, float]:
+def _size(material: ReportInput, cause: dict[str, Any]) -> tuple[int, float]:
     setting = material.setting_with(cause["boundary"])
     return len(cause["changes"]), float(material.case.characteristics.largest_change(setting[np.newaxis])[0])
 
 
-def _told(material: Material, place: int, one: dict[str, Any]) -> dict[str, Any]:
+def _told(material: ReportInput, place: int, one: dict[str, Any]) -> dict[str, Any]:
     cause = one["cause"]
     setting = material.setting_with(cause["changes"])
     members = {member.name: member for member in material.case.characteristics}
@@ -104,13 +104,13 @@ def _told(material: Material, place: int, one: dict[str, Any]) -> dict[str, Any]
             "fraction": cause["fraction"], "below": cause["end"], "replay": material.replay(setting)}
 
 
-def replays(material: Material, explained: Found | None) -> list[dict[str, Any]]:
+def replays(material: ReportInput, explained: Found | None) -> list[dict[str, Any]]:
     """The solutions worth a look: the chosen ones, the explained ones, and unsafe ones that no other beats in every objective."""
     told, chosen = [], _chosen(material, explained)
     if material.system is not None and chosen:
-        material.again([material.setting_of(Handle.parse(handle)) for handle in chosen])
+        material.again([material.setting_of(SolutionId.parse(handle)) for handle in chosen])
     for place, handle in enumerate(chosen):
-        row, setting = material.solutions[handle], material.setting_of(Handle.parse(handle))
+        row, setting = material.solutions[handle], material.setting_of(SolutionId.parse(handle))
         one = {"handle": handle, "anchor": material.anchor("replay", handle), "f_safe": row["f_safe"], "f_diff": row["f_diff"],
                "f_num_diff": row["f_num_diff"], "outcome": row["outcome"], "open": place == 0 and not explained,
                "differences": [], "where": None, "changes": material.changes(setting)}
@@ -120,7 +120,7 @@ def replays(material: Material, explained: Found | None) -> list[dict[str, Any]]
     return sorted(told, key=lambda one: (one["f_safe"], one["handle"]))
 
 
-def _chosen(material: Material, explained: Found | None) -> list[str]:
+def _chosen(material: ReportInput, explained: Found | None) -> list[str]:
     """Their handles, each once."""
     solutions, degree = material.case.solutions, material.case.original["safety_degree"]
     if solutions.empty:

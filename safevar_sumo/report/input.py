@@ -29,7 +29,7 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare
 from safevar_sumo.replay.page import player_data
 from safevar_sumo.replay.scene import scene_of
-from safevar_sumo.results import RESULTS, Handle, handles, write_whole
+from safevar_sumo.results import RESULTS, SolutionId, handles, write_whole
 from safevar_sumo.results.manifest import MANIFEST, read_manifest
 from safevar_sumo.results.store import SOLUTIONS
 from safevar_sumo.scenarios import Point
@@ -86,7 +86,7 @@ class Again(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Material:
+class ReportInput:
     """One study of a report.
 
     `place` is its results directory as it was given, `number` its place among the studies, from 1; `system` is None where
@@ -112,7 +112,7 @@ class Material:
         named = zip(handles(self.case.solutions), self.case.solutions.to_dict("records"), strict=True)
         return {str(handle): {**{str(name): value for name, value in row.items()}, "handle": str(handle)} for handle, row in named}
 
-    def setting_of(self, handle: Handle) -> FloatArray:
+    def setting_of(self, handle: SolutionId) -> FloatArray:
         """A solution's setting, shape (n,)."""
         row = self.solutions[str(handle)]
         return np.array([row[name] for name in self.case.characteristics.names], dtype=float)
@@ -185,7 +185,7 @@ class Material:
         return "".join(sign if sign.isascii() and sign.isalnum() else "-" for sign in words)
 
 
-def gather(directories: Iterable[str | Path], point: str = "", *, as_it_is_now: bool = False) -> list[Material]:
+def gather(directories: Iterable[str | Path], point: str = "", *, as_it_is_now: bool = False) -> list[ReportInput]:
     """Read results directories, or what their solutions are at one point of a matrix, where they are simulated once more.
 
     Raises
@@ -207,7 +207,7 @@ def gather(directories: Iterable[str | Path], point: str = "", *, as_it_is_now: 
         if point:
             case = _at_point(case, point)
             system = assemble(case.study, str(place))
-        found.append(Material(number=number, place=place, case=case, manifest=read_manifest(place), system=system, lacking=lacking,
+        found.append(ReportInput(number=number, place=place, case=case, manifest=read_manifest(place), system=system, lacking=lacking,
                               point=point, changed=changed))
     return found
 
@@ -227,7 +227,7 @@ FOLDER = "answers"
 """Of a results directory."""
 
 
-def stored(material: Material, name: str, compute: Callable[[], Any]) -> Any:
+def stored(material: ReportInput, name: str, compute: Callable[[], Any]) -> Any:
     """What `compute` gives as plain values; from the results directory if it was computed from the same results before.
 
     Where the directory cannot be written, or nothing tells which code an answer comes from, nothing is kept.
@@ -252,7 +252,7 @@ def stored(material: Material, name: str, compute: Callable[[], Any]) -> Any:
     return json.loads(text)["value"]
 
 
-def _identity(material: Material, name: str) -> str:
+def _identity(material: ReportInput, name: str) -> str:
     """Results of other content, other options, another package or other files of the study give other answers."""
     digest = sha256(_package().encode())
     for kept in (MANIFEST, SOLUTIONS):

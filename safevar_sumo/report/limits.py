@@ -13,14 +13,14 @@ from safevar_sumo.analysis.rules.compute import find_rules
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import number_of, rule_in_words
 from safevar_sumo.replay.comparison import number, raised, spaced
-from safevar_sumo.report.input import Material, stored
+from safevar_sumo.report.input import ReportInput, stored
 from safevar_sumo.report.svg import Bar, rows
 from safevar_sumo.vehicles import Characteristic
 
 Found = dict[str, Any]
 
 
-def tolerance(material: Material, jobs: int | None, progress: Progress) -> Found:
+def tolerance(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
     """Every characteristic's safe interval alone, as bars over its domain, and the factor for all together."""
     def compute() -> Found:
         told = find_tolerances(material.case.study, **material.options["tolerance"].keywords(), jobs=jobs, progress=progress)
@@ -30,7 +30,7 @@ def tolerance(material: Material, jobs: int | None, progress: Progress) -> Found
     return {"verdict": found["verdict"], "unsafe": found["unsafe"], "joint": found["joint"], "chart": _bars(material, found["alone"])}
 
 
-def risk(material: Material, jobs: int | None, progress: Progress) -> Found:
+def risk(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
     """The probability of a failure with its interval, and what decides, as bars."""
     def compute() -> Found:
         return estimate_risk(material.case.study, **material.options["risk"].keywords(), jobs=jobs, progress=progress).record()
@@ -41,7 +41,7 @@ def risk(material: Material, jobs: int | None, progress: Progress) -> Found:
             "chart": _sensitivity(material, found["sensitivity"])}
 
 
-def rules(material: Material, jobs: int | None, progress: Progress) -> Found:
+def rules(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
     """Rules in words, with what they are worth on vehicles that they were not made from."""
     def compute() -> Found:
         told = find_rules(material.case.study, **material.options["rules"].keywords(), jobs=jobs, progress=progress)
@@ -56,11 +56,11 @@ def rules(material: Material, jobs: int | None, progress: Progress) -> Found:
     return found
 
 
-LIMITS: Mapping[str, Callable[[Material, int | None, Progress], Found]] = {"tolerance": tolerance, "risk": risk, "rules": rules}
+LIMITS: Mapping[str, Callable[[ReportInput, int | None, Progress], Found]] = {"tolerance": tolerance, "risk": risk, "rules": rules}
 """The sections that ask what the whole domain holds, by name."""
 
 
-def _bars(material: Material, alone: list[Found]) -> Markup:
+def _bars(material: ReportInput, alone: list[Found]) -> Markup:
     members = {member.name: member for member in material.case.characteristics}
     names, pieces, marks, ends = [], [], [], []
     for one in alone:
@@ -95,7 +95,7 @@ def _share(member: Characteristic, value: float) -> float:
     return (value - member.lower) / (member.upper - member.lower)
 
 
-def _sensitivity(material: Material, sensitivity: list[Found]) -> Markup | None:
+def _sensitivity(material: ReportInput, sensitivity: list[Found]) -> Markup | None:
     known = [one for one in sensitivity if one["total"] is not None]
     ordered = sorted(known, key=lambda one: (-one["total"], one["characteristic"]))
     if not ordered:

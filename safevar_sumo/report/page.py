@@ -13,7 +13,7 @@ from safevar_sumo.analysis.evaluator import Progress, silent
 from safevar_sumo.errors import InputError, did_you_mean
 from safevar_sumo.replay.page import environment, player_parts
 from safevar_sumo.report.findings import causes, explanations, necessity, replays
-from safevar_sumo.report.input import Material, gather
+from safevar_sumo.report.input import ReportInput, gather
 from safevar_sumo.report.limits import LIMITS
 from safevar_sumo.report.questions import figures, front, tables
 from safevar_sumo.report.trust import reproduce, trust
@@ -93,7 +93,7 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     return page + "\n"
 
 
-def _study(material: Material, wanted: Sequence[str], jobs: int | None, progress: Progress) -> Mapping[str, Any]:
+def _study(material: ReportInput, wanted: Sequence[str], jobs: int | None, progress: Progress) -> Mapping[str, Any]:
     """What one study gives to every section that is wanted."""
     explained = explanations(material, jobs, progress) if "causes" in wanted and material.system is not None else None
     limits = {name: make(material, jobs, _named(progress, material)) for name, make in LIMITS.items()
@@ -117,7 +117,7 @@ def _study(material: Material, wanted: Sequence[str], jobs: int | None, progress
             **limits, **{name: make() for name, make in made.items() if name in wanted or (name == "necessity" and "causes" in wanted)}}
 
 
-def _named(progress: Progress, material: Material) -> Progress:
+def _named(progress: Progress, material: ReportInput) -> Progress:
     """Progress that tells of which study it is."""
     return lambda what, done, total: progress(f"{material.case.name}: {what}", done, total)
 

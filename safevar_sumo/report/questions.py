@@ -17,7 +17,7 @@ from safevar_sumo.analysis.research_questions.figures import draw
 from safevar_sumo.analysis.research_questions.layout import Bold, Table, lay_out
 from safevar_sumo.replay.comparison import raised
 from safevar_sumo.report.findings import best_of, spread
-from safevar_sumo.report.input import Material
+from safevar_sumo.report.input import ReportInput
 from safevar_sumo.report.svg import Dot, scatter
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def _inline(figure: Figure) -> str:
     return "data:image/svg+xml," + quote(picture, safe=" =:/;,()'!?@&+$*")
 
 
-def front(material: Material, shown: Sequence[str]) -> Markup:
+def front(material: ReportInput, shown: Sequence[str]) -> Markup:
     """The solutions that no other one beats, by largest change and safety degree; those that are replayed lead there."""
     rows = [row for row in material.solutions.values() if not np.isnan([row["f_safe"], row["f_diff"]]).any()]
     best = best_of(rows)
@@ -80,7 +80,7 @@ def front(material: Material, shown: Sequence[str]) -> Markup:
                    list(dots.values()), "largest change [% of the original]", "safety degree [m, or -m/s]", 0.0, "collision below")
 
 
-def _dot(material: Material, row: dict[Any, Any], is_shown: bool) -> Dot:
+def _dot(material: ReportInput, row: dict[Any, Any], is_shown: bool) -> Dot:
     words = (f"{row['handle']}: {row['outcome']}, safety degree {row['f_safe']:.2f}, largest change {row['f_diff']:.0%}, "
              f"{row['f_num_diff']} changed")
     look = "hit" if row["outcome"] == "collision" else "miss"

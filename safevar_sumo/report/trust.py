@@ -16,7 +16,7 @@ from safevar_sumo.analysis.options import RUN
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Outcome
 from safevar_sumo.report.findings import Found
-from safevar_sumo.report.input import Material
+from safevar_sumo.report.input import ReportInput
 from safevar_sumo.report.verdict import agreement
 from safevar_sumo.study import Study, load_study, study_names
 
@@ -28,7 +28,7 @@ NOT_MODELLED = (
 )
 
 
-def trust(material: Material, explained: Found | None) -> dict[str, Any]:
+def trust(material: ReportInput, explained: Found | None) -> dict[str, Any]:
     """What a reader should hold against the findings of one study."""
     case = material.case
     rows = [{"name": name, "published": case.study.published[name], "here": case.original[name]}
@@ -52,7 +52,7 @@ def trust(material: Material, explained: Found | None) -> dict[str, Any]:
     return {"published": rows, "told": told, "general": NOT_MODELLED, "agreement": agreement(material)["rows"]}
 
 
-def reproduce(materials: Sequence[Material], parts: Sequence[str]) -> list[dict[str, str]]:
+def reproduce(materials: Sequence[ReportInput], parts: Sequence[str]) -> list[dict[str, str]]:
     """Commands that make the numbers of this page again."""
     places = " ".join(shlex.quote(str(material.place)) for material in materials)
     commands = []

@@ -17,14 +17,14 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.reference import Totals, quoted
 from safevar_sumo.replay.comparison import number, raised
 from safevar_sumo.report.findings import Found, handle_of
-from safevar_sumo.report.input import Material
-from safevar_sumo.results import Handle, chosen_handle, unsafe_rows
+from safevar_sumo.report.input import ReportInput
+from safevar_sumo.results import SolutionId, chosen_handle, unsafe_rows
 from safevar_sumo.scenarios import SCENARIOS, Point, tags
 from safevar_sumo.sumo.matrix import vehicle_remarks
 from safevar_sumo.vehicles import VEHICLES
 
 
-def tested(material: Material) -> dict[str, Any]:
+def tested(material: ReportInput) -> dict[str, Any]:
     """Two sentences, and the characteristics that were varied."""
     case, study = material.case, material.case.study
     return {
@@ -41,7 +41,7 @@ def tested(material: Material) -> dict[str, Any]:
                     *(vehicle_remarks(material.system) if material.system else [])]}
 
 
-def _where(material: Material) -> str:
+def _where(material: ReportInput) -> str:
     """The weather, or how many points a matrix has, and in which weathers."""
     points = () if material.system is None else material.system.matrix
     if material.point:
@@ -59,7 +59,7 @@ def _tests(points: Sequence[Point]) -> list[str]:
     return [f"{test} ({len(weathers)}, {' and '.join(dict.fromkeys(weathers))})" for test, weathers in of_test.items()]
 
 
-def _how(material: Material) -> str:
+def _how(material: ReportInput) -> str:
     case, search = material.case, material.case.study.search
     versions = ", ".join(f"{name} {value}" for name, value in material.manifest["versions"].items())
     if not case.has_runs:
@@ -89,7 +89,7 @@ KMH = 3.6
 UNKNOWN = "–"  # noqa: RUF001
 
 
-def verdict(material: Material, explained: Found | None, tolerance: Mapping[str, Any] | None) -> dict[str, Any]:
+def verdict(material: ReportInput, explained: Found | None, tolerance: Mapping[str, Any] | None) -> dict[str, Any]:
     """What happened to the original vehicle, and what makes it unsafe: the smallest robust failure first, every other one with a badge.
 
     All values of a failure are those of its solution as it was found, nowhere shrunk.
@@ -115,13 +115,13 @@ def _rule(hits: bool, degree: float) -> str:
     return f"a safety degree below {degree / 2:.2f} m, half of the original's (nothing collides)"
 
 
-def _original(material: Material) -> str:
+def _original(material: ReportInput) -> str:
     if material.system is None:
         return f"The original vehicle's safety degree is {material.case.original['safety_degree']:.2f} m."
     return f"The original vehicle {material.compared(material.case.characteristics.original).verdict(0)}."
 
 
-def _findings(material: Material, explained: Found, *, any_unsafe: bool) -> list[dict[str, Any]]:
+def _findings(material: ReportInput, explained: Found, *, any_unsafe: bool) -> list[dict[str, Any]]:
     """The failures worth a sentence, each once, with all that it was chosen for; without explanations, chosen among the solutions alone."""
     reasons: dict[str, list[str]] = {}
     shares: dict[str, float] = {}
@@ -137,11 +137,11 @@ def _findings(material: Material, explained: Found, *, any_unsafe: bool) -> list
             reasons.setdefault(str(handle), []).append(REASONS[choice])
     order = list(TITLES)
     chosen = sorted(reasons.items(), key=lambda one: min(order.index(reason) for reason in one[1]))
-    return [_finding(material, handle, of_it, shares.get(handle)) for handle, of_it in chosen]
+    return [_finding(material, handle, group, shares.get(handle)) for handle, group in chosen]
 
 
-def _finding(material: Material, handle: str, reasons: list[str], share: float | None) -> dict[str, Any]:
-    setting = material.setting_of(Handle.parse(handle))
+def _finding(material: ReportInput, handle: str, reasons: list[str], share: float | None) -> dict[str, Any]:
+    setting = material.setting_of(SolutionId.parse(handle))
     changes = material.changes(setting)
     largest = float(material.case.characteristics.largest_change(setting[np.newaxis])[0])
     titles = [TITLES[reason] for reason in TITLES if reason in reasons]
@@ -152,14 +152,14 @@ def _finding(material: Material, handle: str, reasons: list[str], share: float |
             "short": f"{_changes(len(changes))} of at most {largest:.0%}", "f_safe": material.solutions[handle]["f_safe"]}
 
 
-def _end(material: Material, handle: str, setting: FloatArray) -> str:
+def _end(material: ReportInput, handle: str, setting: FloatArray) -> str:
     if material.system is None:
         return f"safety degree {material.solutions[handle]['f_safe']:.2f}"
     comparison = material.compared(setting)
     return comparison.verdict(comparison.rows[-1])
 
 
-def _headline(result: Mapping[str, Any], material: Material, explained: Found | None) -> str:
+def _headline(result: Mapping[str, Any], material: ReportInput, explained: Found | None) -> str:
     if not result["unsafe"]:
         return f"Nothing unsafe among {result['solutions']} solutions; the nearest miss is shown below."
     if material.original_fails:
@@ -179,7 +179,8 @@ def _changes(number: int) -> str:
     return "1 change" if number == 1 else f"{number} changes"
 
 
-def _figures(result: Mapping[str, Any], material: Material, explained: Found, tolerance: Mapping[str, Any] | None) -> list[dict[str, str]]:
+def _figures(result: Mapping[str, Any], material: ReportInput, explained: Found,
+             tolerance: Mapping[str, Any] | None) -> list[dict[str, str]]:
     """The four key figures, each a title, a value and a note."""
     by_reason = {reason: one for one in result["findings"] for reason in one["reasons"]}
     preventable = next((one["summary"].get("preventable") for one in explained if "summary" in one), None)
@@ -196,7 +197,7 @@ def _smallest(robust: Mapping[str, Any] | None, explained: Found, result: Mappin
     return {"title": title, "value": robust["short"], "note": f"{robust['share']:.0%} of its neighbours are unsafe too"}
 
 
-def _severity(worst: Mapping[str, Any] | None, material: Material) -> dict[str, str]:
+def _severity(worst: Mapping[str, Any] | None, material: ReportInput) -> dict[str, str]:
     degree = float(material.case.solutions["f_safe"].min()) if worst is None else worst["f_safe"]
     if degree < 0:
         return {"title": "Most severe", "value": f"collision at {-degree:.1f} m/s", "note": f"{-KMH * degree:.0f} km/h"}
@@ -224,7 +225,7 @@ def _together(tolerance: Mapping[str, Any] | None) -> dict[str, str]:
             "note": f"from the original to the ends of their domains; none of {samples} vehicles within is unsafe"}
 
 
-def agreement(material: Material) -> dict[str, Any]:
+def agreement(material: ReportInput) -> dict[str, Any]:
     """How well the study agrees with published data: a sentence, and the rows of a table; none where nothing is known."""
     known = quoted(material.case.study)
     if not known:

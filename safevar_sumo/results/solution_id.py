@@ -15,7 +15,7 @@ HALF = 0.5
 """Share of the original's safety degree below which a solution counts as unsafe where none collides."""
 
 
-class Handle(NamedTuple):
+class SolutionId(NamedTuple):
     """One solution: the `row`-th of a run's solutions in the order of solutions.csv, from 0.
 
     Imported solutions belong to no run; theirs count as run 0.
@@ -29,7 +29,7 @@ class Handle(NamedTuple):
         return f"{self.algorithm}:{self.run}:{self.row}"
 
     @classmethod
-    def parse(cls, text: str, source: object = "solution") -> Handle:
+    def parse(cls, text: str, source: object = "solution") -> SolutionId:
         """Read a handle.
 
         Raises
@@ -44,17 +44,17 @@ class Handle(NamedTuple):
         return cls(algorithm, int(run), int(row))
 
 
-def handles(solutions: pd.DataFrame) -> list[Handle]:
+def handles(solutions: pd.DataFrame) -> list[SolutionId]:
     """The handle of every row of a frame of solutions, as `safevar_sumo.results.load` gives it."""
     import pandas as pd
 
     run = solutions["run"] if "run" in solutions else pd.Series(0, index=solutions.index)
     row = solutions.groupby([solutions["algorithm"], run], sort=False).cumcount()
-    return [Handle(str(algorithm), int(number), int(place))
+    return [SolutionId(str(algorithm), int(number), int(place))
             for algorithm, number, place in zip(solutions["algorithm"], run, row, strict=True)]
 
 
-def position_of(solutions: pd.DataFrame, handle: Handle, source: object = "solution") -> int:
+def position_of(solutions: pd.DataFrame, handle: SolutionId, source: object = "solution") -> int:
     """The place of a handle's solution among the rows of the frame.
 
     Raises
@@ -90,7 +90,7 @@ CHOICES = {
 """What solutions are asked for by: the objectives that decide, one after the other, the least first."""
 
 
-def chosen_handle(solutions: pd.DataFrame, original: float, choice: str, source: object) -> Handle:
+def chosen_handle(solutions: pd.DataFrame, original: float, choice: str, source: object) -> SolutionId:
     """The most severe of all solutions, or the unsafe one with the fewest or the smallest changes.
 
     Parameters
@@ -111,4 +111,4 @@ def chosen_handle(solutions: pd.DataFrame, original: float, choice: str, source:
         if named.empty:
             raise InputError(source, "these results hold no solution", "results with a solution")
         raise InputError(source, "these results hold no unsafe solution", "the most severe one, or a solution by its handle")
-    return Handle.parse(candidates.sort_values(CHOICES[choice], kind="stable")["handle"].iloc[0], source)
+    return SolutionId.parse(candidates.sort_values(CHOICES[choice], kind="stable")["handle"].iloc[0], source)

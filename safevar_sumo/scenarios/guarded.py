@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from safevar_sumo.plugins import Contract, Guard, lent
+from safevar_sumo.plugins import Contract, Guard, read_only_copy
 from safevar_sumo.records import Encounter, Trace
 from safevar_sumo.scenarios.base import STEEPEST, Actors, Roads, Scenario, Scene, World
 
@@ -64,7 +64,7 @@ class GuardedScenario:
         return Scene(**values), memory
 
     def encounter(self, trace: Trace) -> Encounter:
-        given = self._guard.call("encounter", self._scenario.encounter, lent(trace))
+        given = self._guard.call("encounter", self._scenario.encounter, read_only_copy(trace))
         shape = trace.speed.shape
         values = {name: self._guard.field("encounter", given, name) for name in Encounter._fields}
         in_conflict = self._guard.truths("encounter", "in_conflict", values.pop("in_conflict"), shape)
@@ -87,4 +87,4 @@ class _LentWorld:
         if name.startswith("_") or not hasattr(World, name):
             raise AttributeError(f"a scenario's world has no {name!r}")
         method = getattr(self._world, name)
-        return lambda *arguments: lent(method(*arguments))
+        return lambda *arguments: read_only_copy(method(*arguments))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.errors import ForeignError
-from safevar_sumo.plugins import Contract, Guard, lent
+from safevar_sumo.plugins import Contract, Guard, read_only_copy
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search.base import Algorithm, Problem, Search
 
@@ -22,7 +22,7 @@ class GuardedAlgorithm:
         self._algorithm, self._guard = algorithm, guard
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        search = self._guard.call("search", self._algorithm.search, lent(problem), rng)
+        search = self._guard.call("search", self._algorithm.search, read_only_copy(problem), rng)
         if not (hasattr(search, "send") and hasattr(search, "__next__")):
             raise self._guard.wrong("search", "the search", search, "a generator: a method that yields settings and returns its result")
         known: dict[bytes, Evaluations] = {}
@@ -37,7 +37,7 @@ class GuardedAlgorithm:
             evaluated = yield settings
             for i, row in enumerate(settings):
                 known[row.tobytes()] = evaluated.take([i])
-            answer = lent(evaluated)
+            answer = read_only_copy(evaluated)
 
     def _step(self, search: Any, answer: Evaluations | None) -> tuple[Any, bool]:
         """What the search yields next, or what it returns in the end."""

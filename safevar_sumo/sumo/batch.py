@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import undisturbed
-from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Drives, Evaluations, FloatArray, Outcome, Trace
+from safevar_sumo.plugins import guard_process_state
+from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Evaluations, FloatArray, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios import VUT, Lane, Point
 from safevar_sumo.scenarios.frame import Frame
 from safevar_sumo.sumo.contact import Contacts
@@ -29,7 +29,7 @@ Watcher = Callable[[SumoWorld], None]
 
 
 @np.errstate(all="ignore")
-def score(system: System, settings: FloatArray, run: Drives) -> Evaluations:
+def score(system: System, settings: FloatArray, run: SimulationRuns) -> Evaluations:
     """Metrics and objectives of simulated settings."""
     metrics = {name: metric(run, system.metrics) for name, metric in system.measuring.metrics.items()}
     invalid = run.outcome == Outcome.INVALID_TEST
@@ -46,7 +46,7 @@ def score(system: System, settings: FloatArray, run: Drives) -> Evaluations:
 
 
 def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = (),
-             watch: Watcher | None = None) -> Drives:
+             watch: Watcher | None = None) -> SimulationRuns:
     """Drive every setting, shape (N, n), at every one of the points, which share a network; `watch` is shown the world at every sample.
 
     The drives at the first point come first, then those at the second, and so on.
@@ -70,17 +70,17 @@ def step_options(system: System) -> tuple[str, ...]:
 
 
 @np.errstate(all="ignore")
-def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher | None = None) -> Drives:
+def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher | None = None) -> SimulationRuns:
     """Drive the vehicles of an open world that nobody has stepped yet; see `drive_all`.
 
     With several points the k-th part of the settings is in the k-th of them.
     """
     guards = [member.guard for member in system.members if member.guard is not None]
-    with undisturbed(guards[0].source if guards else "", [guard.name for guard in guards]):
+    with guard_process_state(guards[0].source if guards else "", [guard.name for guard in guards]):
         return _driven(system, settings, world, watch)
 
 
-def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher | None) -> Drives:
+def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher | None) -> SimulationRuns:
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_surface(system.points, n))
@@ -123,9 +123,10 @@ def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watch
         _refuse_no_number(state.speed, settings, system.characteristics)
         world.advance(np.where(verdict.open, state.speed, 0.0))
     trace = log.trace(sample + 1, step, length)
-    return Drives(trace=trace, encounter=parts.encounter(trace), outcome=np.where(robot.invalid, Outcome.INVALID_TEST, verdict.outcome()),
-                  collision_speed=np.where(robot.invalid, np.nan, verdict.collision_speed), contact=contacts.contact(),
-                  test_speed_error=robot.error)
+    return SimulationRuns(
+        trace=trace, encounter=parts.encounter(trace), outcome=np.where(robot.invalid, Outcome.INVALID_TEST, verdict.outcome()),
+        collision_speed=np.where(robot.invalid, np.nan, verdict.collision_speed), contact=contacts.contact(),
+        test_speed_error=robot.error)
 
 
 def _refuse_no_number(speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet) -> None:

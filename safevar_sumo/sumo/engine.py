@@ -17,7 +17,7 @@ from typing import Any
 
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
 from safevar_sumo.sumo.network import CopiedNetwork, copied_network, empty_fingerprint, empty_network, round_up
-from safevar_sumo.sumo.reusable import StandingSumo
+from safevar_sumo.sumo.reusable import ReusableSumo
 from safevar_sumo.sumo.traffic import Traffic, common_checks, repeatable_traffic
 from safevar_sumo.sumo.world import SumoWorld
 
@@ -70,7 +70,7 @@ def open_world(files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, op
         stop_engine(api)
 
 
-_standing: StandingSumo | None = None
+_standing: ReusableSumo | None = None
 """The libsumo of this process, if it is open."""
 
 
@@ -83,7 +83,7 @@ def _standing_world(folder: str, traffic: Sequence[Traffic], options: Sequence[s
         if _standing is None or not _standing.serves(wanted, n):
             copies = round_up(n)
             start_engine(api, Engine.LIBSUMO, [*sumo_command(Engine.LIBSUMO, empty_network(folder, copies)), *options])
-            _standing = StandingSumo(api, wanted, copies)
+            _standing = ReusableSumo(api, wanted, copies)
         _standing.expect(traffic)
         yield SumoWorld(api, n, standing=_standing)
     except BaseException as error:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.records import Drives, FloatArray
+from safevar_sumo.records import FloatArray, SimulationRuns
 from safevar_sumo.sumo.copies import copy_and_name
 from safevar_sumo.sumo.matrix import at_worst, simulate
 from safevar_sumo.sumo.network import built_network
@@ -50,7 +50,7 @@ class Film:
     comes after it is whatever SUMO did with the rest of the batch.
     """
 
-    drives: Drives
+    drives: SimulationRuns
     tracks: Mapping[str, Track]
     road: tuple[Lane, ...]
 

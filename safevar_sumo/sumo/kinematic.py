@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from safevar_sumo.records import BoolArray, Drives, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, SimulationRuns
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.batch import drive, step_options
 from safevar_sumo.sumo.copies import copied_id
@@ -24,7 +24,7 @@ from safevar_sumo.sumo.world import Body, SumoWorld, direction_of
 from safevar_sumo.vehicles import SumoType
 
 
-def simulate_alone(system: System, settings: FloatArray) -> Drives:
+def simulate_alone(system: System, settings: FloatArray) -> SimulationRuns:
     """`simulate` in the study's one scenario, with one copy of the network for all settings, shape (N, n)."""
     files = copied_network(staged(system.scenario), 1)
     with open_world(files, 1, Engine.LIBSUMO, step_options(system)) as world:

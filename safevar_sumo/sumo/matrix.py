@@ -12,7 +12,7 @@ import numpy.typing as npt
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Contact, Drives, Encounter, Evaluations, FloatArray, Outcome, Trace
+from safevar_sumo.records import Contact, Encounter, Evaluations, FloatArray, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.study import Study
@@ -35,7 +35,7 @@ class AtPoint(NamedTuple):
 
     point: Point
     evaluations: Evaluations
-    drives: Drives
+    drives: SimulationRuns
 
 
 def point_record(found: AtPoint, row: int = 0) -> dict[str, Any]:
@@ -100,7 +100,7 @@ def aggregated(system: System, found: Sequence[AtPoint]) -> Evaluations:
 
 
 def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = (),
-             watch: Watcher | None = None) -> Drives:
+             watch: Watcher | None = None) -> SimulationRuns:
     """Run the scenario once for every setting; shape (N, n). `watch` is shown the world at every sample.
 
     In a matrix a setting's drive is that of the point in which it comes off worst; who watches sees all settings at the
@@ -205,7 +205,7 @@ def worst_points(found: Sequence[AtPoint]) -> npt.NDArray[np.intp]:
     return np.asarray(np.array(order)[np.argmin(degrees, axis=0)])
 
 
-def _picked(drives: Sequence[Drives], number: npt.NDArray[np.intp]) -> Drives:
+def _picked(drives: Sequence[SimulationRuns], number: npt.NDArray[np.intp]) -> SimulationRuns:
     """For every vehicle its drive among several; shorter ones stay at their last sample, where nothing counts any more."""
     length, columns = max(len(one.trace.time) for one in drives), np.arange(len(number))
 
@@ -223,7 +223,7 @@ def _picked(drives: Sequence[Drives], number: npt.NDArray[np.intp]) -> Drives:
     ended = np.array([len(one.trace.time) for one in drives])[number]
     active = trace.active & (np.arange(length)[:, np.newaxis] < ended)
     encounters = zip(*(one.encounter for one in drives), strict=True)
-    return Drives(
+    return SimulationRuns(
         trace=replace(trace, active=active), encounter=Encounter._make(picked(list(values)) for values in encounters),
         outcome=of_each([one.outcome for one in drives]), collision_speed=of_each([one.collision_speed for one in drives]),
         contact=Contact._make(of_each(list(values)) for values in zip(*(one.contact for one in drives), strict=True)),

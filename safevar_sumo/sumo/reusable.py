@@ -18,7 +18,7 @@ PARKING = 1
 """Flag of a stop beside the lane (TraCI, "set stop")."""
 
 
-class StandingSumo:
+class ReusableSumo:
     """An open SUMO whose network nobody is on; `enter` puts the actors onto its first copies.
 
     Parameters

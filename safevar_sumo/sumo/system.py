@@ -18,7 +18,7 @@ import numpy as np
 from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown
 from safevar_sumo.metrics import F_SAFE, METRICS, Metric, Objective, Scoring, foreign_metric
-from safevar_sumo.plugins import Guard, Lookup, Member, OwnModules, check_parameters, made, undisturbed
+from safevar_sumo.plugins import Guard, Lookup, Member, OwnModules, check_parameters, guard_process_state, made
 from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, weather_of
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, foreign_names
@@ -173,7 +173,7 @@ def assemble(study: Study, source: str = "") -> System:
         Naming the study, the key, the value and what is legal.
     """
     source = source or f"study {study.name!r}"
-    with undisturbed(source, foreign_names(study)):
+    with guard_process_state(source, foreign_names(study)):
         return _assembled(study, source)
 
 

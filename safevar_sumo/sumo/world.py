@@ -15,7 +15,7 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import VUT, Lane
 from safevar_sumo.scenarios.base import lane_through
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
-from safevar_sumo.sumo.reusable import StandingSumo
+from safevar_sumo.sumo.reusable import ReusableSumo
 from safevar_sumo.vehicles import Sensors, SumoType
 
 # Speed mode: SUMO obeys every speed that is set and yields to nobody on a junction (TraCI "set speed mode", bit 5).
@@ -42,7 +42,7 @@ class Body(NamedTuple):
 class SumoWorld:
     """N copies of a network under simulation; made by `open_world`. Shapes: (N,) or (N, 2)."""
 
-    def __init__(self, api: Any, n: int, *, first: int = 0, watched: bool = False, standing: StandingSumo | None = None,
+    def __init__(self, api: Any, n: int, *, first: int = 0, watched: bool = False, standing: ReusableSumo | None = None,
                  whole: SumoWorld | None = None) -> None:
         self._api, self.n, self._first, self._standing = api, n, first, standing
         self._set_speed, self._get_speed = _direct(api, "vehicle", "setSpeed"), _direct(api, "vehicle", "getSpeed")

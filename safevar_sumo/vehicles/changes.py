@@ -8,7 +8,7 @@ from typing import Any
 from msgspec import Struct
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import Guard, lent
+from safevar_sumo.plugins import Guard, read_only_copy
 from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
@@ -45,7 +45,7 @@ def foreign_change(change: Any, guard: Guard) -> Change:
         raise InputError(guard.source, f"{guard.name}: function = {change.function!r}", "a function of settings and characteristics")
 
     def checked(settings: FloatArray, known: CharacteristicSet) -> FloatArray:
-        given = guard.call(change.name, change.function, lent(settings), known)
+        given = guard.call(change.name, change.function, read_only_copy(settings), known)
         return guard.numbers(change.name, "values", given, (len(settings),))
 
     return Change(name=change.name, title=change.title, unit=change.unit, function=checked)

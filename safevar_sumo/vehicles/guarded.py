@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import ForeignError
-from safevar_sumo.plugins import Contract, Guard, lent, takes
+from safevar_sumo.plugins import Contract, Guard, read_only_copy, takes
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType, Vehicle
 from safevar_sumo.vehicles.sensors import Sensors
@@ -59,11 +59,11 @@ class GuardedVehicle:
         if slope is not LEVEL and not takes(method, 4):
             problem = f"{self._guard.name} has no slope in prepare(characteristics, road_friction, step, slope), and the road has a grade"
             raise ForeignError(self._guard.source, problem, "a vehicle with it, or scenarios with grade 0")
-        given: tuple[Any, ...] = (lent(characteristics), road_friction, step)
+        given: tuple[Any, ...] = (read_only_copy(characteristics), road_friction, step)
         if np.any(wet) and takes(method, 5):
-            given = (*given, lent(slope), wet if isinstance(wet, bool) else wet.copy())
+            given = (*given, read_only_copy(slope), wet if isinstance(wet, bool) else wet.copy())
         elif slope is not LEVEL:
-            given = (*given, lent(slope))
+            given = (*given, read_only_copy(slope))
         theirs = self._guard.call("prepare", method, *given)
         types = self._guard.call("sumo_type", self._vehicle.sumo_type, theirs)
         return _Prepared(n, theirs, SumoType(*(
@@ -82,12 +82,13 @@ class GuardedVehicle:
         if not hasattr(self._vehicle, "at_speed"):
             problem = f"{self._guard.name} has no method at_speed(prepared, speed), and the traffic puts it onto the road in motion"
             raise ForeignError(self._guard.source, problem, "a vehicle with it, or traffic that departs with speed 0")
-        return self._state("at_speed", prepared.n, self._guard.call("at_speed", self._vehicle.at_speed, prepared.theirs, lent(speed)))
+        state = self._guard.call("at_speed", self._vehicle.at_speed, prepared.theirs, read_only_copy(speed))
+        return self._state("at_speed", prepared.n, state)
 
     def hold_gear(self, prepared: _Prepared, state: _State, holds: BoolArray) -> _State:
         if not hasattr(self._vehicle, "hold_gear"):
             return state
-        given = self._guard.call("hold_gear", self._vehicle.hold_gear, prepared.theirs, state.theirs, lent(holds))
+        given = self._guard.call("hold_gear", self._vehicle.hold_gear, prepared.theirs, state.theirs, read_only_copy(holds))
         return self._state("hold_gear", prepared.n, given)
 
     def sensors(self, prepared: _Prepared) -> Sensors | None:
@@ -115,7 +116,7 @@ class GuardedVehicle:
                                        "latency, reach, scale); or an ADS that is given what is sensed, without ads.kind = \"traci\"")
 
     def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
-        given = self._guard.call("sense", self._vehicle.sense, prepared.theirs, state.theirs, lent(seen))
+        given = self._guard.call("sense", self._vehicle.sense, prepared.theirs, state.theirs, read_only_copy(seen))
         theirs, after = self._guard.parts("sense", given, "(Observation, state)")
         values: dict[str, Any] = {}
         for name, value in seen._asdict().items():
@@ -126,7 +127,7 @@ class GuardedVehicle:
         return Observation(**values), self._state("sense", prepared.n, after)
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
-        given = self._guard.call("advance", self._vehicle.advance, prepared.theirs, state.theirs, lent(command))
+        given = self._guard.call("advance", self._vehicle.advance, prepared.theirs, state.theirs, read_only_copy(command))
         state = self._state("advance", prepared.n, given)
         self._refuse_faster(state.speed, prepared.types.max_speed)
         return state

@@ -6,9 +6,26 @@ from safevar_sumo.workers.evaluation import Pool, PoolLostError, WorkerLostError
 from safevar_sumo.workers.identity import identity_of
 from safevar_sumo.workers.isolation import check_isolation, refuse_difference
 from safevar_sumo.workers.local import available_cores, first_of, local_pool, result_of
-from safevar_sumo.workers.retrying import PersistentPool, reproducing
+from safevar_sumo.workers.retrying import RetryingPool, reproducing
 from safevar_sumo.workers.sources import inputs_of, sources_of
 
-__all__ = ["PersistentPool", "Pool", "PoolLostError", "WorkerLostError", "available_cores", "check_isolation",
-           "cluster_pool", "evaluate_all", "evaluate_batch", "first_of", "identity_of", "inputs_of", "local_pool", "packed",
-           "refuse_difference", "reproducing", "result_of", "sources_of"]
+__all__ = [
+           "Pool",
+           "PoolLostError",
+           "RetryingPool",
+           "WorkerLostError",
+           "available_cores",
+           "check_isolation",
+           "cluster_pool",
+           "evaluate_all",
+           "evaluate_batch",
+           "first_of",
+           "identity_of",
+           "inputs_of",
+           "local_pool",
+           "packed",
+           "refuse_difference",
+           "reproducing",
+           "result_of",
+           "sources_of",
+]

@@ -12,7 +12,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.isolation import check_isolation
 from safevar_sumo.workers.local import first_of
-from safevar_sumo.workers.retrying import PersistentPool
+from safevar_sumo.workers.retrying import RetryingPool
 from safevar_sumo.workers.sources import inputs_of
 
 BATCH = 100
@@ -28,7 +28,7 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     Models that are not ours are first seen to keep settings apart (`check_isolation`). `done` is called with the number of
     settings of every batch that is finished.
     """
-    persistent, work = PersistentPool(pool, study), packed(study, inputs_of(study, pool), alone=alone)
+    persistent, work = RetryingPool(pool, study), packed(study, inputs_of(study, pool), alone=alone)
     if work not in _isolated:
         check_isolation(study, CharacteristicSet.of(study.vehicle.characteristics), lambda rows: persistent.submit(work, rows))
         _isolated.add(work)

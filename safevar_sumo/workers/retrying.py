@@ -32,7 +32,7 @@ FAILURES_IN_A_ROW = 20
 """So many settings that fail one after the other are a fault of the study, not of the settings."""
 
 
-class PersistentPool:
+class RetryingPool:
     """Settings that fail alone are evaluated as `simulator-error`; too many of them in a row are an error.
 
     Parameters

@@ -14,7 +14,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.identity import Inputs, networks_of
 from safevar_sumo.workers.local import result_of
-from safevar_sumo.workers.retrying import PersistentPool
+from safevar_sumo.workers.retrying import RetryingPool
 
 _read: dict[tuple[bytes, str], Files] = {}
 """What models were seen to read in this process, by packed study and working directory."""
@@ -42,7 +42,7 @@ def sources_of(study: Study, pool: Pool) -> Files:
         key = work, os.getcwd()
         if any(digest_of(located(name, study.origin.places)) != digest for name, digest in _read.get(key, {"": "never read"}).items()):
             original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
-            _read[key] = dict(result_of(PersistentPool(pool, study).submit(work, original, must_succeed=True)).files)
+            _read[key] = dict(result_of(RetryingPool(pool, study).submit(work, original, must_succeed=True)).files)
         files |= _read[key]
     return dict(sorted(files.items()))
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare, course
 from safevar_sumo.analysis.words import sentence
-from safevar_sumo.records import Drives, Encounter, Outcome, Trace
+from safevar_sumo.records import Encounter, Outcome, SimulationRuns, Trace
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
@@ -19,7 +19,7 @@ from safevar_sumo.sumo.system import assemble
 STEP, OBSTACLE = 0.002, 20.0
 
 
-def drive_of(*vehicles: tuple[float, float, float, float]) -> Drives:
+def drive_of(*vehicles: tuple[float, float, float, float]) -> SimulationRuns:
     """Vehicles of (speed, gap at which the brake is commanded, delay, deceleration) towards an obstacle at 20 m."""
     time = np.arange(0, 8, STEP)
     columns = []
@@ -38,7 +38,7 @@ def drive_of(*vehicles: tuple[float, float, float, float]) -> Drives:
     trace = Trace(step=STEP, vehicle_length=5.0, time=time, position=place, speed=speed, gap=OBSTACLE - place, lateral=nothing,
                   lateral_speed=nothing, throttle=nothing, brake=brake, gear=nothing, active=active, pedal=pedal)
     outcome = np.where(np.isnan(collision_speed), Outcome.STOPPED.value, Outcome.COLLISION.value)
-    return Drives(trace=trace, encounter=Encounter(trace.gap, trace.gap, speed, trace.gap > 0), outcome=outcome,
+    return SimulationRuns(trace=trace, encounter=Encounter(trace.gap, trace.gap, speed, trace.gap > 0), outcome=outcome,
                   collision_speed=collision_speed)
 
 
@@ -113,7 +113,7 @@ LARGER = {"it begins to brake nearer": False, "it begins to brake farther away":
 SYSTEMS = {name: assemble(load_study(name)) for name in ("sun", "rain")}
 
 
-def margin(drives: Drives, column: int) -> tuple[float, float, float]:
+def margin(drives: SimulationRuns, column: int) -> tuple[float, float, float]:
     """Distance left where a vehicle stands or would stand, its speed at the brake command, and the time until its pedal is at 0.9."""
     trace = drives.trace
     samples = [(trace.speed[i, column], trace.position[i, column], trace.gap[i, column], trace.brake[i, column], trace.pedal[i, column])

@@ -18,7 +18,7 @@ from rich.console import Console
 from safevar_sumo.analysis.risk.compute import Risk
 from safevar_sumo.analysis.risk.compute import estimate_risk as risk
 from safevar_sumo.analysis.risk.render import print_risk
-from safevar_sumo.analysis.risk.variation_model import World
+from safevar_sumo.analysis.risk.variation_model import VariationModel
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import load_study
@@ -86,7 +86,7 @@ def test_the_promised_record_and_the_same_again() -> None:
 def drawn(**variation: dict[str, Any]) -> FloatArray:
     correlations = variation.pop("correlations", [])
     study = load_study(made_up_study(2), variation=variation, correlations=correlations)
-    return World(study).settings(np.random.default_rng(1).random((20_000, 2)))
+    return VariationModel(study).settings(np.random.default_rng(1).random((20_000, 2)))
 
 
 def test_every_distribution_has_its_moments() -> None:
@@ -104,7 +104,7 @@ def test_every_distribution_has_its_moments() -> None:
 
 def test_lognormal_has_its_median_and_spread() -> None:
     study = load_study("smoke", variation={"mass": {"distribution": "lognormal", "sigma": 0.02}})
-    mass = World(study).settings(np.random.default_rng(1).random((20_000, 12)))[:, 6]
+    mass = VariationModel(study).settings(np.random.default_rng(1).random((20_000, 12)))[:, 6]
     assert np.median(mass) == pytest.approx(2404, rel=0.001)
     assert np.log(mass).std() == pytest.approx(0.02, rel=0.02)
 
@@ -137,7 +137,7 @@ def test_correlations_are_those_of_the_copula() -> None:
     ({"variation": {"mass": {"distribution": "lognormal", "sigma": 1e300}}}, "variation.mass.sigma")])
 def test_impossible_distributions_are_refused(changes: dict[str, Any], says: str) -> None:
     with pytest.raises(InputError, match=says.replace("[", r"\[").replace("+", r"\+")):
-        World(load_study("smoke", **changes))
+        VariationModel(load_study("smoke", **changes))
 
 
 def test_another_distribution_replaces_the_row_that_a_study_extends() -> None:

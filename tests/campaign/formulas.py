@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from safevar_sumo.campaign import Campaign, RunKey, all_runs, carry_out
+from safevar_sumo.campaign import Campaign, RunKey, all_runs, run_campaign
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
@@ -79,7 +79,7 @@ def carried_out(study: Study, path: Path, pool: FormulaPool | None = None, keys:
                 batch: int | None = None) -> tuple[Campaign, Told]:
     told = Told()
     results = ResultsDirectory(path, study)
-    campaign = carry_out(study, all_runs(study) if keys is None else keys, results, pool or FormulaPool(), told, batch)
+    campaign = run_campaign(study, all_runs(study) if keys is None else keys, results, pool or FormulaPool(), told, batch)
     results.finish(campaign.solutions)
     return campaign, told
 

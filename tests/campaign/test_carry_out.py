@@ -13,7 +13,7 @@ import pytest
 from formulas import SUN, FormulaPool, Told, carried_out, evaluated, solutions, with_search
 from rich.console import Console
 
-from safevar_sumo.campaign import RunKey, all_runs, carry_out, run_generator
+from safevar_sumo.campaign import RunKey, all_runs, run_campaign, run_generator
 from safevar_sumo.campaign.batcher import BATCHES_PER_WORKER
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations
@@ -36,7 +36,7 @@ def test_bar_status_and_campaign_count_the_same_collisions(study: Study, tmp_pat
     for _ in range(2):
         console, results = Console(file=StringIO(), width=200, force_terminal=True, _environ={}), ResultsDirectory(tmp_path, study)
         with CampaignProgress(console, study, all_runs(study), quiet=False) as progress:
-            campaign = carry_out(study, all_runs(study), results, FormulaPool(), progress)
+            campaign = run_campaign(study, all_runs(study), results, FormulaPool(), progress)
         results.finish(campaign.solutions)
         found = load(tmp_path).evaluations
         expected = len(found[found["outcome"] == "collision"].drop_duplicates(["algorithm", "run", *SUN.names]))
@@ -133,7 +133,7 @@ def test_more_runs_extend_and_fewer_leave_out(study: Study, tmp_path: Path) -> N
 @pytest.mark.parametrize("key", [RunKey("nsga2", 1), RunKey("rs", 0), RunKey("safe_fuzzer", 1)])
 def test_a_run_alone_is_the_same_as_in_the_whole(study: Study, tmp_path: Path, key: RunKey) -> None:
     campaign, _ = carried_out(study, tmp_path / "whole")
-    alone = carry_out(study, [key], ResultsDirectory(tmp_path / "alone", study), FormulaPool(), Told())
+    alone = run_campaign(study, [key], ResultsDirectory(tmp_path / "alone", study), FormulaPool(), Told())
     assert list(alone.solutions) == [key]
     assert np.array_equal(alone.solutions[key].settings, campaign.solutions[key].settings)
     assert np.array_equal(alone.solutions[key].objectives, campaign.solutions[key].objectives)
@@ -150,7 +150,7 @@ def test_a_run_in_other_hands_is_left_to_them(study: Study, tmp_path: Path) -> N
     carried_out(study, tmp_path / "whole")
     results = ResultsDirectory(tmp_path / "out", study)
     theirs = [results.journal("rs-01"), results.journal("original")]
-    campaign = carry_out(study, all_runs(study), results, FormulaPool(), Told())
+    campaign = run_campaign(study, all_runs(study), results, FormulaPool(), Told())
     assert campaign.busy == [RunKey("rs", 1)]
     assert set(campaign.solutions) == set(all_runs(study)) - {RunKey("rs", 1)}
     for journal in theirs:

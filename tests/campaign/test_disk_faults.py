@@ -12,7 +12,7 @@ import msgspec
 import pytest
 from formulas import FormulaPool, Told
 
-from safevar_sumo.campaign import all_runs, carry_out
+from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.results import ResultsDirectory, files, journal, load
 from safevar_sumo.study import Study, load_study
@@ -82,7 +82,7 @@ def tiny() -> Study:
 
 def carried_out(study: Study, path: Path) -> bytes:
     results = ResultsDirectory(path, study)
-    results.finish(carry_out(study, all_runs(study), results, FormulaPool(), Told()).solutions)
+    results.finish(run_campaign(study, all_runs(study), results, FormulaPool(), Told()).solutions)
     return (path / "solutions.csv").read_bytes()
 
 

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 from formulas import SUN, FormulaPool, Told, carried_out, evaluated, solutions, with_search
 
-from safevar_sumo.campaign import RunKey, all_runs, carry_out
+from safevar_sumo.campaign import RunKey, all_runs, run_campaign
 from safevar_sumo.campaign.run import Run
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import Evaluations
@@ -123,9 +123,9 @@ def test_failed_settings_are_tried_again_when_that_is_asked_for(study: Study, tm
     assert list(results.failures) == failed.failures != []
     assert {one.reason for one in failed.failures} == {"SUMO failed: it has its day off"}
     with pytest.raises(PoolLostError):  # a retry that breaks down is gone on with
-        carry_out(study, all_runs(study), ResultsDirectory(tmp_path / "out", study), FormulaPool(lasts=7), Told(), retry_failed=True)
+        run_campaign(study, all_runs(study), ResultsDirectory(tmp_path / "out", study), FormulaPool(lasts=7), Told(), retry_failed=True)
     pool = FormulaPool()
-    campaign = carry_out(study, all_runs(study), ResultsDirectory(tmp_path / "out", study), pool, Told(), retry_failed=True)
+    campaign = run_campaign(study, all_runs(study), ResultsDirectory(tmp_path / "out", study), pool, Told(), retry_failed=True)
     ResultsDirectory(tmp_path / "out", study).finish(campaign.solutions)
     carried_out(study, tmp_path / "whole")
     assert campaign.failures == []

@@ -67,13 +67,13 @@ def test_tables_agree_with_the_solutions_that_are_stored(results: Path) -> None:
     solutions = pd.read_csv(results / "solutions.csv")
     records = json.loads(run("tables", str(results), "--rq", "collisions", "--format", "json").stdout)
     for one in records:
-        of_it = solutions[solutions["algorithm"] == one["algorithm"]]
-        assert one["solutions"] == len(of_it)
-        assert one["collisions"] == (of_it["outcome"] == "collision").sum()
+        group = solutions[solutions["algorithm"] == one["algorithm"]]
+        assert one["solutions"] == len(group)
+        assert one["collisions"] == (group["outcome"] == "collision").sum()
     rq1 = json.loads(run("tables", str(results), "--rq", "rq1", "--format", "json").stdout)
     for one in rq1:
-        of_it = solutions[(solutions["algorithm"] == one["algorithm"])]
-        assert one["mean"] == pytest.approx(of_it[one["metric"]].mean())
+        group = solutions[(solutions["algorithm"] == one["algorithm"])]
+        assert one["mean"] == pytest.approx(group[one["metric"]].mean())
 
 
 def test_all_tables_at_once_and_into_files(results: Path, in_tmp: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 from in_process import Here, Silent
 
-from safevar_sumo.campaign import all_runs, carry_out
+from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.results import RESULTS, ResultsDirectory, load
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.system import assemble
@@ -33,7 +33,7 @@ def computed(name: str) -> dict[str, Any]:
     study = small(name)
     with tempfile.TemporaryDirectory() as folder:
         results = ResultsDirectory(Path(folder), study, identity_of(study, assemble(study)))
-        results.finish(carry_out(study, all_runs(study), results, Here(), Silent()).solutions)
+        results.finish(run_campaign(study, all_runs(study), results, Here(), Silent()).solutions)
         found = load(folder)
     digests = {algorithm: sha256(rows.to_csv(index=False, lineterminator="\n").encode()).hexdigest()
                for algorithm, rows in found.solutions.groupby("algorithm")}

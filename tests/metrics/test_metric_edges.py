@@ -11,11 +11,11 @@ from test_metrics import STEP, braking_run, value
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import time_to_collision
 from safevar_sumo.metrics.scoring import F_DIFF, F_SAFE, Objective, Scoring
-from safevar_sumo.records import Drives, Encounter, Evaluations
+from safevar_sumo.records import Encounter, Evaluations, SimulationRuns
 from safevar_sumo.study import MetricsTable
 
 
-def ended(run: Drives, after: float) -> Drives:
+def ended(run: SimulationRuns, after: float) -> SimulationRuns:
     """The same drive of which only the samples before a moment count."""
     return dataclasses.replace(run, trace=dataclasses.replace(run.trace, active=run.trace.time[:, np.newaxis] < after))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from beside import InThisProcess, Mine
 
-from safevar_sumo.api.running import Unheard, carried_out
+from safevar_sumo.api.running import NullObserver, carried_out
 from safevar_sumo.campaign import all_runs
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.study import load_study
@@ -34,7 +34,7 @@ def test_a_class_that_remembers_what_only_a_rare_setting_does(mine: Mine, folder
     study = load_study(str(folder / "mine.toml"), search={"algorithms": ["nsga2"], "evaluations": 60, "runs": 1})
     for _ in range(2):  # the same command again does not get by either
         with pytest.raises(ForeignError, match=r"in run nsga2-00 and [\d.]+ alone; again by: python -m safevar_sumo simulate") as caught:
-            carried_out(study, system, all_runs(study), tmp_path / "out", InThisProcess(), Unheard(), 7)
+            carried_out(study, system, all_runs(study), tmp_path / "out", InThisProcess(), NullObserver(), 7)
         assert "ads.model = 'mine:Mine' a result depends on what else is simulated" in str(caught.value)
     assert not (tmp_path / "out/solutions.csv").exists()
 
@@ -60,7 +60,7 @@ def test_an_algorithm_whose_runs_learn_from_each_other(own: str, shared: bool, m
     study = load_study(str(folder / "mine.toml"))
 
     def searched() -> object:
-        return carried_out(study, system, all_runs(study), tmp_path / "out", InThisProcess(), Unheard(), None)
+        return carried_out(study, system, all_runs(study), tmp_path / "out", InThisProcess(), NullObserver(), None)
 
     if shared:
         with pytest.raises(ForeignError, match="'mine:Mine' asks for other settings when run 2 is repeated alone"):
@@ -94,7 +94,7 @@ def test_a_class_that_makes_every_twelfth_vehicle_safer(mine: Mine, folder: Path
     system = mine(SAFER)
     study = load_study(str(folder / "mine.toml"), search={"algorithms": ["rs"], "evaluations": 100, "runs": 2})
     with pytest.raises(ForeignError, match=r"ads.model = 'mine:Mine' a result depends on what else is simulated"):
-        carried_out(study, system, all_runs(study), tmp_path / "out", InThisProcess(), Unheard(), None)
+        carried_out(study, system, all_runs(study), tmp_path / "out", InThisProcess(), NullObserver(), None)
 
 
 CLOCK = """
@@ -118,7 +118,7 @@ def test_an_algorithm_that_draws_from_the_clock(first: str, later: str, mine: Mi
     system = mine(CLOCK.format(first=first, later=later), '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 1\n')
     study = load_study(str(folder / "mine.toml"))
     with pytest.raises(ForeignError, match="'mine:Mine' asks for other settings when run 0 is repeated alone"):
-        carried_out(study, system, all_runs(study), tmp_path / "out", InThisProcess(), Unheard(), None)
+        carried_out(study, system, all_runs(study), tmp_path / "out", InThisProcess(), NullObserver(), None)
 
 
 GREEDY = """
@@ -154,7 +154,7 @@ def test_an_algorithm_that_changes_its_problem_or_asks_for_nothing(module: str, 
     system = mine(module, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 10\nruns = 1\n')
     study = load_study(str(folder / "mine.toml"))
     with pytest.raises(ForeignError, match=problem):
-        carried_out(study, system, all_runs(study), tmp_path / "out", InThisProcess(), Unheard(), None)
+        carried_out(study, system, all_runs(study), tmp_path / "out", InThisProcess(), NullObserver(), None)
 
 
 def test_what_an_algorithm_does_to_its_problem_reaches_nobody_else(mine: Mine, folder: Path, tmp_path: Path) -> None:
@@ -163,6 +163,6 @@ def test_what_an_algorithm_does_to_its_problem_reaches_nobody_else(mine: Mine, f
     for table in (with_mine, alone):
         system = mine(SETATTR, table.format("evaluations = 10\nruns = 1\n"))
         study = load_study(str(folder / "mine.toml"))
-        campaign = carried_out(study, system, all_runs(study), tmp_path / f"{len(found)}", InThisProcess(), Unheard(), None)
+        campaign = carried_out(study, system, all_runs(study), tmp_path / f"{len(found)}", InThisProcess(), NullObserver(), None)
         found.append(next(one for key, one in campaign.solutions.items() if key.algorithm == "rs"))
     assert found[0].settings.tobytes() == found[1].settings.tobytes()

@@ -68,9 +68,9 @@ def test_a_study_of_six_members_from_outside(study: Path, tmp_path: Path) -> Non
 
 def search_in_this_process(study: Path, out: Path) -> sv.Results:
     """As `run`, computed here: members that are patched into the package are not in worker processes."""
-    from safevar_sumo.api.running import Unheard, carried_out, prepared
+    from safevar_sumo.api.running import NullObserver, carried_out, prepared
     from safevar_sumo.campaign import all_runs
 
     chosen, system = prepared(str(study))
-    carried_out(chosen, system, all_runs(chosen), out, InThisProcess(), Unheard(), None)
+    carried_out(chosen, system, all_runs(chosen), out, InThisProcess(), NullObserver(), None)
     return sv.load(out)

@@ -25,7 +25,7 @@ from safevar_sumo.report.limits import LIMITS
 from safevar_sumo.report.page import gather
 from safevar_sumo.report.svg import Dot, scatter
 from safevar_sumo.report.verdict import verdict
-from safevar_sumo.results import Handle
+from safevar_sumo.results import SolutionId
 from safevar_sumo.sumo.system import assemble
 
 
@@ -45,16 +45,16 @@ class Outline(HTMLParser):
         self.feed(page)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        of_it = dict(attrs)
+        group = dict(attrs)
         if tag not in self.VOID:
             self.open.append(tag)
         if re.fullmatch("h[1-6]", tag):
             self.headings.append(int(tag[1]))
-        self.ids += [str(of_it["id"])] if "id" in of_it else []
-        self.links += [str(of_it["href"])] if tag == "a" else []
-        self.fetched += [str(of_it[name]) for name in ("src", "srcset", "data", "poster") if name in of_it]
+        self.ids += [str(group["id"])] if "id" in group else []
+        self.links += [str(group["href"])] if tag == "a" else []
+        self.fetched += [str(group[name]) for name in ("src", "srcset", "data", "poster") if name in group]
         if tag == "img":
-            self.alternatives.append(of_it.get("alt"))
+            self.alternatives.append(group.get("alt"))
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.handle_starttag(tag, attrs)
@@ -173,7 +173,7 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
     told = verdict(material, [fewest, robust, summary], {"joint": {"factor": 0.42, "samples": 1024}})
     assert [(one["title"], one["borderline"]) for one in told["findings"]] == [("Smallest robust failure", False), ("Fewest changes", True)]
     first = told["findings"][0]
-    setting = material.setting_of(Handle.parse(first["handle"]))
+    setting = material.setting_of(SolutionId.parse(first["handle"]))
     assert [one["text"] for one in first["changes"]] == changes_in_words(material.case.characteristics, setting)
     assert told["headline"].startswith(f"{len(first['changes'])} changes suffice for a collision that is robust")
     assert [one["value"] for one in told["figures"][2:]] == ["14% of the collisions", "42.0% of the way"]

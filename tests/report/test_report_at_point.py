@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from in_process import Here, Silent
 
-from safevar_sumo.campaign import all_runs, carry_out
+from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.errors import InputError
 from safevar_sumo.report import make_report
 from safevar_sumo.report.page import gather
@@ -26,7 +26,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     matrix = {"aggregate": "worst", "tests": [{"name": "crossing", "weathers": ["clear", "hard_rain"]}]}
     study = load_study("smoke", matrix=matrix, search={"runs": 1, "population": 10, "evaluations": 40, "algorithms": ["rs"]})
     results = ResultsDirectory(tmp_path_factory.mktemp("matrix") / "results", study, identity_of(study, assemble(study)))
-    results.finish(carry_out(study, all_runs(study), results, Here(), Silent()).solutions)
+    results.finish(run_campaign(study, all_runs(study), results, Here(), Silent()).solutions)
     return results.path
 
 

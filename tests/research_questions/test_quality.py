@@ -114,11 +114,11 @@ def test_convergence_grows_to_the_hypervolume_of_all() -> None:
     case = made_up(row(sd=0.1, f_diff=1), row(run=1, sd=1, f_diff=0.1), evaluations=evaluations)
     grown = convergence(case)
     assert set(grown["evaluations"]) >= {10, 100}
-    for run, of_it in grown.groupby("run"):
-        assert (np.diff(of_it["hypervolume"]) >= 0).all()
+    for run, group in grown.groupby("run"):
+        assert (np.diff(group["hypervolume"]) >= 0).all()
         seen = case.evaluations[case.evaluations["run"] == run]
         normal = Scale.of(reference_front(case)).normalised(objectives(case, seen))
-        assert of_it["hypervolume"].iloc[-1] == pytest.approx(moocore.hypervolume(normal, ref=[1.1] * 3))
+        assert group["hypervolume"].iloc[-1] == pytest.approx(moocore.hypervolume(normal, ref=[1.1] * 3))
     early = grown[grown["run"] == 0]
     assert early.loc[early["evaluations"] >= 40, "hypervolume"].nunique() == 1, "a run that ended early keeps what it had"
 

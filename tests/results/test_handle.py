@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.results import Handle, chosen_handle, handles, position_of
+from safevar_sumo.results import SolutionId, chosen_handle, handles, position_of
 
 FRAME = pd.DataFrame({
     "algorithm": ["nsga2", "nsga2", "nsga2", "rs"], "run": [0, 0, 3, 0], "f_safe": [-3.0, -1.0, -2.0, 2.0], "f_diff": [0.3, 0.2, 0.1, 0.01],
@@ -16,7 +16,7 @@ FRAME = pd.DataFrame({
 def test_rows_count_within_their_run() -> None:
     assert list(map(str, handles(FRAME))) == ["nsga2:0:0", "nsga2:0:1", "nsga2:3:0", "rs:0:0"]
     for place, handle in enumerate(handles(FRAME)):
-        assert position_of(FRAME, Handle.parse(str(handle))) == place
+        assert position_of(FRAME, SolutionId.parse(str(handle))) == place
 
 
 def test_imported_solutions_count_as_run_0() -> None:
@@ -27,13 +27,13 @@ def test_imported_solutions_count_as_run_0() -> None:
     "", "nsga2", "nsga2:0", "nsga2:0:", ":0:0", "nsga2:-1:0", "nsga2:0:0:0", "nsga2:0:x", "nsga2:0:" + "9" * 30])
 def test_what_is_no_handle_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="ALGORITHM:RUN:N"):
-        Handle.parse(text)
+        SolutionId.parse(text)
 
 
 @pytest.mark.parametrize(("handle", "legal"), [("nsga2:0:2", "0 to 1"), ("nsga2:1:0", "nsga2:0, nsga2:3, rs:0"), ("sf:0:0", "nsga2:0")])
 def test_a_solution_that_is_not_there_is_told_with_what_is(handle: str, legal: str) -> None:
     with pytest.raises(InputError) as refused:
-        position_of(FRAME, Handle.parse(handle))
+        position_of(FRAME, SolutionId.parse(handle))
     assert handle in str(refused.value)
     assert legal in str(refused.value)
 

@@ -30,9 +30,9 @@ def test_a_finished_study_is_told_as_its_journals_hold_it(slippery: Path) -> Non
     assert told.share == 1
     assert told.simulated == len(case.evaluations)
     for run in told.runs:
-        of_it = case.evaluations[(case.evaluations["algorithm"] == run.algorithm) & (case.evaluations["run"] == run.run)]
-        assert run.collisions == (of_it["outcome"] == "collision").sum()
-        assert run.best == of_it["f_safe"].min()
+        group = case.evaluations[(case.evaluations["algorithm"] == run.algorithm) & (case.evaluations["run"] == run.run)]
+        assert run.collisions == (group["outcome"] == "collision").sum()
+        assert run.best == group["f_safe"].min()
     assert sorted(told.points[:, 0].tolist()) == sorted(case.evaluations["f_safe"].tolist())
 
 

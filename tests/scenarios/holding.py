@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from safevar_sumo.records import Command, Drives, FloatArray, Nominal, Observation
+from safevar_sumo.records import Command, FloatArray, Nominal, Observation, SimulationRuns
 from safevar_sumo.scenarios import Scenario
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
@@ -32,13 +32,13 @@ class Hold:
         return Command(np.where(brakes, 0.0, throttle), np.where(brakes, 1.0, brake)), memory
 
 
-def driven(scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = CARLA) -> Drives:
+def driven(scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = CARLA) -> SimulationRuns:
     """The original vehicle of CARLA, or settings, in a scenario; held at its speed unless an ADS is given."""
     system = replace(system, scenario=scenario, ads=ads or Hold())
     return simulate(system, system.characteristics.original[np.newaxis] if settings is None else settings)
 
 
-def at_contact(run: Drives, values: FloatArray, vehicle: int = 0) -> float:
+def at_contact(run: SimulationRuns, values: FloatArray, vehicle: int = 0) -> float:
     """A value when the bumper reaches the obstacle, linear between the two samples around it."""
     gap = run.trace.gap[:, vehicle]
     after = int(np.argmax(gap <= 1e-9))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from holding import Hold, at_contact
 
-from safevar_sumo.records import Drives
+from safevar_sumo.records import SimulationRuns
 from safevar_sumo.scenarios import Crossing
 from safevar_sumo.scenarios.along import Along
 from safevar_sumo.study import load_study
@@ -54,7 +54,7 @@ def test_who_does_not_brake_is_where_the_protocol_says_at_every_point(study: str
             assert late * scenario.speed / 3.6 < 0.05, found.point.name
 
 
-def struck(run: Drives, width: float) -> float:
+def struck(run: SimulationRuns, width: float) -> float:
     return at_contact(run, run.trace.lateral[:, 0]) / width + 0.5
 
 

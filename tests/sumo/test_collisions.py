@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.records import Command, Drives, Nominal, Observation, Outcome
+from safevar_sumo.records import Command, Nominal, Observation, Outcome, SimulationRuns
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import System, assemble
@@ -28,7 +28,7 @@ class _Pedals:
         return Command(np.where(brakes, 0.0, self._throttle), np.where(brakes, 1.0, 0.0)), memory
 
 
-def driven(study: str, n: int, brakes_until: float = 9.0) -> tuple[System, Drives]:
+def driven(study: str, n: int, brakes_until: float = 9.0) -> tuple[System, SimulationRuns]:
     """The original vehicle n times, with pedals that make for n different encounters."""
     system = assemble(load_study(study))
     rng = np.random.default_rng(7)
@@ -53,7 +53,7 @@ def test_sumo_reports_who_hardly_touches_a_pedestrian_with_a_corner() -> None:
     _held_against_geometry("sun", run)
 
 
-def _held_against_geometry(study: str, run: Drives) -> None:
+def _held_against_geometry(study: str, run: SimulationRuns) -> None:
     trace, collided = run.trace, run.outcome == Outcome.COLLISION
     half_width, person, thickness = (2.1284 / 2, 0.478, 0.215) if study == "sun" else (1.85 / 2, 0.0, 0.0)
     beside = np.abs(trace.lateral) <= half_width + thickness + 0.02 if study == "sun" else np.ones_like(trace.active)

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from safevar_sumo.errors import SimulationError
-from safevar_sumo.records import Command, Drives, Nominal, Observation
+from safevar_sumo.records import Command, Nominal, Observation, SimulationRuns
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study, study_names
@@ -65,13 +65,13 @@ def loadings(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return loaded
 
 
-def fresh(system: System, population: np.ndarray) -> Drives:
+def fresh(system: System, population: np.ndarray) -> SimulationRuns:
     n = len(population)
     with open_world(copied_network(staged(system.scenario), n), n) as world:
         return drive(system, population, world)
 
 
-def bits(drives: Drives) -> dict[str, bytes]:
+def bits(drives: SimulationRuns) -> dict[str, bytes]:
     """Everything that is told of simulations."""
     trace = drives.trace
     told = {"outcome": drives.outcome.tobytes(), "collision speed": drives.collision_speed.tobytes()}

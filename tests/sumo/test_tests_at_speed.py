@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from safevar_sumo.records import Command, Drives, FloatArray, Nominal, Observation, Outcome
+from safevar_sumo.records import Command, FloatArray, Nominal, Observation, Outcome, SimulationRuns
 from safevar_sumo.scenarios import Crossing, Scenario
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, load_study
@@ -40,7 +40,7 @@ class Pedals:
         return Command(nothing + throttle, nothing + (0.5 if brakes else 0.0)), memory
 
 
-def run(scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = SUN) -> Drives:
+def run(scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = SUN) -> SimulationRuns:
     system = replace(system, scenario=scenario, ads=ads or Pedals())
     return simulate(system, system.characteristics.original[np.newaxis] if settings is None else settings)
 

@@ -15,7 +15,7 @@ from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.study import ModelTable, Origin, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError
-from safevar_sumo.workers.retrying import ATTEMPTS, PersistentPool
+from safevar_sumo.workers.retrying import ATTEMPTS, RetryingPool
 
 STUDY = load_study("sun")
 SUN = CharacteristicSet.of(STUDY.vehicle.characteristics)
@@ -68,14 +68,14 @@ def deadly(*values: float) -> Callable[[np.ndarray, int], Exception | None]:
 
 def test_a_batch_that_lost_its_worker_once_is_tried_again() -> None:
     pool = ToldPool(lambda rows, before: None if before else died())
-    found = PersistentPool(pool, STUDY).submit(b"", settings(8)).result(timeout=5)
+    found = RetryingPool(pool, STUDY).submit(b"", settings(8)).result(timeout=5)
     assert pool.tried == [8, 8]
     assert found.valid.all()
 
 
 def test_the_setting_that_kills_its_worker_alone_is_told_from_the_others() -> None:
     pool = ToldPool(deadly(4302, 4305))
-    found = PersistentPool(pool, STUDY).submit(b"", settings(8)).result(timeout=5)
+    found = RetryingPool(pool, STUDY).submit(b"", settings(8)).result(timeout=5)
     assert np.array_equal(found.settings, settings(8))
     assert np.array_equal(found.valid, ~np.isin(settings(8)[:, 0], (4302, 4305)))
     assert found.outcome[2] == Outcome.SIMULATOR_ERROR
@@ -87,32 +87,32 @@ def test_the_setting_that_kills_its_worker_alone_is_told_from_the_others() -> No
 
 def test_a_setting_alone_gets_a_second_chance_too() -> None:
     pool = ToldPool(lambda rows, before: died() if len(rows) > 1 or not before else None)
-    assert PersistentPool(pool, STUDY).submit(b"", settings(3)).result(timeout=5).valid.all()
+    assert RetryingPool(pool, STUDY).submit(b"", settings(3)).result(timeout=5).valid.all()
 
 
 def test_what_the_study_is_at_fault_for_ends_at_once_with_that_fault() -> None:
     pool = ToldPool(lambda rows, before: InputError("study", "ads.model = 'x' cannot be imported"))
     with pytest.raises(InputError, match="cannot be imported"):
-        PersistentPool(pool, STUDY).submit(b"", settings(1000)).result(timeout=5)
+        RetryingPool(pool, STUDY).submit(b"", settings(1000)).result(timeout=5)
     assert len(pool.tried) == 1
 
 
 @pytest.mark.parametrize("fault", [SimulationError("SUMO failed: no place"), WorkerLostError("died")])
 def test_a_setting_is_blamed_only_if_the_original_vehicle_can_be_simulated(fault: Exception) -> None:
     with pytest.raises(EnvironmentFault, match=f"{fault}; the original vehicle cannot be simulated either"):
-        PersistentPool(ToldPool(lambda rows, before: fault), STUDY).submit(b"", settings(4)).result(timeout=5)
+        RetryingPool(ToldPool(lambda rows, before: fault), STUDY).submit(b"", settings(4)).result(timeout=5)
 
 
 def test_an_outage_that_ends_in_time_is_nobodys_fault() -> None:
     down = iter([True] * 4)
     pool = ToldPool(lambda rows, before: SimulationError("outage") if next(down, False) else None)
-    assert PersistentPool(pool, STUDY).submit(b"", settings(3)).result(timeout=5).valid.all()
+    assert RetryingPool(pool, STUDY).submit(b"", settings(3)).result(timeout=5).valid.all()
 
 
 def test_a_fault_of_the_surroundings_is_an_error_and_no_outcome() -> None:
     pool = ToldPool(lambda rows, before: EnvironmentFault("the disk is full") if np.isin(rows[:, 0], 4302).any() else None)
     with pytest.raises(EnvironmentFault, match="the disk is full"):
-        PersistentPool(pool, STUDY).submit(b"", settings(4)).result(timeout=5)
+        RetryingPool(pool, STUDY).submit(b"", settings(4)).result(timeout=5)
     assert pool.tried == [4, 4]
 
 
@@ -122,7 +122,7 @@ def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> No
 
     pool = ToldPool(fault)
     with pytest.raises(ForeignError) as told:
-        PersistentPool(pool, FOREIGN).submit(b"", settings(50)).result(timeout=5)
+        RetryingPool(pool, FOREIGN).submit(b"", settings(50)).result(timeout=5)
     assert "ZeroDivisionError; again by: python -m safevar_sumo simulate 'my study.toml' --set " in str(told.value)
     assert f"--set {SUN.names[0]}=4313.0" in str(told.value)
     assert str(told.value).count("--set") == 1, "what is not changed need not be set"
@@ -132,43 +132,43 @@ def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> No
 def test_a_process_that_ends_with_a_users_code_in_it_is_an_error() -> None:
     told = r"exit code -9\), again and again, with ads.model = 'my_ads:Mine' in it; .* cannot tell file and line; again by: .*=4302\.0"
     with pytest.raises(ForeignError, match=told):
-        PersistentPool(ToldPool(deadly(4302)), FOREIGN).submit(b"", settings(8)).result(timeout=5)
+        RetryingPool(ToldPool(deadly(4302)), FOREIGN).submit(b"", settings(8)).result(timeout=5)
 
 
 def test_settings_that_fail_one_after_the_other_without_end_are_a_fault_of_the_study() -> None:
-    pool = PersistentPool(ToldPool(deadly(*4300 + np.arange(40))), STUDY)
+    pool = RetryingPool(ToldPool(deadly(*4300 + np.arange(40))), STUDY)
     assert not pool.submit(b"", settings(19)).result(timeout=5).valid.any()
     with pytest.raises(WorkerLostError, match="exit code -9"):
         pool.submit(b"", settings(40)).result(timeout=5)
 
 
 def test_why_a_setting_could_not_be_simulated_is_kept() -> None:
-    found = PersistentPool(ToldPool(deadly(4301)), STUDY).submit(b"", settings(3)).result(timeout=5)
+    found = RetryingPool(ToldPool(deadly(4301)), STUDY).submit(b"", settings(3)).result(timeout=5)
     assert found.reason(1) == "the worker process died (exit code -9)"
 
 
 def test_failures_between_successes_are_no_fault_of_the_study() -> None:
     every_second = 4300 + np.arange(0, 200, 2)
-    found = PersistentPool(ToldPool(deadly(*every_second)), STUDY).submit(b"", settings(200)).result(timeout=5)
+    found = RetryingPool(ToldPool(deadly(*every_second)), STUDY).submit(b"", settings(200)).result(timeout=5)
     assert np.count_nonzero(~found.valid) == 100
 
 
 def test_the_original_vehicle_must_succeed() -> None:
     with pytest.raises(WorkerLostError):
-        PersistentPool(ToldPool(deadly(4300)), STUDY).submit(b"", settings(1), must_succeed=True).result(timeout=5)
+        RetryingPool(ToldPool(deadly(4300)), STUDY).submit(b"", settings(1), must_succeed=True).result(timeout=5)
 
 
 def test_a_batch_of_one_has_as_many_chances_as_a_setting_of_a_larger_one() -> None:
     pool = ToldPool(lambda rows, before: died() if before < 2 * ATTEMPTS - 1 else None)
-    assert PersistentPool(pool, STUDY).submit(b"", settings(1)).result(timeout=5).valid.all()
-    assert not PersistentPool(ToldPool(deadly(4300)), STUDY).submit(b"", settings(1)).result(timeout=5).valid.any()
+    assert RetryingPool(pool, STUDY).submit(b"", settings(1)).result(timeout=5).valid.all()
+    assert not RetryingPool(ToldPool(deadly(4300)), STUDY).submit(b"", settings(1)).result(timeout=5).valid.any()
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError("a bug"), PoolLostError("gone")])
 def test_a_bug_and_a_lost_pool_are_not_tried_again(error: Exception) -> None:
     pool = ToldPool(lambda rows, before: error)
     with pytest.raises(type(error), match=str(error)):
-        PersistentPool(pool, STUDY).submit(b"", settings(5)).result(timeout=5)
+        RetryingPool(pool, STUDY).submit(b"", settings(5)).result(timeout=5)
     assert pool.tried == [5]
 
 
@@ -180,7 +180,7 @@ def test_a_pool_that_takes_nothing_any_more_ends_the_wait() -> None:
             return super().submit(study, settings)
 
     with pytest.raises(PoolLostError, match="closed"):
-        PersistentPool(Closed(lambda rows, before: died()), STUDY).submit(b"", settings(5)).result(timeout=5)
+        RetryingPool(Closed(lambda rows, before: died()), STUDY).submit(b"", settings(5)).result(timeout=5)
 
 
 def test_a_cancelled_batch_ends_the_wait() -> None:
@@ -192,4 +192,4 @@ def test_a_cancelled_batch_ends_the_wait() -> None:
             return future
 
     with pytest.raises(PoolLostError, match="cancelled"):
-        PersistentPool(Cancelling(died), STUDY).submit(b"", settings(5)).result(timeout=5)  # type: ignore[arg-type]
+        RetryingPool(Cancelling(died), STUDY).submit(b"", settings(5)).result(timeout=5)  # type: ignore[arg-type]

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.records import STANDSTILL, Drives
+from safevar_sumo.records import STANDSTILL, SimulationRuns
 
 FULL = 0.9
 """The brake pedal has followed its command where it stands at this share of it [-]: at 0.9 where full braking is commanded."""
@@ -91,7 +91,7 @@ class BrakingComparison(NamedTuple):
         return sum(self.parts.values())
 
 
-def course(drives: Drives, column: int, safety_degree: float) -> Course:
+def course(drives: SimulationRuns, column: int, safety_degree: float) -> Course:
     """What there is to tell of one of N drives."""
     trace, encounter = drives.trace, drives.encounter
     active = np.flatnonzero(trace.active[:, column])
@@ -108,7 +108,7 @@ def course(drives: Drives, column: int, safety_degree: float) -> Course:
     return Course(str(drives.outcome[column]), safety_degree, braking, closest, speed_then)
 
 
-def _braking(drives: Drives, column: int, first: int, last: int) -> Braking | None:
+def _braking(drives: SimulationRuns, column: int, first: int, last: int) -> Braking | None:
     """The braking from sample `first` to `last`; None where the vehicle does not slow down once the pedal has followed."""
     trace = drives.trace
     speed, place = trace.speed[:last + 1, column], trace.position[:last + 1, column]

@@ -51,8 +51,8 @@ def minimal_causes(bench: Bench, settings: FloatArray, unsafe: Unsafe) -> list[l
     changed = [tuple(np.flatnonzero(row).tolist()) for row in bench.characteristics.changed(settings)]
     found: list[list[MinimalCause]] = [[] for _ in settings]
     for size in range(max(map(len, changed), default=0) + 1):
-        subsets = [_Subset(setting, columns) for setting, of_it in enumerate(changed) if not found[setting]
-                   for columns in combinations(of_it, size)]
+        subsets = [_Subset(setting, columns) for setting, group in enumerate(changed) if not found[setting]
+                   for columns in combinations(group, size)]
         for start in range(0, len(subsets), CHUNK):
             part = subsets[start:start + CHUNK]
             tried = np.tile(original, (len(part), 1))
@@ -144,13 +144,13 @@ def boundaries(bench: Bench, causes: list[MinimalCause], unsafe: Unsafe) -> list
         if not cause.columns:
             shrunk.append(Boundary(0.0, cause.setting, {}))
             continue
-        of_it = {}
+        group = {}
         for column in cause.columns:
             line, fraction = next(single)
-            of_it[column] = float(line.at(np.array([fraction]))[0, column])
+            group[column] = float(line.at(np.array([fraction]))[0, column])
         setting = lines[i].at(fractions[i:i + 1])[0]
         limiting = lines[i].first_filtered(bench.characteristics.threshold) if ends[i] == End.FILTER else None
-        shrunk.append(Boundary(float(fractions[i]), setting, of_it, ends[i], limiting))
+        shrunk.append(Boundary(float(fractions[i]), setting, group, ends[i], limiting))
     return shrunk
 
 
@@ -197,7 +197,7 @@ def edges(bench: Bench, lines: list[Line], unsafe: Unsafe, what: str = "boundari
     for parts in (GRID, *(FINER,) * ROUNDS):
         shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(1, parts + 1) / parts
         shares[:, -1] = high
-        inner = np.concatenate([line.at(of_it[:-1]) for line, of_it in zip(lines, shares, strict=True)]) if lines else np.zeros((0, 0))
+        inner = np.concatenate([line.at(group[:-1]) for line, group in zip(lines, shares, strict=True)]) if lines else np.zeros((0, 0))
         evaluations = bench.evaluate(inner, what)
         is_unsafe, valid = (np.ones(shares.shape, dtype=bool) for _ in range(2))
         is_unsafe[:, :-1] = unsafe.of(evaluations).reshape(len(lines), parts - 1)

@@ -16,7 +16,7 @@ from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation
 from safevar_sumo.analysis.preventability import preventability, preventable_by
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import Handle
+from safevar_sumo.results import SolutionId
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers.evaluation import Pool
@@ -57,7 +57,7 @@ def explain_failures(source: Study | Case, *, solutions: Sequence[str] = (), uns
     """
     ExplainOptions(solutions=tuple(solutions), unsafe=unsafe, top=top, limit=limit)
     study = source if isinstance(source, Study) else source.study
-    means, named = Unsafe.given(unsafe), [Handle.parse(text) for text in solutions]
+    means, named = Unsafe.given(unsafe), [SolutionId.parse(text) for text in solutions]
     limit //= len(assemble(study).points)
     with open_bench(study, pool, jobs, progress) as bench:
         original = bench.original()
@@ -104,13 +104,13 @@ def _with_one_of_each_cause(found: Failures, bench: Bench, sample: Causes, reaso
                             top: int) -> dict[int, Reasons]:
     """Add one failure of each distinct minimal cause that is not there yet, the simplest that has it, up to `top` in all."""
     chosen = dict(list(reasons.items())[:top])
-    keys = {row: {key_of(bench.characteristics, cause) for cause in of_it} for row, of_it in causes.items()}
+    keys = {row: {key_of(bench.characteristics, cause) for cause in group} for row, group in causes.items()}
     for key in distinct_causes(bench.characteristics, list(sample.values()))["cause"]:
         if len(chosen) >= top:
             break
         if not any(key in keys[row] for row in chosen):
-            of_it = [row for row in sample if key in keys[row]]
-            simplest = min(of_it, key=lambda row: (found.evaluations.f_num_diff[row], found.evaluations.f_diff[row], row))
+            group = [row for row in sample if key in keys[row]]
+            simplest = min(group, key=lambda row: (found.evaluations.f_num_diff[row], found.evaluations.f_diff[row], row))
             chosen[simplest] = ("a cause of its own",)
     return chosen
 
@@ -129,10 +129,10 @@ def _explained(found: Failures, bench: Bench, original: Evaluations, causes: Cau
     avoided = dict(zip(collided.tolist(), preventable_by(bench, here.settings[collided]), strict=True))
     explanations = []
     for i, row in enumerate(rows):
-        of_it = []
+        group = []
         for cause in causes[row]:
             boundary = next(shrunk)
-            of_it.append(Cause(
+            group.append(Cause(
                 changes={names[column]: float(cause.setting[column]) for column in cause.columns},
                 boundary={names[column]: float(boundary.setting[column]) for column in cause.columns}, fraction=boundary.fraction,
                 alone={names[column]: value for column, value in boundary.alone.items()}, outcome=cause.outcome,
@@ -143,6 +143,6 @@ def _explained(found: Failures, bench: Bench, original: Evaluations, causes: Cau
             handle=found.handles[row], reasons=reasons[row], setting=dict(zip(names, here.settings[i].tolist(), strict=True)),
             outcome=str(here.outcome[i]), safety_degree=number(here.f_safe[i]),
             changed=tuple(name for name, is_changed in zip(names, changed, strict=True) if is_changed),
-            necessary=tuple(names[column] for column in sorted(necessary(causes[row]))), causes=tuple(of_it), robustness=robust[i],
+            necessary=tuple(names[column] for column in sorted(necessary(causes[row]))), causes=tuple(group), robustness=robust[i],
             because=beside[i].because, preventable=str(avoided.get(i) or ""), points=beside[i].points))
     return tuple(explanations)

@@ -13,7 +13,7 @@ from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, 
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import CHOICES, UNKNOWN, Handle, handles, position_of
+from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles, position_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import AtPoint, at_every_point, worst_points
 from safevar_sumo.sumo.system import System
@@ -40,7 +40,7 @@ class Failures(NamedTuple):
     """
 
     evaluations: Evaluations
-    handles: list[Handle | None]
+    handles: list[SolutionId | None]
     unsafe: Unsafe
     rows: list[int]
     otherwise: int
@@ -51,7 +51,7 @@ class Failures(NamedTuple):
         return self.rows[int(np.lexsort([getattr(among, name) for name in reversed(CHOICES[choice])])[0])]
 
 
-def failures_of(source: Study | Case, bench: Bench, original: Evaluations, named: Sequence[Handle], unsafe: Unsafe | None) -> Failures:
+def failures_of(source: Study | Case, bench: Bench, original: Evaluations, named: Sequence[SolutionId], unsafe: Unsafe | None) -> Failures:
     """Look at all solutions of results and evaluate them, or at settings all over a study's domain.
 
     Raises
@@ -63,7 +63,7 @@ def failures_of(source: Study | Case, bench: Bench, original: Evaluations, named
         if named:
             raise InputError("solution", f"{source.name!r} is a study and has no solutions", "a results directory")
         settings = bench.characteristics.filter(spread(bench.characteristics, LOOKED_AT, source.search.seed))
-        called: list[Handle | None] = [None] * len(settings)
+        called: list[SolutionId | None] = [None] * len(settings)
         recorded = None
         rows = None
     else:

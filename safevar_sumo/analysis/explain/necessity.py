@@ -70,7 +70,7 @@ def distinct_causes(characteristics: CharacteristicSet, causes: Sequence[Sequenc
     pandas.DataFrame
         Columns `cause`, a tuple of changes with their directions; `failures`, how many have it; `share` of all failures.
     """
-    counts = Counter(key for of_it in causes for key in {key_of(characteristics, cause) for cause in of_it})
+    counts = Counter(key for group in causes for key in {key_of(characteristics, cause) for cause in group})
     order = sorted(counts, key=lambda key: (-counts[key], len(key), key))
     return pd.DataFrame({
         "cause": pd.Series(order, dtype=object), "failures": pd.Series([counts[key] for key in order], dtype=int),
@@ -125,7 +125,7 @@ def robustness(bench: Bench, settings: FloatArray, step: float, unsafe: Unsafe) 
         evaluations = on.evaluate(around, f"neighbours at {step * factor:g} s a step")
         outcomes, valid = (truths.reshape(len(settings), NEIGHBOURS) for truths in (unsafe.of(evaluations), evaluations.valid))
         shares[step * factor] = (outcomes & valid).sum(axis=1) / np.maximum(valid.sum(axis=1), 1)
-    return [Robustness({step: float(of_it[row]) for step, of_it in shares.items()}) for row in range(len(settings))]
+    return [Robustness({step: float(group[row]) for step, group in shares.items()}) for row in range(len(settings))]
 
 
 def smallest_robust(bench: Bench, failures: Evaluations, step: float, unsafe: Unsafe, limit: int) -> int | None:

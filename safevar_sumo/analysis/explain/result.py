@@ -14,7 +14,7 @@ from safevar_sumo.analysis.explain.necessity import Robustness
 from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.words import sentence
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import Handle
+from safevar_sumo.results import SolutionId
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -63,7 +63,7 @@ class Explanation:
     a collision who would have avoided it in the same vehicle; `points` are those of a matrix at which it is unsafe.
     """
 
-    handle: Handle | None
+    handle: SolutionId | None
     reasons: tuple[str, ...]
     setting: dict[str, float]
     outcome: str
@@ -121,11 +121,11 @@ class Explained:
 
     def records(self) -> list[dict[str, Any]]:
         """As `explain --json` prints them: one for each failure, and a summary."""
-        of_it = self.necessity.set_index("characteristic")
+        group = self.necessity.set_index("characteristic")
         shares: dict[str, Any] = {
-            name: dict(zip(of_it.index, of_it[name].tolist(), strict=True)) for name in ("necessary", "changed")}
-        ends = zip(of_it["necessary_lower"].tolist(), of_it["necessary_upper"].tolist(), strict=True)
-        shares["necessary_interval"] = dict(zip(of_it.index, map(list, ends), strict=True))
+            name: dict(zip(group.index, group[name].tolist(), strict=True)) for name in ("necessary", "changed")}
+        ends = zip(group["necessary_lower"].tolist(), group["necessary_upper"].tolist(), strict=True)
+        shares["necessary_interval"] = dict(zip(group.index, map(list, ends), strict=True))
         return [*(one.record() for one in self.explanations), {"summary": {**shares, "preventable": self.preventability.to_dict()}}]
 
     def __repr__(self) -> str:

@@ -91,8 +91,8 @@ def weather(clear: Case, wet: Case) -> pd.DataFrame:
         share, size = rq32(case), rq33(case)
         side = share[share["j"] == ANY].set_index("characteristic")[["percent", "rank"]]
         for direction in ("increase", "decrease"):
-            of_it = size[(size["j"] == ANY) & (size["direction"] == direction)]
-            side[direction] = of_it.set_index("characteristic")["delta"]
+            group = size[(size["j"] == ANY) & (size["direction"] == direction)]
+            side[direction] = group.set_index("characteristic")["delta"]
         sides.append(side)
     both = sides[0].join(sides[1].add_suffix("_other"))
     difference = [None if a is None or b is None else b - a for a, b in zip(both["percent"], both["percent_other"], strict=True)]

@@ -54,10 +54,10 @@ def number_of_changes(cases: Sequence[Case]) -> Figure:
     title = "number of changed characteristics"
     figure, axes = _figure(f"{cases[0].name}: {title}" if len(cases) == 1 else title, rows, columns,
                            (6.4 if columns == 1 else 3.9 * columns, 0.5 + 3.3 * rows))
-    for axis, case, of_it in zip(axes.flat, cases, counts, strict=False):
-        sns.boxplot(of_it, x="j", y="count", ax=axis, color="#56b4e9", linecolor="black", linewidth=0.8, fliersize=3)
+    for axis, case, group in zip(axes.flat, cases, counts, strict=False):
+        sns.boxplot(group, x="j", y="count", ax=axis, color="#56b4e9", linecolor="black", linewidth=0.8, fliersize=3)
         axis.set_xlabel("characteristics changed")
-        axis.set_ylabel(f"critical solutions per run\n({of_it['run'].nunique()} runs)")
+        axis.set_ylabel(f"critical solutions per run\n({group['run'].nunique()} runs)")
         axis.set_title(_plain(case.name) if len(cases) > 1 else "", fontsize=FONT)
         _whole_numbers(axis.yaxis)
     for axis in list(axes.flat)[len(cases):]:
@@ -176,14 +176,14 @@ def hypervolume_growth(case: Case) -> Figure:
     """Convergence: the hypervolume of what was found against evaluations, median and range over the runs."""
     growth = convergence(case)
     figure, ((axis,),) = _figure(f"{case.name}: convergence", 1, 1, (6.4, 4.0))
-    for i, (algorithm, of_it) in enumerate(growth.groupby("algorithm", sort=False)):
-        over = of_it.groupby("evaluations")["hypervolume"].agg(["min", "median", "max"])
+    for i, (algorithm, group) in enumerate(growth.groupby("algorithm", sort=False)):
+        over = group.groupby("evaluations")["hypervolume"].agg(["min", "median", "max"])
         colour = COLOURS[i % len(COLOURS)]
         axis.fill_between(over.index, over["min"], over["max"], color=colour, alpha=0.12, linewidth=0)
         for edge in ("min", "max"):
             axis.plot(over.index, over[edge], color=colour, linestyle=DASHES[i % len(DASHES)], linewidth=0.6)
         axis.plot(over.index, over["median"], color=colour, linestyle=DASHES[i % len(DASHES)], linewidth=1.8,
-                  label=f"{_title(str(algorithm))} ({of_it['run'].nunique()} runs)")
+                  label=f"{_title(str(algorithm))} ({group['run'].nunique()} runs)")
     axis.set_xlabel("evaluations")
     axis.set_ylabel(f"hypervolume of all found, normalised\n(thick: median, thin: range over runs; reference point {WORST:g})")
     _legend_below(figure, axis)
@@ -215,9 +215,9 @@ def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
         if able:
             found[name] = of_all(able)
     for case in cases:
-        for name, of_it in OF_A_CASE.items():
+        for name, group in OF_A_CASE.items():
             try:
-                found[name if alone else f"{case.name}-{name}"] = of_it(case)
+                found[name if alone else f"{case.name}-{name}"] = group(case)
             except Unanswerable as error:
                 refused.append(error)
     if not found:

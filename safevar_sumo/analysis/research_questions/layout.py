@@ -155,16 +155,16 @@ def _rq31(frame: pd.DataFrame) -> list[Table]:
     for j in _js(frame):
         quartiles = [np.quantile(counts[case, j], [0, 0.25, 0.5, 0.75, 1]) if (case, j) in counts else [None] * 5
                      for case in cases]
-        rows.append((j, *(_number(value, "g") for of_it in quartiles for value in of_it)))
+        rows.append((j, *(_number(value, "g") for group in quartiles for value in group)))
     return [Table(TITLES["rq3.1"], ("j", *heads * len(cases)), rows, 1, tuple((case, 5) for case in cases),
                   ("Critical solutions of a run with exactly j characteristics changed, over the runs.",))]
 
 
 def _rq32(frame: pd.DataFrame) -> list[Table]:
     tables = []
-    for case, of_it in frame.groupby("setting", sort=False):
-        percent, js = _grid(of_it, ["characteristic"], "percent"), _js(of_it)
-        overall = of_it[of_it["j"] == ANY]
+    for case, group in frame.groupby("setting", sort=False):
+        percent, js = _grid(group, ["characteristic"], "percent"), _js(group)
+        overall = group[group["j"] == ANY]
         rank: dict[str, object] = dict(zip(overall["characteristic"], overall["rank"], strict=True))
         rows = [(name, *(_number(percent[name, j], ".1f") for j in js), _number(rank[name], "d")) for name in rank]
         tables.append(Table(f"{TITLES['rq3.2']}: {case}", ("characteristic", *js, "rank"), rows, 1,
@@ -186,12 +186,12 @@ def _side_by_side(frame: pd.DataFrame) -> Table:
 
 def _rq33(frame: pd.DataFrame) -> list[Table]:
     tables = []
-    for case, of_it in frame.groupby("setting", sort=False):
-        of_it = of_it.assign(pc=[_number(value, ".1%") for value in of_it["pc"]],
-                             delta=[_number(value, "+.3g") for value in of_it["delta"]])
-        pc, delta, js = (*(_grid(of_it, ["characteristic", "direction"], name) for name in ("pc", "delta")), _js(of_it))
+    for case, group in frame.groupby("setting", sort=False):
+        group = group.assign(pc=[_number(value, ".1%") for value in group["pc"]],
+                             delta=[_number(value, "+.3g") for value in group["delta"]])
+        pc, delta, js = (*(_grid(group, ["characteristic", "direction"], name) for name in ("pc", "delta")), _js(group))
         of_paper = [j for j in PAPER_NUMBERS if j in js]
-        labels = list(dict.fromkeys(zip(of_it["characteristic"], of_it["direction"], strict=True)))
+        labels = list(dict.fromkeys(zip(group["characteristic"], group["direction"], strict=True)))
         note = ("PC: mean of |v - v''| / v; delta: mean signed change in the characteristic's unit.",)
         tables += [
             Table(f"{TITLES['rq3.3']}, 2 to 6 changed: {case}", ("characteristic", "direction", *("PC", "delta") * len(of_paper)),
@@ -205,8 +205,8 @@ def _rq33(frame: pd.DataFrame) -> list[Table]:
 
 def _safety(frame: pd.DataFrame) -> list[Table]:
     tables = []
-    for case, of_it in frame.groupby("setting", sort=False):
-        value, percent, js = _grid(of_it, ["quantity"], "value"), _grid(of_it, ["quantity"], "percent"), _js(of_it)
+    for case, group in frame.groupby("setting", sort=False):
+        value, percent, js = _grid(group, ["quantity"], "value"), _grid(group, ["quantity"], "percent"), _js(group)
         rows = []
         for name, title in SAFETY_UNITS.items():
             rows.append((title, *(_number(value[name, j], ".2f") for j in js)))
@@ -237,9 +237,9 @@ def _combinations(frame: pd.DataFrame) -> list[Table]:
 
 def _weather(frame: pd.DataFrame) -> list[Table]:
     tables = []
-    for (case, other), of_it in frame.groupby(["setting", "other"], sort=False):
+    for (case, other), group in frame.groupby(["setting", "other"], sort=False):
         rows = [(row["characteristic"], *(_number(row[name], form) for name, form in WEATHER_COLUMNS.items()))
-                for row in of_it.to_dict("records")]
+                for row in group.to_dict("records")]
         tables.append(Table(f"{TITLES['weather']}: {case} against {other}",
                             ("characteristic", str(case), str(other), "diff.", *(str(case), str(other)) * 3), rows, 1,
                             (("% changed", 3), ("rank", 2), ("mean increase", 2), ("mean decrease", 2)),

@@ -13,7 +13,7 @@ from safevar_sumo.analysis.criterion import Unsafe, usual_in
 from safevar_sumo.analysis.evaluator import Bench, Progress, open_bench, silent
 from safevar_sumo.analysis.explain.causes import number
 from safevar_sumo.analysis.risk.options import RiskOptions
-from safevar_sumo.analysis.risk.variation_model import World
+from safevar_sumo.analysis.risk.variation_model import VariationModel
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study
@@ -104,7 +104,7 @@ def estimate_risk(study: Study, *, samples: int = RiskOptions.samples, confidenc
         If a distribution of the study is impossible, or as in `tolerance`.
     """
     RiskOptions(samples=samples, confidence=confidence, width=width, unsafe=unsafe)
-    means, world = Unsafe.given(unsafe), World(study)
+    means, world = Unsafe.given(unsafe), VariationModel(study)
     rng = np.random.default_rng(study.search.seed)
     count = failures = errors = 0
     with open_bench(study, pool, jobs, progress) as bench:
@@ -134,7 +134,7 @@ RESAMPLES = 200
 """Bootstrap samples that the intervals come from."""
 
 
-def sensitivities(bench: Bench, world: World, unsafe: Unsafe, confidence: float) -> tuple[pd.DataFrame, pd.DataFrame]:
+def sensitivities(bench: Bench, world: VariationModel, unsafe: Unsafe, confidence: float) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Sensitivity of the safety degree, and of being unsafe.
 
     Returns

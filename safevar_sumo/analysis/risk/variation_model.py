@@ -21,7 +21,7 @@ WIDEST = 100
 its numbers break down."""
 
 
-class World:
+class VariationModel:
     """How the characteristics of a study vary.
 
     Parameters

@@ -11,7 +11,7 @@ import pandas as pd
 
 from safevar_sumo.analysis.criterion import Unsafe, usual_in
 from safevar_sumo.analysis.evaluator import Bench, Progress, open_bench, silent
-from safevar_sumo.analysis.tolerance.one_at_a_time import Alone, scan
+from safevar_sumo.analysis.tolerance.one_at_a_time import OneAtATimeScan, scan
 from safevar_sumo.analysis.tolerance.pairs import Pair, planes
 from safevar_sumo.analysis.tolerance.safe_box import SafeBox, no_box, safe_box
 from safevar_sumo.errors import unknown
@@ -27,7 +27,7 @@ class Tolerance:
     study: Study
     unsafe: Unsafe
     original: Evaluations
-    alone: list[Alone]
+    alone: list[OneAtATimeScan]
     pairs: list[Pair] | None
     joint: SafeBox
 
@@ -110,7 +110,7 @@ def _columns(study: Study, characteristics: Sequence[str] | None) -> list[int]:
     return [column for column, name in enumerate(names) if characteristics is None or name in characteristics]
 
 
-def _known(bench: Bench, alone: Sequence[Alone], pairs: Sequence[Pair]) -> FloatArray:
+def _known(bench: Bench, alone: Sequence[OneAtATimeScan], pairs: Sequence[Pair]) -> FloatArray:
     """The unsafe settings that are known, shape (K, n)."""
     names, original = bench.characteristics.names, bench.characteristics.original
     known = [{one.characteristic.name: value} for one in alone for interval in one.unsafe for value in interval]

@@ -26,7 +26,7 @@ SAFE, UNSAFE, NOT_SIMULATED = range(3)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Alone:
+class OneAtATimeScan:
     """What one characteristic does while all others are the original's.
 
     Attributes
@@ -82,7 +82,7 @@ class Alone:
                 "not_simulated": [list(interval) for interval in self.not_simulated]}
 
 
-def scan(bench: Bench, columns: Sequence[int], unsafe: Unsafe) -> list[Alone]:
+def scan(bench: Bench, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATimeScan]:
     """Scan the domains of some characteristics, one at a time."""
     members = bench.characteristics.members
     values = [np.union1d(np.linspace(members[column].lower, members[column].upper, VALUES), members[column].original) for column in columns]
@@ -94,7 +94,7 @@ def scan(bench: Bench, columns: Sequence[int], unsafe: Unsafe) -> list[Alone]:
         finer = _evaluated(bench, columns, between, unsafe)
         profiles = [pd.concat([profile, more], ignore_index=True).sort_values("value", ignore_index=True)
                     for profile, more in zip(profiles, finer, strict=True)]
-    return [Alone(characteristic=members[column], profile=profile) for column, profile in zip(columns, profiles, strict=True)]
+    return [OneAtATimeScan(characteristic=members[column], profile=profile) for column, profile in zip(columns, profiles, strict=True)]
 
 
 def _where_it_changes(profile: pd.DataFrame) -> FloatArray:
@@ -112,11 +112,11 @@ def _states(profile: pd.DataFrame) -> npt.NDArray[np.int_]:
 
 def _evaluated(bench: Bench, columns: Sequence[int], values: Sequence[FloatArray], unsafe: Unsafe) -> list[pd.DataFrame]:
     """Profiles of characteristics at some values each."""
-    ends = np.cumsum([len(of_it) for of_it in values])
+    ends = np.cumsum([len(group) for group in values])
     settings = np.tile(bench.characteristics.original, (ends[-1], 1))
-    for column, of_it, end in zip(columns, values, ends, strict=True):
-        settings[end - len(of_it):end, column] = of_it
+    for column, group, end in zip(columns, values, ends, strict=True):
+        settings[end - len(group):end, column] = group
     evaluations = bench.evaluate(settings, "one characteristic at a time")
     frame = pd.DataFrame({"value": np.concatenate(values), "safety_degree": evaluations.f_safe, "outcome": evaluations.outcome,
                           "unsafe": unsafe.of(evaluations), "valid": evaluations.valid})
-    return [frame.iloc[end - len(of_it):end].reset_index(drop=True) for of_it, end in zip(values, ends, strict=True)]
+    return [frame.iloc[end - len(group):end].reset_index(drop=True) for group, end in zip(values, ends, strict=True)]

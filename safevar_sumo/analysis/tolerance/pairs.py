@@ -71,8 +71,8 @@ def planes(bench: Bench, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
     chosen = list(combinations(columns, 2))
     axes = {column: np.linspace(members[column].lower, members[column].upper, SIDE) for column in columns}
     settings = np.tile(original, (len(chosen), SIDE, SIDE, 1))
-    for of_it, (first, second) in zip(settings, chosen, strict=True):
-        of_it[:, :, first], of_it[:, :, second] = axes[first][:, np.newaxis], axes[second]
+    for group, (first, second) in zip(settings, chosen, strict=True):
+        group[:, :, first], group[:, :, second] = axes[first][:, np.newaxis], axes[second]
     evaluations = bench.evaluate(settings.reshape(-1, len(original)), "two characteristics at a time")
     shape = (len(chosen), SIDE, SIDE)
     degrees, valid = evaluations.f_safe.reshape(shape), evaluations.valid.reshape(shape)
@@ -139,6 +139,6 @@ def _first_of_each(plane: npt.NDArray[np.intp], bound: FloatArray, rows: npt.NDA
     """Of some rows, the `SQUARES` with the least bound of each plane."""
     kept: list[int] = []
     for number in np.unique(plane[rows]):
-        of_it = rows[plane[rows] == number]
-        kept += of_it[np.argsort(bound[of_it], kind="stable")[:SQUARES]].tolist()
+        group = rows[plane[rows] == number]
+        kept += group[np.argsort(bound[group], kind="stable")[:SQUARES]].tolist()
     return np.array(kept, dtype=np.intp)

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from safevar_sumo.analysis.tolerance.compute import Tolerance
-from safevar_sumo.analysis.tolerance.one_at_a_time import Alone
+from safevar_sumo.analysis.tolerance.one_at_a_time import OneAtATimeScan
 from safevar_sumo.terminal import WholeTable, print_meanings
 from safevar_sumo.vehicles import Characteristic
 
@@ -54,7 +54,7 @@ def _alone(told: Tolerance) -> WholeTable:
     return table
 
 
-def _ends(one: Alone) -> tuple[str, str, str]:
+def _ends(one: OneAtATimeScan) -> tuple[str, str, str]:
     if one.safe is None:
         return "nowhere", "nowhere", "-"
     low, high = (_end(one.characteristic, value) for value in one.safe)

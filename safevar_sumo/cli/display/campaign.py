@@ -50,9 +50,9 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
             console.print(line, soft_wrap=True, markup=False, highlight=False)
     found = {"original vehicle": campaign.original}
     for algorithm in study.search.labels:
-        of_it = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]
-        if of_it:
-            found[algorithm] = Evaluations.concatenate(of_it)
+        group = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]
+        if group:
+            found[algorithm] = Evaluations.concatenate(group)
     table = WholeTable("", title=escape(study.title), title_justify="left")
     for head in found:
         table.add_column(head, justify="right")
@@ -113,8 +113,8 @@ def status_view(told: Status, rate: float | None) -> RenderableType:
     for head in ("runs", "under\nway", "simulated", "collisions", "simulator\nerrors", "best\nSD"):
         table.add_column(head, justify="right")
     for algorithm in dict.fromkeys(run.algorithm for run in told.runs):
-        of_it = [run for run in told.runs if run.algorithm == algorithm]
-        table.add_row(Text(algorithm), *_cells(of_it))
+        group = [run for run in told.runs if run.algorithm == algorithm]
+        table.add_row(Text(algorithm), *_cells(group))
     return Group(table, Text(_under_way(told)), Text(_left(told, rate)), _front(told))
 
 
