@@ -35,7 +35,7 @@ _ROOM_OF = {
     "tables": "api", "Tables": "api",
     "figures": "api", "Figures": "api",
     "explain": "api", "tolerance": "api", "risk": "api", "rules": "api",
-    "Comparison": "showing", "compare": "showing", "draw_comparison": "showing", "animate": "showing", "show_in_gui": "showing",
+    "Comparison": "replay", "compare": "replay", "draw_comparison": "replay", "animate": "replay", "show_in_gui": "replay",
     "make_report": "report",
     "status": "results", "Status": "results",
     "SafevarError": "errors", "InputError": "errors", "SimulationError": "errors",

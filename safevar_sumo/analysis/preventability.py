@@ -87,7 +87,7 @@ class Preventability:
         if not self.looked_at:
             return ""
         sample = "" if self.looked_at == self.collisions else f"{self.looked_at}, drawn at random, of "
-        parts = [f"{self.share(by):.0%} {by}" for by in PreventableBy if self.numbers.get(by)]
+        parts = [f"{self.share(by):.0%} {by.replace('by full', 'only by full')}" for by in PreventableBy if self.numbers.get(by)]
         return f"Preventability in the same vehicle ({sample}{number_of(self.collisions, 'collision')}): {', '.join(parts)}."
 
 

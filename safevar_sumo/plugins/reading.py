@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 from safevar_sumo.shipped import NETWORKS, PACKAGE, STUDIES
 
@@ -27,7 +28,8 @@ NOT_FOREIGN = tuple(f"{place}{os.sep}" for place in sorted({
 """Where this package, the interpreter, installed libraries and the operating system's own files lie: devices, fonts, time zones."""
 CACHES = ("__pycache__", ".cache", ".config")
 """Names of folders that programs keep for themselves."""
-WRITES = os.O_WRONLY | os.O_RDWR
+WRITES = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+"""A file that is opened to be written anew; one that is opened for both counts as read."""
 
 
 class Reading:
@@ -85,7 +87,10 @@ class _Watch:
             what = arguments[1]
         if not isinstance(what, str | bytes | os.PathLike):
             return
-        path = os.path.abspath(os.fsdecode(what))
+        path = os.fsdecode(what)
+        if event == "sqlite3.connect" and path.startswith("file:"):
+            path = unquote(urlsplit(path).path)
+        path = os.path.abspath(path)
         if event == "open" and isinstance(arguments[2], int) and arguments[2] & WRITES:
             self.written.add(path)
             return

@@ -113,7 +113,8 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     try:
         refuse_other_than_file(file)
         manifest = json.loads(file.read_text(encoding="utf-8"))
-        if isinstance(manifest["study"], dict) and isinstance(manifest["versions"], dict) and manifest.get("format", FORMAT) in READABLE:
+        if isinstance(manifest["study"], dict) and isinstance(manifest["versions"], dict) and manifest.get("format", FORMAT) in READABLE \
+                and isinstance(manifest.get(DIGESTS, {}), dict):
             return dict(manifest)
     except FileNotFoundError:
         meant = Path("results") / directory.name

@@ -228,8 +228,8 @@ def _keep_the_net_alone(file: Path) -> None:
     file.write_text(text[text.index("<net "):], encoding="utf-8")
 
 
-SHORTEST_STEP = 0.001
-"""SUMO's shortest time step [s]."""
+SHORTEST_STEP, LONGEST_STEP = 0.001, 1.0
+"""SUMO's shortest time step, and the longest in which anybody could react [s]."""
 ABOVE_0: Mapping[str, tuple[str, ...]] = {
     "vType": ("length", "width", "height", "maxSpeed", "accel", "decel", "mass"),
     "edge": ("length", "width", "speed"), "lane": ("length", "width", "speed"),
@@ -295,8 +295,8 @@ def _check_edited(sources: Sources, built: str) -> None:
 
 def _check_step(file: Path) -> None:
     step = options_of(file).get("step-length", "1")
-    if not SHORTEST_STEP <= _number(step) < math.inf:
-        raise InputError(file, f"step-length = {step!r}", f"a number from {SHORTEST_STEP} on [s]")
+    if not SHORTEST_STEP <= _number(step) <= LONGEST_STEP:
+        raise InputError(file, f"step-length = {step!r}", f"a number from {SHORTEST_STEP:g} to {LONGEST_STEP:g} [s]")
 
 
 def _check_numbers(root: ElementTree.Element, file: Path, unsaid: str = "") -> None:

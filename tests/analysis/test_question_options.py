@@ -30,12 +30,12 @@ import pandas as pd
 import safevar_sumo as sv
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.cli.questions import explain
-from safevar_sumo.report.input import Material
+from safevar_sumo.report.input import ReportInput
 
 flag = next(one.default for one in explain.params if one.name == "top")
 signatures = [inspect.signature(one).parameters["top"].default for one in (sv.explain, explain_failures)]
 case = types.SimpleNamespace(solutions=pd.DataFrame())
-asked = Material(number=1, place="it", case=case, manifest={}, system=None).options["explain"]
+asked = ReportInput(number=1, place="it", case=case, manifest={}, system=None).options["explain"]
 print(flag, *signatures, asked.top, "--top" in asked.command_line("it"), "--top 8" in module.ExplainOptions(top=8).command_line("it"))
 """
 

@@ -106,6 +106,7 @@ def test_a_thread_that_somebody_has_left_running_does_not_keep_the_program(monke
     with pytest.raises(SystemExit, match=r"^0$"):
         main()
     ended.set()
+    left.join()
     assert capsys.readouterr().err == "note: still running and ended now: left\n"
 
 

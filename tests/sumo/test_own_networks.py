@@ -183,6 +183,7 @@ def test_a_road_that_the_vehicle_would_not_feel_is_refused(mine: Path, file: str
 
 @pytest.mark.parametrize(("file", "old", "new", "problem"), [
     ("scenario.sumocfg", r'step-length value="[^"]*"', 'step-length value="0"', "scenario.sumocfg: step-length = '0'"),
+    ("scenario.sumocfg", r'step-length value="[^"]*"', 'step-length value="1e9"', "scenario.sumocfg: step-length = '1e9'"),
     ("traffic.rou.xml", r'id="vut"(.*) length="[^"]*"', r'id="vut"\1 length="-4"', "traffic.rou.xml: vType 'vut': length = '-4'"),
     ("network.edg.xml", r'id="approach"', r'id="approach" length="-20"', "network.edg.xml: edge 'approach': length = '-20'"),
     ("scenario.sumocfg", r'collision.action value="[^"]*"', 'collision.action value="stop"', "Invalid collision.action 'stop'")])

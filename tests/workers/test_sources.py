@@ -16,6 +16,7 @@ from safevar_sumo.workers.sources import sources_of
 
 ADS = """
 import json
+import sqlite3
 from pathlib import Path
 
 import my_maps.rules
@@ -33,6 +34,8 @@ class Mine(ScalarAds):
     def drive(self, seen):
         import my_lazy
         (HERE / "tiles" / "1.txt").read_bytes()
+        (HERE / "both.txt").open("r+").close()
+        sqlite3.connect(f"{(HERE / 'map.db').as_uri()}?mode=ro", uri=True).close()
         (HERE / "log.txt").write_text("written, then read")
         (HERE / "log.txt").read_text()
         return (0.0, 1.0) if seen.gap < self.gap else (0.5, 0.0)
@@ -40,7 +43,7 @@ class Mine(ScalarAds):
 FILES = {
     "my_ads.py": ADS, "my_maps/__init__.py": "", "my_maps/rules.py": "import numpy\n", "my_maps/unused.py": "", "my_space/roads.py": "",
     "my_lazy.py": "X = 1\n", "weights.json": '{"gap": 9.0}', "tiles/1.txt": "tile", "tiles/2.txt": "another tile", "unused.py": "",
-    "table.bin": "read by compiled code"}
+    "table.bin": "read by compiled code", "both.txt": "opened to be read and written", "map.db": ""}
 STUDY = """
 extends = "smoke"
 [ads]
@@ -48,7 +51,8 @@ model = "my_ads:Mine"
 parameters = { weights = "weights.json", table = "table.bin" }
 """
 READ = {
-    "my_ads.py", "my_maps/__init__.py", "my_maps/rules.py", "my_space/roads.py", "my_lazy.py", "weights.json", "tiles/1.txt", "table.bin"}
+    "my_ads.py", "my_maps/__init__.py", "my_maps/rules.py", "my_space/roads.py", "my_lazy.py", "weights.json", "tiles/1.txt", "table.bin",
+    "both.txt", "map.db"}
 
 
 class Here:

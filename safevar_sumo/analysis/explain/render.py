@@ -42,7 +42,7 @@ def print_explained(console: Console, place: str, told: Explained, point: str = 
     again: Again = partial(command, place, point=point)
     _print_answer(console, again, told, members)
     if not full:
-        _say(console, f"All {number_of(len(told.explanations), 'failure')} explained in full: {ask('explain', place, point)} --full")
+        _say(console, f"{number_of(len(told.explanations), 'failure')} explained in full: {ask('explain', place, point)} --full")
         return
     _say(console, _sawtooth(told))
     for one in told.explanations:

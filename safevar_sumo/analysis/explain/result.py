@@ -52,7 +52,7 @@ class Cause:
         below = {End.SAFE: "slightly less is safe",
                  End.FILTER: f"with less, the change of {self.at_threshold} falls below the filter's threshold and counts as none",
                  End.NOT_SIMULATED: "slightly less could not be simulated"}[self.end]
-        return f"Scaling all changes to {self.fraction:.0%} is still unsafe; {below}."
+        return f"Scaling all changes to {self.fraction:.1%} is still unsafe; {below}."
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -248,7 +248,7 @@ def _avoided(preventable: Preventability) -> list[str]:
     if not preventable.looked_at:
         return []
     words = {PreventableBy.COMPETENT_DRIVER: "a competent driver avoids {}", PreventableBy.FULL_BRAKING:
-             "full braking at the first possible moment {}", PreventableBy.NOBODY: "{} are physically unavoidable"}
+             "only full braking at the first possible moment avoids another {}", PreventableBy.NOBODY: "{} are physically unavoidable"}
     parts = [text.format(f"{100 * (preventable.share(by) or 0.0):.0f} %") for by, text in words.items() if preventable.numbers.get(by)]
     sample = "" if preventable.looked_at == preventable.collisions else f"{preventable.looked_at} drawn at random from "
     return [f"In the same vehicle, of {sample}{preventable.collisions} collisions, {joined(parts)}."]
