@@ -21,6 +21,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import changes_in_words
 from safevar_sumo.report import SECTIONS, findings, limits, make_report
 from safevar_sumo.report import input as material
+from safevar_sumo.report.input import stored
 from safevar_sumo.report.limits import LIMITS
 from safevar_sumo.report.page import gather
 from safevar_sumo.report.svg import Dot, scatter
@@ -216,6 +217,23 @@ def test_what_was_explained_of_other_results_is_not_taken(
     monkeypatch.setattr(findings, "explain", lambda case, **_: asked.append(case) or Explained(case))
     make_report([tmp_path / "copy"], only=["causes"], jobs=1)
     assert len(asked) == 1
+
+
+def test_a_kept_answer_belongs_to_its_options_and_to_the_code_that_computed_it(
+        slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))
+    computed: list[str] = []
+
+    def ask(why: str) -> None:
+        stored(gather([place])[0], "risk", lambda: computed.append(why))
+
+    for why in ("first", "again"):
+        ask(why)
+    monkeypatch.setattr(material, "SAMPLES", 33)
+    ask("another sample size")
+    monkeypatch.setattr(material, "_package", lambda: "edited since")
+    ask("other code")
+    assert computed == ["first", "another sample size", "other code"]
 
 
 def test_what_is_not_as_the_results_say_any_more_is_told(page: str, slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
