@@ -9,10 +9,10 @@ from pathlib import Path
 
 import hypothesis
 import pytest
-from slippery import make_results
 
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.sumo.system import System, assemble
+from tests.slippery import make_results
 
 collect_ignore = [] if os.name == "posix" else [
     "workers/test_local_pool.py",

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from in_process import Here, Silent
-
 from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers.identity import identity_of
+from tests.in_process import Here, Silent
 
 STUDY = """
 extends = "smoke"

@@ -9,13 +9,13 @@ import pytest
 import scipy
 from hypothesis import given
 from hypothesis import strategies as st
-from known_regions import ORIGINAL, Plant, box, diagonal_band, everywhere, made_up_bench, made_up_study, nowhere, two_islands
 
 from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.evaluator import Bench
 from safevar_sumo.analysis.explain.causes import RESOLUTION, End, affordable, boundaries, involved, minimal_causes, necessary
 from safevar_sumo.analysis.explain.necessity import distinct_causes, necessity, robustness, smallest_robust
 from safevar_sumo.records import BoolArray, FloatArray
+from tests.analysis.known_regions import ORIGINAL, Plant, box, diagonal_band, everywhere, made_up_bench, made_up_study, nowhere, two_islands
 
 COLLISION = Unsafe()
 

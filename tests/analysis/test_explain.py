@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from in_process import Here
 from rich.console import Console
 
 from safevar_sumo.analysis.evaluator import Bench
@@ -26,6 +25,7 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import handles
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.in_process import Here
 
 
 @pytest.fixture(scope="module")

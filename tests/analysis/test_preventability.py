@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 import pytest
 import scipy
-from in_process import Here
 
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.analysis.evaluator import Bench
@@ -17,6 +16,7 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.study import ModelTable, load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
+from tests.in_process import Here
 
 STUDY = load_study("euro_ncap_pedestrian")
 BLIND = ModelTable(model="aeb", parameters={"reach": 3.0})

@@ -12,7 +12,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
 from rich.console import Console
 
 from safevar_sumo.analysis.risk.compute import Risk
@@ -23,6 +22,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import load_study
 from safevar_sumo.study.variation import Distribution
+from tests.analysis.known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
 
 
 def of(region: Region, **options: Any) -> Risk:

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
 
 from safevar_sumo.analysis.rules.compute import Rules
 from safevar_sumo.analysis.rules.compute import find_rules as rules
 from safevar_sumo.analysis.words import rule_in_words
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.analysis.known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
 
 
 def of(region: Region, n: int = 4, **options: Any) -> Rules:

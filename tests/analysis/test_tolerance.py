@@ -11,7 +11,6 @@ import pytest
 import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
 
 from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.evaluator import Bench
@@ -19,6 +18,7 @@ from safevar_sumo.analysis.tolerance import safe_box
 from safevar_sumo.analysis.tolerance.compute import Tolerance
 from safevar_sumo.analysis.tolerance.compute import find_tolerances as tolerance
 from safevar_sumo.errors import InputError
+from tests.analysis.known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
 
 
 def of(n: int, region: Region, pairs: bool = False, unsafe: str | None = "collision", failing: Region = nowhere,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from in_process import Here
 
 from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.explain.failures import Where, points_in_words, where
@@ -15,6 +14,7 @@ from safevar_sumo.results import solutions_frame
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate, study_at
 from safevar_sumo.sumo.system import System, assemble
+from tests.in_process import Here
 
 TESTS = [{"name": "CPLA", "model": "along", "over": {"speed": [20, 40]}, "weathers": ["clear", "night"]},
          {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [30]}}]

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from formulas import SUN, FormulaPool, Told, carried_out, evaluated, solutions, with_search
 from rich.console import Console
 
 from safevar_sumo.campaign import RunKey, all_runs, run_campaign, run_generator
@@ -20,6 +19,7 @@ from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory, load, status
 from safevar_sumo.study import Study, tables_of
 from safevar_sumo.workers.evaluation import PoolLostError
+from tests.campaign.formulas import SUN, FormulaPool, Told, carried_out, evaluated, solutions, with_search
 
 
 def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches(study: Study, tmp_path: Path) -> None:

@@ -10,12 +10,12 @@ from typing import Any
 
 import msgspec
 import pytest
-from formulas import FormulaPool, Told
 
 from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.results import ResultsDirectory, files, journal, load
 from safevar_sumo.study import Study, load_study
+from tests.campaign.formulas import FormulaPool, Told
 
 KINDS = (errno.EIO, errno.ENOSPC, errno.EINTR, 0)
 """Errors that a step fails with; 0 is a write of half of what was to be written, and no error elsewhere."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from formulas import FormulaPool, carried_out, with_search
 
 from safevar_sumo.campaign import forecast
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.study import Study
 from safevar_sumo.workers.evaluation import PoolLostError
+from tests.campaign.formulas import FormulaPool, carried_out, with_search
 
 
 def test_a_forecast_counts_and_measures(study: Study) -> None:

@@ -10,7 +10,6 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pytest
-from formulas import SUN, FormulaPool, Told, carried_out, evaluated, solutions, with_search
 
 from safevar_sumo.campaign import RunKey, all_runs, run_campaign
 from safevar_sumo.campaign.run import Run
@@ -22,6 +21,7 @@ from safevar_sumo.results.journal import read_journal
 from safevar_sumo.search import Search
 from safevar_sumo.study import Study
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError
+from tests.campaign.formulas import SUN, FormulaPool, Told, carried_out, evaluated, solutions, with_search
 
 
 def test_a_torn_tail_is_told_and_simulated_again(study: Study, tmp_path: Path) -> None:

@@ -8,9 +8,10 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
-import processes
 import pytest
-from small import STUDY
+
+from tests.end_to_end import processes
+from tests.end_to_end.small import STUDY
 
 
 @pytest.fixture(autouse=True)

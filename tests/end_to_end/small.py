@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from processes import ended, started
+from tests.end_to_end.processes import ended, started
 
 STUDY = """
 extends = "smoke"

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from processes import ended, killed, started, until, written
-from small import solutions
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import load
 from safevar_sumo.workers import cluster
+from tests.end_to_end.processes import ended, killed, started, until, written
+from tests.end_to_end.small import solutions
 
 Start = Callable[..., subprocess.Popen[str]]
 

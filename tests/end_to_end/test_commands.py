@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from typed import refused
 
 from safevar_sumo.shipped import STUDIES
+from tests.end_to_end.typed import refused
 
 SAFEVAR = [sys.executable, "-m", "safevar_sumo"]
 SMALL = ["--algorithms", "rs", "--runs", "1", "--evaluations", "40"]

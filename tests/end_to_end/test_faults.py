@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from processes import ended, killed, left_of_group, started, until, workers_of, written
-from small import STUDY, solutions, study
 
 from safevar_sumo.results import load
+from tests.end_to_end.processes import ended, killed, left_of_group, started, until, workers_of, written
+from tests.end_to_end.small import STUDY, solutions, study
 
 pytestmark = pytest.mark.usefixtures("small")
 

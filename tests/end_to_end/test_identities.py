@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from processes import ended, started, until, workers_of, written
 
 import safevar_sumo as sv
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import load
 from safevar_sumo.shipped import NETWORKS
+from tests.end_to_end.processes import ended, started, until, workers_of, written
 
 ADS = """
 from safevar_sumo.ads import ScalarAds

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import psutil
 import pytest
-from processes import ended, killed, left_of_group, started, until, workers_of, written
+
+from tests.end_to_end.processes import ended, killed, left_of_group, started, until, workers_of, written
 
 pytestmark = pytest.mark.usefixtures("small")
 

@@ -6,8 +6,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from processes import SAFEVAR, started
-from small import study
+
+from tests.end_to_end.processes import SAFEVAR, started
+from tests.end_to_end.small import study
 
 pytestmark = pytest.mark.usefixtures("small")
 

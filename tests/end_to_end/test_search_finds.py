@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from test_commands import run
 
 from safevar_sumo.study import study_names
+from tests.end_to_end.test_commands import run
 
 LONG = ("euro_ncap_car_to_car", "euro_ncap_pedestrian", "wear")
 

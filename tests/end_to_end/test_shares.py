@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from processes import ended, started, written
-from small import solutions, study
 
 from safevar_sumo.results import ResultsDirectory, load
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers.identity import identity_of
+from tests.end_to_end.processes import ended, started, written
+from tests.end_to_end.small import solutions, study
 
 pytestmark = pytest.mark.usefixtures("small")
 

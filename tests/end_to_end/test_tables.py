@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from test_commands import run as run_process
-from typed import refused
-from typed import run_here as run
 
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.end_to_end.test_commands import run as run_process
+from tests.end_to_end.typed import refused
+from tests.end_to_end.typed import run_here as run
 
 QUESTIONS = ("rq1", "rq2", "rq1-runs", "rq2-runs", "rq3.1", "rq3.2", "rq3.3", "collisions")
 FORMATS = {"text": "smoke", "markdown": "| ", "latex": r"\toprule", "csv": "setting,", "json": '"setting": "smoke"'}

@@ -11,8 +11,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner
-from test_commands import run
-from typed import refused
 
 from safevar_sumo.cli import reference
 from safevar_sumo.cli.program import commands
@@ -20,6 +18,8 @@ from safevar_sumo.reference import with_values
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
+from tests.end_to_end.test_commands import run
+from tests.end_to_end.typed import refused
 
 COLUMNS = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from processes import SAFEVAR, ended, started, until, workers_of, written
-from small import solutions, study
 
 from safevar_sumo.results import load
+from tests.end_to_end.processes import SAFEVAR, ended, started, until, workers_of, written
+from tests.end_to_end.small import solutions, study
 
 pytestmark = pytest.mark.usefixtures("small")
 

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from in_process import Here, Silent
 
 from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.results import RESULTS, ResultsDirectory, load
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers.identity import identity_of
+from tests.in_process import Here, Silent
 
 STUDIES = ("sun", "rain", "lgsvl", "native", "smoke")
 FILE = Path(__file__).with_name("golden.json")

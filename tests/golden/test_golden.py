@@ -6,9 +6,9 @@ import json
 import platform
 
 import pytest
-from renew import FILE, STUDIES, computed, platform_here
 
 from safevar_sumo.results import RESULTS
+from tests.golden.renew import FILE, STUDIES, computed, platform_here
 
 CHANGED = "results changed: if that is meant, raise RESULTS in safevar_sumo/results/manifest.py, renew golden.json and say why"
 GOLDEN = json.loads(FILE.read_text(encoding="utf-8"))
@@ -24,7 +24,7 @@ def test_a_shipped_studys_results_are_those_of_ever(name: str) -> None:
 
 
 def test_results_and_the_number_that_stands_for_them_change_together() -> None:
-    assert GOLDEN["results"] == RESULTS, "RESULTS is not the one of golden.json: renew it with tests/golden/renew.py"
+    assert GOLDEN["results"] == RESULTS, "RESULTS is not the one of golden.json: renew it with python -m tests.golden.renew"
 
 
 @pytest.mark.skipif((platform.system(), platform.machine()) != ("Linux", "x86_64"), reason="bytes are promised for Linux on x86-64")

@@ -6,13 +6,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from test_metrics import STEP, braking_run, value
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import time_to_collision
 from safevar_sumo.metrics.scoring import F_DIFF, F_SAFE, Objective, Scoring
 from safevar_sumo.records import Encounter, Evaluations, SimulationRuns
 from safevar_sumo.study import MetricsTable
+from tests.metrics.test_metrics import STEP, braking_run, value
 
 
 def ended(run: SimulationRuns, after: float) -> SimulationRuns:

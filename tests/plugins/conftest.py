@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from beside import ADS, Mine
 
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import System, assemble
+from tests.plugins.beside import ADS, Mine
 
 
 @pytest.fixture

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from beside import SCALAR, Mine
 
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import assemble
+from tests.plugins.beside import SCALAR, Mine
 
 VEHICLE = '[vehicle]\nmodel = "mine:Mine"\n[vehicle.characteristics]\n{}\n[ads]\nmodel = "krauss"\n'
 SCENARIO = '[scenario]\nmodel = "mine:Mine"\n'

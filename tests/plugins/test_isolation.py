@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from beside import SCALAR, Mine
 
 from safevar_sumo.errors import ForeignError, InputError
 from safevar_sumo.records import Evaluations
@@ -17,6 +16,7 @@ from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers.isolation import check_isolation
+from tests.plugins.beside import SCALAR, Mine
 
 ADS = ("import numpy as np\n\n\nclass Mine:\n    def start(self, n, nominal, step):\n        return 0\n\n"
        "    def drive(self, seen, memory):\n")

@@ -7,12 +7,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from beside import ADS, SCALAR, Mine
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
+from tests.plugins.beside import ADS, SCALAR, Mine
 
 CHARACTERISTICS = "characteristics = { mass = { unit = 'kg', original = 1, lower = 0.5, upper = 2 } }\n"
 CONSTANT = SCALAR + "    def drive(self, seen):\n        return {}, 0.0\n"

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from beside import InThisProcess, Mine
 
 from safevar_sumo.api.running import NullObserver, carried_out
 from safevar_sumo.campaign import all_runs
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.study import load_study
+from tests.plugins.beside import InThisProcess, Mine
 
 LATCH = """
 from safevar_sumo.ads import ScalarAds

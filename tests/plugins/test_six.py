@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from beside import InThisProcess
 from click.testing import CliRunner
 
 import safevar_sumo as sv
 from safevar_sumo import ads, metrics, scenarios, search, vehicles
 from safevar_sumo.cli.program import commands
+from tests.plugins.beside import InThisProcess
 
 SIX = Path(__file__).parent / "six"
 MEMBERS = {"my_vehicle:Cart": vehicles.VEHICLES, "my_ads:Careful": ads.ADS, "my_scenario:Wall": scenarios.SCENARIOS,

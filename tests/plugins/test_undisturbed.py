@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from beside import SCALAR, Mine
 
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.metrics import deceleration
 from safevar_sumo.sumo import batch
 from safevar_sumo.sumo.matrix import evaluate
+from tests.plugins.beside import SCALAR, Mine
 
 DRIVE = "    def drive(self, seen):\n        {}\n        return 0.5, 0.0\n"
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from in_process import Here
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.reference import ReferenceData, calibrate, fitted_as, with_values
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
+from tests.in_process import Here
 
 GAP = "ads.parameters.brake_gap"
 

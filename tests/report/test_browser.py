@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from browser import axe_core, chromium, resized, violations
 from selenium.webdriver import Chrome
 from selenium.webdriver.common.by import By
 
@@ -19,6 +18,7 @@ from safevar_sumo.replay.comparison import compare
 from safevar_sumo.report import input as material
 from safevar_sumo.report import make_report
 from safevar_sumo.sumo.system import assemble
+from tests.report.browser import axe_core, chromium, resized, violations
 
 ORDER = "return [...arguments[0].tBodies[0].rows].map((row) => parseFloat(row.cells[2].textContent))"
 

@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 
 import pytest
-from in_process import Here, Silent
 
 from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.errors import InputError
@@ -16,6 +15,7 @@ from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers.identity import identity_of
+from tests.in_process import Here, Silent
 
 DAY, RAIN = "crossing, clear", "crossing, hard_rain"
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up import CHARACTERISTICS, made_up, made_up_study, row
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -31,6 +30,7 @@ from safevar_sumo.analysis.research_questions.figures import (
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.research_questions.made_up import CHARACTERISTICS, made_up, made_up_study, row
 
 
 def random_setting(name: str) -> Case:

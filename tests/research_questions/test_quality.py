@@ -8,7 +8,6 @@ from typing import Any
 import moocore
 import numpy as np
 import pytest
-from made_up import made_up, row
 
 from safevar_sumo.analysis.research_questions.case import Unanswerable
 from safevar_sumo.analysis.research_questions.indicators import (
@@ -23,6 +22,7 @@ from safevar_sumo.analysis.research_questions.indicators import (
     reference_front,
 )
 from safevar_sumo.errors import InputError
+from tests.research_questions.made_up import made_up, row
 
 FRONT = np.array([[0.0, 1, 2], [1, 0, 1], [2, 2, 0]])
 

@@ -7,7 +7,6 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from made_up import ORIGINAL, UNCHANGED, made_up, made_up_study, row
 
 from safevar_sumo.analysis.research_questions.answer import answer
 from safevar_sumo.analysis.research_questions.case import Unanswerable
@@ -15,6 +14,7 @@ from safevar_sumo.analysis.research_questions.changes import rq33_safety
 from safevar_sumo.analysis.research_questions.comparisons import ASYMPTOTIC, EXACT, compare, rq1
 from safevar_sumo.analysis.research_questions.discussion import combinations, weather, weather_pairs
 from safevar_sumo.analysis.research_questions.indicators import indicators
+from tests.research_questions.made_up import ORIGINAL, UNCHANGED, made_up, made_up_study, row
 
 HEAVY = (1200.0, 2.0, 0.1)
 

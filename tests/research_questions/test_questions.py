@@ -10,7 +10,6 @@ import msgspec
 import pandas as pd
 import pytest
 import scipy
-from made_up import CHARACTERISTICS, ORIGINAL, UNCHANGED, made_up, made_up_study, row
 
 from safevar_sumo.analysis.research_questions.answer import answer
 from safevar_sumo.analysis.research_questions.brief import brief
@@ -21,6 +20,7 @@ from safevar_sumo.analysis.research_questions.discussion import collisions, comb
 from safevar_sumo.analysis.research_questions.over_runs import difference_line, holm, rq1_runs, rq2_runs
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable
+from tests.research_questions.made_up import CHARACTERISTICS, ORIGINAL, UNCHANGED, made_up, made_up_study, row
 
 HEAVY, GRIPLESS, BOTH = (1100.0, 2.0, 0.1), (1000.0, 1.0, 0.1), (1200.0, 1.5, 0.1)
 

@@ -14,8 +14,6 @@ from typing import Any
 import msgspec
 import pandas as pd
 import pytest
-from latex_syntax import mistakes
-from made_up import made_up, made_up_study, row
 
 from safevar_sumo.analysis.research_questions.answer import Answer, answer
 from safevar_sumo.analysis.research_questions.case import Case
@@ -23,6 +21,8 @@ from safevar_sumo.analysis.research_questions.layout import LAYOUTS, Layouts
 from safevar_sumo.analysis.research_questions.paper import PAPER
 from safevar_sumo.analysis.research_questions.tables import FORMATS, as_json, csv, escaped, latex, markdown, text
 from safevar_sumo.study import CharacteristicTable
+from tests.research_questions.latex_syntax import mistakes
+from tests.research_questions.made_up import made_up, made_up_study, row
 
 NASTY = ['a&b',
          "50%_of $x$", "#1 {brace}", r"back\slash", "~tilde^2", "[option]", "*star", "<less|more>", "quo\"te'`", "ä µ ° ² Δ 車", "--"]

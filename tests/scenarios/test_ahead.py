@@ -9,7 +9,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from holding import CARLA, NATIVE, Hold, at_contact, driven
 
 from safevar_sumo.ads.aeb import Aeb
 from safevar_sumo.errors import InputError
@@ -19,6 +18,7 @@ from safevar_sumo.scenarios.along import Along
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.euro_ncap import VUT_WIDTH
 from safevar_sumo.sumo.matrix import simulate
+from tests.scenarios.holding import CARLA, NATIVE, Hold, at_contact, driven
 
 KMH = 1 / 3.6
 STOPS_AT_ONCE = Hold(np.array([0.0]))

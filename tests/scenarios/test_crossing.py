@@ -5,7 +5,6 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from holding import CARLA, NATIVE, Hold, at_contact, driven
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,6 +13,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.euro_ncap import VUT_WIDTH, Walk
+from tests.scenarios.holding import CARLA, NATIVE, Hold, at_contact, driven
 
 STANDARD = [("CPFA", 50.0), ("CPNA", 25.0), ("CPNA", 50.0), ("CPNA", 75.0), ("CPNCO", 50.0)]
 NUMBERS = {"CPFA": (8 / 3.6, 6.0, 1.5), "CPNA": (5 / 3.6, 4.0, 1.0), "CPNCO": (5 / 3.6, 4.0, 1.0)}

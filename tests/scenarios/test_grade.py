@@ -9,7 +9,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from holding import CARLA, NATIVE, Hold, at_contact, driven
 
 from safevar_sumo.ads.aeb import Aeb
 from safevar_sumo.errors import InputError
@@ -20,6 +19,7 @@ from safevar_sumo.scenarios.euro_ncap import VUT_WIDTH
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import assemble
+from tests.scenarios.holding import CARLA, NATIVE, Hold, at_contact, driven
 
 WORN = assemble(load_study("wear", matrix=None))
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from holding import Hold, at_contact
 
 from safevar_sumo.records import SimulationRuns
 from safevar_sumo.scenarios import Crossing
@@ -14,6 +13,7 @@ from safevar_sumo.scenarios.along import Along
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import at_every_point
 from safevar_sumo.sumo.system import System, assemble
+from tests.scenarios.holding import Hold, at_contact
 
 BRAKE = {"euro_ncap_pedestrian": "maxBrakeTorque", "euro_ncap_car_to_car": "maxBrakeTorque", "wear": "brakeTorque"}
 

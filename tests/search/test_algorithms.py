@@ -6,11 +6,11 @@ import random
 
 import numpy as np
 import pytest
-from problems import POPULATION, SUN, begun, evaluated, searched, sphere
 
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.search.problems import POPULATION, SUN, begun, evaluated, searched, sphere
 
 
 @pytest.fixture(params=sorted(ALGORITHMS))

@@ -12,11 +12,11 @@ from jmetal.operator.crossover import SBXCrossover
 from jmetal.operator.mutation import PolynomialMutation
 from jmetal.problem import DTLZ2
 from jmetal.util.termination_criterion import StoppingByEvaluations
-from problems import POPULATION, evaluated, searched
 from scipy.stats import mannwhitneyu
 
 from safevar_sumo.records import Evaluations
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+from tests.search.problems import POPULATION, evaluated, searched
 
 
 @pytest.mark.parametrize("name", ["nsga2", "rs"])

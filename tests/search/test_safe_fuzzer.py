@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from problems import SUN, evaluated, searched, sphere
 
 from safevar_sumo.records import Evaluations
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+from tests.search.problems import SUN, evaluated, searched, sphere
 
 
 def flat(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:

@@ -8,13 +8,13 @@ import pytest
 from deap import tools
 from hypothesis import given
 from hypothesis import strategies as st
-from problems import POPULATION, SUN, evaluated, searched, sphere
 
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.search import Problem
 from safevar_sumo.search.nsga2 import _fitness, _Individual, _survivors, _tournament
 from safevar_sumo.search.safe_fuzzer import _improves, _Ranges, _scores
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+from tests.search.problems import POPULATION, SUN, evaluated, searched, sphere
 
 TWO = CharacteristicSet((Characteristic(name="a", unit="-", original=50.0, lower=0.0, upper=100.0),
                          Characteristic(name="b", unit="-", original=50.0, lower=0.0, upper=100.0)))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from drives import STEP, SYSTEMS, braking_after, drawn, drive, ends, full_throttle, original
 from scipy.integrate import solve_ivp
 
 from safevar_sumo.records import Command, Observation
 from safevar_sumo.vehicles.carla import AIR_DENSITY, ENGINE_INERTIA, FINAL_RATIO, FRONTAL_AREA, GEAR_RATIOS, GRAVITY, RPM, Carla
+from tests.vehicles.drives import STEP, SYSTEMS, braking_after, drawn, drive, ends, full_throttle, original
 
 
 def carla() -> Carla:

@@ -8,7 +8,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from drives import STEP, SYSTEMS, drawn, original
 
 from safevar_sumo.records import Command
 from safevar_sumo.shipped import NETWORKS
@@ -16,6 +15,7 @@ from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import at_start, slope_of
+from tests.vehicles.drives import STEP, SYSTEMS, drawn, original
 
 SPEEDS = (10, 20, 30, 40, 50, 60)  # km/h, where the original vehicles' gearboxes hold their gear
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from drives import STEP, SYSTEMS, braking_after, drive, full_throttle, original
 
 from safevar_sumo.records import Command, Observation
 from safevar_sumo.vehicles.lgsvl import _roll, _tyre_stiffness
+from tests.vehicles.drives import STEP, SYSTEMS, braking_after, drive, full_throttle, original
 
 GRAVITY = 9.81
 

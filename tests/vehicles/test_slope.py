@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 import pytest
-from drives import STEP, SYSTEMS, drive, original
 
 from safevar_sumo.records import Command
 from safevar_sumo.vehicles import LEVEL, slope_of
+from tests.vehicles.drives import STEP, SYSTEMS, drive, original
 
 G = 9.81
 ANGLE = math.atan(0.08)

@@ -6,7 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from drives import (
+
+from safevar_sumo.records import Command, Observation
+from safevar_sumo.vehicles import VEHICLES
+from safevar_sumo.vehicles.carla import ENGINE_INERTIA, FINAL_RATIO, GEAR_RATIOS, Carla
+from safevar_sumo.vehicles.lgsvl import Lgsvl
+from safevar_sumo.vehicles.sensors import delayed
+from tests.vehicles.drives import (
     STEP,
     SYSTEMS,
     Drive,
@@ -19,12 +25,6 @@ from drives import (
     half_throttle,
     original,
 )
-
-from safevar_sumo.records import Command, Observation
-from safevar_sumo.vehicles import VEHICLES
-from safevar_sumo.vehicles.carla import ENGINE_INERTIA, FINAL_RATIO, GEAR_RATIOS, Carla
-from safevar_sumo.vehicles.lgsvl import Lgsvl
-from safevar_sumo.vehicles.sensors import delayed
 
 MODELS = sorted(VEHICLES)
 
