@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from safevar_sumo.study import SAFETY_DEGREE
+
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
@@ -238,7 +240,7 @@ class Evaluations:
     @property
     def f_safe(self) -> FloatArray:
         """First objective: the safety degree (method section 3) [m, or -m/s on a collision]."""
-        return self.metrics["safety_degree"]
+        return self.metrics[SAFETY_DEGREE]
 
     def column(self, name: str) -> FloatArray:
         """A metric, f_safe, f_diff or f_num_diff by name; shape (M,). A metric that nothing could measure is undefined everywhere."""

@@ -14,6 +14,7 @@ from safevar_sumo.analysis.tolerance.compute import Tolerance
 from safevar_sumo.analysis.tolerance.one_at_a_time import OneAtATimeScan
 from safevar_sumo.analysis.tolerance.pairs import Pair
 from safevar_sumo.errors import InputError
+from safevar_sumo.study import SAFETY_DEGREE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,7 +51,7 @@ def profiles_figure(told: Tolerance) -> Figure:
     rows = -(-len(told.alone) // columns)
     title = f"{told.study.name}: one characteristic at a time (unsafe: {told.unsafe})"
     figure, axes = new_figure(title, rows, columns, (max(2.3 * columns, 4.6), 1.0 + 1.75 * rows))
-    degrees = np.concatenate([one.profile["safety_degree"].dropna() for one in told.alone])
+    degrees = np.concatenate([one.profile[SAFETY_DEGREE].dropna() for one in told.alone])
     margin = 0.05 * (np.ptp(degrees) if degrees.size else 0.0) or 0.5
     for axis, one in zip(axes.flat, told.alone, strict=False):
         _profile(axis, one)
@@ -67,12 +68,12 @@ def profiles_figure(told: Tolerance) -> Figure:
 
 def _profile(axis: Axes, one: OneAtATimeScan) -> None:
     member, profile = one.characteristic, one.profile
-    axis.plot(profile["value"], profile["safety_degree"], color=NECESSARY, linewidth=1.2)
+    axis.plot(profile["value"], profile[SAFETY_DEGREE], color=NECESSARY, linewidth=1.2)
     for low, high in one.unsafe:
         axis.axvspan(low, high, facecolor=UNSAFE, alpha=0.35, hatch="////", edgecolor="white", linewidth=0)
-    at_original = profile.loc[profile["value"] == member.original, "safety_degree"]
+    at_original = profile.loc[profile["value"] == member.original, SAFETY_DEGREE]
     axis.plot([member.original], at_original, marker="o", color="black", markersize=4)
-    if profile["safety_degree"].min() <= 0:
+    if profile[SAFETY_DEGREE].min() <= 0:
         axis.axhline(0, color="black", linewidth=0.8, linestyle="--")
     axis.set_xlim(member.lower, member.upper)
     axis.set_title(plain(member.name), fontsize=FONT)

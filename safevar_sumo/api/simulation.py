@@ -14,7 +14,7 @@ from safevar_sumo.ads import Ads
 from safevar_sumo.metrics import Scoring, time_to_collision
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns
 from safevar_sumo.results import record
-from safevar_sumo.study import Study, StudyLike, load_study
+from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import simulate as drive
@@ -144,7 +144,7 @@ class Simulation:
         """How it ended, in words."""
         if self.outcome is Outcome.COLLISION:
             return f"collides at {self.collision_speed:.2f} m/s"
-        least = self.metrics["safety_degree"]
+        least = self.metrics[SAFETY_DEGREE]
         return WORDS[self.outcome] + ("" if np.isnan(least) else f", with a safety degree of {least:.2f} m")
 
     def record(self) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from safevar_sumo.reference import (
     read_reference,
 )
 from safevar_sumo.results import write_imported
-from safevar_sumo.study import Study, check_writable, load_study, write_study
+from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, load_study, write_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import evaluate_all
@@ -65,7 +65,7 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     result = agreement(data, here, chosen, evaluations.take([0]))
     if plot is not None:
         plot_agreement(plot, f"{chosen.title}\nagainst {reference.name}", system.characteristics, data, here,
-                       chosen.repeatability.get("safety_degree"))
+                       chosen.repeatability.get(SAFETY_DEGREE))
     if totals is not None:
         keep_totals(totals, chosen, reference.name, result)
     if as_json:

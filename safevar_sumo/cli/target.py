@@ -16,7 +16,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import SolutionId, chosen_handle, position_of
 from safevar_sumo.results.imported import UNKNOWN
-from safevar_sumo.study import Study, study_names
+from safevar_sumo.study import SAFETY_DEGREE, Study, study_names
 
 if TYPE_CHECKING:
     from safevar_sumo.analysis.research_questions.case import Case
@@ -69,7 +69,7 @@ def target_of(place: str, solution: str | None, choice: str | None) -> Target:
     if solution is not None:
         handle = SolutionId.parse(solution)
     else:
-        handle = chosen_handle(case.solutions, case.original["safety_degree"], str(choice), place)
+        handle = chosen_handle(case.solutions, case.original[SAFETY_DEGREE], str(choice), place)
     row = case.solutions.iloc[position_of(case.solutions, handle)]
     setting = row[list(case.characteristics.names)].to_numpy(dtype=float)
     return Target(case.study, place, handle, setting, {str(name): value for name, value in row.items()})

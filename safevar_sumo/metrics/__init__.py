@@ -2,12 +2,12 @@
 
 from safevar_sumo.metrics.base import Metric, MetricFacts, foreign_metric
 from safevar_sumo.metrics.deceleration import AVE_DECE
-from safevar_sumo.metrics.safety_degree import SAFETY_DEGREE
+from safevar_sumo.metrics.safety_degree import SAFETY_DEGREE_METRIC
 from safevar_sumo.metrics.scoring import F_DIFF, F_NUM_DIFF, F_SAFE, Objective, Scoring
 from safevar_sumo.metrics.time_to_collision import TET, TIT, time_to_collision
 
 METRICS = {metric.name: metric for metric in (
-    SAFETY_DEGREE,
+    SAFETY_DEGREE_METRIC,
     TET,
     TIT,
     AVE_DECE,

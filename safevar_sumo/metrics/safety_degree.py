@@ -6,7 +6,7 @@ import numpy as np
 
 from safevar_sumo.metrics.base import Metric
 from safevar_sumo.records import FloatArray, SimulationRuns
-from safevar_sumo.study import MetricsTable
+from safevar_sumo.study import SAFETY_DEGREE, MetricsTable
 
 
 def safety_degree(drives: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
@@ -20,6 +20,6 @@ def safety_degree(drives: SimulationRuns, thresholds: MetricsTable) -> FloatArra
     return np.where(np.isnan(drives.collision_speed), least, -drives.collision_speed)
 
 
-SAFETY_DEGREE = Metric(
-    name="safety_degree", title="SD", unit="m, or -m/s", head="SD", more_is_unsafe=False, function=safety_degree,
+SAFETY_DEGREE_METRIC = Metric(
+    name=SAFETY_DEGREE, title="SD", unit="m, or -m/s", head="SD", more_is_unsafe=False, function=safety_degree,
     description="Least separation during the encounter [m, > 0], or minus the speed of the collision [m/s, <= 0].")

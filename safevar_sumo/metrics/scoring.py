@@ -6,7 +6,7 @@ import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.metrics.base import MetricFacts
-from safevar_sumo.metrics.safety_degree import SAFETY_DEGREE
+from safevar_sumo.metrics.safety_degree import SAFETY_DEGREE_METRIC
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 
 
@@ -21,7 +21,7 @@ class Objective(Struct, frozen=True, kw_only=True):
     @classmethod
     def of(cls, metric: MetricFacts) -> Objective:
         """A metric in its unsafe direction."""
-        if metric.name == SAFETY_DEGREE.name:
+        if metric.name == SAFETY_DEGREE_METRIC.name:
             return F_SAFE
         return cls(name=metric.name, title=metric.title, unit=metric.unit, maximised=metric.more_is_unsafe)
 

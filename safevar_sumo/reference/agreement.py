@@ -14,7 +14,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.reference.rows import ReferenceData
-from safevar_sumo.study import Study
+from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
@@ -93,15 +93,15 @@ def agreement(reference: ReferenceData, here: Evaluations, study: Study, origina
         original={name: {"reference": study.published.get(name), "here": _defined(values[0])} for name, values in original.metrics.items()},
         precision=counts["both"] / counts["here"] if counts["here"] else None,
         recall=counts["both"] / counts["reference"] if counts["reference"] else None,
-        collision_speed={"reference": _mean(-reference.metrics["safety_degree"][collided]), "here": _mean(here.collision_speed[collided])},
+        collision_speed={"reference": _mean(-reference.metrics[SAFETY_DEGREE][collided]), "here": _mean(here.collision_speed[collided])},
         in_repeats={name: _in_repeats(error, study.repeatability.get(name)) for name, error in errors.items()},
-        undecided=_undecided(reference, here, study.repeatability.get("safety_degree")),
-        by_predicted=_by_predicted(here.f_safe, here.f_safe - reference.metrics["safety_degree"]))
+        undecided=_undecided(reference, here, study.repeatability.get(SAFETY_DEGREE)),
+        by_predicted=_by_predicted(here.f_safe, here.f_safe - reference.metrics[SAFETY_DEGREE]))
 
 
 def may_be_either(reference: ReferenceData, here: Evaluations, repeatability: float) -> BoolArray:
     """Which settings collide on one side alone, though repeats of them may do either."""
-    nearest = np.minimum(np.abs(reference.metrics["safety_degree"]), np.abs(here.f_safe))
+    nearest = np.minimum(np.abs(reference.metrics[SAFETY_DEGREE]), np.abs(here.f_safe))
     return np.asarray((reference.collided != here.collided) & (nearest <= FLIP * repeatability))
 
 
@@ -180,7 +180,7 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
             _error_by(below, here.metrics[metric], here.metrics[metric] - reference.metrics[metric])
             below.set_xlabel(f"here: {_label(metric)}")
             below.set_ylabel("mean error")
-        error = here.metrics["safety_degree"] - reference.metrics["safety_degree"]
+        error = here.metrics[SAFETY_DEGREE] - reference.metrics[SAFETY_DEGREE]
         lowest, highest = [], []
         for i, axis in enumerate(axes[2:].flat):
             if i >= len(characteristics):

@@ -15,7 +15,7 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.agreement import Agreement, agreement
 from safevar_sumo.reference.fit import LARGEST, Search, check_bound, original_cost, reference_cost, value_of, with_values
 from safevar_sumo.reference.rows import ReferenceData
-from safevar_sumo.study import FreeParameter, Study
+from safevar_sumo.study import SAFETY_DEGREE, FreeParameter, Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import BATCH, evaluate_all
@@ -65,7 +65,7 @@ def _data_line(name: str, data: ReferenceData) -> str:
 
 
 def _rho(told: Agreement) -> str:
-    rho = told.spearman["safety_degree"]
+    rho = told.spearman[SAFETY_DEGREE]
     return "undefined" if rho is None else f"{rho:.3f}"
 
 

@@ -15,6 +15,7 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.reference.beside import HERE, THERE, Beside, Pairs, paired, tables_beside
 from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, RULES, Conclusion, conclusions
 from safevar_sumo.reference.rows import ReferenceData
+from safevar_sumo.study import SAFETY_DEGREE
 
 NEIGHBOURS = 5
 
@@ -43,7 +44,7 @@ def nearness(case: Case, references: Sequence[ReferenceData]) -> list[Nearness]:
     domains = case.characteristics
     width = domains.upper - domains.lower
     rows = np.concatenate([data.settings for data in references]) / width
-    safety = np.concatenate([data.metrics["safety_degree"] for data in references])
+    safety = np.concatenate([data.metrics[SAFETY_DEGREE] for data in references])
     tree, number = scipy.spatial.cKDTree(rows), min(NEIGHBOURS, len(rows))
     among = tree.query(rows, number + 1)[0][:, 1:] if len(rows) > number else np.full((1, 1), np.nan)
     found = []
@@ -56,7 +57,7 @@ def nearness(case: Case, references: Sequence[ReferenceData]) -> list[Nearness]:
         hit = collided(solutions).to_numpy()
         found.append(Nearness(
             case.name, algorithm, len(solutions), float(np.median(distance)), float(np.median(among)),
-            float(np.nanmean(solutions["safety_degree"])), float(safety[nearest].mean()), int(hit.sum()),
+            float(np.nanmean(solutions[SAFETY_DEGREE])), float(safety[nearest].mean()), int(hit.sum()),
             float((safety[nearest[hit]] <= 0).mean()) if hit.any() else None))
     return found
 

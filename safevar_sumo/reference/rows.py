@@ -22,10 +22,10 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import UNKNOWN
-from safevar_sumo.study import refuse_other_than_file
+from safevar_sumo.study import SAFETY_DEGREE, refuse_other_than_file
 from safevar_sumo.vehicles import CharacteristicSet
 
-COLUMNS = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
+COLUMNS = {SAFETY_DEGREE: "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
 OPTIONAL = "ave_dece"
 ALIASES = {"dampratezeroce": "dampratezerotce", "dampratezerocd": "dampratezerotcd", "wheelradius": "radius"}
 """Names of characteristics in the package's files that are not those of its paper, without case and underscores."""
@@ -59,7 +59,7 @@ class ReferenceData(NamedTuple):
 
     @property
     def collided(self) -> BoolArray:
-        return np.asarray(self.metrics["safety_degree"] <= 0)
+        return np.asarray(self.metrics[SAFETY_DEGREE] <= 0)
 
     def take(self, rows: BoolArray) -> ReferenceData:
         """The data of some rows."""
@@ -88,7 +88,7 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
         raise InputError(path, "has no row whose values are all in the domains of the study", "a file of this study's vehicle")
     undefined = np.full(len(table), np.nan)
     metrics = {name: numbers.get(column, undefined)[inside] for name, column in COLUMNS.items()}
-    collided = metrics["safety_degree"] <= 0
+    collided = metrics[SAFETY_DEGREE] <= 0
     metrics["ave_dece"] = np.abs(metrics["ave_dece"])
     metrics["tet"], metrics["tit"] = (np.where(collided, np.nan, metrics[name]) for name in ("tet", "tit"))
     return ReferenceData(package_filter(characteristics, settings[inside]), metrics, int(np.count_nonzero(~inside)),
@@ -181,7 +181,7 @@ def evaluations_of(data: ReferenceData, characteristics: CharacteristicSet) -> E
     """Reference rows as evaluations; f_diff and f_numDiff are those of the filtered settings (method section 3)."""
     return Evaluations(
         settings=data.settings, outcome=np.where(data.collided, str(Outcome.COLLISION), UNKNOWN),
-        collision_speed=np.where(data.collided, -data.metrics["safety_degree"], np.nan), metrics=data.metrics,
+        collision_speed=np.where(data.collided, -data.metrics[SAFETY_DEGREE], np.nan), metrics=data.metrics,
         f_diff=characteristics.largest_change(data.settings), f_num_diff=characteristics.number_changed(data.settings))
 
 
@@ -203,6 +203,6 @@ def original_metrics(given: str | None, published: Mapping[str, float]) -> dict[
         if name not in SHORT or not np.isfinite(value):
             raise InputError("original", f"{part!r} in {given!r}", ORIGINAL_FORM)
         original[SHORT[name]] = value
-    if original["safety_degree"] is None:
+    if original[SAFETY_DEGREE] is None:
         raise InputError("original", "the study has no published values of the original vehicle", ORIGINAL_FORM)
     return original

@@ -15,6 +15,7 @@ from safevar_sumo.replay.comparison import differences, number, raised, spaced
 from safevar_sumo.report.input import ReportInput, stored
 from safevar_sumo.report.svg import Bar, rows
 from safevar_sumo.results import SolutionId, chosen_handle, unsafe_rows
+from safevar_sumo.study import SAFETY_DEGREE
 
 Found = list[dict[str, Any]]
 """What `explain --json` prints."""
@@ -122,7 +123,7 @@ def replays(material: ReportInput, explained: Found | None) -> list[dict[str, An
 
 def _chosen(material: ReportInput, explained: Found | None) -> list[str]:
     """Their handles, each once."""
-    solutions, degree = material.case.solutions, material.case.original["safety_degree"]
+    solutions, degree = material.case.solutions, material.case.original[SAFETY_DEGREE]
     if solutions.empty:
         return []
     unsafe = unsafe_rows(solutions, degree).tolist()

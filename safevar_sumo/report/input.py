@@ -34,7 +34,7 @@ from safevar_sumo.results.manifest import MANIFEST, read_manifest
 from safevar_sumo.results.store import SOLUTIONS
 from safevar_sumo.scenarios import Point
 from safevar_sumo.shipped import PACKAGE
-from safevar_sumo.study import foreign_names, refuse_other_than_file
+from safevar_sumo.study import SAFETY_DEGREE, foreign_names, refuse_other_than_file
 from safevar_sumo.sumo.matrix import aggregated, at_every_point, evaluate, study_at
 from safevar_sumo.sumo.system import System, assemble
 
@@ -152,7 +152,7 @@ class ReportInput:
     @property
     def unsafe(self) -> Unsafe:
         """What counts as unsafe: a collision if a solution is one, else half of the original's safety degree."""
-        degree = self.case.original["safety_degree"]
+        degree = self.case.original[SAFETY_DEGREE]
         return Unsafe() if collided(self.case.solutions).any() or math.isnan(degree) else Unsafe.half_of(degree)
 
     @cached_property
@@ -167,7 +167,7 @@ class ReportInput:
     @property
     def original_fails(self) -> bool:
         """Whether the original vehicle itself collides: then no change causes anything."""
-        return self.case.original["safety_degree"] < 0
+        return self.case.original[SAFETY_DEGREE] < 0
 
     def where(self, setting: FloatArray) -> dict[str, Any] | None:
         """At which points of a matrix a setting fails; None of a study without one, and where one point is asked about."""

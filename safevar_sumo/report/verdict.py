@@ -20,6 +20,7 @@ from safevar_sumo.report.findings import Found, handle_of
 from safevar_sumo.report.input import ReportInput
 from safevar_sumo.results import SolutionId, chosen_handle, unsafe_rows
 from safevar_sumo.scenarios import SCENARIOS, Point, tags
+from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.sumo.matrix import vehicle_remarks
 from safevar_sumo.vehicles import VEHICLES
 
@@ -95,7 +96,7 @@ def verdict(material: ReportInput, explained: Found | None, tolerance: Mapping[s
     All values of a failure are those of its solution as it was found, nowhere shrunk.
     """
     case = material.case
-    degree = case.original["safety_degree"]
+    degree = case.original[SAFETY_DEGREE]
     unsafe = case.solutions[unsafe_rows(case.solutions, degree)]
     hits = bool(collided(case.solutions).any())
     result: dict[str, Any] = {"unsafe": len(unsafe), "solutions": len(case.solutions), "rule": _rule(hits, degree), "findings": [],
@@ -117,7 +118,7 @@ def _rule(hits: bool, degree: float) -> str:
 
 def _original(material: ReportInput) -> str:
     if material.system is None:
-        return f"The original vehicle's safety degree is {material.case.original['safety_degree']:.2f} m."
+        return f"The original vehicle's safety degree is {material.case.original[SAFETY_DEGREE]:.2f} m."
     return f"The original vehicle {material.compared(material.case.characteristics.original).verdict(0)}."
 
 
@@ -131,7 +132,7 @@ def _findings(material: ReportInput, explained: Found, *, any_unsafe: bool) -> l
                 reasons.setdefault(handle_of(failure), []).append(reason)
                 shares[handle_of(failure)] = failure["robustness"]
     if not reasons:
-        degree = material.case.original["safety_degree"]
+        degree = material.case.original[SAFETY_DEGREE]
         for choice in REASONS if any_unsafe else ("most_severe",):
             handle = chosen_handle(material.case.solutions, degree, choice, material.place)
             reasons.setdefault(str(handle), []).append(REASONS[choice])
@@ -236,7 +237,7 @@ def agreement(material: ReportInput) -> dict[str, Any]:
         f"{first.both} of the {first.reference} published collisions collide here too (recall {first.recall:.2f})")
     if first.precision is not None:
         shares += f", and {first.both} of the {first.here} here are published ones (precision {first.precision:.2f})"
-    rho = first.spearman.get("safety_degree")
+    rho = first.spearman.get(SAFETY_DEGREE)
     order = "" if rho is None else f" safety degrees are in the same order with a rank correlation of {rho:.2f} (1 is perfect);"
     return {"sentence": f"Agreement with published data, {first.rows} vehicles simulated again:{order} {shares}.",
             "rows": [_row(one) for one in known]}
@@ -246,6 +247,6 @@ def _row(one: Totals) -> dict[str, str]:
     def decimal(value: float | None) -> str:
         return UNKNOWN if value is None else f"{value:.2f}"
 
-    return {"file": one.file, "vehicles": str(one.rows), "rho": decimal(one.spearman.get("safety_degree")),
-            "error": decimal(one.mean_absolute_error.get("safety_degree")), "reference": str(one.reference), "here": str(one.here),
+    return {"file": one.file, "vehicles": str(one.rows), "rho": decimal(one.spearman.get(SAFETY_DEGREE)),
+            "error": decimal(one.mean_absolute_error.get(SAFETY_DEGREE)), "reference": str(one.reference), "here": str(one.here),
             "both": str(one.both), "recall": decimal(one.recall), "precision": decimal(one.precision)}

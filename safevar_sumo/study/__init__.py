@@ -3,6 +3,7 @@
 from safevar_sumo.errors import refuse_other_than_file
 from safevar_sumo.study.file import check_writable, load_study, write_study
 from safevar_sumo.study.schema import (
+    SAFETY_DEGREE,
     WORDS,
     CharacteristicTable,
     FitTable,
@@ -27,6 +28,7 @@ from safevar_sumo.study.schema import (
 from safevar_sumo.study.validation import converted, invalid
 
 __all__ = [
-    "WORDS", "CharacteristicTable", "FitTable", "FreeParameter", "MatrixTable", "MatrixTest", "MetricsTable", "ModelTable", "Origin",
-    "SearchTable", "Study", "StudyLike", "VehicleTable", "Weather", "check_writable", "converted", "foreign_names", "foreign_packages",
-    "invalid", "label_of", "load_study", "refuse_other_than_file", "study_names", "study_path", "tables_of", "write_study"]
+    "SAFETY_DEGREE", "WORDS", "CharacteristicTable", "FitTable", "FreeParameter", "MatrixTable", "MatrixTest", "MetricsTable", "ModelTable",
+    "Origin", "SearchTable", "Study", "StudyLike", "VehicleTable", "Weather", "check_writable", "converted", "foreign_names",
+    "foreign_packages", "invalid", "label_of", "load_study", "refuse_other_than_file", "study_names", "study_path",
+    "tables_of", "write_study"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 import msgspec
 from msgspec import Meta, Struct
@@ -20,7 +20,9 @@ Weight = Annotated[float, Meta(ge=0, le=1e6)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
-OBJECTIVES = ("safety_degree", "f_diff", "f_num_diff")
+SAFETY_DEGREE: Final = "safety_degree"
+"""Column and key of that metric."""
+OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
 """What the published study minimises."""
 LONGEST_WORDS = 200
 """Characters of what a characteristic is, in words."""
@@ -193,7 +195,7 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     rank: Weight = 5.0
     collisions: Weight = 10.0
     weights: dict[str, Weight] = msgspec.field(
-        default_factory=lambda: {"safety_degree": 1.0, "tet": 0.3, "tit": 0.3, "ave_dece": 0.5})
+        default_factory=lambda: {SAFETY_DEGREE: 1.0, "tet": 0.3, "tit": 0.3, "ave_dece": 0.5})
 
 
 class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -15,7 +15,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Contact, Encounter, Evaluations, FloatArray, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
-from safevar_sumo.study import Study
+from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.batch import Watcher, drive_all, score
 from safevar_sumo.sumo.engine import Engine, standing_network
 from safevar_sumo.sumo.network import empty_fingerprint, lanes_of
@@ -44,7 +44,7 @@ def point_record(found: AtPoint, row: int = 0) -> dict[str, Any]:
     """
     evaluations, relative = found.evaluations, found.drives.relative_speed
     numbers = {"impact_speed": evaluations.collision_speed[row], "relative_impact_speed": relative[row],
-               "safety_degree": evaluations.f_safe[row],
+               SAFETY_DEGREE: evaluations.f_safe[row],
                "test_speed_error": np.broadcast_to(found.drives.test_speed_error, relative.shape)[row] / KMH}
     side, place = (np.broadcast_to(values, relative.shape)[row] for values in found.drives.contact)
     return {"point": found.point.name, **dict(found.point.place), "outcome": str(evaluations.outcome[row]),

@@ -15,7 +15,7 @@ from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.words import sentence
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import SolutionId
-from safevar_sumo.study import Study
+from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 
@@ -81,7 +81,7 @@ class Explanation:
         return {
             "algorithm": self.handle.algorithm if self.handle else None, "run": self.handle.run if self.handle else None,
             "index": self.handle.row if self.handle else None, "setting": self.setting, "outcome": self.outcome,
-            "safety_degree": self.safety_degree, "changed": list(self.changed),
+            SAFETY_DEGREE: self.safety_degree, "changed": list(self.changed),
             "minimal_causes": [
                 {name: getattr(cause, name) for name in ("changes", "boundary", "fraction", "outcome", "safety_degree", "end")}
                 for cause in self.causes],
@@ -148,4 +148,4 @@ class Explained:
                                      cause.boundary[member.name], cause.alone[member.name], cause.fraction, cause.outcome,
                                      cause.safety_degree, one.robustness.share, one.preventable, "; ".join(one.points)))
         return pd.DataFrame(rows, columns=["failure", "algorithm", "run", "index", "cause", "characteristic", "unit", "original", "value",
-                                           "boundary", "alone", "fraction", "outcome", "safety_degree", "robustness", "whose", "points"])
+                                           "boundary", "alone", "fraction", "outcome", SAFETY_DEGREE, "robustness", "whose", "points"])

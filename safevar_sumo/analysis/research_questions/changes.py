@@ -7,6 +7,7 @@ import pandas as pd
 
 from safevar_sumo.analysis.research_questions.case import NSGA2, Case, Unanswerable, collided
 from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import SAFETY_DEGREE
 
 ANY = "any"
 
@@ -20,9 +21,9 @@ def critical(case: Case) -> pd.DataFrame:
         If NSGA-II is missing or the original's safety degree is not known.
     """
     solutions = case.solutions_of(NSGA2)
-    if np.isnan(case.original["safety_degree"]):
+    if np.isnan(case.original[SAFETY_DEGREE]):
         raise Unanswerable(case.name, "does not tell the original vehicle's safety degree", "results that do")
-    return solutions[solutions["safety_degree"] < case.original["safety_degree"]]
+    return solutions[solutions[SAFETY_DEGREE] < case.original[SAFETY_DEGREE]]
 
 
 def changes(case: Case, solutions: pd.DataFrame) -> FloatArray:
@@ -113,10 +114,10 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     """
     found = critical(case)
     crash = collided(found).to_numpy()
-    sd, tet, tit, dece = (found[name].to_numpy(dtype=float) for name in ("safety_degree", "tet", "tit", "ave_dece"))
+    sd, tet, tit, dece = (found[name].to_numpy(dtype=float) for name in (SAFETY_DEGREE, "tet", "tit", "ave_dece"))
     original = case.original
     quantities = {
-        "avgSD_mD": (np.where(crash, np.nan, original["safety_degree"] - sd), original["safety_degree"]),
+        "avgSD_mD": (np.where(crash, np.nan, original[SAFETY_DEGREE] - sd), original[SAFETY_DEGREE]),
         "avgSD_cS": (np.where(crash, -sd, np.nan), np.nan),
         "TET": (np.where(crash, np.nan, tet - original["tet"]), original["tet"]),
         "TIT": (np.where(crash, np.nan, tit - original["tit"]), original["tit"]),

@@ -16,6 +16,7 @@ from safevar_sumo.analysis.research_questions.discussion import effects
 from safevar_sumo.analysis.research_questions.indicators import WORST, convergence, nondominated, objectives
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
+from safevar_sumo.study import SAFETY_DEGREE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -169,7 +170,7 @@ def _of_original(case: Case, objective: Objective) -> float:
     """The original vehicle's value; NaN where nobody knows it."""
     if objective.name in (F_DIFF.name, F_NUM_DIFF.name):
         return 0.0
-    return case.original.get("safety_degree" if objective == F_SAFE else objective.name, np.nan)
+    return case.original.get(SAFETY_DEGREE if objective == F_SAFE else objective.name, np.nan)
 
 
 def hypervolume_growth(case: Case) -> Figure:

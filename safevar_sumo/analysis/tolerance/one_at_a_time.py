@@ -15,6 +15,7 @@ from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.evaluator import Bench
 from safevar_sumo.analysis.explain.causes import number
 from safevar_sumo.records import FloatArray
+from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.vehicles import Characteristic
 
 VALUES = 201
@@ -60,7 +61,7 @@ class OneAtATimeScan:
     def margins(self) -> tuple[float | None, float | None]:
         """Safety degrees at the ends of the safe interval [m]."""
         around = self._around
-        return (None, None) if around is None else (number(around["safety_degree"].iloc[0]), number(around["safety_degree"].iloc[-1]))
+        return (None, None) if around is None else (number(around[SAFETY_DEGREE].iloc[0]), number(around[SAFETY_DEGREE].iloc[-1]))
 
     @property
     def unsafe(self) -> list[tuple[float, float]]:
@@ -117,6 +118,6 @@ def _evaluated(bench: Bench, columns: Sequence[int], values: Sequence[FloatArray
     for column, group, end in zip(columns, values, ends, strict=True):
         settings[end - len(group):end, column] = group
     evaluations = bench.evaluate(settings, "one characteristic at a time")
-    frame = pd.DataFrame({"value": np.concatenate(values), "safety_degree": evaluations.f_safe, "outcome": evaluations.outcome,
+    frame = pd.DataFrame({"value": np.concatenate(values), SAFETY_DEGREE: evaluations.f_safe, "outcome": evaluations.outcome,
                           "unsafe": unsafe.of(evaluations), "valid": evaluations.valid})
     return [frame.iloc[end - len(group):end].reset_index(drop=True) for group, end in zip(values, ends, strict=True)]

@@ -12,7 +12,7 @@ from rich.text import Text
 from safevar_sumo.api.simulation import Simulation
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, Outcome
-from safevar_sumo.study import Study
+from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.matrix import AtPoint, point_record
 from safevar_sumo.terminal import WholeTable, plain, print_meanings
 from safevar_sumo.vehicles import CharacteristicSet
@@ -53,7 +53,7 @@ def _print_setting(console: Console, found: Simulation) -> None:
 
 
 def _against(found: Simulation) -> str:
-    here, there = found.metrics["safety_degree"], found.original.metrics["safety_degree"]
+    here, there = found.metrics[SAFETY_DEGREE], found.original.metrics[SAFETY_DEGREE]
     if np.isnan(here) or np.isnan(there):
         return "nothing tells whether that is less safe"
     if here == there:
