@@ -25,8 +25,7 @@ import numpy as np
 import traci
 from measuring import Record, clock_seconds, medians_in_turn, processor_seconds, told
 
-from safevar_sumo.ads import ScalarAds
-from safevar_sumo.ads.guarded import PerVehicle
+from safevar_sumo.ads import PerVehicle, ScalarAds
 from safevar_sumo.campaign import BATCH
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import FloatArray, Observation

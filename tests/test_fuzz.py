@@ -15,7 +15,7 @@ from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from safevar_sumo.ads.guarded import GuardedAds, PerVehicle
+from safevar_sumo.ads import GuardedAds, PerVehicle
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import ForeignError, InputError, SafevarError
 from safevar_sumo.plugins import Guard

@@ -6,11 +6,10 @@ from typing import Any
 from safevar_sumo.ads.acc import Acc
 from safevar_sumo.ads.aeb import Aeb
 from safevar_sumo.ads.apollo import Apollo
-from safevar_sumo.ads.base import Ads, ScalarAds
+from safevar_sumo.ads.base import ADS_CONTRACT, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.ads.full_braking import FullBraking
 from safevar_sumo.ads.fuzzy_safety import FuzzySafety
-from safevar_sumo.ads.guarded import ADS_CONTRACT, SCALAR_ADS_CONTRACT, GuardedAds, PerVehicle
 from safevar_sumo.ads.idm import Idm
 from safevar_sumo.ads.krauss import Krauss
 from safevar_sumo.ads.r157 import R157

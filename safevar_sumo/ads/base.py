@@ -1,28 +1,32 @@
-"""The contract of an automated driving system, and the base of one that drives a single vehicle."""
+"""The contract of an automated driving system (ADS), the base of an ADS for a single vehicle, and checks of ADSs from outside."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from itertools import repeat
 from typing import Annotated, Any, Protocol
 
+import numpy as np
 from msgspec import Meta
 
-from safevar_sumo.records import Command, Nominal, Observation
+from safevar_sumo.plugins import Contract, Guard, read_only_copy
+from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
 Positive = Annotated[float, Meta(gt=0, le=1e3)]
 """A driver's parameter above 0, in SI units."""
 NotNegative = Annotated[float, Meta(ge=0, le=1e3)]
-"""One that may be 0."""
+"""A driver's parameter that may be 0, in SI units."""
 
 
 class Ads(Protocol):
     """An ADS that drives N vehicles at once. Its fields are the parameters of `ads.parameters`.
 
-    It sees an `Observation` and knows the original vehicle (`Nominal`); no ADS sees the setting.
+    It sees an `Observation` and knows the original vehicle (`Nominal`), never the setting.
     Element i of a command depends on element i of the observations alone, to the bit.
 
-    A class with `own_reactions = True` has a reaction time of its own: a weather's `recognition_delay` and `hesitation`,
-    which were measured on another driver, do not act on it. Without the attribute they do.
+    A class with `own_reactions = True` has its own reaction time: a weather's `recognition_delay` and `hesitation`, measured on
+    another driver, do not act on it. Without the attribute they do.
     """
 
     def start(self, n: int, nominal: Nominal, step: float) -> Any:
@@ -33,7 +37,7 @@ class Ads(Protocol):
 
 
 class ScalarAds(ABC):
-    """Base of an ADS that is written for one vehicle; every simulated vehicle gets an instance of its own.
+    """Base of an ADS for one vehicle; every simulated vehicle gets its own instance.
 
     A study names it as `package.module:Name`; its parameters are the arguments of `__init__`.
     """
@@ -43,17 +47,65 @@ class ScalarAds(ABC):
     own_reactions = False
 
     def start(self, nominal: Nominal, step: float) -> None:
-        """Called once before the run; keeps what is known of the original vehicle and the time between two calls.
-
-        Parameters
-        ----------
-        nominal
-            What is known of the original vehicle.
-        step
-            Time between two calls of `drive` [s].
-        """
+        """Called once before the run, with the original vehicle and the time between two calls of `drive` [s]."""
         self.nominal, self.step = nominal, step
 
     @abstractmethod
     def drive(self, seen: Observation) -> tuple[float, float]:
         """Command throttle and brake, each in [0, 1], from an observation whose fields are numbers."""
+
+
+ADS_CONTRACT = Contract.of(Ads, "an ADS")
+SCALAR_ADS_CONTRACT = Contract.of(ScalarAds, "a ScalarAds")
+
+
+class GuardedAds:
+    """An ADS from outside: it gets read-only copies, and its commands are checked."""
+
+    def __init__(self, ads: Ads, guard: Guard) -> None:
+        self._ads, self._guard = ads, guard
+        self.own_reactions = bool(getattr(ads, "own_reactions", False))
+
+    def start(self, n: int, nominal: Nominal, step: float) -> Any:
+        return self._guard.call("start", self._ads.start, n, read_only_copy(nominal), step)
+
+    def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
+        result = self._guard.call("drive", self._ads.drive, read_only_copy(seen), memory)
+        command, memory = self._guard.parts("drive", result, "(Command(throttle, brake), memory)")
+        throttle, brake = self._guard.parts("drive", command, "(Command(throttle, brake), memory)")
+        return Command(self._pedal("throttle", throttle, seen), self._pedal("brake", brake, seen)), memory
+
+    def _pedal(self, name: str, value: Any, seen: Observation) -> FloatArray:
+        return self._guard.numbers("drive", name, value, seen.speed.shape, 0.0, 1.0)
+
+
+class PerVehicle:
+    """Drives N vehicles with N instances of a `ScalarAds`."""
+
+    def __init__(self, make: Callable[[], ScalarAds], guard: Guard, own_reactions: bool = False) -> None:
+        self._make, self._guard, self.own_reactions = make, guard, own_reactions
+
+    def start(self, n: int, nominal: Nominal, step: float) -> list[ScalarAds]:
+        drivers = [self._guard.call("__init__", self._make) for _ in range(n)]
+        for driver in drivers:
+            self._guard.call("start", driver.start, read_only_copy(nominal), step)
+        return drivers
+
+    def drive(self, seen: Observation, memory: list[ScalarAds]) -> tuple[Command, list[ScalarAds]]:
+        pedals = [self._pedals(self._guard.call("drive", driver.drive, one)) for driver, one in zip(memory, _each(seen), strict=True)]
+        return Command(*np.array(pedals, dtype=float).reshape(len(memory), 2).T.copy()), memory
+
+    def _pedals(self, command: Any) -> tuple[float, float]:
+        if type(command) is tuple and len(command) == 2:
+            throttle, brake = command
+            if type(throttle) is type(brake) is float and 0 <= throttle <= 1 and 0 <= brake <= 1:
+                return throttle, brake  # the fast path: this runs for every vehicle in every step
+        throttle, brake = self._guard.parts("drive", command, "(throttle, brake), each in [0, 1]")
+        return (float(self._guard.numbers("drive", "throttle", throttle, (), 0.0, 1.0)),
+                float(self._guard.numbers("drive", "brake", brake, (), 0.0, 1.0)))
+
+
+def _each(seen: Observation) -> Iterator[Observation]:
+    """The observation of each vehicle, as plain numbers."""
+    columns = [value.tolist() if isinstance(value, np.ndarray) and value.ndim else repeat(float(value)) for value in seen]
+    return map(Observation._make, zip(*columns, strict=False))

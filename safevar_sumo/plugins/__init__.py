@@ -1,11 +1,11 @@
-"""Other people's code: looked up by name, held to a contract, called through one guard."""
+"""Code from outside the package: looked up by name, held to a contract, called through one guard."""
 
-from safevar_sumo.plugins.contract import Contract, takes
-from safevar_sumo.plugins.digests import DIGITS, Files, changes, digest_of, digests, located, named_files
-from safevar_sumo.plugins.guard import Guard, read_only_copy
+from safevar_sumo.plugins.files import DIGITS, Files, changes, digest_of, digests, located, named_files, noted_reading
+from safevar_sumo.plugins.guard import Contract, Guard, accepts, guard_process_state, read_only_copy
 from safevar_sumo.plugins.lookup import (
     Lookup,
     Member,
+    OwnModules,
     check_parameters,
     forget_foreign,
     inherit_reachable,
@@ -13,31 +13,8 @@ from safevar_sumo.plugins.lookup import (
     make_reachable,
     reachable,
 )
-from safevar_sumo.plugins.own_modules import OwnModules
-from safevar_sumo.plugins.process_state import guard_process_state
-from safevar_sumo.plugins.reading import noted_reading
 
 __all__ = [
-    "DIGITS",
-    "Contract",
-    "Files",
-    "Guard",
-    "Lookup",
-    "Member",
-    "OwnModules",
-    "changes",
-    "check_parameters",
-    "digest_of",
-    "digests",
-    "forget_foreign",
-    "guard_process_state",
-    "inherit_reachable",
-    "located",
-    "made",
-    "make_reachable",
-    "named_files",
-    "noted_reading",
-    "reachable",
-    "read_only_copy",
-    "takes",
-]
+    "DIGITS", "Contract", "Files", "Guard", "Lookup", "Member", "OwnModules", "accepts", "changes", "check_parameters", "digest_of",
+    "digests", "forget_foreign", "guard_process_state", "inherit_reachable", "located", "made", "make_reachable", "named_files",
+    "noted_reading", "reachable", "read_only_copy"]

@@ -1,21 +1,106 @@
-"""What other people's code is given: copies that it cannot write to, so that nothing it does reaches what is logged and measured."""
+"""Code from outside the package: what its classes must have, how it is called, and what is checked of its results."""
 
 from __future__ import annotations
 
 import importlib
-import multiprocessing
+import inspect
+import os
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from safevar_sumo.errors import ForeignError, InputError, told
-from safevar_sumo.plugins.reading import watch
+from safevar_sumo.plugins.files import watch
 from safevar_sumo.records import BoolArray, FloatArray
+
+_OURS = str(Path(__file__).resolve().parents[1])
+_IMPORTS = str(Path(importlib.__file__).parent)
+INSTALLED = "site-packages"
+INFINITE = float("inf")
+
+
+class Contract(NamedTuple):
+    """What a class must have, read off the protocol or base class that documents it.
+
+    Attributes
+    ----------
+    title
+        What an instance is, such as "an ADS".
+    methods, optional
+        The parameters of every method that must be there, and of every method that may be missing.
+    attributes
+        What an instance must have beside methods.
+    base
+        The class that it must derive from, if there is one.
+    """
+
+    title: str
+    methods: Mapping[str, tuple[str, ...]]
+    optional: Mapping[str, tuple[str, ...]]
+    attributes: tuple[str, ...]
+    base: type | None = None
+
+    @classmethod
+    def of(cls, protocol: type, title: str, optional: Iterable[str] = ()) -> Self:
+        """The public methods and annotated attributes of a protocol or base class; those in `optional` may be missing."""
+        methods = {name: _required_parameters(member) for name, member in vars(protocol).items()
+                   if not name.startswith("_") and inspect.isfunction(member)}
+        return cls(title, {name: parameters for name, parameters in methods.items() if name not in optional},
+                   {name: parameters for name, parameters in methods.items() if name in optional},
+                   tuple(inspect.get_annotations(protocol)), None if getattr(protocol, "_is_protocol", False) else protocol)
+
+    def applies_to(self, candidate: Any) -> bool:
+        """Whether a class derives from the base; a contract without a base applies to everything."""
+        return self.base is None or (inspect.isclass(candidate) and issubclass(candidate, self.base))
+
+    def violation(self, candidate: Any) -> str:
+        """Why `candidate` does not meet the contract, as far as a class shows without being called; "" if it does."""
+        if not inspect.isclass(candidate):
+            kind = "module" if inspect.ismodule(candidate) else "function" if callable(candidate) else f"value of type {_type(candidate)}"
+            return f"is a {kind}, not a class"
+        for name, parameters in {**self.methods, **self.optional}.items():
+            member = getattr(candidate, name, None)
+            signature = ", ".join(parameters)
+            if member is None and name in self.optional:
+                continue
+            if member is None or name in getattr(candidate, "__abstractmethods__", ()):
+                return f"has no method {name}({signature})"
+            if not callable(member):
+                return f"has {name} = {member!r} instead of a method {name}({signature})"
+            itself = 1 if inspect.isfunction(inspect.getattr_static(candidate, name)) else 0
+            if not accepts(member, itself + len(parameters)):
+                return f"has a method {name} that does not take ({signature})"
+        return ""
+
+    def __str__(self) -> str:
+        abstract = self.methods if self.base is None else getattr(self.base, "__abstractmethods__", ())
+        methods = [f"{name}({', '.join(parameters)})" for name, parameters in self.methods.items() if name in abstract]
+        if self.base is not None:
+            return f"a subclass of {self.base.__module__.rpartition('.')[0]}.{self.base.__name__} with {', '.join(methods)}"
+        return f"{self.title}: a class with {', '.join([*methods, *self.attributes])}"
+
+
+def _required_parameters(method: Any) -> tuple[str, ...]:
+    """Names of a method's parameters that have no default, without `self`."""
+    parameters = inspect.signature(method).parameters.values()
+    return tuple(parameter.name for parameter in parameters if parameter.default is parameter.empty)[1:]
+
+
+def accepts(function: Any, number: int) -> bool:
+    """Whether a function can be called with that many positional arguments; True where it has no signature."""
+    try:
+        inspect.signature(function).bind(*[None] * number)
+    except TypeError:
+        return False
+    except ValueError:  # compiled code, without a signature
+        return True
+    return True
 
 
 def read_only_copy(value: Any) -> Any:
@@ -24,10 +109,9 @@ def read_only_copy(value: Any) -> Any:
         copy = value.copy()
         copy.flags.writeable = False
         return copy
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return type(value)(*map(read_only_copy, value))
-    if type(value) is tuple:
-        return tuple(map(read_only_copy, value))
+    if isinstance(value, tuple):
+        copies = map(read_only_copy, value)
+        return type(value)(*copies) if hasattr(value, "_fields") else tuple(copies)
     if is_dataclass(value) and not isinstance(value, type):
         return replace(value, **{field.name: read_only_copy(getattr(value, field.name)) for field in fields(value)})
     if isinstance(value, Mapping):
@@ -35,23 +119,34 @@ def read_only_copy(value: Any) -> Any:
     return value
 
 
-_OURS = str(Path(__file__).resolve().parents[1])
-_IMPORTS = str(Path(importlib.__file__).parent)
-INSTALLED = "site-packages"
-INFINITE = float("inf")
+@contextmanager
+def guard_process_state(source: str, names: Sequence[str]) -> Iterator[None]:
+    """Restore the working directory, environment variables and numpy's error state after plug-ins of such names; no-op without any."""
+    if not names:
+        yield
+        return
+    folder, environment = os.getcwd(), dict(os.environ)
+    try:
+        with np.errstate():
+            yield
+    finally:
+        os.chdir(folder)
+        if dict(os.environ) != environment:
+            os.environ.clear()
+            os.environ.update(environment)
 
 
 class Guard(NamedTuple):
-    """Calls one plug-in and checks what it returns.
+    """Calls a plug-in and checks what it returns.
 
     Attributes
     ----------
     source
-        The study, as errors call it.
+        The study, as errors name it.
     name
         The plug-in as the study names it, such as `ads.model = 'my_ads:Careful'`.
     folder
-        Where its sources lie: the innermost line of them is told when it fails.
+        Folder of its sources; an error names the innermost line in it.
     """
 
     source: str
@@ -64,43 +159,39 @@ class Guard(NamedTuple):
         Raises
         ------
         ForeignError
-            Whatever it raises, an attempt to end the process included.
+            If the function raises anything, `SystemExit` included.
         """
         watch.inside += 1
         try:
             return function(*arguments)
         except ForeignError:
             raise
-        except KeyboardInterrupt as error:
-            if multiprocessing.parent_process() is None:
-                raise
-            raise self.failed(method, error) from error  # Ctrl-C does not reach a worker: the plug-in has raised it
-        except BaseException as error:
+        except (Exception, SystemExit) as error:
             raise self.failed(method, error) from error
         finally:
             watch.inside -= 1
 
     def failed(self, method: str, error: BaseException) -> ForeignError:
-        """The error that tells of an exception."""
+        """The error for an exception that the plug-in raised."""
         place = self._place(error)
-        legal = error.legal if isinstance(error, InputError) else ""
-        return ForeignError(self.source, f"{self.name} raised in {method}: {told(error)}{f' ({place})' if place else ''}", legal)
+        problem = f"{self.name} raised in {method}: {told(error)}{f' ({place})' if place else ''}"
+        return ForeignError(self.source, problem, error.legal if isinstance(error, InputError) else "")
 
     def wrong(self, method: str, what: str, got: object, expected: str) -> ForeignError:
-        """The error that tells of a result; one wording for all of them."""
+        """The error for a wrong part of a result."""
         return ForeignError(self.source, f"{self.name} returned {what} = {_short(got)} from {method}", expected)
 
     def parts(self, method: str, value: Any, expected: str, number: int = 2) -> tuple[Any, ...]:
-        """A result of several parts."""
+        """The parts of a result that must be a tuple or list of `number` parts."""
         if not isinstance(value, tuple | list) or len(value) != number:
             raise ForeignError(self.source, f"{self.name} returned {_short(value)} from {method}", expected)
         return tuple(value)
 
     def field(self, method: str, value: Any, name: str) -> Any:
-        """An attribute that a result has to have."""
+        """An attribute that a result must have."""
         try:
             return getattr(value, name)
-        except BaseException:
+        except AttributeError:
             problem = f"{self.name} returned {_short(value)} from {method}"
             raise ForeignError(self.source, problem, f"an object with the attribute {name}") from None
 
@@ -111,23 +202,25 @@ class Guard(NamedTuple):
         Parameters
         ----------
         shape
-            What it must have; a plain number stands for all elements.
+            Expected shape; a plain number stands for all elements.
         lowest, highest
-            Bounds, the lowest itself excluded if `above`.
+            Bounds; with `above` the lowest itself is excluded.
         infinite, undefined
             Whether infinities and NaN are legal.
         """
-        expected = f"numbers{_range(lowest, highest, above=above)}, {'' if infinite else 'finite, '}shape {shape}"
-        found = self._array(method, what, value, shape, "biuf", expected).astype(float)
-        good = (found > lowest) if above else (found >= lowest)
-        good &= found <= highest
+        bounds = "" if (lowest, highest) == (-INFINITE, INFINITE) else f" {'above' if above else 'from'} {lowest:g}" \
+            if highest == INFINITE else f" in {'(' if above else '['}{lowest:g}, {highest:g}]"
+        expected = f"numbers{bounds}, {'' if infinite else 'finite, '}shape {shape}"
+        numbers = self._array(method, what, value, shape, "biuf", expected).astype(float)
+        good = (numbers > lowest) if above else (numbers >= lowest)
+        good &= numbers <= highest
         if not infinite:
-            good &= np.isfinite(found)
+            good &= np.isfinite(numbers)
         if undefined:
-            good |= np.isnan(found)
+            good |= np.isnan(numbers)
         if not good.all():
-            raise self.wrong(method, what, float(found[~good][0]), expected)
-        return found
+            raise self.wrong(method, what, float(numbers[~good][0]), expected)
+        return numbers
 
     def truths(self, method: str, what: str, value: Any, shape: tuple[int, ...]) -> BoolArray:
         """A result as an array of its own, bool."""
@@ -135,17 +228,17 @@ class Guard(NamedTuple):
 
     def _array(self, method: str, what: str, value: Any, shape: tuple[int, ...], kinds: str, expected: str) -> np.ndarray:
         try:
-            found = np.asarray(value)
-        except BaseException:
+            array = np.asarray(value)
+        except ValueError:
             raise self.wrong(method, what, value, expected) from None
-        if found.dtype.kind not in kinds:
+        if array.dtype.kind not in kinds:
             raise self.wrong(method, what, value, expected)
-        if found.shape not in (shape, ()):
-            raise ForeignError(self.source, f"{self.name} returned {what} of shape {found.shape} from {method}", expected)
-        return np.broadcast_to(found, shape)
+        if array.shape not in (shape, ()):
+            raise ForeignError(self.source, f"{self.name} returned {what} of shape {array.shape} from {method}", expected)
+        return np.broadcast_to(array, shape)
 
     def _place(self, error: BaseException) -> str:
-        """File and line of the innermost frame that is the plug-in's own, else of the innermost that is not ours."""
+        """File and line of the innermost frame in the plug-in's folder, else of the innermost frame outside this package."""
         frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
         if isinstance(error, SyntaxError) and error.filename:
             frames.append((error.filename, error.lineno))
@@ -155,20 +248,13 @@ class Guard(NamedTuple):
         return "{}:{}".format(*(own or outside)[-1]) if outside else ""
 
 
-def _range(lowest: float, highest: float, *, above: bool) -> str:
-    if lowest == -INFINITE and highest == INFINITE:
-        return ""
-    if highest == INFINITE:
-        return f" {'above' if above else 'from'} {lowest:g}"
-    return f" in {'(' if above else '['}{lowest:g}, {highest:g}]"
+def _type(value: object) -> str:
+    return type(value).__name__
 
 
 def _short(value: object) -> str:
-    """What was returned, in a few words on one line."""
+    """A returned value in a few words on one line."""
     if isinstance(value, np.ndarray) and value.size > 4:
         return f"an array of {value.dtype}, shape {value.shape}"
-    try:
-        text = " ".join(repr(value).split())
-    except BaseException:
-        text = ""
-    return text if text and len(text) <= 80 else f"a {type(value).__name__}"
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 80 else f"a {_type(value)}"

@@ -1,6 +1,6 @@
-"""A name in a study becomes a class or a record.
+"""Turns a name in a study into a class or a record.
 
-It is one of ours, or `package.module:Name` from beside the study, from the working directory or from what is installed.
+The name is one of the package's own, or `package.module:Name` from beside the study, the working directory or an installed package.
 """
 
 from __future__ import annotations
@@ -9,10 +9,11 @@ import importlib
 import inspect
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from hashlib import sha256
-from importlib.machinery import ModuleSpec, PathFinder
+from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -20,28 +21,18 @@ from typing import Any, NamedTuple
 import msgspec
 
 from safevar_sumo.errors import ForeignError, InputError, did_you_mean, one_of
-from safevar_sumo.plugins.contract import Contract
-from safevar_sumo.plugins.digests import beside
-from safevar_sumo.plugins.guard import Guard
-from safevar_sumo.plugins.reading import is_foreign, watch
+from safevar_sumo.plugins.files import beside, is_foreign, watch
+from safevar_sumo.plugins.guard import Contract, Guard
 from safevar_sumo.study import converted
 
 _NOT_FOREIGN = {__name__.partition(".")[0], *sys.stdlib_module_names}
 
 
 class Member(NamedTuple):
-    """What a name in a study stands for.
+    """The class or record that a name in a study stands for.
 
-    Attributes
-    ----------
-    what
-        The class or record itself.
-    guard
-        Through which it is called; None for one that comes with the package.
-    module
-        The module that it was found in, by name; "" for one of ours.
-    folder
-        Where that module's top package lies.
+    `guard` calls it (None for the package's own), `module` is the name of its module ("" for the package's own), `folder` the folder
+    of that module's top package.
     """
 
     what: Any
@@ -51,7 +42,7 @@ class Member(NamedTuple):
 
 
 class _Loaded(NamedTuple):
-    """A module that was loaded from a user's folder, and its source then."""
+    """A module loaded from a user's folder, and the digest of its source at that time."""
 
     folder: str
     file: str
@@ -64,21 +55,17 @@ _reachable: list[str] = []
 
 
 class Lookup(NamedTuple):
-    """Where a study's names are looked up.
+    """Looks up the names of a study.
 
-    Attributes
-    ----------
-    source
-        How errors call the study.
-    places
-        Folders that come first: the study file's own, then those of the files that it extends.
+    `source` is the study, as errors name it; `places` are the folders that come first: those of the study's file and of the files
+    that it extends.
     """
 
     source: str
     places: Sequence[str] = ()
 
     def find(self, members: Mapping[str, Any], name: str, key: str) -> Member:
-        """The member of ours by that name, or what `package.module:Name` stands for.
+        """The one of `members` with that name, or what `package.module:Name` stands for.
 
         Raises
         ------
@@ -102,29 +89,28 @@ class Lookup(NamedTuple):
         return Member(what, Guard(self.source, f"{key} = {name!r}", folder), module_name, folder)
 
     def class_of(self, members: Mapping[str, Any], name: str, key: str, *contracts: Contract, otherwise: str = "") -> Member:
-        """A class by name; one from outside meets a contract, which is looked at before anything of it is called.
+        """A class by name; a class from outside must meet the first contract that applies to it.
 
-        Of several contracts the first that concerns the class counts. `otherwise` tells what else there is than a class.
+        `otherwise` describes legal values that are no classes.
         """
-        found = self.find(members, name, key)
-        contract = next(contract for contract in contracts if contract.concerns(found.what))
-        reason = contract.lacking(found.what) if found.guard else ""
+        member = self.find(members, name, key)
+        contract = next(contract for contract in contracts if contract.applies_to(member.what))
+        reason = contract.violation(member.what) if member.guard else ""
         if reason:
             raise InputError(self.source, f"{key} = {name!r} {reason}", "; or ".join([*map(str, contracts), *filter(None, [otherwise])]))
-        return found
+        return member
 
     def with_paths(self, member: Member, parameters: Mapping[str, Any], key: str) -> dict[str, Any]:
-        """Parameters for a member from outside: texts that name files beside the study's file as whole paths.
+        """Parameters for a member from outside, in which names of files beside the study's file are whole paths.
 
         Raises
         ------
         InputError
-            If a text names a file of the working directory alone, which would be another file in another one.
+            If a text names a file of the working directory alone: the study would read another file elsewhere.
         """
         if member.guard is None or not self.places:
             return dict(parameters)
-        return {name: self._with_paths(value, f"{key}.{name}") for name, value in parameters.items() if name != "network"} | {
-            name: value for name, value in parameters.items() if name == "network"}
+        return {name: value if name == "network" else self._with_paths(value, f"{key}.{name}") for name, value in parameters.items()}
 
     def _with_paths(self, value: Any, key: str) -> Any:
         if isinstance(value, dict):
@@ -133,14 +119,14 @@ class Lookup(NamedTuple):
             return [self._with_paths(one, key) for one in value]
         if not isinstance(value, str):
             return value
-        found = beside(value, self.places)
-        if not found and beside(value, [os.getcwd()]):
+        path = beside(value, self.places)
+        if not path and beside(value, [os.getcwd()]):
             raise InputError(self.source, f"{key} = {value!r}: that file lies in the working directory, not beside the study's file",
                              f"a path relative to {self.places[0]}")
-        return found or value
+        return path or value
 
     def _imported(self, name: str, guard: Guard, places: list[str]) -> tuple[ModuleType, str]:
-        """The module, and the folder that its top package lies in."""
+        """The module and the folder of its top package."""
         importlib.invalidate_caches()
         top = name.partition(".")[0]
         if top == "__main__":
@@ -149,7 +135,7 @@ class Lookup(NamedTuple):
         _forget_all_but(places)
         make_reachable(places)
         if place:
-            self._refuse_taken(top, place, guard)
+            self._refuse_installed_name(top, place, guard)
         before = set(sys.modules)
         writes_bytecode, sys.dont_write_bytecode = sys.dont_write_bytecode, True
         try:
@@ -163,8 +149,8 @@ class Lookup(NamedTuple):
             remember(set(sys.modules) - before, places)
         return module, place or _folder_of(sys.modules[top])
 
-    def _refuse_taken(self, top: str, place: str, guard: Guard) -> None:
-        """Refuse a file whose module name stands for another, installed one; import anew what somebody else has imported."""
+    def _refuse_installed_name(self, top: str, place: str, guard: Guard) -> None:
+        """Refuse a file with the name of an installed module; drop a module of the file that something else imported."""
         loaded = sys.modules.get(top)
         if loaded is None or top in _loaded:
             return
@@ -176,27 +162,26 @@ class Lookup(NamedTuple):
 
 
 def _place_of(top: str, places: Iterable[str]) -> str:
-    """The first folder that holds a module or package of that name; "" if only an installed one can be meant."""
-    specs = {place: PathFinder.find_spec(top, [place]) for place in places}
-    regular = [place for place, spec in specs.items() if spec is not None and spec.origin is not None]
-    if regular:
-        return regular[0]
-    without_init = [place for place, spec in specs.items() if spec is not None]
-    return without_init[0] if without_init and _installed(top) is None else ""
+    """The first folder with a module or package of that name; "" if the name can only mean an installed module.
 
-
-def _installed(top: str) -> ModuleSpec | None:
-    return PathFinder.find_spec(top, [place for place in sys.path if place and place not in _reachable])
+    A package without __init__.py gives way to an installed one.
+    """
+    specs = {place: spec for place in places if (spec := PathFinder.find_spec(top, [place]))}
+    regular = [place for place, spec in specs.items() if spec.origin is not None]
+    if regular or not specs:
+        return next(iter(regular), "")
+    installed = PathFinder.find_spec(top, [place for place in sys.path if place and place not in _reachable])
+    return "" if installed else next(iter(specs))
 
 
 def _folder_of(module: ModuleType) -> str:
-    """The folder that a top module or package lies in."""
+    """The folder of a top module or package."""
     paths = list(getattr(module, "__path__", []))
     return str(Path(paths[0] if paths else module.__file__ or "").resolve().parent)
 
 
 def make_reachable(places: Iterable[str]) -> None:
-    """Let modules import what lies beside them, or in the working directory, but nothing there hides what is installed."""
+    """Let modules import what lies beside them or in the working directory; installed modules come first."""
     sys.path[:] = [place for place in sys.path if place not in _reachable]
     _reachable[:] = [place for place in dict.fromkeys((*places, os.getcwd())) if place not in sys.path]
     here = [i for i, place in enumerate(sys.path) if place in ("", os.getcwd())]
@@ -205,17 +190,17 @@ def make_reachable(places: Iterable[str]) -> None:
 
 
 def reachable() -> list[str]:
-    """The folders that `make_reachable` has put into Python's path."""
+    """The folders that `make_reachable` has added to Python's path."""
     return list(_reachable)
 
 
 def inherit_reachable(folders: Iterable[str]) -> None:
-    """In a process that was given another one's path: those are what `make_reachable` had put there, for a study of its own."""
+    """Tell a process that inherited its path from another process which folders `make_reachable` had added to it."""
     _reachable[:] = folders
 
 
 def forget_foreign() -> None:
-    """Drop all modules that other people's code consists of: who looks one up next has it loaded anew."""
+    """Unload all modules from outside: the next lookup loads them anew."""
     _forget(list(_loaded))
     for name in sorted(watch.imported):
         module = sys.modules.get(name)
@@ -226,7 +211,7 @@ def forget_foreign() -> None:
 
 
 def _forget_all_but(places: Iterable[str]) -> None:
-    """Drop what was loaded from folders that are not this study's, and all of a folder in which a file has changed."""
+    """Unload modules from folders of other studies, and all modules of a folder in which a file has changed."""
     stale = {one.folder for one in _loaded.values() if one.folder not in places or _digest(one.file) != one.digest}
     _forget({name for name, one in _loaded.items() if one.folder in stale})
 
@@ -238,14 +223,14 @@ def _forget(names: Iterable[str]) -> None:
 
 
 def foreign_modules(top: str) -> list[str]:
-    """Names of the modules that were loaded from users' folders, and of an installed package of theirs as far as it is loaded."""
+    """Names of the modules loaded from users' folders; with those of the installed package `top`, if it is one."""
     if top in _loaded:
         return list(_loaded)
     return [*_loaded, *(name for name in list(sys.modules) if name.partition(".")[0] == top)]
 
 
 def remember(names: Iterable[str], places: Iterable[str]) -> None:
-    """Take note of those modules that were loaded from users' folders."""
+    """Record which of these modules come from users' folders."""
     for name in names:
         if name in _loaded:
             continue
@@ -263,14 +248,14 @@ def _digest(file: str) -> bytes:
 
 
 def made(member: Member, parameters: Mapping[str, Any], name: str, key: str, source: str) -> Any:
-    """An instance.
+    """An instance of a class.
 
     Parameters
     ----------
     name
-        The member as the study names it, such as `ads.model = 'my_ads:Careful'`.
+        The class as the study names it, such as `ads.model = 'my_ads:Careful'`.
     key
-        Where its parameters stand in the study, such as `ads.parameters`.
+        Key of its parameters in the study, such as `ads.parameters`.
 
     Raises
     ------
@@ -295,5 +280,48 @@ def check_parameters(function: Callable[..., Any], arguments: tuple[Any, ...], p
         inspect.signature(function).bind(*arguments, **parameters)
     except TypeError as error:
         raise InputError(source, f"{name} does not take {key} = {dict(parameters)}: {error}") from None
-    except ValueError:  # compiled, without a signature: it tells itself when it is called
+    except ValueError:  # compiled code, without a signature: the call itself checks them
         pass
+
+
+class OwnModules:
+    """A copy of the user's modules for one of many vehicles, so that what they keep in variables is that vehicle's own.
+
+    Parameters
+    ----------
+    attribute
+        Name of the member in its module.
+    places
+        The user's folders, as for `Lookup`.
+    others
+        Names of modules from elsewhere; this object adds to them.
+    """
+
+    def __init__(self, member: Member, attribute: str, places: Sequence[str], others: set[str]) -> None:
+        self._member, self._attribute, self._places, self._others = member, attribute, places, others
+        self._modules: dict[str, ModuleType] = {}
+
+    def load(self) -> Any:
+        """The member from its own copy of the module; call it `inside`."""
+        return getattr(importlib.import_module(self._member.module), self._attribute)
+
+    @contextmanager
+    def inside(self) -> Iterator[None]:
+        """Within, an import finds these copies, and loads further ones."""
+        shared = self._removed()
+        sys.modules.update(self._modules)
+        number, writes_bytecode, sys.dont_write_bytecode = len(sys.modules), sys.dont_write_bytecode, True
+        try:
+            yield
+        finally:
+            sys.dont_write_bytecode = writes_bytecode
+            if len(sys.modules) != number:
+                remember(sys.modules.keys() - self._others, self._places)
+            self._modules = self._removed()
+            if len(sys.modules) + len(self._modules) != number:
+                self._others.update(sys.modules)
+            sys.modules.update(shared)
+
+    def _removed(self) -> dict[str, ModuleType]:
+        names = foreign_modules(self._member.module.partition(".")[0])
+        return {name: sys.modules.pop(name) for name in names if name in sys.modules}

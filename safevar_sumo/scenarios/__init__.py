@@ -4,14 +4,24 @@ from collections.abc import Mapping
 from typing import Any
 
 from safevar_sumo.scenarios.along import Along
-from safevar_sumo.scenarios.base import VUT, Lane, Point, Scenario, Scene, World
+from safevar_sumo.scenarios.base import (
+    SCENARIO_CONTRACT,
+    VUT,
+    WEATHERS,
+    GuardedScenario,
+    Lane,
+    Point,
+    PreCrash,
+    Scenario,
+    Scene,
+    World,
+    tags,
+    weather_of,
+)
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
-from safevar_sumo.scenarios.guarded import SCENARIO_CONTRACT, GuardedScenario
 from safevar_sumo.scenarios.lead_vehicle_stopped import LeadVehicleStopped
 from safevar_sumo.scenarios.pedestrian_crossing import PedestrianCrossing
-from safevar_sumo.scenarios.pre_crash import PreCrash, tags
-from safevar_sumo.scenarios.weather import WEATHERS, weather_of
 
 SCENARIOS: Mapping[str, type[Any]] = {
     "pedestrian_crossing": PedestrianCrossing,

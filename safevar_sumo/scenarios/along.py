@@ -7,9 +7,8 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from safevar_sumo.scenarios.ahead import Ahead, BehindSomebody, right_of
-from safevar_sumo.scenarios.base import Actors, Roads
+from safevar_sumo.scenarios.base import Actors, PreCrash, Roads
 from safevar_sumo.scenarios.euro_ncap import BODIES, KMH, Body, Range, Walk
-from safevar_sumo.scenarios.pre_crash import PreCrash
 
 PROTOCOL = Range(10, 60, (50, 10, 25, 75, 90))
 

@@ -1,23 +1,30 @@
-"""The contract of a scenario: who meets the vehicle under test, and what of it counts."""
+"""The contract of a scenario: who meets the vehicle under test, and the geometry of the encounter; checks of scenarios from outside."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from enum import StrEnum
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Protocol
 
+import msgspec
+import numpy as np
 from msgspec import Meta
 
+from safevar_sumo.errors import unknown
+from safevar_sumo.plugins import Contract, Guard, read_only_copy
 from safevar_sumo.records import EVERYWHERE, NOTHING, BoolArray, Encounter, FloatArray, Trace
 from safevar_sumo.study import Weather
 
 VUT = "vut"
 """Id of the vehicle under test in every network's traffic."""
 STEEPEST = 30.0
-"""Of a road [%]."""
+"""Steepest road [%]."""
 Grade = Annotated[float, Meta(ge=-STEEPEST, le=STEEPEST)]
 BEND = 0.05
-"""So far the middle of a lane that counts as straight may stray [m]."""
+"""Largest deviation of a straight lane's middle line from the straight [m]."""
 Coordinates = tuple[float, float]
 Actors = Mapping[str, Mapping[str, str] | None]
 """Changes to a network's traffic file: attributes to set, or None to leave it out, by the XPath of an element below its root."""
@@ -141,3 +148,126 @@ class Point(NamedTuple):
     weather: Weather
     name: str = ""
     place: tuple[tuple[str, Any], ...] = ()
+
+
+_CATALOGUE = tomllib.loads(Path(__file__).with_name("weather.toml").read_text(encoding="utf-8"))
+WEATHERS = {name: msgspec.convert({"name": name, **row}, Weather) for name, row in _CATALOGUE.items()}
+"""Weathers by name, from weather.toml beside this module."""
+
+
+def weather_of(choice: str | Weather, source: object) -> Weather:
+    """The weather that a study names or defines.
+
+    Raises
+    ------
+    InputError
+        If there is no weather of that name.
+    """
+    if isinstance(choice, Weather):
+        return choice
+    if choice not in WEATHERS:
+        fields = ", ".join(Weather.__struct_fields__)
+        raise unknown(source, f"weather = {choice!r}", choice, WEATHERS, f", or a table with {fields}")
+    return WEATHERS[choice]
+
+
+class PreCrash(StrEnum):
+    """Pre-crash types by NHTSA's names (Najm, Smith, Yanagisawa: Pre-Crash Scenario Typology for Crash Avoidance Research, 2007)."""
+
+    PEDESTRIAN_AFTER_MANOEUVRE = "pedestrian crash with prior vehicle manoeuvre"
+    PEDESTRIAN = "pedestrian crash without prior vehicle manoeuvre"
+    LEAD_STOPPED = "lead vehicle stopped"
+    LEAD_SLOWER = "lead vehicle moving at lower constant speed"
+    LEAD_DECELERATING = "lead vehicle decelerating"
+
+
+def pre_crash_of(scenario: Any) -> str:
+    """A scenario's pre-crash type; "" if it has none."""
+    return str(getattr(scenario, "pre_crash", ""))
+
+
+def tags(points: Iterable[Point]) -> str:
+    """Pre-crash types and light of some points, in a sentence."""
+    points = tuple(points)
+    types = dict.fromkeys(filter(None, (pre_crash_of(point.scenario) for point in points)))
+    light = " and ".join(dict.fromkeys(f"by {point.weather.light}" for point in points))
+    return f"NHTSA's pre-crash types: {'; '.join(types)}; {light}." if types else f"It is {light}; the scenario tells no pre-crash type."
+
+
+SCENARIO_CONTRACT = Contract.of(Scenario, "a scenario")
+LONGEST = 3600.0
+"""Longest run [s]."""
+FASTEST_TEST = 100.0
+"""Highest speed of a test [m/s]."""
+
+
+class GuardedScenario:
+    """A scenario from outside: it gets read-only copies, and its results are checked."""
+
+    def __init__(self, scenario: Any, guard: Guard) -> None:
+        self._scenario, self._guard = scenario, guard
+        network = guard.field("__init__", scenario, "network")
+        if not isinstance(network, str):
+            raise guard.wrong("__init__", "network", network, "the name or path of a folder with a network")
+        self.network = network
+        duration = guard.numbers("__init__", "duration", guard.field("__init__", scenario, "duration"), (), 0.0, LONGEST, above=True)
+        self.duration = float(duration)
+        grade = guard.numbers("__init__", "grade", getattr(scenario, "grade", 0.0), (), -STEEPEST, STEEPEST)
+        speed = getattr(scenario, "test_speed", None)
+        self.test_speed = speed if speed is None else float(
+            guard.numbers("__init__", "test_speed", speed, (), 0.0, FASTEST_TEST, above=True))
+        self.grade, self.pre_crash = float(grade), str(getattr(scenario, "pre_crash", ""))
+
+    def actors(self, roads: Roads) -> Actors:
+        """Its changes to the network's traffic; none without such a method."""
+        changes = self._guard.call("actors", getattr(self._scenario, "actors", lambda roads: {}), roads)
+        if not isinstance(changes, Mapping):
+            raise self._guard.wrong("actors", "changes", changes, "a mapping from XPaths of the traffic file to attributes")
+        return {str(path): change if change is None else {str(name): str(value) for name, value in change.items()}
+                for path, change in changes.items()}
+
+    def remarks(self) -> list[str]:
+        """Remarks on its parameters for the user."""
+        return [str(remark) for remark in self._guard.call("remarks", getattr(self._scenario, "remarks", list))]
+
+    def begin(self, world: World) -> Any:
+        return self._guard.call("begin", self._scenario.begin, _ReadOnlyWorld(world))
+
+    def observe(self, world: World, step: float, memory: Any) -> tuple[Scene, Any]:
+        n = len(world.vehicle_positions("vut"))
+        result = self._guard.call("observe", self._scenario.observe, _ReadOnlyWorld(world), step, memory)
+        scene, memory = self._guard.parts("observe", result, "(Scene, memory)")
+        values: dict[str, Any] = {}
+        for name in Scene._fields:
+            value = self._guard.field("observe", scene, name)
+            if name in ("over", "visible"):
+                values[name] = self._guard.truths("observe", name, value, (n,))
+            else:
+                values[name] = self._guard.numbers("observe", name, value, (n,), infinite=name == "gap")
+        return Scene(**values), memory
+
+    def encounter(self, trace: Trace) -> Encounter:
+        encounter = self._guard.call("encounter", self._scenario.encounter, read_only_copy(trace))
+        shape = trace.speed.shape
+        values = {name: self._guard.field("encounter", encounter, name) for name in Encounter._fields}
+        in_conflict = self._guard.truths("encounter", "in_conflict", values.pop("in_conflict"), shape)
+        counts = in_conflict & trace.active
+        numbers = {name: self._guard.numbers("encounter", name, value, shape, infinite=True, undefined=True)
+                   for name, value in values.items()}
+        for name, array in numbers.items():
+            if np.isnan(array[counts]).any():
+                raise self._guard.wrong("encounter", name, float("nan"), "numbers wherever in_conflict is true")
+        return Encounter(**numbers, in_conflict=in_conflict)
+
+
+class _ReadOnlyWorld:
+    """The methods of the contract `World` alone, with read-only results."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or not hasattr(World, name):
+            raise AttributeError(f"a scenario's world has no {name!r}")
+        method = getattr(self._world, name)
+        return lambda *arguments: read_only_copy(method(*arguments))

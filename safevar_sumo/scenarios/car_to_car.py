@@ -9,9 +9,8 @@ from msgspec import Meta
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.scenarios.ahead import Ahead, BehindSomebody, right_of
-from safevar_sumo.scenarios.base import Actors, Roads
+from safevar_sumo.scenarios.base import Actors, PreCrash, Roads
 from safevar_sumo.scenarios.euro_ncap import KMH, Body, Range
-from safevar_sumo.scenarios.pre_crash import PreCrash
 
 CAR = Body(4.023, 1.712)
 """Euro NCAP's global vehicle target [m]."""

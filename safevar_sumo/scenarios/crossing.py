@@ -9,10 +9,9 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import VUT, Actors, Grade, Roads, Scene, World
+from safevar_sumo.scenarios.base import VUT, Actors, Grade, PreCrash, Roads, Scene, World
 from safevar_sumo.scenarios.euro_ncap import BODIES, KMH, VUT_LENGTH, VUT_WIDTH, Range, Walk, beside, lateral_of
 from safevar_sumo.scenarios.frame import SKEW, Frame
-from safevar_sumo.scenarios.pre_crash import PreCrash
 
 PEDESTRIAN = "pedestrian"
 APPROACH, CROSSING, KERB = "approach_0", ":crossing_c0_0", "kerb_0"

@@ -8,9 +8,8 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import VUT, Grade, Scene, World
+from safevar_sumo.scenarios.base import VUT, Grade, PreCrash, Scene, World
 from safevar_sumo.scenarios.frame import Frame
-from safevar_sumo.scenarios.pre_crash import PreCrash
 
 PARKED = "parked_ahead"
 

@@ -9,9 +9,8 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import VUT, Grade, Scene, World
+from safevar_sumo.scenarios.base import VUT, Grade, PreCrash, Scene, World
 from safevar_sumo.scenarios.frame import SKEW, Frame
-from safevar_sumo.scenarios.pre_crash import PreCrash
 
 Positive = Annotated[float, Meta(gt=0, le=3600)]
 PEDESTRIAN = "pedestrian"

@@ -2,8 +2,7 @@
 
 from collections.abc import Mapping
 
-from safevar_sumo.search.base import Algorithm, Problem, Search
-from safevar_sumo.search.guarded import ALGORITHM_CONTRACT, GuardedAlgorithm
+from safevar_sumo.search.base import ALGORITHM_CONTRACT, Algorithm, GuardedAlgorithm, Problem, Search
 from safevar_sumo.search.nsga2 import Nsga2
 from safevar_sumo.search.random_search import RandomSearch
 from safevar_sumo.search.safe_fuzzer import SafeFuzzer

@@ -1,14 +1,16 @@
-"""The contract of a search algorithm. It knows settings and evaluations, and nothing of SUMO, processes or files."""
+"""The contract of a search algorithm, which knows nothing of SUMO, processes or files, and checks of algorithms from outside."""
 
 from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from safevar_sumo.errors import ForeignError
 from safevar_sumo.metrics import SAFEVAR, Scoring
+from safevar_sumo.plugins import Contract, Guard, read_only_copy
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -18,10 +20,9 @@ Search = Generator[FloatArray, Evaluations, Evaluations]
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """What is searched: the characteristics, the original vehicle's evaluation, how many evaluations there are, and for what.
+    """The characteristics to vary, the original vehicle's evaluation and the budget of evaluations.
 
-    `population` is how many settings a generation has, as far as an algorithm knows generations; `scoring` gives the
-    objectives of evaluations.
+    `population` is the number of settings of a generation, for algorithms with generations; `scoring` gives the objectives.
     """
 
     characteristics: CharacteristicSet
@@ -40,9 +41,72 @@ class Algorithm(Protocol):
     """A search algorithm. Its fields are the parameters that a study gives in a table such as [search.nsga2]."""
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        """One run, which asks for the problem's number of evaluations, or fewer if the algorithm ends before.
+        """One run, which asks for at most the problem's number of evaluations.
 
-        Everything that is random comes from `rng`: a run that is resumed is run again from its journal. What is yielded
-        is in the domains and filtered. The result holds evaluations that the run was sent; one that is not valid
-        (`problem.scoring.valid`) is none of them.
+        All randomness comes from `rng`: a resumed run is repeated from its journal. Yielded settings are in the domains and filtered.
+        The result holds valid evaluations (`problem.scoring.valid`) that the run was sent.
         """
+
+
+ALGORITHM_CONTRACT = Contract.of(Algorithm, "an algorithm")
+
+
+class GuardedAlgorithm:
+    """An algorithm from outside: it gets read-only copies, and what it asks for and returns is checked."""
+
+    def __init__(self, algorithm: Algorithm, guard: Guard) -> None:
+        self._algorithm, self._guard = algorithm, guard
+
+    def search(self, problem: Problem, rng: np.random.Generator) -> Search:
+        search = self._guard.call("search", self._algorithm.search, read_only_copy(problem), rng)
+        if not (hasattr(search, "send") and hasattr(search, "__next__")):
+            raise self._guard.wrong("search", "the search", search, "a generator: a method that yields settings and returns its result")
+        known: dict[bytes, Evaluations] = {}
+        answer: Evaluations | None = None
+        left = problem.evaluations
+        while True:
+            asked, over = self._guard.call("search", _next, search, answer)
+            if over:
+                return self._result(asked, known, problem)
+            settings = self._settings(asked, problem, left)
+            left -= len(settings)
+            evaluated = yield settings
+            for i, row in enumerate(settings):
+                known[row.tobytes()] = evaluated.take([i])
+            answer = read_only_copy(evaluated)
+
+    def _settings(self, asked: Any, problem: Problem, left: int) -> FloatArray:
+        members = problem.characteristics
+        legal = f"an array of shape (k, {len(members)}) with k from 1 to the {left} evaluations that are left"
+        if not isinstance(asked, np.ndarray) or asked.ndim != 2 or asked.shape[1] != len(members) or not 1 <= len(asked) <= left:
+            raise self._guard.wrong("search", "settings", asked, legal)
+        settings = self._guard.numbers("search", "settings", asked, asked.shape)
+        for column, member in enumerate(members):
+            self._guard.numbers("search", member.name, settings[:, column], (len(settings),), member.lower, member.upper)
+        unfiltered = np.argwhere(members.filter(settings) != settings)
+        if len(unfiltered):
+            row, column = unfiltered[0]
+            raise self._guard.wrong("search", members.names[column], float(settings[row, column]),
+                                    "filtered settings: problem.characteristics.filter(settings)")
+        return settings
+
+    def _result(self, result: Any, known: dict[bytes, Evaluations], problem: Problem) -> Evaluations:
+        legal = "an Evaluations of settings that it was sent, such as evaluations.take(rows)"
+        if not isinstance(result, Evaluations):
+            raise self._guard.wrong("search", "its result", result, legal)
+        if not known:
+            raise ForeignError(self._guard.source, f"{self._guard.name} ended in search without asking for any setting",
+                               f"a generator that yields from 1 to {problem.evaluations} settings before it returns")
+        rows = self._guard.numbers("search", "its result's settings", result.settings, (len(result), len(problem.characteristics)))
+        if any(row.tobytes() not in known for row in rows):
+            raise self._guard.wrong("search", "its result", "settings that it never asked for", legal)
+        nothing = next(iter(known.values())).take([])
+        evaluations = Evaluations.concatenate([nothing, *(known[row.tobytes()] for row in rows)])
+        return evaluations.take(problem.scoring.valid(evaluations))
+
+
+def _next(search: Any, answer: Evaluations | None) -> tuple[Any, bool]:
+    try:
+        return (next(search) if answer is None else search.send(answer)), False
+    except StopIteration as end:
+        return end.value, True

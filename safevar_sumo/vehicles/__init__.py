@@ -3,12 +3,20 @@
 from collections.abc import Mapping
 from typing import Any
 
-from safevar_sumo.vehicles.base import LEVEL, Slope, SumoType, Vehicle, VehicleState, at_start, slope_of
+from safevar_sumo.vehicles.base import (
+    LEVEL,
+    VEHICLE_CONTRACT,
+    GuardedVehicle,
+    Slope,
+    SumoType,
+    Vehicle,
+    VehicleState,
+    at_start,
+    slope_of,
+)
 from safevar_sumo.vehicles.calibration_drive import calibration_drive
 from safevar_sumo.vehicles.carla import Carla
-from safevar_sumo.vehicles.changes import CHANGES, Change, foreign_change
-from safevar_sumo.vehicles.characteristics import Characteristic, CharacteristicSet
-from safevar_sumo.vehicles.guarded import VEHICLE_CONTRACT, GuardedVehicle
+from safevar_sumo.vehicles.characteristics import CHANGES, Change, Characteristic, CharacteristicSet, foreign_change
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.sensors import Sensors
 from safevar_sumo.vehicles.sumo import SumoVehicle

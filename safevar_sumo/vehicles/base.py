@@ -1,4 +1,4 @@
-"""What a road that rises or falls does to whoever drives on it."""
+"""The contract of a vehicle model, slopes, and checks of models from outside."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from safevar_sumo.errors import ForeignError
+from safevar_sumo.plugins import Contract, Guard, accepts, read_only_copy
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
+from safevar_sumo.vehicles.sensors import Sensors
 
 GRAVITY = 9.81
 """[m/s^2]"""
@@ -108,3 +111,126 @@ def at_start(vehicle: Vehicle, prepared: Any, speed: FloatArray) -> Any:
     if rolls.all():
         return steady
     return type(rest)(*(one if one is None else np.where(rolls, one, other) for one, other in zip(steady, rest, strict=True)))
+
+
+VEHICLE_CONTRACT = Contract.of(Vehicle, "a vehicle", optional=("at_speed",))
+FASTEST = 1000.0
+"""Highest speed of a vehicle [m/s]; beyond it a model has diverged."""
+ROUNDING = 1e-9
+PROBE_STEP = 0.1  # s
+_BOUNDS = {"speed": (0.0, FASTEST), "throttle": (0.0, 1.0), "brake": (0.0, 1.0)}
+_INFINITE = ("gap", "lateral")
+"""Quantities that are infinite while nobody is detected."""
+
+
+class _Prepared(NamedTuple):
+    n: int
+    theirs: Any
+    types: SumoType
+
+
+class _State(NamedTuple):
+    """The checked columns of a model's state, and the state itself."""
+
+    speed: FloatArray
+    throttle: FloatArray
+    brake: FloatArray
+    gear: FloatArray
+    theirs: Any
+
+
+class GuardedVehicle:
+    """A model from outside: it gets read-only copies, and its results are checked."""
+
+    UNITS: Mapping[str, str]
+
+    def __init__(self, vehicle: Any, guard: Guard) -> None:
+        self._vehicle, self._guard = vehicle, guard
+        units = guard.field("__init__", vehicle, "UNITS")
+        if not isinstance(units, Mapping) or not all(isinstance(word, str) for pair in units.items() for word in pair):
+            raise guard.wrong("__init__", "UNITS", units, "a mapping from names of characteristics to their units")
+        self.UNITS = dict(units)
+
+    def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
+                wet: bool | BoolArray = False) -> _Prepared:
+        n, method = len(next(iter(characteristics.values()))), self._vehicle.prepare
+        if slope is not LEVEL and not accepts(method, 4):
+            problem = f"{self._guard.name} has no slope in prepare(characteristics, road_friction, step, slope), and the road has a grade"
+            raise ForeignError(self._guard.source, problem, "a vehicle with it, or scenarios with grade 0")
+        arguments: tuple[Any, ...] = (read_only_copy(characteristics), road_friction, step)
+        if np.any(wet) and accepts(method, 5):
+            arguments = (*arguments, read_only_copy(slope), read_only_copy(wet))
+        elif slope is not LEVEL:
+            arguments = (*arguments, read_only_copy(slope))
+        theirs = self._guard.call("prepare", method, *arguments)
+        types = self._guard.call("sumo_type", self._vehicle.sumo_type, theirs)
+        return _Prepared(n, theirs, SumoType(*(
+            self._guard.numbers("sumo_type", name, self._guard.field("sumo_type", types, name), (n,), 0.0, above=True)
+            for name in SumoType._fields)))
+
+    def sumo_type(self, prepared: _Prepared) -> SumoType:
+        return prepared.types
+
+    def at_rest(self, prepared: _Prepared) -> _State:
+        state = self._state("at_rest", prepared.n, self._guard.call("at_rest", self._vehicle.at_rest, prepared.theirs))
+        self._guard.numbers("at_rest", "speed", state.speed, (prepared.n,), 0.0, 0.0)
+        return state
+
+    def at_speed(self, prepared: _Prepared, speed: FloatArray) -> _State:
+        if not hasattr(self._vehicle, "at_speed"):
+            problem = f"{self._guard.name} has no method at_speed(prepared, speed), and the traffic puts it onto the road in motion"
+            raise ForeignError(self._guard.source, problem, "a vehicle with it, or traffic that departs with speed 0")
+        state = self._guard.call("at_speed", self._vehicle.at_speed, prepared.theirs, read_only_copy(speed))
+        return self._state("at_speed", prepared.n, state)
+
+    def hold_gear(self, prepared: _Prepared, state: _State, holds: BoolArray) -> _State:
+        if not hasattr(self._vehicle, "hold_gear"):
+            return state
+        return self._state("hold_gear", prepared.n,
+                           self._guard.call("hold_gear", self._vehicle.hold_gear, prepared.theirs, state.theirs, read_only_copy(holds)))
+
+    def sensors(self, prepared: _Prepared) -> Sensors | None:
+        """The model's sensors; None for a model without that method."""
+        if not hasattr(self._vehicle, "sensors"):
+            return None
+        theirs = self._guard.call("sensors", self._vehicle.sensors, prepared.theirs)
+        return Sensors(*(self._guard.numbers("sensors", name, self._guard.field("sensors", theirs, name), (prepared.n,), 0.0,
+                                             above=name == "scale", infinite=name == "reach") for name in Sensors._fields))
+
+    def refuse_unknown_sensors(self, characteristics: Characteristics) -> None:
+        """Refuse a model without a method `sensors` whose `sense` changes observations: a TraCI controller does not go through `sense`."""
+        if hasattr(self._vehicle, "sensors"):
+            return
+        prepared = self.prepare(characteristics, 1.0, PROBE_STEP)
+        state, nothing = self.at_rest(prepared), np.zeros(prepared.n)
+        for sample, gap in enumerate((60.0, 5.0, 2000.0)):
+            seen = Observation(sample * PROBE_STEP, nothing, nothing + gap, nothing + sample, nothing - 1 - sample, nothing + sample, 0.5,
+                               nothing - sample, nothing, nothing)
+            sensed, state = self.sense(prepared, state, seen)
+            for name, value in seen._asdict().items():
+                if not np.array_equal(getattr(sensed, name), value):
+                    problem = f"{self._guard.name} changes {name} in sense, which nothing that a controller reads through TraCI passes"
+                    raise ForeignError(self._guard.source, problem, "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors("
+                                       "latency, reach, scale); or an ADS that is given what is sensed, without ads.kind = \"traci\"")
+
+    def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
+        result = self._guard.call("sense", self._vehicle.sense, prepared.theirs, state.theirs, read_only_copy(seen))
+        sensed, after = self._guard.parts("sense", result, "(Observation, state)")
+        values: dict[str, Any] = {}
+        for name, value in seen._asdict().items():
+            shape = (prepared.n,) if hasattr(value, "shape") else ()
+            numbers = self._guard.numbers("sense", name, self._guard.field("sense", sensed, name), shape, infinite=name in _INFINITE)
+            values[name] = numbers if shape else float(numbers)
+        return Observation(**values), self._state("sense", prepared.n, after)
+
+    def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
+        result = self._guard.call("advance", self._vehicle.advance, prepared.theirs, state.theirs, read_only_copy(command))
+        state, most = self._state("advance", prepared.n, result), prepared.types.max_speed
+        for i in np.flatnonzero(state.speed > most * (1 + ROUNDING))[:1]:  # SUMO itself accepts any speed that it is given
+            raise self._guard.wrong("advance", "speed", float(state.speed[i]), f"up to max_speed = {most[i]:g} of its sumo_type")
+        return state
+
+    def _state(self, method: str, n: int, theirs: Any) -> _State:
+        read = {name: self._guard.numbers(method, name, self._guard.field(method, theirs, name), (n,), *_BOUNDS.get(name, ()))
+                for name in _State._fields[:-1]}
+        return _State(**read, theirs=theirs)

@@ -1,10 +1,10 @@
-"""Vehicle characteristics: their domains, the filter of small changes, and how much a setting changes."""
+"""Vehicle characteristics: their domains, the filter of small changes, and measures of change."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
@@ -12,13 +12,15 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec import Struct
 
 from safevar_sumo.errors import InputError, unknown
+from safevar_sumo.plugins import Guard, read_only_copy
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import CharacteristicTable
 
 FARTHEST = 1000.0
-"""By so much no value is farther from 0 than its domain: what lies beyond is a slip, and no physics hold there."""
+"""Largest magnitude of a value over that of its domain; beyond it a typo is assumed."""
 # beta of method section 2, by the least width of the domain that it holds for.
 FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
 
@@ -27,7 +29,7 @@ FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
 class Characteristic:
     """One characteristic of the vehicle under test; all quantities in `unit`. A change counts `weight` times in f_diff.
 
-    `meaning` is what it is, in words, and `counterpart` what sets it in a real vehicle; empty where the study does not say.
+    `meaning` describes it in words, `counterpart` names what sets it in a real vehicle; both may be empty.
     """
 
     name: str
@@ -52,17 +54,17 @@ class Characteristic:
 
     @property
     def threshold(self) -> float:
-        """Largest change that the filter takes for noise: Th = beta (u - l) (method section 2)."""
+        """Largest change that the filter removes: Th = beta (u - l) (method section 2)."""
         width = self.upper - self.lower
         return next(share for least, share in FILTER_SHARES if width >= least) * width
 
     @property
     def farthest(self) -> float:
-        """Largest magnitude that is taken when values beyond the domain are asked for."""
+        """Largest legal magnitude where values beyond the domain are legal."""
         return FARTHEST * max(abs(self.lower), abs(self.upper))
 
     def text(self, value: float) -> str:
-        """A value with the digits that matter: the last one is worth no more than a quarter of the threshold, and no less than 1/40."""
+        """A value with its significant digits: the last is worth between 1/40 and 1/4 of the threshold."""
         return f"{value:.{max(0, math.ceil(-math.log10(self.threshold / 4)))}f}"
 
     @property
@@ -72,14 +74,14 @@ class Characteristic:
 
     def check(self, value: float, source: object, *, beyond: bool = False, otherwise: str = "",
               switch: str = "beyond=True") -> None:
-        """Refuse what is no number or outside the domain, or with `beyond` only what means nothing (`is_legal`).
+        """Refuse a value that is no legal number (`is_legal`).
 
-        `otherwise` is what would be right beside a number in the domain, `switch` how a caller asks for values beyond it.
+        `otherwise` describes further legal values, `switch` is how a caller allows values beyond the domain.
 
         Raises
         ------
         InputError
-            Naming the value and what is legal.
+            Naming the value and what is expected.
         """
         if not isinstance(value, Real) or not self.is_legal(value, beyond=beyond):
             above = " above 0" if self.lower > 0 else ""
@@ -89,9 +91,9 @@ class Characteristic:
                              f"{farther if beyond else within}{self.suffix}{otherwise}{f', or any with {switch}' if may_be_beyond else ''}")
 
     def is_legal(self, values: Any, *, beyond: bool = False) -> Any:
-        """Whether values, a number or an array, are in the domain; with `beyond`, whether they mean anything.
+        """Whether values, a number or an array, are in the domain; with `beyond`, whether they are plausible.
 
-        That is not a thousand times as far as the domain, and above 0 if that is (nothing has a mass of -5 kg).
+        Plausible values are up to 1000 times as large as the domain, and above 0 if the domain is (no mass of -5 kg).
         """
         if beyond:
             return (np.abs(values) <= self.farthest) & ((values > 0) | (self.lower <= 0))
@@ -106,10 +108,8 @@ class CharacteristicSet:
 
     @classmethod
     def of(cls, table: Mapping[str, CharacteristicTable]) -> CharacteristicSet:
-        """Take the characteristics of a study's table, in its order."""
-        return cls(tuple(
-            Characteristic(name=name, **msgspec.structs.asdict(row))
-            for name, row in table.items()))
+        """The characteristics of a study's table, in its order."""
+        return cls(tuple(Characteristic(name=name, **msgspec.structs.asdict(row)) for name, row in table.items()))
 
     def __len__(self) -> int:
         return len(self.members)
@@ -142,13 +142,13 @@ class CharacteristicSet:
         return self._column("weight")
 
     def _column(self, attribute: str) -> FloatArray:
-        """One number of every characteristic; read-only, because all runs share it."""
+        """One number of every characteristic; read-only."""
         values = np.array([getattr(member, attribute) for member in self.members], dtype=float)
         values.flags.writeable = False
         return values
 
     def filter(self, settings: FloatArray) -> FloatArray:
-        """Put back to the original what changes by no more than its threshold (method section 2)."""
+        """Reset values that change by no more than their thresholds to the original (method section 2)."""
         return np.where(np.abs(self.original - settings) > self.threshold, settings, self.original)
 
     def changed(self, filtered: FloatArray) -> BoolArray:
@@ -164,7 +164,7 @@ class CharacteristicSet:
         return np.asarray(np.count_nonzero(self.changed(filtered), axis=1), dtype=float)
 
     def setting(self, values: Mapping[str, float], source: object, *, beyond: bool = False) -> FloatArray:
-        """The original setting with some values replaced, checked; shape (n,). With `beyond` any value that can be will do.
+        """The original setting with some values replaced, shape (n,); with `beyond`, plausible values outside the domain are legal.
 
         Raises
         ------
@@ -181,3 +181,44 @@ class CharacteristicSet:
             self.members[column].check(value, source, beyond=beyond)
             setting[column] = value
         return setting
+
+
+Function = Callable[[FloatArray, CharacteristicSet], FloatArray]
+
+
+class Change(Struct, frozen=True, kw_only=True):
+    """A measure of change: `function` takes filtered settings, shape (N, n), and the characteristics; returns shape (N,)."""
+
+    name: str
+    title: str
+    unit: str
+    function: Function
+
+
+CHANGES = {change.name: change for change in (
+    Change(name="f_diff", title="largest change", unit="fraction",
+           function=lambda settings, characteristics: characteristics.largest_change(settings)),
+    Change(name="f_num_diff", title="characteristics changed", unit="-",
+           function=lambda settings, characteristics: characteristics.number_changed(settings)),
+)}
+
+
+def foreign_change(change: Any, guard: Guard) -> Change:
+    """A measure of change from outside: its function gets read-only copies, and its result is checked.
+
+    Raises
+    ------
+    InputError
+        If the record is wrong.
+    """
+    texts = (change.name, change.title, change.unit)
+    if not (all(isinstance(text, str) and text.isprintable() for text in texts) and change.name.isidentifier()):
+        raise InputError(guard.source, f"{guard.name}: name, title, unit = {texts!r}", "printable texts, the name an identifier")
+    if not callable(change.function):
+        raise InputError(guard.source, f"{guard.name}: function = {change.function!r}", "a function of settings and characteristics")
+
+    def checked(settings: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
+        values = guard.call(change.name, change.function, read_only_copy(settings), characteristics)
+        return guard.numbers(change.name, "values", values, (len(settings),))
+
+    return Change(name=change.name, title=change.title, unit=change.unit, function=checked)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ def failing(system: object) -> str:
 
 @pytest.mark.parametrize(("body", "told"), [
     ("1 / 0", "raised in drive: ZeroDivisionError: division by zero"), ("raise SystemExit(0)", "raised in drive: SystemExit: 0"),
-    ("raise GeneratorExit", "raised in drive: GeneratorExit"), ("pass", "returned None from drive"),
+    ("pass", "returned None from drive"),
     ("return 0.5", "returned 0.5 from drive"), ("return 0.5, 0, 0", "returned (0.5, 0, 0) from drive"),
     ("return '0.5', 0", "returned throttle = '0.5' from drive"), ("return 0, 2", "returned brake = 2.0 from drive"),
     ("return float('nan'), 0", "returned throttle = nan"), ("return [0.1, 0.2], 0", "returned throttle of shape (2,)"),
@@ -148,3 +149,14 @@ def test_a_scenario_that_is_wrong(method: str, body: str, told: str, mine: Mine)
 def test_a_scenario_without_a_network_or_a_duration_is_told(values: str, mine: Mine) -> None:
     with pytest.raises(ForeignError, match=r"network|duration"):
         mine(scenario("", "").replace("network, duration = 'pedestrian_crossing', 2.0", values), SCENARIO)
+
+
+@pytest.mark.parametrize("where", ["__init__", "drive"])
+def test_working_directory_environment_and_error_state_are_restored(where: str, mine: Mine, folder: Path) -> None:
+    before = Path.cwd(), dict(os.environ), np.geterr()
+    disturb = "os.chdir('/'); os.environ['HOME'] = '/nowhere'; np.seterr(all='raise')"
+    init = f"    def __init__(self):\n        {disturb}\n\n" if where == "__init__" else ""
+    drive = f"    def drive(self, seen):\n        {'pass' if init else disturb}\n        return 0.5, 0.0\n"
+    system = mine("import os\nimport numpy as np\n" + SCALAR + init + drive)
+    evaluate(system, system.characteristics.original[None])
+    assert (Path.cwd(), dict(os.environ), np.geterr()) == before

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import pytest
 
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS, Point, PreCrash, tags
+from safevar_sumo.scenarios.base import pre_crash_of
 from safevar_sumo.scenarios.car_to_car import CarToCar
-from safevar_sumo.scenarios.pre_crash import pre_crash_of
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 

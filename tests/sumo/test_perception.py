@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from safevar_sumo.ads import ADS, ScalarAds
-from safevar_sumo.ads.guarded import GuardedAds, PerVehicle
+from safevar_sumo.ads import ADS, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios.base import Scene

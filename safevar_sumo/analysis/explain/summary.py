@@ -19,7 +19,7 @@ from safevar_sumo.analysis.words import ENDS, ask, changes, joined, number_of
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, unsafe_rows
 from safevar_sumo.scenarios import Point
-from safevar_sumo.scenarios.pre_crash import pre_crash_of
+from safevar_sumo.scenarios.base import pre_crash_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import at_every_point, study_at, worst_points
 from safevar_sumo.sumo.system import System, assemble
