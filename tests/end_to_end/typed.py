@@ -29,7 +29,8 @@ def run_here(*arguments: str, expect: int = 0) -> Done:
         except SystemExit as end:
             code = end.code
     for name in set(sys.modules) - before:
-        if str(getattr(sys.modules[name], "__file__", None) or "").startswith(os.getcwd()):
+        file = str(getattr(sys.modules[name], "__file__", None) or "")
+        if file.startswith(os.getcwd()) and not file.startswith(sys.prefix):
             del sys.modules[name]
     assert code == expect, f"{code}\n{out.getvalue()}\n{err.getvalue()}"
     return Done(out.getvalue(), err.getvalue())

@@ -10,9 +10,8 @@ import pytest
 
 from safevar_sumo.analysis.research_questions.answer import answer
 from safevar_sumo.analysis.research_questions.case import Unanswerable
-from safevar_sumo.analysis.research_questions.changes import rq33_safety
+from safevar_sumo.analysis.research_questions.changes import combinations, rq33_safety, weather, weather_pairs
 from safevar_sumo.analysis.research_questions.comparisons import ASYMPTOTIC, EXACT, compare, rq1
-from safevar_sumo.analysis.research_questions.discussion import combinations, weather, weather_pairs
 from safevar_sumo.analysis.research_questions.indicators import indicators
 from tests.research_questions.made_up import ORIGINAL, UNCHANGED, made_up, made_up_study, row
 

@@ -12,12 +12,21 @@ import pytest
 import scipy
 
 from safevar_sumo.analysis.research_questions.answer import answer
-from safevar_sumo.analysis.research_questions.brief import brief
 from safevar_sumo.analysis.research_questions.case import Unanswerable
-from safevar_sumo.analysis.research_questions.changes import critical, rq31, rq32, rq33, rq33_safety
+from safevar_sumo.analysis.research_questions.changes import (
+    collisions,
+    combinations,
+    critical,
+    effects,
+    rq31,
+    rq32,
+    rq33,
+    rq33_safety,
+    weather,
+    weather_pairs,
+)
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, rq1, rq2
-from safevar_sumo.analysis.research_questions.discussion import collisions, combinations, effects, weather, weather_pairs
-from safevar_sumo.analysis.research_questions.over_runs import difference_line, holm, rq1_runs, rq2_runs
+from safevar_sumo.analysis.research_questions.over_runs import brief, difference_line, holm, rq1_runs, rq2_runs
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable
 from tests.research_questions.made_up import CHARACTERISTICS, ORIGINAL, UNCHANGED, made_up, made_up_study, row

@@ -17,8 +17,7 @@ import pytest
 
 from safevar_sumo.analysis.research_questions.answer import Answer, answer
 from safevar_sumo.analysis.research_questions.case import Case
-from safevar_sumo.analysis.research_questions.layout import LAYOUTS, Layouts
-from safevar_sumo.analysis.research_questions.paper import PAPER
+from safevar_sumo.analysis.research_questions.layout import LAYOUTS, PAPER, Layouts
 from safevar_sumo.analysis.research_questions.tables import FORMATS, as_json, csv, escaped, latex, markdown, text
 from safevar_sumo.study import CharacteristicTable
 from tests.research_questions.latex_syntax import mistakes

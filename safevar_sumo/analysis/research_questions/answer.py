@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import pandas as pd
 
-from safevar_sumo.analysis.research_questions import discussion
 from safevar_sumo.analysis.research_questions.case import NSGA2, Case, Unanswerable, counted
-from safevar_sumo.analysis.research_questions.changes import critical, rq31, rq32, rq33, rq33_safety
+from safevar_sumo.analysis.research_questions.changes import (
+    collisions,
+    combinations,
+    critical,
+    rq31,
+    rq32,
+    rq33,
+    rq33_safety,
+    weather,
+    weather_pairs,
+)
 from safevar_sumo.analysis.research_questions.comparisons import rq1, rq2
-from safevar_sumo.analysis.research_questions.discussion import combinations
 from safevar_sumo.analysis.research_questions.over_runs import difference_line, rq1_runs, rq2_runs
 from safevar_sumo.errors import unknown
 from safevar_sumo.metrics import SAFEVAR, MetricFacts
@@ -28,7 +36,7 @@ OF_A_CASE: Mapping[str, Callable[[Case], Frames]] = {
     "rq3.1": lambda case: {"rq3.1": rq31(case)},
     "rq3.2": lambda case: {"rq3.2": rq32(case)},
     "rq3.3": lambda case: {"rq3.3": rq33(case), SAFETY: rq33_safety(case)},
-    "collisions": lambda case: {"collisions": discussion.collisions(case)},
+    "collisions": lambda case: {"collisions": collisions(case)},
     "combinations": lambda case: {"combinations": combinations(case)},
 }
 WEATHER = "weather"
@@ -36,7 +44,7 @@ QUESTIONS = (*OF_A_CASE, WEATHER)
 
 
 class Answer(NamedTuple):
-    """The answer to a question: a tidy frame over all cases (empty if none can be asked), what to know about it, and its metrics."""
+    """The answer to a question: a tidy frame over all cases (empty if none can be asked), notes about it, and its metrics."""
 
     name: str
     frame: pd.DataFrame
@@ -57,46 +65,44 @@ def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
     answers, refusals, names = [], [], [case.name for case in cases]
     metrics = tuple({metric.name: metric for case in cases for metric in case.scoring.metrics}.values())
     for name in QUESTIONS if question is None else (question,):
-        frames, refused = _asked(name, cases)
+        tables, refused = _ask(name, cases)
         refusals += refused
         notes = [f"{error.source}: {error.problem}." for error in refused]
-        if not frames:
+        if not tables:
             answers.append(Answer(name, pd.DataFrame(), tuple(notes)))
-        for part, found in frames.items():
-            frame = pd.concat(found, ignore_index=True)
+        for table, frames in tables.items():
+            frame = pd.concat(frames, ignore_index=True)
             inside = {*frame["setting"], *frame["other"]} if name == WEATHER else set(names) - {error.source for error in refused}
             about = [note for case in cases if case.name in inside for note in _notes(name, case)]
-            answers.append(Answer(part, frame, tuple(dict.fromkeys([*notes, *about])), metrics))
+            answers.append(Answer(table, frame, tuple(dict.fromkeys([*notes, *about])), metrics))
     if refusals and all(one.frame.empty for one in answers):
         raise refusals[0]
     return answers
 
 
-def _asked(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd.DataFrame]], list[Unanswerable]]:
+def _ask(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd.DataFrame]], list[Unanswerable]]:
     """The frames of a question by table, and why some cases have none."""
-    frames: dict[str, list[pd.DataFrame]] = {}
+    tables: dict[str, list[pd.DataFrame]] = {}
     refused = []
-    for ask in _asking(name, cases):
+    for group in [cases] if name == WEATHER else [[case] for case in cases]:
         try:
-            for part, frame in ask().items():
-                frames.setdefault(part, []).append(frame)
+            frames = {WEATHER: pd.concat([weather(*pair) for pair in weather_pairs(group)])} if name == WEATHER else OF_A_CASE[name](*group)
+            for table, frame in frames.items():
+                tables.setdefault(table, []).append(frame)
         except Unanswerable as error:
             refused.append(error)
-    return frames, refused
-
-
-def _asking(name: str, cases: Sequence[Case]) -> Iterable[Callable[[], Frames]]:
-    """What to call for the question's frames: once per case, or once for all weathers."""
-    if name == WEATHER:
-        return [lambda: {WEATHER: pd.concat([discussion.weather(*pair) for pair in discussion.weather_pairs(cases)])}]
-    return [lambda case=case: OF_A_CASE[name](case) for case in cases]  # type: ignore[misc]
+    return tables, refused
 
 
 def _notes(question: str, case: Case) -> list[str]:
     """What a reader of this table should know of a case."""
     notes = case.remarks
     if question in ("rq1", "rq2"):
-        notes += _undefined(case)
+        for metric in case.scoring.metrics:
+            rows = counted(case.solutions, metric)
+            undefined = int(rows[metric.name].isna().sum())
+            if undefined:
+                notes.append(f"{case.name}: {metric.name} is undefined in {undefined} of {len(rows)} solutions, which are left out of it.")
     if question == "rq1":
         lacking = [name for name, value in case.original.items() if pd.isna(value)]
         if lacking:
@@ -106,24 +112,11 @@ def _notes(question: str, case: Case) -> list[str]:
     if question == "rq2" and not case.has_runs:
         notes.append(f"{case.name}: igd, igd_plus and hypervolume need runs, which imported solutions do not have.")
     if question == "rq2" and case.has_runs:
-        empty = len(set(case.finished) - {(name, run) for name, run in zip(case.solutions["algorithm"], case.solutions["run"],
-                                                                             strict=True)})
+        empty = len(set(case.finished) - set(zip(case.solutions["algorithm"], case.solutions["run"], strict=True)))
         if empty:
             notes.append(f"{case.name}: {empty} finished runs found no solution; they have no igd, igd_plus and hypervolume.")
     if question.startswith("rq3") or question in ("combinations", WEATHER):
-        number = len(critical(case))
-        notes.append(f"{case.name}: {number} critical solutions of {len(case.solutions_of(NSGA2))} of {NSGA2}.")
+        notes.append(f"{case.name}: {len(critical(case))} critical solutions of {len(case.solutions_of(NSGA2))} of {NSGA2}.")
     if question == "combinations" and combinations(case).empty:
         notes.append(f"{case.name}: no critical solution has exactly four characteristics changed.")
     return notes
-
-
-def _undefined(case: Case) -> list[str]:
-    """Which values are missing where they should be there."""
-    told = []
-    for metric in case.scoring.metrics:
-        rows = counted(case.solutions, metric)
-        number = int(rows[metric.name].isna().sum())
-        if number:
-            told.append(f"{case.name}: {metric.name} is undefined in {number} of {len(rows)} solutions, which are left out of it.")
-    return told

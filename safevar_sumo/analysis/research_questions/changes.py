@@ -1,6 +1,13 @@
-"""RQ3: how many, which and how large changes make the vehicle unsafe? Over NSGA-II's critical solutions."""
+"""RQ3 and the discussion: how many, which and how large changes make the vehicle unsafe, collisions, combinations, sun against rain.
+
+Functions of a case raise `Unanswerable` as `critical` does; those over runs also where solutions belong to no run.
+"""
 
 from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from itertools import permutations
 
 import numpy as np
 import pandas as pd
@@ -10,6 +17,10 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import SAFETY_DEGREE
 
 ANY = "any"
+COMBINED = 4
+"""How many characteristics are changed in the combinations that are counted."""
+SHOWN = 3
+"""How many of the most frequent combinations are shown."""
 
 
 def critical(case: Case) -> pd.DataFrame:
@@ -18,11 +29,11 @@ def critical(case: Case) -> pd.DataFrame:
     Raises
     ------
     Unanswerable
-        If NSGA-II is missing or the original's safety degree is not known.
+        If NSGA-II is missing or the original's safety degree is undefined.
     """
     solutions = case.solutions_of(NSGA2)
     if np.isnan(case.original[SAFETY_DEGREE]):
-        raise Unanswerable(case.name, "does not tell the original vehicle's safety degree", "results that do")
+        raise Unanswerable(case.name, "lacks the original vehicle's safety degree", "results that have it")
     return solutions[solutions[SAFETY_DEGREE] < case.original[SAFETY_DEGREE]]
 
 
@@ -38,18 +49,10 @@ def by_number(case: Case, changed: FloatArray) -> dict[str, BoolArray]:
 
 
 def rq31(case: Case) -> pd.DataFrame:
-    """How many critical solutions of each run have exactly j characteristics changed; columns setting, run, j, count.
-
-    Raises
-    ------
-    Unanswerable
-        As `critical`, or if the solutions belong to no run.
-    """
-    found = critical(case)
-    runs = case.runs_of(NSGA2)
-    number = np.count_nonzero(changes(case, found), axis=1)
-    of_run = found["run"].to_numpy()
-    rows = [(case.name, run, str(j), int(np.count_nonzero((of_run == run) & (number == j))))
+    """How many critical solutions of each run have exactly j characteristics changed; columns setting, run, j, count."""
+    solutions, runs = critical(case), case.runs_of(NSGA2)
+    number, run_of = np.count_nonzero(changes(case, solutions), axis=1), solutions["run"].to_numpy()
+    rows = [(case.name, run, str(j), int(np.count_nonzero((run_of == run) & (number == j))))
             for run in runs for j in range(1, len(case.characteristics) + 1)]
     return pd.DataFrame(rows, columns=["setting", "run", "j", "count"])
 
@@ -59,11 +62,6 @@ def rq32(case: Case) -> pd.DataFrame:
 
     Columns setting, characteristic, j ("1".."n", "any"), percent (None without such a solution), rank (by `any`, of
     j = "any" alone; ties share the better rank and the next one is skipped).
-
-    Raises
-    ------
-    Unanswerable
-        As `critical`.
     """
     changed = changes(case, critical(case))
     times = np.count_nonzero(changed, axis=0)
@@ -81,11 +79,6 @@ def rq33(case: Case) -> pd.DataFrame:
 
     Columns setting, characteristic, direction, j ("1".."n", "any"), pc (mean of |v - v''| / v, a fraction), delta (mean
     signed change in the characteristic's unit), n (over how many changes); pc and delta are None where n is 0.
-
-    Raises
-    ------
-    Unanswerable
-        As `critical`.
     """
     changed = changes(case, critical(case))
     rows = []
@@ -101,20 +94,15 @@ def rq33(case: Case) -> pd.DataFrame:
 
 
 def rq33_safety(case: Case) -> pd.DataFrame:
-    """What the critical solutions with j changed did to safety: the footer of RQ3.3's table.
+    """Effect of the critical solutions with j changed on safety: the footer of RQ3.3's table.
 
     Columns setting, quantity, j, value, percent (of the original's value), n; value is None where n is 0. Quantities:
     avgSD_mD, mean reduction of the distance, without collisions [m]; avgSD_cS, mean speed of the collisions [m/s], no
     percent; TET [s] and TIT [s^2], mean increase, without collisions; aveDece, mean decrease, over all [m/s^2].
-
-    Raises
-    ------
-    Unanswerable
-        As `critical`.
     """
-    found = critical(case)
-    crash = collided(found).to_numpy()
-    sd, tet, tit, dece = (found[name].to_numpy(dtype=float) for name in (SAFETY_DEGREE, "tet", "tit", "ave_dece"))
+    solutions = critical(case)
+    crash = collided(solutions).to_numpy()
+    sd, tet, tit, dece = (solutions[name].to_numpy(dtype=float) for name in (SAFETY_DEGREE, "tet", "tit", "ave_dece"))
     original = case.original
     quantities = {
         "avgSD_mD": (np.where(crash, np.nan, original[SAFETY_DEGREE] - sd), original[SAFETY_DEGREE]),
@@ -124,9 +112,103 @@ def rq33_safety(case: Case) -> pd.DataFrame:
         "aveDece": (original["ave_dece"] - dece, original["ave_dece"])}
     rows = []
     for quantity, (difference, whole) in quantities.items():
-        for j, chosen in by_number(case, changes(case, found)).items():
+        for j, chosen in by_number(case, changes(case, solutions)).items():
             counted = difference[chosen & ~np.isnan(difference)]
             mean = float(np.mean(counted)) if counted.size else None
             percent = None if mean is None or np.isnan(whole) or whole == 0 else 100 * mean / abs(whole)
             rows.append((case.name, quantity, j, mean, percent, counted.size))
     return pd.DataFrame(rows, columns=["setting", "quantity", "j", "value", "percent", "n"], dtype=object)
+
+
+def collisions(case: Case) -> pd.DataFrame:
+    """Per algorithm how many of its solutions are collisions; columns setting, algorithm, solutions, collisions, share [fraction].
+
+    Raises
+    ------
+    Unanswerable
+        If no run is finished.
+    """
+    if not case.algorithms:
+        raise Unanswerable(case.name, "has no finished run", "results with at least one finished run")
+    rows = []
+    for algorithm in case.algorithms:
+        solutions = case.solutions_of(algorithm)
+        crashes = int(collided(solutions).sum())
+        rows.append((case.name, algorithm, len(solutions), crashes, crashes / len(solutions) if len(solutions) else None))
+    return pd.DataFrame(rows, columns=["setting", "algorithm", "solutions", "collisions", "share"], dtype=object)
+
+
+def combinations(case: Case) -> pd.DataFrame:
+    """The most frequent combinations among the critical solutions with exactly four characteristics changed.
+
+    Columns setting, rank (ties share the better one), characteristics (a list), percent of those solutions; no row
+    where there is no such solution. Of combinations that are equally frequent, those whose characteristics stand
+    earlier in the study come first.
+    """
+    changed = changes(case, critical(case)) != 0
+    of_four = changed[np.count_nonzero(changed, axis=1) == COMBINED]
+    counted = Counter(tuple(np.flatnonzero(row).tolist()) for row in of_four)
+    ordered = sorted(counted.items(), key=lambda item: (-item[1], item[0]))[:SHOWN]
+    names = case.characteristics.names
+    rows = [(case.name, 1 + sum(other > number for other in counted.values()), [names[i] for i in members], 100 * number / len(of_four))
+            for members, number in ordered]
+    return pd.DataFrame(rows, columns=["setting", "rank", "characteristics", "percent"])
+
+
+def weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
+    """Settings that differ in the weather alone: the clearer one first (by friction, then sight, then delay).
+
+    Raises
+    ------
+    Unanswerable
+        If there is no such pair.
+    """
+    pairs = [(one, other) for one, other in permutations(cases, 2)
+             if _without_weather(one) == _without_weather(other) and _clearness(one) > _clearness(other)]
+    if not pairs:
+        raise Unanswerable(", ".join(one.name for one in cases), "two cases are needed that differ in the weather alone",
+                           "results such as those of sun and rain")
+    return pairs
+
+
+def weather(clear: Case, wet: Case) -> pd.DataFrame:
+    """One weather against another, characteristic by characteristic, over the critical solutions.
+
+    Columns setting, other, characteristic, percent and percent_other (in which share of the critical solutions it is
+    changed), difference (the other's minus the first's), rank and rank_other, and for increase and decrease the mean
+    signed change in its unit: increase, increase_other, decrease, decrease_other.
+    """
+    sides = []
+    for case in (clear, wet):
+        share, size = rq32(case), rq33(case)
+        side = share[share["j"] == ANY].set_index("characteristic")[["percent", "rank"]]
+        for direction in ("increase", "decrease"):
+            group = size[(size["j"] == ANY) & (size["direction"] == direction)]
+            side[direction] = group.set_index("characteristic")["delta"]
+        sides.append(side)
+    both = sides[0].join(sides[1].add_suffix("_other"))
+    difference = [None if a is None or b is None else b - a for a, b in zip(both["percent"], both["percent_other"], strict=True)]
+    both.insert(0, "difference", pd.Series(difference, index=both.index, dtype=object))
+    both.insert(0, "other", wet.name)
+    both.insert(0, "setting", clear.name)
+    columns = ["setting", "other", "characteristic", "percent", "percent_other", "difference", "rank", "rank_other",
+               "increase", "increase_other", "decrease", "decrease_other"]
+    return both.reset_index()[columns]
+
+
+def effects(case: Case) -> pd.DataFrame:
+    """Every change in every critical solution; columns setting, characteristic, change (signed, in its unit)."""
+    changed = changes(case, critical(case))
+    parts = [pd.DataFrame({"setting": case.name, "characteristic": name, "change": column[column != 0]})
+             for name, column in zip(case.characteristics.names, changed.T, strict=True)]
+    return pd.concat(parts, ignore_index=True)
+
+
+def _clearness(case: Case) -> tuple[float, float, float]:
+    weather = case.weather
+    return weather.road_friction, weather.visibility, -weather.recognition_delay - weather.hesitation
+
+
+def _without_weather(case: Case) -> tuple[object, ...]:
+    study = case.study
+    return study.scenario, study.vehicle, study.ads, study.metrics

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -38,11 +37,6 @@ class Comparison(NamedTuple):
     n2: int
     method: str | None
 
-    @property
-    def reversed_effect(self) -> float | None:
-        """A21 = 1 - A12."""
-        return None if self.effect_size is None else 1 - self.effect_size
-
 
 def compare(x: ArrayLike, y: ArrayLike) -> Comparison:
     """Compare two samples by U test and effect size.
@@ -62,11 +56,6 @@ def compare(x: ArrayLike, y: ArrayLike) -> Comparison:
     test = scipy.stats.mannwhitneyu(one, other, alternative="two-sided", method="exact" if exact else "asymptotic")
     a12 = float(test.statistic) / (one.size * other.size)
     return Comparison(float(test.pvalue), a12, magnitude(a12), one.size, other.size, EXACT if exact else ASYMPTOTIC)
-
-
-def too_few(n1: int, n2: int) -> bool:
-    """Whether samples are so small that not even two which do not overlap differ significantly."""
-    return 2 / math.comb(n1 + n2, n1) >= ALPHA
 
 
 def magnitude(effect_size: float) -> str:
@@ -96,26 +85,19 @@ def rq1(case: Case) -> pd.DataFrame:
         solutions = case.solutions_of(algorithm)
         for metric in case.scoring.metrics:
             sample, original = values(solutions, metric), case.original[metric.name]
-            told = against(sample, original, metric.more_is_unsafe)
-            rows.append((case.name, algorithm, metric.name, *told, float(np.mean(sample)) if sample.size else None,
-                         None if np.isnan(original) else original))
+            test = compare(sample, np.full(0 if np.isnan(original) else len(sample), original))
+            rows.append((case.name, algorithm, metric.name, *(turned(test) if metric.more_is_unsafe else test),
+                         float(np.mean(sample)) if sample.size else None, None if np.isnan(original) else original))
     return pd.DataFrame(rows, columns=RQ1_COLUMNS, dtype=object)
 
 
-def against(sample: np.ndarray, original: float, more_is_unsafe: bool) -> Comparison:
-    """A sample against one value, n1 the sample's size; the effect size is smaller for a more unsafe sample."""
-    told = compare(sample, np.full(0 if np.isnan(original) else len(sample), original))
-    return turned(told) if more_is_unsafe else told
-
-
-def turned(told: Comparison) -> Comparison:
-    """The same comparison with the effect size of the other sample."""
-    effect = told.reversed_effect
-    return told if effect is None else told._replace(effect_size=effect, magnitude=magnitude(effect))
+def turned(test: Comparison) -> Comparison:
+    """The same comparison with the effect size of the other sample, A21 = 1 - A12."""
+    effect = None if test.effect_size is None else 1 - test.effect_size
+    return test if effect is None else test._replace(effect_size=effect, magnitude=magnitude(effect))
 
 
 RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "effect_size", "magnitude", "n1", "n2", "method"]
-NO_RUNS = Comparison(None, None, None, 0, 0, None)
 
 
 def rq2(case: Case) -> pd.DataFrame:
@@ -138,11 +120,9 @@ def rq2(case: Case) -> pd.DataFrame:
     rows: list[tuple[object, ...]] = []
     for baseline in baselines:
         for indicator, more_is_better in MORE_IS_BETTER.items():
-            told = NO_RUNS
-            if quality is not None:
-                told = compare(*(quality.loc[quality["algorithm"] == name, indicator] for name in (NSGA2, baseline)))
-            rows.append((case.name, baseline, indicator, *(told if more_is_better else turned(told))))
+            test = compare(*([] if quality is None else quality.loc[quality["algorithm"] == name, indicator] for name in (NSGA2, baseline)))
+            rows.append((case.name, baseline, indicator, *(test if more_is_better else turned(test))))
         for metric in case.scoring.metrics:
-            told = compare(values(own, metric), values(case.solutions_of(baseline), metric))
-            rows.append((case.name, baseline, metric.name, *(told if metric.more_is_unsafe else turned(told))))
+            test = compare(values(own, metric), values(case.solutions_of(baseline), metric))
+            rows.append((case.name, baseline, metric.name, *(test if metric.more_is_unsafe else turned(test))))
     return pd.DataFrame(rows, columns=RQ2_COLUMNS, dtype=object)

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
-from safevar_sumo.analysis.research_questions.changes import ANY, critical, rq31, rq32
-from safevar_sumo.analysis.research_questions.discussion import effects
+from safevar_sumo.analysis.research_questions.changes import ANY, critical, effects, rq31, rq32
 from safevar_sumo.analysis.research_questions.indicators import WORST, convergence, nondominated, objectives
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective

@@ -7,7 +7,7 @@ other, and a repeated value is no sample: p-values become too small. Here every 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -93,7 +93,7 @@ def fewest_runs(question: str) -> int:
 
 
 def difference_line(case: Case) -> str:
-    """Which tests are significant (p < ALPHA) in the paper's way and not over runs, or the other way round; one line.
+    """Which tests are significant (p < ALPHA) in the paper's way and not over runs, or the other way round; a single line.
 
     Such as "... RQ2 SafeFuzzer TET loses its star (p 3.8e-4 to 0.059, 0.23 after Holm)".
 
@@ -116,8 +116,40 @@ def difference_line(case: Case) -> str:
             verb = "loses" if before < ALPHA else "gains"
             changes.append(f"{question} {name} {titles[old['metric']]} {verb} its star (p {_p(before)} to {_p(new['p_value'])}, "
                            f"{_p(after)} after Holm)")
-    told = "; ".join(changes) if changes else "the same tests are significant"
-    return f"One value for each run and Holm's correction for {number} tests, instead of the paper's pooled solutions: {told}."
+    return (f"One value for each run and Holm's correction for {number} tests, instead of the paper's pooled solutions: "
+            f"{'; '.join(changes) or 'the same tests are significant'}.")
+
+
+def brief(case: Case) -> list[str]:
+    """RQ1 and RQ2 for the end of a study: effect sizes over runs, an asterisk where significant; and what differs from pooling.
+
+    Where runs are too few for a significant difference, the line says so.
+    """
+    titles = titles_of(case.scoring.metrics)
+    lines, enough = [], False
+    for question, ask, who, meaning in BRIEF:
+        try:
+            frame = ask(case)
+        except Unanswerable as error:
+            lines.append(f"{question}: {error.problem}.")
+            continue
+        lines.append(f"{question}: {meaning}; * p < {ALPHA:g} after Holm's correction")
+        for name, group in frame.groupby(who, sort=False):
+            rows = group.to_dict("records")
+            defined = [row for row in rows if row["effect_size"] is not None]
+            few = [titles[row["metric"]] for row in defined if min(row.get("runs", np.inf), row.get("n1", np.inf), row.get("n2", np.inf))
+                   < fewest_runs(question)]
+            enough = enough or len(few) < len(defined)
+            subject = "" if len(few) == len(defined) else f"{', '.join(few)}: "
+            note = f"; {subject}too few runs for a test ({fewest_runs(question)} are needed)" if few else ""
+            effects = ", ".join(f"{titles[row['metric']]} " + ("-" if row["effect_size"] is None or row["p_holm"] is None else
+                                f"{row['effect_size']:.2f}{'*' if row['p_holm'] < ALPHA else ''}") for row in rows)
+            lines.append(f"  {ALGORITHM_TITLES.get(str(name), name)}: {effects}{note}")
+    return [*lines, difference_line(case)] if enough else lines
+
+
+BRIEF = (("RQ1", rq1_runs, "algorithm", "runs are more unsafe than the original if below 0.5 (A12)"),
+         ("RQ2", rq2_runs, "baseline", "NSGA-II's runs are better than the other's if above 0.5 (A12)"))
 
 
 def _p(value: float) -> str:
@@ -131,8 +163,7 @@ def _corrected(case: Case) -> tuple[pd.DataFrame, pd.DataFrame | None]:
     first = _rq1_rows(case)
     several = NSGA2 in case.algorithms and len(case.algorithms) > 1
     second = _rq2_rows(case) if several else []
-    corrected = holm([row["p_value"] for row in [*first, *second]])
-    for row, p in zip([*first, *second], corrected, strict=True):
+    for row, p in zip([*first, *second], holm([row["p_value"] for row in [*first, *second]]), strict=True):
         row["p_holm"] = p
     return (pd.DataFrame(first, columns=RQ1_COLUMNS, dtype=object),
             pd.DataFrame(second, columns=RQ2_COLUMNS, dtype=object) if several else None)
@@ -144,11 +175,9 @@ def _rq1_rows(case: Case) -> list[dict[str, Any]]:
         for metric in case.scoring.metrics:
             means, original = run_means(case, algorithm, metric), case.original[metric.name]
             test = signed_rank(means, original)
-            rows.append({
-                "setting": case.name, "algorithm": algorithm, "metric": metric.name,
-                **_columns(turned(test) if metric.more_is_unsafe else test), "runs": len(means),
-                "mean": float(np.mean(means)) if means.size else None,
-                "original": None if np.isnan(original) else original})
+            rows.append({"setting": case.name, "algorithm": algorithm, "metric": metric.name,
+                         **(turned(test) if metric.more_is_unsafe else test)._asdict(), "runs": len(means),
+                         "mean": float(np.mean(means)) if means.size else None, "original": None if np.isnan(original) else original})
     return rows
 
 
@@ -156,13 +185,13 @@ def _rq2_rows(case: Case) -> list[dict[str, Any]]:
     quality = indicators(case) if len(case.solutions) else None
     rows = []
     for baseline in (name for name in case.algorithms if name != NSGA2):
-        for indicator, more_is_better in MORE_IS_BETTER.items():
-            sides = [np.zeros(0) if quality is None else quality.loc[quality["algorithm"] == name, indicator].to_numpy(dtype=float)
-                     for name in (NSGA2, baseline)]
-            rows.append({"setting": case.name, "baseline": baseline, "metric": indicator, **_sized(compare(*sides), not more_is_better)})
-        for metric in case.scoring.metrics:
-            test = compare(run_means(case, NSGA2, metric), run_means(case, baseline, metric))
-            rows.append({"setting": case.name, "baseline": baseline, "metric": metric.name, **_sized(test, not metric.more_is_unsafe)})
+        tests = [(indicator, not more_is_better, compare(*(
+            [] if quality is None else quality.loc[quality["algorithm"] == name, indicator] for name in (NSGA2, baseline))))
+            for indicator, more_is_better in MORE_IS_BETTER.items()]
+        tests += [(metric.name, not metric.more_is_unsafe, compare(run_means(case, NSGA2, metric), run_means(case, baseline, metric)))
+                  for metric in case.scoring.metrics]
+        rows += [{"setting": case.name, "baseline": baseline, "metric": name, **(turned(test) if turn else test)._asdict()}
+                 for name, turn, test in tests]
     return rows
 
 
@@ -177,11 +206,3 @@ def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
     solutions = case.solutions_of(algorithm)
     samples = [values(solutions[solutions["run"] == run], metric) for run in case.runs_of(algorithm)]
     return np.array([float(np.mean(sample)) for sample in samples if sample.size])
-
-
-def _sized(test: Comparison, turn: bool) -> dict[str, Any]:
-    return {**_columns(turned(test) if turn else test), "n1": test.n1, "n2": test.n2}
-
-
-def _columns(test: Comparison) -> Mapping[str, Any]:
-    return {"p_value": test.p_value, "effect_size": test.effect_size, "magnitude": test.magnitude, "method": test.method}

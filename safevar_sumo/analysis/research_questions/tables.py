@@ -11,8 +11,7 @@ from typing import Any
 import pandas as pd
 
 from safevar_sumo.analysis.research_questions.answer import Answer
-from safevar_sumo.analysis.research_questions.layout import LAYOUTS, Bold, Layouts, Table, lay_out
-from safevar_sumo.analysis.research_questions.paper import PAPER
+from safevar_sumo.analysis.research_questions.layout import LAYOUTS, PAPER, Bold, Layouts, Table, lay_out
 
 MINUS = "\N{MINUS SIGN}"
 _LATEX = {

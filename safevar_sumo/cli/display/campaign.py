@@ -40,8 +40,8 @@ def print_forecast(console: Console, study: Study, runs: int, told: Forecast) ->
 def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path, pool: Pool) -> None:
     """The answer; per algorithm what was found, beside the original vehicle; the most critical setting; what RQ1 and RQ2 say of it."""
     from safevar_sumo.analysis.explain.summary import lead
-    from safevar_sumo.analysis.research_questions.brief import brief  # takes longer to load than all the rest
     from safevar_sumo.analysis.research_questions.case import case_of
+    from safevar_sumo.analysis.research_questions.over_runs import brief  # takes longer to load than all the rest
 
     names = tuple(study.vehicle.characteristics)
     solutions = solutions_frame(names, campaign.solutions.items())
