@@ -1,4 +1,4 @@
-"""Systems that many tests share, and a cache folder and working directory of their own."""
+"""Systems and results that many tests share; a cache folder and a working directory of their own; pools that compute in this process."""
 
 from __future__ import annotations
 
@@ -12,27 +12,46 @@ import pytest
 
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.sumo.system import System, assemble
-from tests.slippery import make_results
+from safevar_sumo.workers import local
+from tests.in_process import Here, searched
 
-collect_ignore = [] if os.name == "posix" else [
-    "workers/test_local_pool.py",
-    *(f"end_to_end/test_{name}.py" for name in ("cluster", "faults", "identities", "interruptions", "shares", "worlds_that_fail"))]
+collect_ignore = [] if os.name == "posix" else ["workers/test_local_pool.py", "end_to_end/test_cluster.py", "end_to_end/test_processes.py"]
 """Tests that kill, stop and interrupt processes as POSIX has it."""
 
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("default")
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # the programs that tests start need not compile the package each time
+WORKER_PROCESSES = local.LocalPool
+SLIPPERY = """
+extends = "smoke"
+name = "slippery"
+title = "Crossing on wet leaves"
+[weather]
+name = "wet leaves"
+road_friction = 0.75
+visibility = 1.0
+recognition_delay = 0.15
+[search]
+algorithms = ["nsga2", "rs"]
+population = 10
+evaluations = 60
+runs = 1
+"""
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Networks are built anew for every session of tests."""
-    before = os.environ.get("XDG_CACHE_HOME")
-    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
-    yield
-    if before is None:
-        del os.environ["XDG_CACHE_HOME"]
-    else:
-        os.environ["XDG_CACHE_HOME"] = before
+def _own_cache_and_pools_of_this_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Networks are built anew for every session of tests; commands start no worker processes, which take seconds to load."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setattr(local, "LocalPool", Here)
+        yield
+
+
+@pytest.fixture
+def worker_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pools start worker processes, as a user's do."""
+    monkeypatch.setattr(local, "LocalPool", WORKER_PROCESSES)
 
 
 @pytest.fixture(params=study_names())
@@ -56,5 +75,7 @@ def in_tmp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(scope="session")
 def slippery(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A results directory with collisions and near misses."""
-    return make_results(tmp_path_factory.mktemp("slippery"))
+    """Results of a small study on wet leaves: collisions and near misses among 30 solutions."""
+    folder = tmp_path_factory.mktemp("slippery")
+    (folder / "slippery.toml").write_text(SLIPPERY)
+    return searched(load_study(str(folder / "slippery.toml")), folder / "results")

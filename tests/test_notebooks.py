@@ -20,7 +20,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_there_are_no_others() -> None:
-    assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == {*SHOWN, "answers"}  # which has a test beside its room
+    assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == {*SHOWN, "answers"}
 
 
 @pytest.mark.parametrize("name", SHOWN)
@@ -35,6 +35,7 @@ def test_a_notebook_is_stored_with_what_it_shows(name: str) -> None:
     assert all(row in file.read_text() for row in rows.get(name, ()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHOWN)
 def test_a_notebook_shows_its_tables_and_pictures(name: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a smaller study than the one that its stored outputs come from."""
@@ -52,3 +53,16 @@ def _shown(notebook: nbformat.NotebookNode) -> tuple[int, int]:
     tables = [output.data["text/markdown"] for output in outputs if "text/markdown" in output.get("data", {})]
     assert all("| :--- |" in table or "no critical solution" in table for table in tables)
     return len(tables), sum("image/png" in output.get("data", {}) for output in outputs)
+
+
+@pytest.mark.slow
+def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> None:
+    notebook = nbformat.read(NOTEBOOKS / "answers.ipynb", as_version=4)
+    NotebookClient(notebook, timeout=900, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}).execute()
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    shown = [output.get("data", {}) for output in outputs]
+    assert (sum("text/html" in data for data in shown), sum("image/png" in data for data in shown)) == (3, 4)
+    printed = "".join(output["text"] for output in outputs if output.output_type == "stream" and output.name == "stdout")
+    for said in ("The original stops", "all together", "with 95 % confidence", "SD is below 1.1 in"):
+        assert said in printed
+    assert not [output for output in outputs if output.get("name") == "stderr"]

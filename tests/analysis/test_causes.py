@@ -15,7 +15,7 @@ from safevar_sumo.analysis.evaluator import Bench
 from safevar_sumo.analysis.explain.causes import RESOLUTION, End, affordable, boundaries, involved, minimal_causes, necessary
 from safevar_sumo.analysis.explain.necessity import distinct_causes, necessity, robustness, smallest_robust
 from safevar_sumo.records import BoolArray, FloatArray
-from tests.analysis.known_regions import ORIGINAL, Plant, box, diagonal_band, everywhere, made_up_bench, made_up_study, nowhere, two_islands
+from tests.analysis.known_regions import ORIGINAL, Plant, box, everywhere, made_up_bench, made_up_study, two_islands
 
 COLLISION = Unsafe()
 
@@ -37,16 +37,6 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
         assert not any(set(subset) < set(cause.columns) for subset in unsafe)
     assert necessary(found) == (set.intersection(*smallest) if smallest else set())
     assert involved(found) == set().union(*smallest)
-
-
-def test_causes_of_known_regions() -> None:
-    setting = np.array([[9.5, 1.0, 8.0]])
-    for region, expected in ((box, [(0, 1)]), (two_islands, [(0,)]), (everywhere, [()]), (nowhere, [])):
-        (found,) = minimal_causes(made_up_bench(3, region), setting, COLLISION)
-        assert [cause.columns for cause in found] == expected
-        assert all(cause.outcome == "collision" and cause.safety_degree == -1 for cause in found)
-    (found,) = minimal_causes(made_up_bench(3, diagonal_band), np.array([[9.0, 2.0, 8.0]]), COLLISION)
-    assert [cause.columns for cause in found] == [(0, 1)]
 
 
 def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None:

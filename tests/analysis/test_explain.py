@@ -109,14 +109,6 @@ def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: C
         assert max(one.share for one in robustness(bench, settings[:place], 0.05, told.unsafe)) < 0.8
 
 
-def test_the_lost_distance_adds_up(told: Explained) -> None:
-    for one in told.explanations:
-        first, other = one.because.original, one.because.changed
-        assert first.braking is not None
-        assert other.braking is not None
-        assert one.because.lost == pytest.approx(first.safety_degree - other.braking.margin, abs=0.05)
-
-
 def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
     safe = case.solutions["f_safe"].idxmax()
     handle = str(handles(case.solutions)[safe])

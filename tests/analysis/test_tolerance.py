@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.figures import profiles_figure
 from safevar_sumo.analysis.tolerance import safe_box
 from safevar_sumo.analysis.tolerance.compute import Tolerance
 from safevar_sumo.analysis.tolerance.compute import find_tolerances as tolerance
@@ -151,11 +152,6 @@ def test_where_nothing_collides_half_of_the_original_is_the_limit() -> None:
     assert told.alone[0].safe == (pytest.approx(1.0, abs=1e-4), pytest.approx(9.0, abs=1e-4))
 
 
-def test_it_is_shown_in_a_line() -> None:
-    told = of(2, two_islands)
-    assert repr(told) == f"<Tolerance of {told.study.name}, unsafe collision: Unsafe alone: a.>"
-
-
 def test_the_promised_record() -> None:
     record = json.loads(json.dumps(of(2, two_islands, pairs=True).record(), allow_nan=False))
     assert list(record) == ["study", "unsafe", "alone", "pairs", "joint"]
@@ -166,11 +162,14 @@ def test_the_promised_record() -> None:
         "factor", "confidence", "samples", "failed", "attempts", "unsafe_at_most", "characteristics"]
 
 
-def test_one_characteristic_has_no_pair() -> None:
-    assert of(1, nowhere, pairs=True).pairs == []
-
-
 def test_an_unknown_characteristic_is_refused() -> None:
     study = made_up_study(2)
     with pytest.raises(InputError, match="'wings'"):
         tolerance(study, characteristics=["wings"], pool=Plant(study, nowhere))
+
+
+@pytest.mark.parametrize(("region", "told"), [
+    (nowhere, "dot: the original vehicle"),
+    (two_islands, "dot: the original vehicle;\nhatched: unsafe;\nbelow the dashed line: collisions")])
+def test_the_figure_explains_what_it_draws_and_nothing_else(region: Region, told: str) -> None:
+    assert profiles_figure(of(1, region)).get_supxlabel() == told

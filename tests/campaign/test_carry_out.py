@@ -12,8 +12,9 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from safevar_sumo.campaign import RunKey, all_runs, run_campaign, run_generator
+from safevar_sumo.campaign import RunKey, all_runs, forecast, run_campaign, run_generator
 from safevar_sumo.campaign.batcher import BATCHES_PER_WORKER
+from safevar_sumo.metrics import METRICS
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory, load, status
@@ -81,12 +82,6 @@ def test_an_original_vehicle_that_collides_is_told(study: Study, tmp_path: Path)
     _, told = carried_out(study, tmp_path / "unsafe", Colliding())
     assert [line for line in told.warnings if "the original vehicle itself collides" in line] == told.warnings != []
     assert carried_out(study, tmp_path / "safe")[1].warnings == []
-
-
-def test_another_seed_finds_other_solutions(study: Study, tmp_path: Path) -> None:
-    carried_out(study, tmp_path / "a")
-    carried_out(with_search(study, seed=2), tmp_path / "b")
-    assert solutions(tmp_path / "a") != solutions(tmp_path / "b")
 
 
 def test_a_campaign_that_breaks_down_anywhere_is_resumed_where_it_was(study: Study, tmp_path: Path) -> None:
@@ -159,14 +154,6 @@ def test_a_run_in_other_hands_is_left_to_them(study: Study, tmp_path: Path) -> N
     assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")
 
 
-def test_journals_are_given_back_whatever_happens(study: Study, tmp_path: Path) -> None:
-    with pytest.raises(PoolLostError):
-        carried_out(study, tmp_path, FormulaPool(lasts=5))
-    for path in (tmp_path / "runs").iterdir():
-        results = ResultsDirectory(tmp_path, study)
-        results.journal(path.stem).close()
-
-
 @pytest.mark.parametrize("budgets", [(60, 100), (55, 130), (100, 60), (550, 800)])
 def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_others(
         study: Study, tmp_path: Path, budgets: tuple[int, int]) -> None:
@@ -209,11 +196,24 @@ def test_every_evaluation_is_read_in_the_order_in_which_it_was_asked_for(study: 
     assert results.manifest["study"] == tables_of(study)
 
 
-def test_an_unfinished_directory_is_read_too(study: Study, tmp_path: Path) -> None:
-    pool = FormulaPool(lasts=15)
+def test_a_forecast_counts_and_measures(study: Study) -> None:
+    told = forecast(study, 6, FormulaPool())
+    assert told.evaluations == 600
+    assert told.seconds == pytest.approx(600 / told.rate)
+    assert told.size >= 600 * 8 * (12 + len(METRICS))
+
+
+@pytest.mark.parametrize("workers", [1, 4])
+def test_a_forecast_tells_what_all_workers_do_together(workers: int, study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = iter(range(100))
+    monkeypatch.setattr("time.perf_counter", lambda: float(next(seconds)))
+    pool = FormulaPool(workers)
+    rate = forecast(study, 6, pool).rate
+    assert rate == 4 / 5 * (len(pool.simulated) - 1), "settings of the second probe, in a second; the first one warms up"
+
+
+def test_a_forecast_of_a_study_at_fault_tells_the_fault(study: Study) -> None:
     with pytest.raises(PoolLostError):
-        carried_out(study, tmp_path, pool, batch=study.search.population)
-    results = load(tmp_path)
-    in_flight = study.search.population
-    assert len(pool.simulated) - 1 - in_flight <= len(results.evaluations) <= len(pool.simulated) - 1, "all but the original vehicle's"
-    assert set(results.solutions["algorithm"]) <= {"nsga2"}
+        forecast(study, 6, FormulaPool(lasts=0))
+    with pytest.raises(PoolLostError):
+        forecast(study, 6, FormulaPool(lasts=2))

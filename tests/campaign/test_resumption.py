@@ -79,15 +79,6 @@ def test_failures_are_counted_kept_out_and_not_met_again(study: Study, tmp_path:
     assert solutions(tmp_path) == before
 
 
-def test_the_manifest_tells_what_counts(study: Study, tmp_path: Path) -> None:
-    carried_out(with_search(study, runs=3), tmp_path)
-    carried_out(with_search(study, runs=1, algorithms=["nsga2", "rs"]), tmp_path, FormulaPool(lasts=0))
-    found = load(tmp_path)
-    assert found.finished == (("nsga2", 0), ("rs", 0))
-    assert set(found.evaluations["run"]) == {0}
-    assert found.solutions.to_csv(index=False, lineterminator="\n").encode() == solutions(tmp_path)
-
-
 def test_a_journal_from_elsewhere_is_refused_by_readers(study: Study, tmp_path: Path) -> None:
     carried_out(study, tmp_path / "a")
     carried_out(with_search(study, seed=2), tmp_path / "b")
@@ -131,32 +122,3 @@ def test_failed_settings_are_tried_again_when_that_is_asked_for(study: Study, tm
     assert campaign.failures == []
     assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")
     pd.testing.assert_frame_equal(load(tmp_path / "out").evaluations, load(tmp_path / "whole").evaluations)
-
-
-def test_a_torn_journal_of_the_original_is_told_too(study: Study, tmp_path: Path) -> None:
-    carried_out(study, tmp_path)
-    torn = tmp_path / "runs" / "original.journal"
-    torn.write_bytes(torn.read_bytes()[:-5])
-    _, told = carried_out(study, tmp_path)
-    assert len(told.warnings) == 1
-    assert str(torn) in told.warnings[0]
-
-
-def test_a_journal_that_cannot_be_written_ends_the_campaign(study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from safevar_sumo.errors import SafevarError
-
-    written = Journal.append
-
-    def full(self: Journal, positions: list[int], evaluations: Evaluations) -> None:
-        if self.path.stat().st_size > 8000:
-            raise SafevarError("full")
-        written(self, positions, evaluations)
-
-    monkeypatch.setattr(Journal, "append", full)
-    with pytest.raises(SafevarError, match="full"):
-        carried_out(study, tmp_path / "out")
-    monkeypatch.undo()
-    assert len(load(tmp_path / "out").evaluations) > 0
-    carried_out(study, tmp_path / "out")
-    carried_out(study, tmp_path / "whole")
-    assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")

@@ -10,16 +10,20 @@ import re
 import subprocess
 import sys
 import threading
+from io import StringIO
 from pathlib import Path
 
 import click
 import pytest
+from click.shell_completion import ShellComplete
 from click.testing import CliRunner
+from rich.console import Console
 
-import safevar_sumo
 from safevar_sumo import cli
 from safevar_sumo.cli.program import COMMANDS, commands, main
 from safevar_sumo.errors import InputError
+from safevar_sumo.study import load_study, study_names
+from safevar_sumo.terminal import WholeTable
 
 ROOT = Path(__file__).parents[2]
 OLD_PYTHON = "import runpy, sys; sys.version_info = (3, 10, 9); runpy.run_module('safevar_sumo', run_name='__main__')"
@@ -81,21 +85,6 @@ def test_what_the_library_says_of_a_parameter_is_said_of_its_flag(in_tmp: Path) 
         assert told.source == arguments[-2]
 
 
-def test_no_module_below_the_commands_names_a_flag() -> None:
-    package = Path(safevar_sumo.__file__).parent
-    for path in package.rglob("*.py"):
-        if "cli" not in path.parts:
-            assert not re.search(r'InputError\(\s*f?"-', path.read_text()), path
-
-
-@pytest.mark.parametrize("typed", [
-    "risk smoke --confidence nan", "risk smoke --width nan", "status . --every nan", "simulate smoke --gui --slower nan"])
-def test_a_range_of_numbers_does_not_hold_what_is_no_number(typed: str) -> None:
-    told = CliRunner().invoke(commands, typed.split())
-    assert told.exit_code == 2
-    assert "nan is not in the range" in told.stderr
-
-
 def test_a_thread_that_somebody_has_left_running_does_not_keep_the_program(monkeypatch: pytest.MonkeyPatch,
                                                                            capsys: pytest.CaptureFixture[str]) -> None:
     ended = threading.Event()
@@ -146,3 +135,48 @@ def test_where_it_cannot_run_it_says_so_in_one_line(start: str, says: str) -> No
     assert re.fullmatch(f"safevar-sumo: {re.escape(says)}.*\n", done.stderr)
     for file in ("__init__.py", "__main__.py"):
         ast.parse((ROOT / "safevar_sumo" / file).read_text(), feature_version=(3, 10))
+
+
+@pytest.mark.parametrize(("words", "incomplete", "expected"), [
+    ([], "s", {name for name in COMMANDS if name.startswith("s")}), (["study"], "ra", {"rain"}), (["simulate"], "su", {"sun"}),
+    (["simulate", "native", "--set"], "t", {"tau="}), (["simulate", "sun", "--set"], "ma", {"mass=", "max_rpm=", "maxBrakeTorque="}),
+    (["simulate", "nothing", "--set"], "t", set()), (["validate"], "lg", {"lgsvl"}),
+])
+def test_names_complete(words: list[str], incomplete: str, expected: set[str]) -> None:
+    found = ShellComplete(commands, {}, "safevar-sumo", "_SAFEVAR_SUMO_COMPLETE").get_completions(words, incomplete)
+    assert expected == {item.value for item in found if item.type == "plain"} or expected <= {item.value for item in found}
+
+
+def printed(table: WholeTable, width: int) -> list[str]:
+    console = Console(file=StringIO(), width=width, _environ={})
+    console.print(table)
+    return console.file.getvalue().splitlines()  # type: ignore[attr-defined, no-any-return]
+
+
+@pytest.mark.parametrize("width", [40, 60, 200])
+def test_names_stay_whole_and_the_rest_goes_on_in_the_next_line(width: int) -> None:
+    table = WholeTable("characteristic", "here", "what [red]it[/red] is")
+    table.add_row("dampRateZeroT_CE [kg m^2/s]", "1.1688135797930421", "abcdefghijklmnopqrstuvwxyz" * 2)
+    lines = printed(table, width)
+    assert max(map(len, lines)) <= width
+    assert any("│ dampRateZeroT_CE" in line for line in lines)
+    letters = "".join(line.rpartition("│")[0].rpartition("│")[2].strip() for line in lines)
+    assert letters == "abcdefghijklmnopqrstuvwxyz" * 2
+    assert "…" not in "".join(lines)
+
+
+def test_every_name_of_the_list_can_be_read_and_typed() -> None:
+    told = CliRunner(env={"COLUMNS": "80"}).invoke(commands, ["list"]).stdout
+    assert "…" not in told
+    for name in study_names():
+        study = load_study(name)
+        for text in (name, study.vehicle.model, study.ads.model, study.scenario.model, *study.vehicle.characteristics):
+            assert text in told
+
+
+@pytest.mark.parametrize("command", [["list"], ["simulate", "native", "--set", "brakeGain=0.8"]])
+def test_what_a_characteristic_is_stands_with_its_name(command: list[str]) -> None:
+    done = CliRunner().invoke(commands, command, catch_exceptions=False)
+    gain = load_study("native").vehicle.characteristics["brakeGain"]
+    assert f"brakeGain {gain.meaning}; counterpart: {gain.counterpart}" in re.sub(r"\s+", " ", done.stdout)
+    assert command == ["list"] or "reactionTime age" not in re.sub(r"\s+", " ", done.stdout), "of what is changed alone"

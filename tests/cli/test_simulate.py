@@ -68,11 +68,6 @@ def test_a_sweep_is_a_table_under_the_original_or_a_list() -> None:
     assert [float(row[1]) for row in rows] == [3.5, 1.0, 1.25, 1.5]
 
 
-def test_values_beyond_the_domain_are_taken_when_asked_for() -> None:
-    assert isinstance(simulate("sun", "--set", "tireFric=0.8").exception, InputError)
-    assert "0.8 (beyond)" in simulate("sun", "--set", "tireFric=0.8", "--beyond").stdout
-
-
 def test_nothing_that_is_read_is_written_over(in_tmp: Path) -> None:
     Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n')
     for flag in ("--trace", "--plot"):
@@ -92,10 +87,3 @@ def test_titles_are_no_markup_and_control_nothing(title: str, width: str, in_tmp
     assert told.exception is None
     assert "\x1b" not in told.stdout
     assert max(map(len, told.stdout.partition("The original")[0].splitlines())) <= int(width)
-
-
-def test_a_title_with_control_characters_is_refused(in_tmp: Path) -> None:
-    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\ntitle = "a\\u001b[31mb\\nc"\n')
-    told = CliRunner().invoke(commands, ["simulate", "mine.toml"])
-    assert isinstance(told.exception, InputError)
-    assert "control characters" in str(told.exception)

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from safevar_sumo.study import load_study
 from tests.end_to_end import processes
-from tests.end_to_end.small import STUDY
+from tests.in_process import searched
 
 
 @pytest.fixture(autouse=True)
@@ -30,16 +31,15 @@ def _nothing_left_running() -> Iterator[None]:
 @pytest.fixture
 def small(in_tmp: Path) -> None:
     """The file of the small study, in an empty working directory."""
-    Path("small.toml").write_text(STUDY)
+    Path("small.toml").write_text(processes.STUDY)
 
 
 @pytest.fixture(scope="session")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The results of the small study carried out in peace by one worker; nobody changes them."""
+    """The results of the small study; nobody changes them."""
     place = tmp_path_factory.mktemp("whole")
-    (place / "small.toml").write_text(STUDY)
-    processes.ended(processes.started("study", str(place / "small.toml"), "--out", str(place / "out"), "--jobs", "1"), 0)
-    return place / "out"
+    (place / "small.toml").write_text(processes.STUDY)
+    return searched(load_study(str(place / "small.toml")), place / "out")
 
 
 @pytest.fixture

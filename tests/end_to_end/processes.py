@@ -1,4 +1,4 @@
-"""A study in processes of its own: started, watched, killed."""
+"""A small study of three algorithms, in this process or in processes of its own: started, watched, killed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,15 @@ from pathlib import Path
 
 import psutil
 
-SAFEVAR = [sys.executable, "-m", "safevar_sumo"]
+from tests.in_process import run
+
+STUDY = """
+extends = "smoke"
+name = "small"
+[search]
+algorithms = ["nsga2", "rs", "safe_fuzzer"]
+evaluations = 150
+"""
 WAIT = 60.0
 running: list[subprocess.Popen[str]] = []
 """What a test has started."""
@@ -20,8 +28,8 @@ running: list[subprocess.Popen[str]] = []
 
 def started(*arguments: str, **options: object) -> subprocess.Popen[str]:
     """A command in a process group of its own, as a shell starts it."""
-    running.append(subprocess.Popen([*SAFEVAR, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,  # type: ignore[call-overload]
-                                    start_new_session=True, **options))
+    running.append(subprocess.Popen([sys.executable, "-m", "safevar_sumo", *arguments], stdout=subprocess.PIPE,  # type: ignore[call-overload]
+                                    stderr=subprocess.PIPE, text=True, start_new_session=True, **options))
     return running[-1]
 
 
@@ -71,3 +79,12 @@ def killed(process: subprocess.Popen[str]) -> None:
     """kill -9."""
     process.send_signal(signal.SIGKILL)
     process.communicate(timeout=WAIT)
+
+
+def study(*arguments: str, expect: int = 0) -> str:
+    """Carry the small study out in this process, without a summary; returns what it prints on stderr."""
+    return run("study", "small.toml", "--quiet", *arguments, expect=expect).stderr
+
+
+def solutions(out: str | Path) -> bytes:
+    return (Path(out) / "solutions.csv").read_bytes()

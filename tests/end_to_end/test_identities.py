@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import time
 from pathlib import Path
 
 import pytest
@@ -16,7 +14,7 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import load
 from safevar_sumo.shipped import NETWORKS
-from tests.end_to_end.processes import ended, started, until, workers_of, written
+from tests.in_process import run
 
 ADS = """
 from safevar_sumo.ads import ScalarAds
@@ -50,8 +48,8 @@ def _mine(in_tmp: Path) -> None:
     shutil.copytree(NETWORKS / "pedestrian_crossing", "my_net")
 
 
-def study(*options: str, expect: int = 0) -> str:
-    return ended(started("study", "mine.toml", "--out", "out", "--jobs", "1", *options), expect)
+def study() -> None:
+    run("study", "mine.toml", "--out", "out", "--quiet")
 
 
 def edited(path: str, old: str, new: str) -> None:
@@ -66,10 +64,9 @@ def test_results_go_with_the_files_that_they_were_computed_with() -> None:
     edits = ("my_ads.py", "0.5", "0.65"), ("my_map.py", "9.0", "8.25"), ("my_net/traffic.rou.xml", "<route", "<!-- --><route")
     for path, old, new in edits:
         edited(path, old, new)
-        told = CliRunner().invoke(commands, ["study", "mine.toml", "--out", "out"]).exception
-        assert isinstance(told, InputError)
-        assert f"{Path(path).name} has changed since" in str(told)
-        assert "another --out, or the" in str(told)
+        told = refused("study", "mine.toml", "--out", "out")
+        assert f"{Path(path).name} has changed since" in told
+        assert "another --out, or the" in told
         edited(path, new, old)
     Path("mine.toml").write_text(STUDY.replace('name = "mine"', 'name = "mine"\ntitle = "Another title"'))
     study()
@@ -116,9 +113,9 @@ def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results
         Path(name).write_text(text)
     Path("elsewhere").mkdir()
     monkeypatch.chdir("elsewhere")
-    ended(started("study", "../mine.toml", "--out", "../out", "--jobs", "1"), 0)
+    run("study", "../mine.toml", "--out", "../out", "--quiet")
     assert {*files, "my_ads.py", "my_map.py"} == set(json.loads(Path("../out/manifest.json").read_text())["sources"])
-    ended(started("study", "../mine.toml", "--out", "../out", "--runs", "2", "--jobs", "1"), 0)
+    run("study", "../mine.toml", "--out", "../out", "--runs", "2", "--quiet")
     for name, text in files.items():
         Path("..", name).write_text(f"{text}\n# a comment\n")
         if name == "my_test.py":
@@ -133,7 +130,7 @@ def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results
         assert "far.txt has changed since" in refused(*words.split())
     with pytest.raises(InputError, match=r"far\.txt has changed since"):
         sv.risk(sv.load("../out"))
-    done = CliRunner().invoke(commands, ["rules", "../out", "--samples", "8", "--jobs", "1", "--json", "--as-it-is-now"])
+    done = CliRunner().invoke(commands, ["rules", "../out", "--samples", "8", "--json", "--as-it-is-now"])
     assert done.exit_code == 0, done.exception
     assert "warning: ../out: far.txt has changed since; simulated as it is now" in done.stderr
     done = CliRunner().invoke(commands, ["report", "../out", "--only", "verdict,reproduce", "--as-it-is-now", "--out", "page.html"])
@@ -167,56 +164,3 @@ def test_a_table_that_was_edited_is_refused_until_the_study_writes_it_again() ->
     study()
     assert Path("out/solutions.csv").read_text() == before
     assert len(load("out").solutions)
-
-
-def under_way() -> subprocess.Popen[str]:
-    """A long study that has journalled something."""
-    Path("mine.toml").write_text(STUDY.replace("evaluations = 30", "evaluations = 400"))
-    process = started("study", "mine.toml", "--out", "out", "--jobs", "1", "--batch", "1")
-    until(lambda: written(Path("out")) > 0, process)
-    return process
-
-
-@pytest.mark.slow
-def test_files_that_are_edited_meanwhile_mix_nothing() -> None:
-    process = under_way()
-    edited("my_ads.py", "0.5", "0.65")
-    before = written(Path("out"))
-    until(lambda: written(Path("out")) > before + 500, process)
-    workers_of(process)[0].kill()
-    told = ended(process, 2)
-    assert "safevar-sumo: my_ads.py: is not the file that this study began with" in told
-    assert len(load("out").evaluations) > 1
-    edited("my_ads.py", "0.65", "0.5")
-    study()
-    mixed = Path("out/solutions.csv").read_bytes()
-    shutil.rmtree("out")
-    study()
-    assert Path("out/solutions.csv").read_bytes() == mixed
-
-
-@pytest.mark.slow
-def test_a_network_that_is_edited_meanwhile_mixes_nothing() -> None:
-    process = under_way()
-    edited("my_net/traffic.rou.xml", "<route", "<!-- --><route")
-    assert "traffic.rou.xml: is not the file that this study began with" in ended(process, 2)
-
-
-def test_of_two_studies_that_start_together_one_gets_the_directory() -> None:
-    Path("other.toml").write_text('extends = "mine.toml"\nname = "other"\n')
-    both = [started("study", name, "--out", "out", "--jobs", "1") for name in ("mine.toml", "other.toml")]
-    outputs = [process.communicate(timeout=60) for process in both]
-    assert sorted(process.returncode for process in both) == [0, 2], outputs
-    assert "another study" in "".join(errors for _, errors in outputs)
-    assert len(load("out").solutions) > 0
-
-
-@pytest.mark.slow
-def test_a_first_try_that_failed_leaves_the_directory_free() -> None:
-    good = Path("my_net/network.edg.xml").read_text()
-    Path("my_net/network.edg.xml").write_text('<edges><edge id="road" from="west" to="nowhere"/></edges>')
-    assert "netconvert refuses the network" in study(expect=2)
-    Path("my_net/network.edg.xml").write_text(good)
-    start = time.monotonic()
-    study()
-    assert time.monotonic() - start < 30

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.reference import ReferenceData, calibrate, fitted_as, with_values
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.reference import ReferenceData, calibrate, with_values
+from safevar_sumo.reference.fit import Search, original_cost
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
@@ -61,5 +68,78 @@ def test_a_fit_is_refused_that_could_not_mean_anything(data: ReferenceData) -> N
         calibrate(mine(1.0, weights={"speed": 1.0}), {"mine": data}, Here())
 
 
-def test_a_fitted_study_has_a_name_of_its_own() -> None:
-    assert fitted_as(load_study("sun"), load_study("sun")).name == "sun-calibrated"
+PUBLISHED = {"safety_degree": 2.0, "tet": 1.0}
+FIT = FitTable(tolerance=0.05, original=0.5, weights={"safety_degree": 1.0, "tet": 0.3})
+
+
+def cost(safety_degree: float, tet: float) -> float:
+    one = np.ones(1)
+    original = Evaluations(settings=np.ones((1, 2)), outcome=np.array([Outcome.STOPPED.value]), collision_speed=one * np.nan,
+                           metrics={"safety_degree": one * safety_degree, "tet": one * tet}, f_diff=0 * one, f_num_diff=0 * one)
+    return original_cost(original, PUBLISHED, FIT)
+
+
+def test_a_miss_is_squared_within_the_tolerance_and_in_proportion_beyond() -> None:
+    assert cost(2.0, 1.0) == 0.0
+    assert cost(2.05, 1.0) == pytest.approx(0.5 * 0.5 ** 2 / 2), "half a tolerance; the mean of two metrics counts half"
+    assert cost(2.0, 0.95) == pytest.approx(0.5 * 0.3 * 1 / 2), "one tolerance"
+    assert cost(2.3, 1.0) == pytest.approx(0.5 * (2 * 3 - 1) / 2), "three tolerances"
+    assert cost(20.0, 1.0) == cost(np.nan, 1.0) == pytest.approx(0.5 * (2 * 10 - 1) / 2), "farther than ten is as far as that"
+
+
+@given(st.floats(0.5, 4.0), st.floats(0.5, 4.0))
+def test_who_misses_by_more_pays_no_less(one: float, other: float) -> None:
+    near, far = sorted([one, other], key=lambda value: abs(value / 2.0 - 1))
+    assert cost(near, 1.0) <= cost(far, 1.0) + 1e-12
+
+
+class Bowl:
+    """Studies are their places; what they cost is how far they are from a place squared, and whether they are in the wrong half."""
+
+    def __init__(self) -> None:
+        self.tried = 0
+
+    def at(self, shares: FloatArray) -> Any:
+        return shares
+
+    def costs(self, studies: Sequence[Any]) -> list[float]:
+        self.tried += len(studies)
+        return [float(((place - 0.2) ** 2).sum() + (place[0] > 0.5)) for place in studies]
+
+
+class Runner:
+    """Has found what it has found, and counts its trials."""
+
+    def __init__(self, lowest: float) -> None:
+        self.lowest, self.rounds = lowest, list[int]()
+
+    def go_on(self, trials: int) -> None:
+        self.rounds.append(trials)
+
+
+def silent(cost: float, best: Any) -> None:
+    pass
+
+
+def test_the_worse_half_gives_up_after_every_round() -> None:
+    runners = [Runner(lowest) for lowest in (5.0, 1.0, 4.0, 2.0, 3.0)]
+    Search(Bowl(), 1, 300, silent).race(runners)  # type: ignore[arg-type]
+    # Rounds of 5, 3 and 2 searches with 100 trials each; the winner gets what remains, which these runners never take.
+    assert [runner.rounds for runner in runners] == [[20], [20, 33, 50, 300], [20], [20, 33, 50], [20, 33]]
+
+
+@pytest.mark.parametrize(("starts", "trials"), [(1, 7), (3, 100), (6, 500), (40, 30)])
+def test_no_trial_is_lost_and_none_too_many(starts: int, trials: int) -> None:
+    bowl, told = Bowl(), list[float]()
+    search = Search(bowl, 6, trials, lambda cost, best: told.append(cost))
+    searches = [search.begun(np.full(2, 0.9), 0.3, seed) for seed in range(1, starts + 1)]
+    search.race(searches)
+    assert bowl.tried == trials == len(told)
+    assert search.left == 0
+    assert told == sorted(told, reverse=True)
+
+
+def test_a_race_finds_the_bottom_from_whatever_half() -> None:
+    search = Search(Bowl(), 8, 1200, silent)
+    search.race([search.begun(np.array([place, 0.9]), 0.1, 3) for place in (0.9, 0.8, 0.1, 0.7)])
+    assert search.best == pytest.approx([0.2, 0.2], abs=0.01)

@@ -88,14 +88,6 @@ def test_what_differs_is_marked_by_the_rules(sides: Path) -> None:
     assert verdicts["RQ3.3", "avgSD_mD"] in (HOLDS, DIRECTION)
 
 
-def test_without_published_nsga2_the_rest_is_compared_and_one_remark_says_what_is_not(sides: Path) -> None:
-    assert typed("import", "sun", "--out", sides / "rs alone", "--rs", sides / "rs.csv").exit_code == 0
-    done = typed("replicate", sides / "one", "--published", sides / "rs alone")
-    assert done.exit_code == 0, done.exception
-    assert done.output.count("no solutions of nsga2 published: RQ2, RQ3 and the weathers are about them and are not compared") == 1
-    assert "RS, safety_degree: more unsafe than the original vehicle | *holds*" in done.output
-
-
 def test_the_page_has_both_sides_and_says_what_is_missing(sides: Path) -> None:
     done = typed("replicate", sides / "one", sides / "rain", "--published", sides / "other", "--out", sides / "page.md",
                  "--reference", f"sun={sides / 'there.csv'}", f"sun={sides / 'rs.csv'}")

@@ -85,11 +85,7 @@ def test_at_an_impact_the_pedals_are_those_that_were_in_force() -> None:
     assert shown.evaluations.metrics["safety_degree"][1] == -drives.collision_speed[0]
 
 
-def test_a_title_of_dollars_is_no_formula(comparison: Comparison, tmp_path: Path) -> None:
-    write_figure(draw_comparison(replace(comparison, title=r"costs $\frac{$ and <b>more</b>")), tmp_path / "it.png")
-
-
-@pytest.mark.parametrize("kind", ["png", "pdf", "svg"])
+@pytest.mark.parametrize("kind", ["png", "svg"])
 def test_the_same_bytes_twice(kind: str, comparison: Comparison, tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_figure(draw_comparison(comparison), tmp_path / f"{name}.{kind}")

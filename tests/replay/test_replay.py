@@ -68,12 +68,6 @@ def test_what_set_says_comes_over_the_solution(slippery: Path) -> None:
     assert back == severe | {"tireFric": 3.5}
 
 
-def test_a_directory_without_a_choice_is_its_study(slippery: Path) -> None:
-    told = json.loads(simulated(str(slippery), "--json").stdout)
-    original = json.loads((slippery / "manifest.json").read_text())["original"]
-    assert {name: told[name] for name in original} == original
-
-
 def test_a_row_that_was_not_found_here_is_told(slippery: Path, case: Case) -> None:
     comparison = compare(case.study, assemble(case.study), case.characteristics.original)
     told = differences(comparison.evaluations, {"safety_degree": 1.0, "tet": np.nan, "outcome": "collision"})

@@ -7,15 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.errors import InputError
 from safevar_sumo.report import make_report
 from safevar_sumo.report.page import gather
-from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.system import assemble
-from safevar_sumo.workers.identity import identity_of
-from tests.in_process import Here, Silent
+from tests.in_process import searched
 
 DAY, RAIN = "crossing, clear", "crossing, hard_rain"
 
@@ -25,9 +21,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A crossing in the clear, where less collides, and in hard_rain."""
     matrix = {"aggregate": "worst", "tests": [{"name": "crossing", "weathers": ["clear", "hard_rain"]}]}
     study = load_study("smoke", matrix=matrix, search={"runs": 1, "population": 10, "evaluations": 40, "algorithms": ["rs"]})
-    results = ResultsDirectory(tmp_path_factory.mktemp("matrix") / "results", study, identity_of(study, assemble(study)))
-    results.finish(run_campaign(study, all_runs(study), results, Here(), Silent()).solutions)
-    return results.path
+    return searched(study, tmp_path_factory.mktemp("matrix") / "results")
 
 
 def test_all_of_it_is_of_the_point(results: Path) -> None:

@@ -22,7 +22,6 @@ from safevar_sumo.analysis.research_questions.figures import (
     changed_characteristics,
     draw,
     draw_all,
-    hypervolume_growth,
     number_of_changes,
     pareto_fronts,
     sizes_of_changes,
@@ -61,11 +60,7 @@ def case() -> Case:
     return made_up(*rows, evaluations=evaluations)
 
 
-def test_there_is_a_figure_for_everything_promised() -> None:
-    assert len({**OF_ALL, **OF_A_CASE}) == 5
-
-
-@pytest.mark.parametrize("study", ["made-up", "sun", "lgsvl", "native"])
+@pytest.mark.parametrize("study", ["made-up", "lgsvl"])
 @pytest.mark.parametrize("name", [*OF_ALL, *OF_A_CASE])
 def test_axes_are_labelled_and_no_text_lies_on_another(name: str, study: str, case: Case) -> None:
     shown = case if study == "made-up" else random_setting(study)
@@ -73,9 +68,8 @@ def test_axes_are_labelled_and_no_text_lies_on_another(name: str, study: str, ca
     _check_layout(figure, name)
 
 
-@pytest.mark.parametrize("number", [2, 5])
-def test_cases_stand_side_by_side_in_one_figure(number: int, case: Case) -> None:
-    cases = [dataclasses.replace(case, name=f"case {i}") for i in range(number)]
+def test_cases_stand_side_by_side_in_one_figure(case: Case) -> None:
+    cases = [dataclasses.replace(case, name=f"case {i}") for i in range(2)]
     figure = number_of_changes(cases)
     assert [axis.get_title() for axis in figure.axes if axis.axison] == [one.name for one in cases]
     _check_layout(figure, "rq3.1-number-of-changes")
@@ -130,24 +124,6 @@ def _texts(figure: Figure) -> Iterator[Text]:
                 yield from (tick.label2 for tick in axis.get_major_ticks() if low - 1e-9 <= tick.get_loc() <= high + 1e-9)
 
 
-def test_f_diff_has_the_unit_of_solutions_csv_in_figures_too(case: Case) -> None:
-    (axis,) = [one for one in pareto_fronts(case).axes if one.get_xlabel().startswith("f_diff")]
-    assert "[fraction of the original]" in axis.get_xlabel()
-    largest = case.solutions["f_diff"].max()
-    assert 0 < max(float(np.max(line.get_xdata())) for line in axis.lines) <= largest
-
-
-def test_each_algorithm_has_its_own_colour_and_marker(case: Case) -> None:
-    lines = [line for line in pareto_fronts(case).axes[0].lines if line.get_label().startswith(("NSGA", "RS"))]
-    assert len({line.get_color() for line in lines}) == len({line.get_marker() for line in lines}) == 2
-
-
-def test_box_plots_are_of_the_runs(case: Case) -> None:
-    axis = number_of_changes([case]).axes[0]
-    assert [label.get_text() for label in axis.get_xticklabels()] == ["1", "2", "3"]
-    assert "2 runs" in axis.get_ylabel()
-
-
 def test_changes_are_counted_on_their_side_of_zero(case: Case) -> None:
     axis = sizes_of_changes(case).axes[0]
     bars = [bar for bar in axis.patches if isinstance(bar, Rectangle) and bar.get_height() > 0]
@@ -156,12 +132,6 @@ def test_changes_are_counted_on_their_side_of_zero(case: Case) -> None:
     assert up > 0
     assert down > 0
     assert not [bar for bar in bars if bar.get_x() < -1e-9 and bar.get_x() + bar.get_width() > 1e-9]
-
-
-def test_convergence_shows_the_median_between_the_extremes(case: Case) -> None:
-    low, high, middle = (line.get_ydata() for line in hypervolume_growth(case).axes[0].lines[:3])
-    assert (np.asarray(low) <= middle).all()
-    assert (np.asarray(middle) <= high).all()
 
 
 def test_what_cannot_be_drawn_says_why(tmp_path: Path) -> None:
@@ -180,5 +150,5 @@ def test_what_cannot_be_drawn_says_why(tmp_path: Path) -> None:
 def test_names_are_no_formulas(tmp_path: Path) -> None:
     strange = made_up(row(values=(1100, 2, 0.1)), study=made_up_study())
     object.__setattr__(strange, "name", "a$b$c ^_/é")
-    written, _ = draw_all([strange], tmp_path, "png")
+    written, _ = draw_all([strange], tmp_path, "svg")
     assert all(path.parent == tmp_path for path in written)

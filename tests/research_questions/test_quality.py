@@ -27,11 +27,6 @@ from tests.research_questions.made_up import made_up, row
 FRONT = np.array([[0.0, 1, 2], [1, 0, 1], [2, 2, 0]])
 
 
-def test_a_front_is_at_no_distance_from_itself() -> None:
-    assert igd(FRONT, FRONT) == 0
-    assert igd_plus(FRONT, FRONT) == 0
-
-
 def test_igd_is_the_mean_distance_to_the_nearest_point() -> None:
     rng = np.random.default_rng(5)
     front, reference = rng.normal(size=(7, 3)), rng.normal(size=(11, 3))
@@ -92,11 +87,6 @@ def test_indicators_are_those_of_each_runs_own_front() -> None:
     assert found.loc[("rs", 0), "hypervolume"] == pytest.approx(1.1 * 0.1 * 1.1)
 
 
-def test_a_finished_run_without_solutions_has_no_indicators() -> None:
-    case = made_up(row(), finished=[("nsga2", 0), ("nsga2", 1)])
-    assert indicators(case)["run"].tolist() == [0]
-
-
 def test_imported_solutions_have_no_indicators() -> None:
     with pytest.raises(Unanswerable, match="imported"):
         indicators(made_up(row(), has_runs=False))
@@ -121,11 +111,3 @@ def test_convergence_grows_to_the_hypervolume_of_all() -> None:
         assert group["hypervolume"].iloc[-1] == pytest.approx(moocore.hypervolume(normal, ref=[1.1] * 3))
     early = grown[grown["run"] == 0]
     assert early.loc[early["evaluations"] >= 40, "hypervolume"].nunique() == 1, "a run that ended early keeps what it had"
-
-
-def test_nothing_is_counted_before_it_is_evaluated() -> None:
-    evaluations = [{**row(sd=1, f_diff=0.5), "evaluation": 0}, {**row(sd=0.5, f_diff=0.2), "evaluation": 50}]
-    grown = convergence(made_up(row(sd=0.5, f_diff=0.2), row(sd=0.4, f_diff=0.9), evaluations=evaluations)).set_index("evaluations")
-    before, after = grown[grown.index <= 50]["hypervolume"], grown[grown.index > 50]["hypervolume"]
-    assert before.nunique() == 1
-    assert (after > before.max()).all()

@@ -7,6 +7,7 @@ import math
 from typing import Any
 
 import msgspec
+import numpy as np
 import pandas as pd
 import pytest
 import scipy
@@ -25,7 +26,8 @@ from safevar_sumo.analysis.research_questions.changes import (
     weather,
     weather_pairs,
 )
-from safevar_sumo.analysis.research_questions.comparisons import ALPHA, rq1, rq2
+from safevar_sumo.analysis.research_questions.comparisons import ALPHA, ASYMPTOTIC, EXACT, compare, rq1, rq2
+from safevar_sumo.analysis.research_questions.indicators import indicators
 from safevar_sumo.analysis.research_questions.over_runs import brief, difference_line, holm, rq1_runs, rq2_runs
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable
@@ -71,12 +73,6 @@ def test_a_tet_that_stands_at_a_collision_is_not_counted() -> None:
     assert only(rq1(case), algorithm="nsga2", metric="tet")["mean"] == 1.4
     assert only(rq2(case), metric="tet")["effect_size"] == 1
     assert only(rq33_safety(case), quantity="TIT", j="any")["value"] == pytest.approx(0.2)
-
-
-def test_rq1_of_collisions_alone_has_no_tet() -> None:
-    frame = rq1(made_up(row(sd=-1), row(sd=-2)))
-    assert only(frame, metric="tet")["p_value"] is None
-    assert only(frame, metric="tet")["n1"] == 0
 
 
 def test_rq1_says_which_values_are_undefined() -> None:
@@ -137,11 +133,6 @@ def test_rq31_counts_runs_without_any() -> None:
     assert counts == {(0, "1"): 2, (0, "2"): 1, (0, "3"): 0, (1, "1"): 0, (1, "2"): 0, (1, "3"): 0}
 
 
-def test_rq31_needs_runs() -> None:
-    with pytest.raises(InputError, match="imported"):
-        answer([made_up(row(), has_runs=False)], "rq3.1")
-
-
 def test_rq32_shares_and_ranks() -> None:
     frame = rq32(made_up(row(values=HEAVY), row(values=GRIPLESS), row(values=BOTH), row(values=HEAVY)))
     assert only(frame, characteristic="mass", j="1")["percent"] == pytest.approx(200 / 3)
@@ -150,11 +141,6 @@ def test_rq32_shares_and_ranks() -> None:
     assert only(frame, characteristic="lag", j="any")["percent"] == 0
     assert only(frame, characteristic="mass", j="3")["percent"] is None
     assert frame[frame["j"] == "any"]["rank"].tolist() == [1, 2, 3]
-
-
-def test_ties_share_the_better_rank_and_the_next_is_skipped() -> None:
-    frame = rq32(made_up(row(values=BOTH), row(values=BOTH), row(values=(1000, 2, 0.2))))
-    assert frame[frame["j"] == "any"]["rank"].tolist() == [1, 1, 3]
 
 
 def test_rq3_without_critical_solutions_is_empty_not_zero() -> None:
@@ -211,12 +197,6 @@ def test_combinations_of_exactly_four() -> None:
     assert found["characteristics"].tolist() == [list("abcd"), list("abcf"), list("bcde")]
     assert found["percent"].tolist() == [40, 20, 20]
     assert found["rank"].tolist() == [1, 2, 2]
-
-
-def test_without_four_changed_there_is_no_combination() -> None:
-    told = answer([made_up(row(values=BOTH))], "combinations")[0]
-    assert told.frame.empty
-    assert any("no critical solution has exactly four" in note for note in told.notes)
 
 
 def test_weather_compares_settings_that_differ_in_it_alone() -> None:
@@ -294,3 +274,61 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
     assert original["p_value"] == 2 * 2 / 2**8, "signed ranks of which all but the smallest are negative: the second of 2^8 orders"
     assert original["effect_size"] == 1 / 8
     assert original["p_holm"] >= original["p_value"] * 2
+
+
+HEAVIER = (1200.0, 2.0, 0.1)
+
+
+def test_no_share_of_an_original_that_is_zero() -> None:
+    told = rq33_safety(made_up(row(values=HEAVIER, tet=1.5, tit=0.5), original={**ORIGINAL, "tet": 0.0, "tit": 0.25}))
+    quantities = {one["quantity"]: one for one in told[told["j"] == "any"].to_dict("records")}
+    assert quantities["TET"]["value"] == 1.5
+    assert quantities["TET"]["percent"] is None
+    assert quantities["TIT"]["percent"] == 100
+
+
+def test_the_footer_of_collisions_alone_has_their_speed_and_deceleration_only() -> None:
+    told = rq33_safety(made_up(row(values=HEAVIER, sd=-2.0, ave_dece=4.0), row(values=HEAVIER, sd=-4.0, ave_dece=5.0)))
+    overall = {one["quantity"]: (one["value"], one["n"]) for one in told[told["j"] == "any"].to_dict("records")}
+    assert overall == {"avgSD_mD": (None, 0), "avgSD_cS": (3.0, 2), "TET": (None, 0), "TIT": (None, 0), "aveDece": (1.5, 2)}
+
+
+def test_what_a_table_tells_of_exposure_in_collisions_does_not_count() -> None:
+    """Published rows have a TET and a TIT for collisions too."""
+    crash = {**row(values=HEAVIER, sd=-2.0), "tet": 9.0, "tit": 9.0}
+    told = rq33_safety(made_up(row(values=HEAVIER, tet=1.5, tit=0.75), crash))
+    overall = {one["quantity"]: (one["value"], one["n"]) for one in told[told["j"] == "any"].to_dict("records")}
+    assert (overall["TET"], overall["TIT"]) == ((0.5, 1), (0.25, 1))
+
+
+@pytest.mark.parametrize(("clear", "wet"), [("clear", "wet"), ("wet", "fog"), ("clear", "night")])
+def test_the_clearer_weather_comes_first(clear: str, wet: str) -> None:
+    friction_first = [made_up(row(values=HEAVIER), study=made_up_study(name=name, weather=name)) for name in (wet, clear)]
+    pair, = weather_pairs(friction_first)
+    expected = sorted((clear, wet), key=lambda name: {"clear": (1, 1), "fog": (0.9, 0.6), "wet": (0.71, 1), "night": (1, 0.75)}[name])
+    assert [one.name for one in pair] == expected[::-1]
+
+
+def test_weather_without_critical_solutions_on_one_side_has_no_difference() -> None:
+    clear, wet = (made_up(row(values=HEAVIER, sd=sd), study=made_up_study(name=name, weather=name))
+                  for name, sd in (("clear", 9), ("wet", 1)))
+    told = weather(clear, wet).set_index("characteristic").loc["mass"]
+    assert told["percent"] is None
+    assert told["percent_other"] == 100
+    assert told["difference"] is None
+
+
+def test_ties_in_small_samples_forbid_the_exact_p() -> None:
+    assert compare([1.0, 1.0, 2.0], [3.0, 4.0, 5.0]).method == ASYMPTOTIC
+    assert compare([1.0, 2.0, 3.0], [3.0, 4.0, 5.0]).method == ASYMPTOTIC
+    assert compare([0.0, 1.0, 2.0], [3.0, 4.0, 5.0]).method == EXACT
+    assert compare(np.arange(8.0), np.arange(100.0, 120)).method == EXACT
+    assert compare(np.arange(9.0), np.arange(100.0, 120)).method == ASYMPTOTIC
+
+
+def test_an_objective_that_is_the_same_everywhere_leaves_the_indicators_finite() -> None:
+    told = indicators(made_up(row(f_diff=0.5, sd=1.0), row(run=1, f_diff=0.5, sd=2.0), row("rs", f_diff=0.5, sd=1.5)))
+    assert np.isfinite(told[["igd", "igd_plus", "hypervolume"]].to_numpy(dtype=float)).all()
+    best = told[(told["algorithm"] == "nsga2") & (told["run"] == 0)].iloc[0]
+    assert best["igd"] == 0
+    assert best["hypervolume"] == pytest.approx(1.1**3)

@@ -16,9 +16,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.records import Evaluations, Outcome
+from safevar_sumo.records import Evaluations
 from safevar_sumo.results import Journal, JournalBusy
-from safevar_sumo.results.frames import HEAD, MAGIC, OUTCOMES, SPARE, Content, Result, batch_of
+from safevar_sumo.results.frames import HEAD, MAGIC, SPARE, Content, Result, batch_of
 from safevar_sumo.results.journal import owner_of, read_journal
 
 BATCHES = 4
@@ -172,23 +172,6 @@ def test_a_run_has_one_owner_and_a_dead_ones_lock_is_gone(tmp_path: Path) -> Non
     Journal(path, "study", "nsga2-00").close()
 
 
-def test_a_full_disk_after_a_torn_tail_leaves_what_was_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "a.journal"
-    end = write(path, batches=2, finished=False)[-1]
-    path.write_bytes(path.read_bytes() + b"torn" * 50)
-    journal = Journal(path, "study", "nsga2-00")
-    assert journal.cut > 0
-
-    def full(handle: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(SafevarError, match="No space left"):
-        journal.append(places(2), batch(2))
-    assert path.stat().st_size == end
-    journal.close()
-
-
 @pytest.mark.parametrize("written", [0, 7, 40])
 def test_a_full_disk_leaves_what_was_there_and_can_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int) -> None:
     path = tmp_path / "a.journal"
@@ -221,12 +204,6 @@ def test_a_full_disk_leaves_what_was_there_and_can_go_on(tmp_path: Path, monkeyp
     journal.close()
     content = read_journal(path, "study", "nsga2-00")
     assert holds_the_first(3, content)
-
-
-def test_outcomes_are_written_as_ever() -> None:
-    assert {str(outcome): code for outcome, code in OUTCOMES.items()} == {
-        "stopped": 0, "passed": 1, "collision": 2, "timeout": 3, "never-moved": 4, "simulator-error": 5, "invalid-test": 6}
-    assert set(OUTCOMES) == set(Outcome), "a new outcome needs a number of its own"
 
 
 def test_a_reason_is_kept_with_its_setting_and_costs_others_nothing(tmp_path: Path) -> None:
@@ -280,15 +257,6 @@ def test_what_is_no_journal_is_refused_and_left_alone(tmp_path: Path) -> None:
         Journal(path, "study", "nsga2-00")
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="POSIX alone has named pipes")
-def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "a.journal")
-    with pytest.raises(InputError, match="is no regular file"):
-        Journal(tmp_path / "a.journal", "study", "nsga2-00")
-    with pytest.raises(InputError, match="is no regular file"):
-        read_journal(tmp_path / "a.journal", "study", "nsga2-00")
-
-
 def test_a_disk_without_locks_is_not_told_as_another_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise portalocker.LockException(OSError(errno.ENOLCK, "No locks available"), "No locks available")
@@ -305,12 +273,3 @@ def test_a_new_journal_and_its_folder_are_known_to_the_disk(tmp_path: Path, monk
     monkeypatch.setattr("safevar_sumo.results.journal.sync_directory", synced.append)
     Journal(tmp_path / "new" / "runs" / "a.journal", "study", "nsga2-00").close()
     assert synced == [tmp_path / "new", tmp_path, tmp_path / "new" / "runs"]
-
-
-def test_a_journal_that_somebody_removed_is_told(tmp_path: Path) -> None:
-    path = tmp_path / "a.journal"
-    journal = Journal(path, "study", "nsga2-00")
-    path.unlink()
-    with pytest.raises(SafevarError, match="the file is gone"):
-        journal.append(places(0), batch(0))
-    journal.close()

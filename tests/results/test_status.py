@@ -7,13 +7,11 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import pytest
 from click.testing import CliRunner
 
 import safevar_sumo as sv
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
-from safevar_sumo.errors import InputError
 from safevar_sumo.results import status
 
 
@@ -70,8 +68,3 @@ def test_watching_ends_with_the_study_and_json_is_json(slippery: Path) -> None:
     told = json.loads(CliRunner().invoke(commands, ["status", str(slippery), "--json"]).output)
     assert told["finished"] is True
     assert np.isfinite(told["runs"][0]["best"])
-
-
-def test_what_is_no_study_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no results directory"):
-        status(tmp_path)

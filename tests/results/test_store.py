@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shutil
 import stat
 from pathlib import Path
 
@@ -15,9 +16,21 @@ import pytest
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import JournalBusy, ResultsDirectory, record, solutions_frame
+from safevar_sumo.results import (
+    JournalBusy,
+    ResultsDirectory,
+    SolutionId,
+    chosen_handle,
+    handles,
+    load,
+    position_of,
+    record,
+    solutions_frame,
+)
 from safevar_sumo.results.manifest import FORMAT, differences_now, owner
 from safevar_sumo.study import ModelTable, Study, load_study, tables_of
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.workers.identity import identity_of
 
 NAMES = ("a", "b")
 
@@ -91,12 +104,6 @@ def test_results_of_another_study_are_not_overwritten(tmp_path: Path, study: Stu
         ResultsDirectory(tmp_path, load_study("native"))
 
 
-def test_another_network_is_another_study(tmp_path: Path, study: Study) -> None:
-    written(tmp_path, study)
-    with pytest.raises(InputError, match=r"traffic\.rou\.xml was not there since"):
-        ResultsDirectory(tmp_path, study, {"network": {"traffic.rou.xml": "abc"}})
-
-
 def test_the_file_that_has_changed_is_named_and_the_two_ways_on(tmp_path: Path, study: Study) -> None:
     ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc", "my_map.py": "def"}}).begin(evaluations(2.5))
     with pytest.raises(InputError) as told:
@@ -136,11 +143,6 @@ def test_a_folder_that_holds_other_things_is_refused(tmp_path: Path, study: Stud
     with pytest.raises(InputError, match=r"holds other things: thesis\.tex"):
         ResultsDirectory(tmp_path, study)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["thesis.tex"]
-
-
-def test_a_first_try_that_failed_locks_nobody_out(tmp_path: Path, study: Study) -> None:
-    ResultsDirectory(tmp_path, study).journal("original").close()
-    ResultsDirectory(tmp_path, with_search(study, seed=2)).journal("original").close()
 
 
 def test_a_directory_belongs_to_who_comes_first(tmp_path: Path, study: Study) -> None:
@@ -184,14 +186,6 @@ def test_a_file_that_is_no_manifest_is_refused(tmp_path: Path, study: Study, tex
         ResultsDirectory(tmp_path, study)
 
 
-def test_a_place_that_cannot_be_written_is_refused(tmp_path: Path, study: Study) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot write"):
-        ResultsDirectory(tmp_path / "file", study)
-    with pytest.raises(InputError, match="cannot write"):
-        ResultsDirectory(Path("/proc/nowhere"), study)
-
-
 def test_a_failed_write_leaves_what_was_there(tmp_path: Path, study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
     directory = written(tmp_path, study)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -212,3 +206,83 @@ def test_what_is_simulated_now_hangs_on_files_and_the_number_of_results_not_on_k
     assert differences_now(stored, {**stored, "resolved": {"a": 1, "b": False}, "versions": {"numpy": "2"}}) == []
     assert differences_now(stored, {**stored, "resolved": {"a": 2}, "sources": {}, "results": 2}) == [
         "a is 1 there and 2 here", "x.py is not there any more since", "the number of the package's results is 1 there and 2 here"]
+
+
+FRAME = pd.DataFrame({
+    "algorithm": ["nsga2", "nsga2", "nsga2", "rs"], "run": [0, 0, 3, 0], "f_safe": [-3.0, -1.0, -2.0, 2.0], "f_diff": [0.3, 0.2, 0.1, 0.01],
+    "f_num_diff": [5, 2, 4, 1], "outcome": ["collision", "collision", "collision", "stopped"]})
+
+
+def test_rows_count_within_their_run() -> None:
+    assert list(map(str, handles(FRAME))) == ["nsga2:0:0", "nsga2:0:1", "nsga2:3:0", "rs:0:0"]
+    for place, handle in enumerate(handles(FRAME)):
+        assert position_of(FRAME, SolutionId.parse(str(handle))) == place
+
+
+def test_imported_solutions_count_as_run_0() -> None:
+    assert list(map(str, handles(FRAME.drop(columns="run")))) == ["nsga2:0:0", "nsga2:0:1", "nsga2:0:2", "rs:0:0"]
+
+
+@pytest.mark.parametrize("text", [
+    "", "nsga2", "nsga2:0", "nsga2:0:", ":0:0", "nsga2:-1:0", "nsga2:0:0:0", "nsga2:0:x", "nsga2:0:" + "9" * 30])
+def test_what_is_no_handle_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match="ALGORITHM:RUN:N"):
+        SolutionId.parse(text)
+
+
+@pytest.mark.parametrize(("handle", "legal"), [("nsga2:0:2", "0 to 1"), ("nsga2:1:0", "nsga2:0, nsga2:3, rs:0"), ("sf:0:0", "nsga2:0")])
+def test_a_solution_that_is_not_there_is_told_with_what_is(handle: str, legal: str) -> None:
+    with pytest.raises(InputError) as refused:
+        position_of(FRAME, SolutionId.parse(handle))
+    assert handle in str(refused.value)
+    assert legal in str(refused.value)
+
+
+def test_chosen_by_what_they_are_among_the_unsafe() -> None:
+    assert str(chosen_handle(FRAME, 2.7, "most_severe", "x")) == "nsga2:0:0"
+    assert str(chosen_handle(FRAME, 2.7, "fewest", "x")) == "nsga2:0:1"
+    assert str(chosen_handle(FRAME, 2.7, "smallest", "x")) == "nsga2:3:0"
+
+
+def test_without_a_collision_half_the_distance_is_unsafe() -> None:
+    safe = FRAME[FRAME["outcome"] == "stopped"]
+    assert str(chosen_handle(safe, 4.1, "smallest", "x")) == "rs:0:0"
+    with pytest.raises(InputError, match="no unsafe solution"):
+        chosen_handle(safe, 4.0, "smallest", "x")
+    assert str(chosen_handle(safe, 4.0, "most_severe", "x")) == "rs:0:0"
+
+
+STORED = Path(__file__).with_name("stored")
+
+
+@pytest.mark.parametrize("stored", ["format-1", "format-2", "format-3"])
+def test_stored_results_are_read_as_they_were_written(stored: str) -> None:
+    found = load(STORED / stored)
+    assert found.finished == (("nsga2", 0), ("rs", 0))
+    assert len(found.evaluations) == 20
+    assert found.solutions.to_csv(index=False, lineterminator="\n").encode() == (STORED / stored / "solutions.csv").read_bytes()
+    keys = ["algorithm", "run", *list(found.solutions.columns[2:14])]
+    assert len(found.solutions.merge(found.evaluations, on=keys)) == len(found.solutions), "what is solved was evaluated"
+    if stored == "format-2":
+        pd.testing.assert_frame_equal(found.evaluations, load(STORED / "format-1").evaluations)
+
+
+def test_the_format_that_is_written_now_is_stored_here() -> None:
+    assert (STORED / f"format-{FORMAT}").is_dir()
+
+
+@pytest.mark.parametrize(("stored", "told"), [("format-1", r"version 0\.[12]\.0 wrote them"), ("format-2", r"version 0\.2\.0 wrote them"),
+                                              ("format-3", "holds results of another study")])
+def test_stored_results_are_not_gone_on_with_by_other_code(stored: str, told: str, tmp_path: Path) -> None:
+    shutil.copytree(STORED / stored, tmp_path / "out")
+    study = load_study("smoke", search={"algorithms": ["nsga2", "rs"], "evaluations": 10})
+    with pytest.raises(InputError, match=told):
+        ResultsDirectory(tmp_path / "out", study, identity_of(study, assemble(study)) | {"results": 0})
+
+
+def test_a_format_of_the_future_is_refused(tmp_path: Path) -> None:
+    shutil.copytree(STORED / f"format-{FORMAT}", tmp_path / "out")
+    manifest = tmp_path / "out" / "manifest.json"
+    manifest.write_text(manifest.read_text().replace(f'"format": {FORMAT}', f'"format": {FORMAT + 1}'))
+    with pytest.raises(InputError, match="is not a manifest of this version of the program"):
+        load(tmp_path / "out")

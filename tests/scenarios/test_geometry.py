@@ -89,14 +89,6 @@ def test_the_pedestrian_turns_in_the_last_step_that_keeps_him_within_the_distanc
     assert turns == [7], "0.63 m; 0.72 m would be beyond"
 
 
-def test_who_walks_on_never_turns() -> None:
-    scenario, world = PedestrianCrossing(turns_after=None), MadeUp(0.0, 0.69)
-    memory = scenario.begin(world)
-    world.place = 0.9
-    scenario.observe(world, STEP, memory)
-    assert world.turned_at is None
-
-
 def trace(gap: np.ndarray, speed: np.ndarray, lateral: np.ndarray, lateral_speed: np.ndarray) -> Trace:
     columns = {name: values[:, np.newaxis] for name, values in
                {"gap": gap, "speed": speed, "lateral": lateral, "lateral_speed": lateral_speed}.items()}

@@ -10,11 +10,6 @@ from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.search.problems import SUN, evaluated, searched, sphere
 
 
-def flat(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
-    """As safe as the original everywhere: nothing ever improves on the best scores but by changing less."""
-    return evaluated(characteristics, settings, np.ones(len(settings)))
-
-
 def test_a_generation_is_fifty_and_changes_between_one_and_all() -> None:
     _, asked = searched("safe_fuzzer", 1, 500)
     assert [len(settings) for settings in asked] == [50] * 10
@@ -30,20 +25,6 @@ def test_values_are_uniform_outside_the_filters_band() -> None:
     assert np.all(np.abs(drawn - 2404) >= 13.2)
     below = (2404 - 13.2 - 2040) / (2700 - 2040 - 26.4)
     assert np.mean(drawn < 2404) == pytest.approx(below, abs=0.1)
-
-
-def test_ranges_narrow_to_the_mean_of_what_was_less_safe() -> None:
-    """Below the original is less safe: the lower end becomes the mean of those values, the upper end stays where it is."""
-    _, asked = searched("safe_fuzzer", 3, 550)
-    window = np.concatenate(asked[:10])
-    unsafe = window[sphere(SUN, window).f_safe < sphere(SUN, SUN.original[np.newaxis]).f_safe[0]]
-    for i, original in enumerate(SUN.original):
-        low, high = unsafe[unsafe[:, i] < original, i].mean(), unsafe[unsafe[:, i] > original, i].mean()
-        drawn = asked[10][:, i]
-        assert drawn.min() >= min(low, original)
-        assert drawn.max() <= max(high, original)
-    most = int(np.floor(SUN.number_changed(unsafe).mean() + 0.5))
-    assert SUN.number_changed(asked[10]).max() <= most
 
 
 def test_it_ends_after_five_generations_without_improvement() -> None:
@@ -82,8 +63,3 @@ def test_the_result_is_the_fifty_best_scores() -> None:
     safety = everything.f_safe
     scores = (6 * (safety - safety.min()) / np.ptp(safety) + everything.f_diff + (everything.f_num_diff - 1) / 11) / 8
     assert np.array_equal(found.settings, everything.settings[np.argsort(scores, kind="stable")[:50]])
-
-
-def test_equal_safety_everywhere_leaves_the_other_terms() -> None:
-    found, _ = searched("safe_fuzzer", 8, 600, evaluate=flat)
-    assert found.f_num_diff.max() <= 3

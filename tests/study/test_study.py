@@ -142,15 +142,3 @@ def test_a_study_may_extend_a_file_beside_it(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text('extends = "base.toml"\nname = "mine"\n[search]\nruns = 3\n')
     study = load_study(str(tmp_path / "mine.toml"))
     assert (study.name, study.search.runs, study.search.population) == ("mine", 3, 50)
-
-
-def test_a_study_that_extends_itself_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.toml").write_text('extends = "b.toml"\n')
-    (tmp_path / "b.toml").write_text('extends = "a.toml"\n')
-    with pytest.raises(InputError, match="leads back"):
-        load_study(str(tmp_path / "a.toml"))
-
-
-def test_an_unknown_study_is_told_which_there_are() -> None:
-    with pytest.raises(InputError, match="sun"):
-        load_study("sum")

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from safevar_sumo.ads import ADS
 from safevar_sumo.records import Command, Nominal, Observation, Outcome, SimulationRuns
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
@@ -63,19 +62,3 @@ def _held_against_geometry(study: str, run: SimulationRuns) -> None:
     touches = (trace.active & (trace.gap <= 0.02) & beside).any(axis=0)
     assert np.all(collided[overlaps])
     assert np.all(touches[collided])
-
-
-@pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
-def test_collision_speed_is_the_speed_at_contact(study: str) -> None:
-    _, run = driven(study, 60)
-    for vehicle in np.flatnonzero(run.outcome == Outcome.COLLISION):
-        last = np.flatnonzero(run.trace.active[:, vehicle])[-1]
-        # In the step in which the pedestrian turns round, SUMO notices one step late, and tells the speed at contact.
-        assert min(abs(run.collision_speed[vehicle] - run.trace.speed[last - 1:last + 1, vehicle])) < 1e-9
-
-
-def test_the_names_of_all_ads_stay_out_of_the_settings() -> None:
-    """No ADS is handed the setting: its interface has no way to it."""
-    for cls in ADS.values():
-        arguments = {name for method in (cls.start, cls.drive) for name in method.__code__.co_varnames[:method.__code__.co_argcount]}
-        assert arguments == {"self", "n", "nominal", "step", "seen", "memory"}

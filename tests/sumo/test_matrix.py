@@ -98,11 +98,3 @@ def test_who_names_no_point_is_told_the_nearest_ones_and_how_many_there_are() ->
 def test_what_is_wrong_in_a_matrix_is_told(tests: list[MatrixTest], told: str) -> None:
     with pytest.raises(InputError, match=told):
         assemble(study(tests))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["euro_ncap_pedestrian", "euro_ncap_car_to_car"])
-def test_the_original_vehicle_avoids_at_every_point_of_the_shipped_matrices(name: str) -> None:
-    system = assemble(load_study(name))
-    found = at_every_point(system, system.characteristics.original[np.newaxis])
-    assert [one.point.name for one in found if one.evaluations.collided[0]] == []

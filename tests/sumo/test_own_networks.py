@@ -89,13 +89,6 @@ def test_traffic_lights_are_copied_with_their_programmes(mine: Path) -> None:
     assert repeatable_traffic(str(mine)) is None, "a world with traffic lights is loaded afresh"
 
 
-def test_options_of_the_recipe_count(mine: Path) -> None:
-    first = copied_network(str(mine), 1).network
-    rewritten(mine / "network.netccfg", "</configuration>", '<junctions><junctions.corner-detail value="3"/></junctions></configuration>')
-    assert ElementTree.parse(copied_network(str(mine), 1).network).getroot().attrib["junctionCornerDetail"] == "3"
-    assert copied_network(str(mine), 1).network != first
-
-
 @pytest.mark.parametrize(("line", "told"), [
     ('<plain-output-prefix value="/tmp/x"/>', "sets netconvert's option 'plain-output-prefix'"), ('<log value="x"/>', "option 'log'"),
     ('<junctions.join-output value="x"/>', "option 'junctions.join-output'"), ('<save-configuration value="x"/>', "save-configuration"),
@@ -107,14 +100,6 @@ def test_a_recipe_that_writes_or_reads_elsewhere_is_refused(mine: Path, line: st
     with pytest.raises(InputError, match=r"network\.netccfg: ") as caught:
         check_network(str(mine))
     assert told in str(caught.value)
-
-
-def test_sources_may_be_called_as_their_recipe_says(mine: Path) -> None:
-    (mine / "network.nod.xml").rename(mine / "my.nod.xml")
-    with pytest.raises(InputError, match=r"node-files: network\.nod\.xml is missing"):
-        check_network(str(mine))
-    rewritten(mine / "network.netccfg", "network.nod.xml", "my.nod.xml")
-    check_network(str(mine))
 
 
 def test_a_built_network_alone_is_simulated_as_its_sources_are(mine: Path) -> None:

@@ -63,10 +63,6 @@ def test_who_hesitates_brakes_later_and_lets_go_at_once() -> None:
     assert pressed(0.12, wanted) == pytest.approx([0.0, 0.0, 0.0, 0.0, 0.6, 1.0, 1.0, 0.2, 0.0, 0.0])
 
 
-def test_who_brakes_from_the_start_goes_on() -> None:
-    assert pressed(0.2, [0.3, 0.3, 0.5]) == [0.3, 0.3, 0.3]
-
-
 class Careful:
     """An ADS from outside that writes its commands into the same arrays again and again."""
 
@@ -113,15 +109,3 @@ def test_an_ads_from_outside_may_have_reactions_of_its_own_too(of_its_own: bool)
     own = type("Own", (Careful,), {"own_reactions": of_its_own})
     trace = simulate(replace(rain, ads=GuardedAds(own(), guard)), rain.characteristics.original[np.newaxis]).trace
     assert (int(np.argmax(trace.brake[:, 0] > 0)) == int(np.argmax(trace.gap[:, 0] < 6))) == of_its_own
-
-
-def test_in_a_drive_the_accelerator_is_let_go_of_as_without_hesitation() -> None:
-    system = assemble(load_study("sun"))
-    hesitant = replace(system, weather=Weather(name="any", road_friction=1.0, visibility=1.0, hesitation=0.15))
-    original = system.characteristics.original[np.newaxis]
-    sure, unsure = (simulate(one, original).trace for one in (system, hesitant))
-    begins = int(np.argmax(sure.brake[:, 0] > 0))
-    assert int(np.argmax(unsure.brake[:, 0] > 0)) == begins + 3
-    assert np.array_equal(unsure.throttle[:begins + 3], sure.throttle[:begins + 3])
-    assert not unsure.throttle[begins:begins + 3].any()
-    assert unsure.gap.min() < sure.gap.min()

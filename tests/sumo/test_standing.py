@@ -19,7 +19,6 @@ from safevar_sumo.records import Command, Nominal, Observation, SimulationRuns
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study, study_names
-from safevar_sumo.sumo import reusable as standing
 from safevar_sumo.sumo.batch import drive
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.matrix import simulate
@@ -116,16 +115,6 @@ def test_whatever_was_driven_before_leaves_no_trace(batches: list[tuple[str, int
         assert bits(here) == bits(fresh(system, population))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(SYSTEMS))
-def test_many_batches_later_nothing_has_crept_in(name: str) -> None:
-    system, rng = SYSTEMS[name], np.random.default_rng(3)
-    asked = [drawn(system, int(n), i) for i, n in enumerate(rng.integers(1, 30, 150))]
-    here = [simulate(system, population) for population in asked]
-    for i in (0, 1, 70, 148, 149):
-        assert bits(here[i]) == bits(fresh(system, asked[i]))
-
-
 def test_the_network_is_loaded_once_for_batches_that_fit(loadings: list[str]) -> None:
     system = SYSTEMS["rain"]
     with pytest.raises(SimulationError):
@@ -136,16 +125,6 @@ def test_the_network_is_loaded_once_for_batches_that_fit(loadings: list[str]) ->
     assert len(loadings) == 1
     simulate(system, drawn(system, 11, 1))
     assert len(loadings) == 2
-
-
-def test_it_is_loaded_anew_every_so_many_batches(loadings: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(standing, "BATCHES_PER_LOADING", 3)
-    system = SYSTEMS["native"]
-    simulate(SYSTEMS["rain"], drawn(SYSTEMS["rain"], 1, 1))
-    loadings.clear()
-    for _ in range(7):
-        simulate(system, drawn(system, 1, 1))
-    assert len(loadings) == 3
 
 
 def test_after_a_failure_it_starts_afresh(loadings: list[str]) -> None:
@@ -179,16 +158,6 @@ def test_actors_that_arrived_or_were_teleported_come_back(tmp_path: Path, loadin
     here = [simulate(system, population) for population in asked]
     assert len(loadings) == 1
     for one, population in zip(here, asked, strict=True):
-        assert bits(one) == bits(fresh(system, population))
-
-
-def test_a_vehicle_that_starts_in_motion_does_so_again(tmp_path: Path) -> None:
-    start = 'departPos="28.196" departSpeed="0"'
-    network = changed_network(tmp_path, "pedestrian_crossing", traffic=(start, 'departPos="8" departSpeed="7.5"'))
-    system = on_network("sun", network)
-    asked = [drawn(system, n, n) for n in (3, 5)]
-    for one, population in zip([simulate(system, population) for population in asked], asked, strict=True):
-        assert one.trace.speed[0, 0] == 7.5
         assert bits(one) == bits(fresh(system, population))
 
 

@@ -293,16 +293,6 @@ def test_a_wish_is_what_the_plant_makes_of_it(tmp_path: Path, monkeypatch: pytes
     assert run.outcome[0] == Outcome.STOPPED
 
 
-@pytest.mark.parametrize(("name", "told"), [("jumps", "moveTo"), ("nothing", "has no 'nothing'")])
-def test_what_it_may_not_do_is_told(name: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def drive() -> None:
-        found = system(name, tmp_path, monkeypatch)
-        simulate(found, found.characteristics.original[np.newaxis])
-
-    with pytest.raises(InputError, match=told):
-        drive()
-
-
 @pytest.mark.parametrize(("table", "told"), [
     ({"model": "my_controller:Hrash", "kind": "traci"}, r"has no 'Hrash'\nlegal: package.module:Name$"),
     ({"model": "my_controller:Harsh", "kind": "traci", "parameters": {"margin": 2}}, r"^mine: ads.model = .* does not take ads.parameters"),

@@ -25,18 +25,6 @@ def tyre_force(vehicle: Carla, friction: float, load: float, speed: float, rim: 
     return float(np.sign(slip) * friction * load * (k - k * k / 3 + k**3 / 27))
 
 
-@pytest.mark.parametrize("tire_friction", [1.0, 2.0, 3.5])
-def test_tyres_follow_physxs_curve(tire_friction: float) -> None:
-    vehicle, settings = carla(), original("carla", 50)
-    settings[:, 8] = tire_friction
-    rng = np.random.default_rng(3)
-    speed, rim = rng.uniform(0, 10, 50), rng.uniform(0, 10, 50)
-    values = dict(zip(SYSTEMS["carla"].characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    forces = vehicle._tyre_force(vehicle.prepare(values, 0.9, STEP), speed, rim)
-    friction = tire_friction * vehicle.tyre_friction * 0.9
-    assert forces == pytest.approx([tyre_force(vehicle, friction, 2404 * GRAVITY, v, w) for v, w in zip(speed, rim, strict=True)])
-
-
 def test_driving_and_braking_follow_the_differential_equations() -> None:
     """Stated bound: 0.1 m/s against an adaptive integrator with a tolerance of 1e-8, from the first gear on until 0.5 m/s."""
     vehicle, pedals = carla(), braking_after(1.4)
@@ -106,21 +94,3 @@ def test_carla_shifts_up_above_its_engine_speed_and_not_before_its_latency() -> 
         gears[up] = [int(state.gear[0]) for state in states]
     assert gears[0.3] == [0] * 11 + [1] * 10 + [0] * 10 + [2] * 2
     assert gears[0.6][:23] == [0] * 11 + [1] * 12
-
-
-def test_carlas_braked_deceleration_is_torque_over_radius_and_mass_where_tyres_hold() -> None:
-    """Neutral of the textbook: F = T / r as long as the slip is small; engine braking comes on top."""
-    run = drive("carla", original("carla"), braking_after(1.4), 3.0)
-    speed = run.speed[:, 0]
-    middle = (speed[1:] < 4) & (speed[1:] > 1) & (np.arange(1, len(speed)) > run.at(1.8))
-    deceleration = -np.diff(speed)[middle] / STEP
-    floor = 4 * 1500 / 0.355 / 2404
-    assert np.all(deceleration > 0.9 * floor)
-    assert np.all(deceleration < 1.8 * floor)
-
-
-def test_pedals_follow_at_their_rates() -> None:
-    vehicle = SYSTEMS["carla"].vehicle
-    run = drive("carla", original("carla"), full_throttle, 0.3)
-    throttle = [float(state.throttle[0]) for state in run.states]
-    assert throttle[:4] == pytest.approx([min(1.0, vehicle.throttle_rise * k * STEP) for k in range(4)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from pathlib import Path
 
@@ -14,8 +15,8 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import at_start, slope_of
-from tests.vehicles.drives import STEP, SYSTEMS, drawn, original
+from safevar_sumo.vehicles import LEVEL, at_start, slope_of
+from tests.vehicles.drives import STEP, SYSTEMS, drawn, drive, original
 
 SPEEDS = (10, 20, 30, 40, 50, 60)  # km/h, where the original vehicles' gearboxes hold their gear
 
@@ -100,3 +101,69 @@ def test_the_depart_speed_of_the_traffic_is_honoured(study: str, tmp_path: Path)
     assert trace.speed[0, 0] == 5
     assert abs(trace.speed[1, 0] - 5) < 0.3, "no jump in the first step, whatever the system commands"
     assert trace.position[1, 0] - trace.position[0, 0] == pytest.approx((trace.speed[0, 0] + trace.speed[1, 0]) / 2 * trace.step)
+
+
+G = 9.81
+ANGLE = math.atan(0.08)
+
+
+def test_a_grade_is_the_tangent_of_the_slopes_angle_and_none_is_level_to_the_bit() -> None:
+    slope = slope_of(np.array([8.0, -8.0, 0.0]))
+    assert slope.back == pytest.approx([G * math.sin(ANGLE), -G * math.sin(ANGLE), 0.0])
+    assert slope.down == pytest.approx([G * math.cos(ANGLE), G * math.cos(ANGLE), G])
+    assert (slope.back[2], slope.down[2]) == LEVEL
+
+
+@pytest.mark.parametrize("model", ["sumo", "worn"])
+@pytest.mark.parametrize(("grade", "gained"), [(8.0, -G * math.sin(ANGLE)), (-8.0, G * math.sin(ANGLE))])
+def test_who_coasts_loses_or_gains_g_sin(model: str, grade: float, gained: float) -> None:
+    run = drive(model, original(model), lambda time: (0.0, 0.0), 4.0, rolling=12.0, grade=grade)
+    assert run.speed[-1, 0] - 12.0 == pytest.approx(4.0 * gained)
+
+
+@pytest.mark.parametrize(("model", "wheels"), [("carla", 4 * 0.5 * 20.0), ("lgsvl", 4 * 0.5 * 30.0)])
+def test_wheels_have_inertia_and_no_weight_of_their_own_to_pull_them(model: str, wheels: float) -> None:
+    """Out of gear, against the level road: m g sin / (m + I / r^2)."""
+    speeds = [drive(model, original(model), lambda time: (0.0, 0.0), 1.0, rolling=12.0, grade=grade).speed[-1, 0] for grade in (0.0, 8.0)]
+    characteristics = SYSTEMS[model].characteristics
+    mass = characteristics.original[characteristics.names.index("mass")]
+    assert speeds[0] - speeds[1] == pytest.approx(G * math.sin(ANGLE) * mass / (mass + wheels), rel=0.02)
+
+
+@pytest.mark.parametrize("model", sorted(SYSTEMS))
+@pytest.mark.parametrize("grade", [8.0, -8.0])
+def test_the_way_to_stop_is_v2_over_twice_what_the_tyres_hold_and_the_slope_adds(model: str, grade: float) -> None:
+    """On ice, where tyres are the limit and hold mu g cos; between 10 and 4 m/s, when the brake has built up."""
+    def way(grade: float) -> float:
+        run = drive(model, original(model), lambda time: (0.0, 1.0), 25.0, rolling=12.0, road=0.25, grade=grade)
+        return float(np.interp(-4.0, -run.speed[:, 0], run.distance[:, 0]) - np.interp(-10.0, -run.speed[:, 0], run.distance[:, 0]))
+
+    level = (10**2 - 4**2) / (2 * way(0.0))
+    expected = level * math.cos(ANGLE) + math.copysign(G * math.sin(ANGLE), grade)
+    assert (10**2 - 4**2) / (2 * way(grade)) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("model", sorted(SYSTEMS))
+@pytest.mark.parametrize("grade", [12.0, -12.0])
+def test_whoever_stands_with_the_brake_on_stays_and_nobody_rolls_back(model: str, grade: float) -> None:
+    braked = drive(model, original(model), lambda time: (0.0, 1.0), 20.0, rolling=5.0, grade=grade)
+    assert np.all(braked.speed[-100:] == 0)
+    released = drive(model, original(model), lambda time: (0.0, 0.0), 3.0, grade=grade).speed[-1, 0]
+    assert released == 0 if grade > 0 else released > 1
+
+
+@pytest.mark.parametrize("model", sorted(SYSTEMS))
+def test_each_vehicle_is_on_a_slope_of_its_own(model: str) -> None:
+    system, n = SYSTEMS[model], 3
+    values = {name: np.full(n, value) for name, value in zip(system.characteristics.names, system.characteristics.original, strict=True)}
+    prepared = system.vehicle.prepare(values, 1.0, STEP, slope_of(np.array([0.0, 5.0, -5.0])))
+    state = system.vehicle.at_rest(prepared)
+    alone = [drive(model, original(model), lambda time: (0.4, 0.0), 2.0, grade=grade).speed[-1, 0] for grade in (0.0, 5.0, -5.0)]
+    for _ in range(round(2.0 / STEP)):
+        state = system.vehicle.advance(prepared, state, Command(np.full(n, 0.4), np.zeros(n)))
+    assert state.speed.tolist() == alone
+    level = system.vehicle.prepare({name: column[:1] for name, column in values.items()}, 1.0, STEP)
+    state = system.vehicle.at_rest(level)
+    for _ in range(round(2.0 / STEP)):
+        state = system.vehicle.advance(level, state, Command(np.full(1, 0.4), np.zeros(1)))
+    assert state.speed[0] == alone[0]

@@ -7,7 +7,7 @@ import pytest
 
 from safevar_sumo.records import Command, Observation
 from safevar_sumo.vehicles.lgsvl import _roll, _tyre_stiffness
-from tests.vehicles.drives import STEP, SYSTEMS, braking_after, drive, full_throttle, original
+from tests.vehicles.drives import STEP, SYSTEMS, drive, full_throttle, original
 
 GRAVITY = 9.81
 
@@ -112,28 +112,6 @@ def test_lgsvls_gearbox_and_traction_control_have_their_numbers() -> None:
     assert np.diff(changes).min() >= 0.7 - STEP / 2
     torque = [float(state.traction_torque[0]) for state in states[:4]]
     assert torque == pytest.approx([0.325 * 450 + 337.5 * STEP * k for k in range(4)])
-
-
-def test_sumos_vehicle_accelerates_with_its_load_and_within_its_grip() -> None:
-    vehicle = SYSTEMS["sumo"].vehicle
-    loaded = vehicle.sumo_type(prepared("sumo", mass=2000.0))
-    assert loaded.accel[0] == pytest.approx(2.6 * 1500 / 2000)
-    assert loaded.decel[0] == pytest.approx(9.0 * 1500 / 2000)
-    assert vehicle.sumo_type(prepared("sumo")).decel[0] == pytest.approx(min(9.0, 0.9 * GRAVITY))
-
-
-def test_a_released_brake_lets_carlas_vehicle_roll_on() -> None:
-    """Braked for 0.2 s, then nothing: it keeps rolling, and rolls farther than one that goes on braking."""
-    def dabbing(time: float) -> tuple[float, float]:
-        return (1.0, 0.0) if time < 1.4 else (0.0, 1.0 if time < 1.6 else 0.0)
-
-    dabbed, held = drive("carla", original("carla"), dabbing, 2.6), drive("carla", original("carla"), braking_after(1.4), 2.6)
-    assert dabbed.speed[-1, 0] > 1.0
-    assert dabbed.speed[-1, 0] > held.speed[-1, 0] + 0.5
-
-
-def test_carlas_wheels_are_four_discs_of_twenty_kilograms() -> None:
-    assert prepared("carla").wheel_inertia[0] == pytest.approx(4 * 0.5 * 20 * 0.355**2)  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(("slip", "share"), [(0.2, 0.75), (0.4, 1.0), (0.6, 0.75), (0.8, 0.5), (0.95, 0.5)])

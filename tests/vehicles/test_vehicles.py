@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from safevar_sumo.records import Command, Observation
+from safevar_sumo.records import Observation
 from safevar_sumo.vehicles import VEHICLES
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, FINAL_RATIO, GEAR_RATIOS, Carla
 from safevar_sumo.vehicles.lgsvl import Lgsvl
@@ -228,14 +228,3 @@ def test_a_brake_command_waits_for_the_delay() -> None:
     run = drive("sumo", ends("sumo", "brakeDelay"), lambda time: (0.0, 1.0), 1.0)
     brake = np.stack([state.brake for state in run.states])
     assert np.allclose([np.argmax(brake[:, i] > 0.5) * STEP for i in range(5)], np.linspace(0.05, 0.5, 5) + STEP, atol=STEP)
-
-
-def test_commands_are_not_changed_in_place() -> None:
-    for model in MODELS:
-        population = original(model)
-        values = dict(zip(SYSTEMS[model].characteristics.names, np.ascontiguousarray(population.T), strict=True))
-        prepared = SYSTEMS[model].vehicle.prepare(values, 1.0, STEP)
-        state = SYSTEMS[model].vehicle.at_rest(prepared)
-        before = [np.copy(value) for value in state if isinstance(value, np.ndarray)]
-        SYSTEMS[model].vehicle.advance(prepared, state, Command(np.ones(1), np.zeros(1)))
-        assert all(np.array_equal(a, b) for a, b in zip(before, (v for v in state if isinstance(v, np.ndarray)), strict=True))

@@ -48,16 +48,6 @@ def test_what_a_characteristic_means_is_no_part_of_a_studys_identity() -> None:
     assert not {"meaning", "counterpart"} & set(identity_of(study, assemble(study))["resolved"]["vehicle"]["characteristics"]["mass"])
 
 
-def test_a_worker_with_another_network_computes_nothing() -> None:
-    study = load_study("native")
-    original = CharacteristicSet.of(study.vehicle.characteristics).original[None]
-    inputs = {"network": networks_of(assemble(study))}
-    evaluate_batch(packed(study, inputs), original)
-    inputs["network"]["a_file.xml"] = "0123456789abcdef"
-    with pytest.raises(InputError, match=r"a_file\.xml: is not the file that this study began with"):
-        evaluate_batch(packed(study, inputs), original)
-
-
 @pytest.mark.parametrize("file", ["scenario.sumocfg", "network.nod.xml", "network.netccfg"])
 def test_every_file_of_a_network_that_results_hang_on_counts(file: str, tmp_path: Path) -> None:
     shutil.copytree(NETWORKS / "lead_vehicle_stopped", tmp_path / "mine")

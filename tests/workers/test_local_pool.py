@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import Future
 from contextlib import suppress
 
 import numpy as np
@@ -15,9 +17,10 @@ import pytest
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, evaluate_batch, packed
-from safevar_sumo.workers.local import LocalPool, local_pool
+from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, packed
+from safevar_sumo.workers.local import LocalPool, first_of, interrupts_noted, local_pool, result_of
 
+pytestmark = pytest.mark.usefixtures("worker_processes")
 SMOKE = packed(load_study("smoke"))
 ORIGINAL = CharacteristicSet.of(load_study("smoke").vehicle.characteristics).original[np.newaxis]
 
@@ -30,11 +33,6 @@ def processes() -> list[psutil.Process]:
 def pool() -> Iterator[LocalPool]:
     with local_pool(1, 30.0) as pool:
         yield pool
-
-
-def test_a_worker_computes_what_this_process_would(pool: LocalPool) -> None:
-    found = pool.submit(SMOKE, ORIGINAL).result(timeout=30)
-    assert found.f_safe == evaluate_batch(SMOKE, ORIGINAL).f_safe
 
 
 def test_workers_start_when_they_are_needed_and_end_with_the_block() -> None:
@@ -68,13 +66,6 @@ def test_a_killed_worker_is_told_and_replaced(pool: LocalPool) -> None:
     assert pool.submit(SMOKE, ORIGINAL).result(timeout=30).valid.all()
 
 
-def test_an_idle_worker_that_was_killed_costs_nothing(pool: LocalPool) -> None:
-    pool.submit(SMOKE, ORIGINAL).result(timeout=30)
-    os.kill(processes()[0].pid, signal.SIGKILL)
-    time.sleep(0.2)
-    assert pool.submit(SMOKE, ORIGINAL).result(timeout=30).valid.all()
-
-
 def test_a_worker_that_was_killed_while_it_started_costs_nothing(pool: LocalPool) -> None:
     future = pool.submit(SMOKE, ORIGINAL)
     for _ in range(2):
@@ -103,3 +94,28 @@ def test_an_error_of_the_study_arrives_as_it_is_and_a_bug_with_its_traceback(poo
     with pytest.raises(RuntimeError, match=r"(?s)Traceback.*evaluate_batch"):
         pool.submit(SMOKE, ORIGINAL[:, :3]).result(timeout=30)
     assert pool.submit(SMOKE, ORIGINAL).result(timeout=30).valid.all()
+
+
+def press() -> None:
+    signal.raise_signal(signal.SIGINT)
+
+
+def test_ctrl_c_is_raised_where_a_result_is_waited_for_and_nowhere_else() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), interrupts_noted():  # noqa: PT012
+        press()
+        press()
+        with pytest.raises(KeyboardInterrupt):
+            result_of(Future())
+        press()  # while the pool is closed, say
+    assert signal.getsignal(signal.SIGINT) is before
+    with interrupts_noted():
+        assert first_of([]) == set(), "what was pressed before is forgotten"
+
+
+def test_ctrl_c_during_a_wait_is_noticed_soon() -> None:
+    threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), interrupts_noted():
+        first_of([Future()])
+    assert time.monotonic() - start < 5

@@ -85,11 +85,6 @@ def test_the_setting_that_kills_its_worker_alone_is_told_from_the_others() -> No
     assert pool.tried.count(1) == 6 + 2 * (ATTEMPTS + 2), "each twice alone, the original in between, and once more"
 
 
-def test_a_setting_alone_gets_a_second_chance_too() -> None:
-    pool = ToldPool(lambda rows, before: died() if len(rows) > 1 or not before else None)
-    assert RetryingPool(pool, STUDY).submit(b"", settings(3)).result(timeout=5).valid.all()
-
-
 def test_what_the_study_is_at_fault_for_ends_at_once_with_that_fault() -> None:
     pool = ToldPool(lambda rows, before: InputError("study", "ads.model = 'x' cannot be imported"))
     with pytest.raises(InputError, match="cannot be imported"):
@@ -142,11 +137,6 @@ def test_settings_that_fail_one_after_the_other_without_end_are_a_fault_of_the_s
         pool.submit(b"", settings(40)).result(timeout=5)
 
 
-def test_why_a_setting_could_not_be_simulated_is_kept() -> None:
-    found = RetryingPool(ToldPool(deadly(4301)), STUDY).submit(b"", settings(3)).result(timeout=5)
-    assert found.reason(1) == "the worker process died (exit code -9)"
-
-
 def test_failures_between_successes_are_no_fault_of_the_study() -> None:
     every_second = 4300 + np.arange(0, 200, 2)
     found = RetryingPool(ToldPool(deadly(*every_second)), STUDY).submit(b"", settings(200)).result(timeout=5)
@@ -170,17 +160,6 @@ def test_a_bug_and_a_lost_pool_are_not_tried_again(error: Exception) -> None:
     with pytest.raises(type(error), match=str(error)):
         RetryingPool(pool, STUDY).submit(b"", settings(5)).result(timeout=5)
     assert pool.tried == [5]
-
-
-def test_a_pool_that_takes_nothing_any_more_ends_the_wait() -> None:
-    class Closed(ToldPool):
-        def submit(self, study: bytes, settings: np.ndarray) -> Future[Evaluations]:
-            if self.tried:
-                raise PoolLostError("closed")
-            return super().submit(study, settings)
-
-    with pytest.raises(PoolLostError, match="closed"):
-        RetryingPool(Closed(lambda rows, before: died()), STUDY).submit(b"", settings(5)).result(timeout=5)
 
 
 def test_a_cancelled_batch_ends_the_wait() -> None:

@@ -1,0 +1,119 @@
+"""A study carried out in parts, gone on with after damage, and with options that are refused."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from safevar_sumo.results import ResultsDirectory, load
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.workers.identity import identity_of
+from tests.end_to_end.processes import STUDY, solutions, study, written
+from tests.in_process import refused, run
+
+pytestmark = pytest.mark.usefixtures("small")
+
+
+def test_shards_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
+    for k in (1, 2):
+        study("--out", "out", "--shard", f"{k}/2")
+    assert not Path("out/solutions.csv").exists()
+    assert len(load("out").solutions.groupby(["algorithm", "run"])) == 6
+    before = written(Path("out"))
+    study("--out", "out", "--batch", "7")
+    assert written(Path("out")) == before, "nothing was left to simulate"
+    assert solutions("out") == solutions(whole)
+    assert "No solution." in run("study", "small.toml", "--out", "none", "--shard", "9/9").stdout
+    study("--out", "alone", "--only", "nsga2:1")
+    assert [path.name for path in Path("alone/runs").glob("*-*")] == ["nsga2-01.journal"]
+    expected = load(whole).solutions.query("algorithm == 'nsga2' and run == 1").reset_index(drop=True)
+    pd.testing.assert_frame_equal(load("alone").solutions, expected)
+
+
+def test_more_runs_extend_what_is_there(copied: Path) -> None:
+    fewer = copied / "runs" / "rs-01.journal"
+    stamp = fewer.stat().st_mtime_ns
+    done = run("study", "small.toml", "--quiet", "--out", "out", "--runs", "3")
+    assert (done.stdout, done.stderr) == ("", "")
+    assert set(pd.read_csv("out/solutions.csv")["run"]) == {0, 1, 2}
+    assert fewer.stat().st_mtime_ns == stamp
+    study("--out", "alone", "--runs", "3", "--only", "rs:2")
+    extended = load("out").solutions.query("algorithm == 'rs' and run == 2").reset_index(drop=True)
+    pd.testing.assert_frame_equal(extended, load("alone").solutions)
+
+
+def test_a_run_in_the_hands_of_another_process_is_not_started_twice(whole: Path) -> None:
+    chosen = load_study("small.toml")
+    theirs = ResultsDirectory(Path("out"), chosen, identity_of(chosen, assemble(chosen))).journal("rs-00")
+    assert "another process works on rs-00" in study("--out", "out", expect=1)
+    assert len(load("out").solutions.groupby(["algorithm", "run"])) == 5
+    theirs.close()
+    study("--out", "out")
+    assert solutions("out") == solutions(whole)
+
+
+def test_results_of_another_version_or_seed_are_refused_and_left_alone(copied: Path) -> None:
+    before = {path: path.read_bytes() for path in copied.rglob("*.*")}
+    assert "search.seed is 1 there and 9 here" in study("--out", "out", "--seed", "9", expect=2)
+    assert {path: path.read_bytes() for path in copied.rglob("*.*")} == before
+    manifest = json.loads((copied / "manifest.json").read_text())
+    manifest["versions"]["libsumo"] = "1.20.0"
+    (copied / "manifest.json").write_text(json.dumps(manifest))
+    assert "version of libsumo is '1.20.0' there and '1.28.0' here" in study("--out", "out", expect=2)
+    (copied / "manifest.json").unlink()
+    (copied / "runs" / "original.journal").unlink()
+    Path("small.toml").write_text(STUDY + "seed = 2\n")
+    assert "belongs to another study, run or version" in study("--out", "out", expect=2)
+
+
+def test_torn_tails_are_cut_off_with_a_warning_and_damage_in_the_middle_names_its_place(copied: Path, whole: Path) -> None:
+    for name, lost in (("nsga2-00", 20), ("safe_fuzzer-01", 9000)):
+        path = copied / "runs" / f"{name}.journal"
+        os.truncate(path, path.stat().st_size - lost)
+    with (copied / "runs" / "rs-00.journal").open("ab") as file:
+        file.write(b"SVJ\n rubbish")
+    told = study("--out", "out")
+    assert told.count("warning") == 3
+    assert "nsga2-00.journal" in told
+    assert solutions("out") == solutions(whole)
+    path = copied / "runs" / "rs-00.journal"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    assert "rs-00.journal: is damaged at byte" in study("--out", "out", expect=2)
+    assert path.read_bytes() == content
+
+
+@pytest.mark.parametrize(("arguments", "told"), [
+    (["--jobs", "0"], ("--jobs", "0")),
+    (["--shard", "3/2"], ("--shard", "'3/2'", "K in 1..N")),
+    (["--shard", "0/2"], ("--shard", "'0/2'")),
+    (["--only", "nonsense"], ("--only", "'nonsense'", "ALGORITHM:RUN")),
+    (["--only", "nsga2:2"], ("--only", "'nsga2:2'")),
+    (["--cluster", "nowhere"], ("--cluster", "'nowhere'", "tcp://host:8786")),
+    (["--cluster", ""], ("--cluster", "''")),
+])
+def test_bad_options_are_refused(arguments: list[str], told: tuple[str, ...]) -> None:
+    refused("study", "small.toml", "--out", "out", *arguments, told=told)
+    assert not Path("out/runs").exists()
+
+
+def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
+    told = run("study", "small.toml", "--dry-run").stdout
+    for word in ("nsga2, rs, safe_fuzzer", "900", "evaluations/s", "min", "MB"):
+        assert word in told
+    assert max(map(len, told.splitlines())) <= 80
+    assert not Path("results").exists()
+
+
+def test_an_ads_that_always_fails_ends_the_study_with_that_fault() -> None:
+    Path("my_ads.py").write_text("from safevar_sumo.ads import ScalarAds\n\n\nclass Bad(ScalarAds):\n"
+                                 "    def drive(self, seen):\n        return 1 / 0\n")
+    Path("bad.toml").write_text('extends = "small.toml"\nname = "bad"\n[ads]\nmodel = "my_ads:Bad"\n')
+    for options in ([], ["--dry-run"]):
+        refused("study", "bad.toml", "--out", "out", *options, told=("ZeroDivisionError", "simulate bad.toml"))
