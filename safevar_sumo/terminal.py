@@ -46,6 +46,14 @@ def print_meanings(console: Console, members: Iterable[Characteristic]) -> None:
         console.print(table)
 
 
+def print_names(console: Console, title: str, rows: Iterable[tuple[str, ...]], heads: tuple[str, ...]) -> None:
+    """A plain table of what there is."""
+    table = WholeTable(*heads, title=plain(title), title_justify="left")
+    for row in rows:
+        table.add_row(*(plain(cell) for cell in row))
+    console.print(table)
+
+
 SECONDS_BETWEEN_LINES = 30.0
 
 

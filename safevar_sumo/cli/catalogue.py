@@ -11,13 +11,12 @@ import msgspec
 from rich.console import Console
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.cli.display.simulation import print_names
 from safevar_sumo.cli.program import commands
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study, study_names
-from safevar_sumo.terminal import print_meanings
+from safevar_sumo.terminal import print_meanings, print_names
 from safevar_sumo.vehicles import VEHICLES, CharacteristicSet
 
 
@@ -76,6 +75,6 @@ def _print_catalogue(console: Console, studies: list[Study]) -> None:
     numbers = ("road_friction", "visibility", "recognition_delay", "hesitation")
     weathers = [(row["name"], *(f"{row[key]:g}" for key in numbers), row["light"], "wet" if row["wet"] else "dry")
                 for row in catalogue["weathers"]]
-    print_names(console, "Weathers", weathers, ("name", "friction", "visibility", "delay, s", "hesitates, s", "light", "road"))
+    print_names(console, "Weathers", weathers, ("name", "friction", "sight", "delay, s", "pause, s", "light", "road"))
     for title, key in (("ADSs", "ads"), ("Scenarios", "scenarios"), ("Algorithms", "algorithms"), ("Metrics", "metrics")):
         print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "what"))

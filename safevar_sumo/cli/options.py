@@ -1,4 +1,4 @@
-"""Files that a command is to write, refused before the work whose result they are to take."""
+"""Checks of files that a command writes, changes given with --set, and what the shell completes."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from typing import Any
 
 import click
 import numpy as np
+from click.shell_completion import CompletionItem
 
-from safevar_sumo.errors import InputError, unknown
+from safevar_sumo.errors import InputError, SafevarError, unknown
 from safevar_sumo.records import FloatArray
-from safevar_sumo.study import check_writable
+from safevar_sumo.study import check_writable, load_study, study_names
 from safevar_sumo.vehicles import CharacteristicSet
 
 PICTURES = (".png", ".pdf", ".svg")
@@ -117,3 +118,22 @@ def _values(change: str, text: str, original: float) -> list[float]:
         return [float(text)]
     except ValueError:
         raise InputError("--set", repr(change), LEGAL) from None
+
+
+def complete_study(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Names of studies, and files or directories."""
+    names = [CompletionItem(name) for name in study_names() if name.startswith(incomplete)]
+    return [*names, CompletionItem(incomplete, type="file")]
+
+
+def complete_changes(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """The characteristics of the study that stands before, each with its sign of equality and its domain."""
+    study = str(ctx.params.get("study") or next(iter(ctx.args), ""))  # an option without its value yet keeps arguments unparsed
+    if not study or Path(study).is_dir():
+        return []
+    try:
+        characteristics = load_study(study).vehicle.characteristics
+    except SafevarError:
+        return []
+    return [CompletionItem(f"{name}=", help=f"{row.lower:g} to {row.upper:g}" + (f" {row.unit}" if row.unit != "-" else ""))
+            for name, row in characteristics.items() if name.startswith(incomplete)]

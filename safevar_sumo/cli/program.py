@@ -23,19 +23,19 @@ if TYPE_CHECKING:
 INTERRUPTED = 130
 COMMANDS = {
     "study": ("study", "Search a study; the same command again goes on where it was stopped."),
-    "status": ("status", "Tell how far a study is that runs elsewhere: runs, front so far, collisions, time left."),
+    "status": ("study", "Tell how far a study is that runs elsewhere: runs, front so far, collisions, time left."),
     "simulate": ("simulate", "Simulate a study once: how it ends, its safety metrics and objectives."),
     "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms and metrics."),
     "explain": ("questions", "Explain failures: which changes did it, how little is enough, and why."),
     "tolerance": ("questions", "Find how far each characteristic may go: alone, in pairs, and all together."),
     "risk": ("questions", "Estimate how likely an unsafe outcome is, and what decides."),
     "rules": ("questions", "Find rules that tell where it is unsafe, in physical units."),
-    "tables": ("research_questions", "Answer the research questions as tables."),
-    "figures": ("research_questions", "Draw the figures of results."),
+    "tables": ("report", "Answer the research questions as tables."),
+    "figures": ("report", "Draw the figures of results."),
     "report": ("report", "Write one page about results: verdict, causes, replays, tables, figures."),
     "import": ("reference", "Make results of solutions in the published package's CSV format."),
     "validate": ("reference", "Compare a study with reference data, row by row."),
-    "replicate": ("replicate", "Hold whole studies against published ones: tables, conclusions, and whether they hold."),
+    "replicate": ("reference", "Hold whole studies against published ones: tables, conclusions, and whether they hold."),
     "calibrate": ("reference", "Fit a study's free parameters to reference data."),
 }
 """Every command, in the order of the help: the module of this folder that it lives in, and what the help says of it."""

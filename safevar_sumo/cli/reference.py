@@ -1,37 +1,45 @@
-"""Commands that hold a study against reference data."""
+"""Commands that compare studies with published data: validate, calibrate, import, replicate; and what they print."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
 import msgspec
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 
-from safevar_sumo.cli.completion import complete_study
-from safevar_sumo.cli.display.reference import print_agreement, print_calibration
-from safevar_sumo.cli.options import PICTURES, check_output
+from safevar_sumo.analysis.research_questions.case import Case, load_cases
+from safevar_sumo.cli.options import PICTURES, check_output, complete_study, refuse_inputs
 from safevar_sumo.cli.program import commands, tell_remarks
 from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.metrics import METRICS
 from safevar_sumo.progress import counted, counted_trials
 from safevar_sumo.records import Evaluations
 from safevar_sumo.reference import (
+    Agreement,
+    Calibration,
     ReferenceData,
     agreement,
     calibrate,
     calibration_comment,
+    cost_line,
     evaluations_of,
     fitted_as,
     keep_totals,
+    on_a_bound,
     original_metrics,
     plot_agreement,
     read_reference,
 )
-from safevar_sumo.results import write_imported
+from safevar_sumo.reference.replication import Nearness, nearness, paired, replication
+from safevar_sumo.results import write_imported, write_whole
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, load_study, write_study
 from safevar_sumo.sumo.system import assemble
+from safevar_sumo.terminal import WholeTable
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import evaluate_all
 from safevar_sumo.workers.local import available_cores, local_pool
@@ -157,3 +165,124 @@ def _simulated(path: Path, data: ReferenceData, here: Evaluations) -> tuple[Refe
     if not valid.all():
         click.echo(f"warning: {path}: {np.count_nonzero(~valid)} rows could not be simulated and are left out", err=True)
     return data.take(valid), here.take(valid)
+
+
+SEVERAL = ("--published", "--reference")
+"""Options that take all words up to the next option."""
+
+
+class _TakesSeveral(click.Command):
+    """`--published A B` as `--published A --published B`."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        words: list[str] = []
+        flag = None
+        for word in args:
+            if word.startswith("-"):
+                flag = word if word in SEVERAL else None
+                words += [] if flag else [word]
+            else:
+                words += [flag, word] if flag else [word]
+        return super().parse_args(ctx, words)
+
+
+@commands.command(cls=_TakesSeveral)
+@click.argument("directories", nargs=-1, required=True, metavar="DIR...")
+@click.option("--published", "published", multiple=True, required=True, metavar="DIR...", help="Imported results (command import).")
+@click.option("--out", type=click.Path(path_type=Path), metavar="FILE.md", help="Write the page to this file.")
+@click.option("--reference", "references", multiple=True, metavar="[STUDY=]FILE.csv...",
+              help="Published rows to look for next to what the searches found; of which study, where several have one vehicle.")
+def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Path | None, references: tuple[str, ...]) -> None:
+    """Hold the results DIR... against published ones: every table cell beside cell, every conclusion marked."""
+    if out is not None:
+        refuse_inputs(out, "--out", *directories, *published, *references)
+        check_writable(out)
+    pairs = paired(load_cases(directories), load_cases(published))
+    page = replication(pairs, _near(pairs.here, references))
+    if out is None:
+        click.echo(page, nl=False)
+    else:
+        write_whole(out, page)
+        click.echo(f"Replication: {out}")
+
+
+def _near(cases: Sequence[Case], references: Sequence[str]) -> list[Nearness]:
+    """Rows next to the solutions of the case that each file belongs to."""
+    rows: dict[str, list[ReferenceData]] = {}
+    for given in references:
+        name, _, place = given.rpartition("=")
+        fitting = [case for case in cases if name in ("", case.study.name)]
+        read = _rows_by_case(Path(place), fitting) if fitting else {}
+        if len(read) != 1:
+            relation = "may belong to each of" if read else "belongs to none of"
+            names = ", ".join(read or (case.study.name for case in cases))
+            raise InputError("--reference", f"{given} {relation} {names}", "STUDY=FILE.csv")
+        for case, data in read.items():
+            rows.setdefault(case, []).append(data)
+    return [one for case in cases if case.name in rows for one in nearness(case, rows[case.name])]
+
+
+def _rows_by_case(path: Path, cases: Sequence[Case]) -> dict[str, ReferenceData]:
+    """The file's rows for every case whose vehicle it is of."""
+    found: dict[str, ReferenceData] = {}
+    for case in cases:
+        try:
+            found[case.name] = read_reference(path, case.characteristics)
+        except InputError as error:
+            if len(cases) == 1 or not ("lacks the columns" in error.problem or "in the domains" in error.problem):
+                raise
+    return found
+
+
+def print_agreement(console: Console, study: Study, told: Agreement) -> None:
+    """Comparison with reference data, metric by metric."""
+    table = WholeTable("", title=escape(f"{study.title}: {told.rows} rows"), title_justify="left")
+    for head in ("Spearman's rho", "mean abs. error", "in repeats", "bias", "original there", "original here"):
+        table.add_column(head, justify="right")
+    for name in told.spearman:
+        head = METRICS[name].heading
+        numbers = (told.spearman[name], told.mean_absolute_error[name], told.in_repeats[name], told.bias[name],
+                   *told.original[name].values())
+        table.add_row(head, *("-" if number is None else f"{number:.3f}" for number in numbers))
+    console.print(table)
+    collisions = told.collisions
+    console.print(f"Collisions: {collisions['reference']} in the reference, {collisions['here']} here, {collisions['both']} in both: "
+                  f"precision {_number(told.precision)}, recall {_number(told.recall)}; their mean speed is "
+                  f"{_number(told.collision_speed['reference'])} m/s there and {_number(told.collision_speed['here'])} m/s here.")
+    if told.undecided["within_repeats"] is not None:
+        console.print(f"Of {told.undecided['differ']} settings that collide on one side alone, {told.undecided['within_repeats']} "
+                      "may do either: repeats of them differ by as much.")
+    bins = ", ".join(f"{part['lowest']:.2f} to {part['highest']:.2f}: {part['bias']:+.2f}" for part in told.by_predicted)
+    console.print(f"Mean error by the safety degree here: {bins}.", markup=False)
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def print_calibration(console: Console, study: Study, found: Calibration) -> None:
+    """Found values, and how well they do on both halves of the data."""
+    table = WholeTable("parameter", "unit", title=escape(study.title), title_justify="left")
+    for head in ("found", "lower", "upper"):
+        table.add_column(head, justify="right")
+    for name, value in found.values.items():
+        row = study.calibration[name]
+        table.add_row(name, row.unit, *(f"{number:.5g}" for number in (value, row.lower, row.upper)))
+    console.print(table)
+    for name in found.used:
+        both = WholeTable(title=escape(f"{name}: rows used / held back"), title_justify="left")
+        both.add_column("")
+        for head in ("Spearman's rho", "mean abs. error", "bias"):
+            both.add_column(head, justify="right")
+        halves = (found.used[name], found.held_back[name])
+        for metric in halves[0].spearman:
+            head = METRICS[metric].heading
+            both.add_row(head, *(
+                " / ".join("-" if number is None else f"{number:.3f}" for number in (getattr(half, what)[metric] for half in halves))
+                for what in ("spearman", "mean_absolute_error", "bias")))
+        console.print(both)
+    for name in on_a_bound(found.values, study.calibration):
+        console.print(f"{name} stands on its bound: a wider one may fit better.", markup=False)
+    if not found.alone:
+        console.print("SUMO simulated every trial in copies of the network: beside one copy, vehicles do something else in this scenario.")
+    console.print(cost_line(found))

@@ -1,17 +1,72 @@
-"""The command that writes a report."""
+"""Commands that answer from results: tables, figures, report."""
 
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from pathlib import Path
 
 import click
 from rich.console import Console
 
+from safevar_sumo.analysis.research_questions.answer import QUESTIONS, answer
+from safevar_sumo.analysis.research_questions.case import load_cases
+from safevar_sumo.analysis.research_questions.figures import FORMATS as PICTURES
+from safevar_sumo.analysis.research_questions.figures import draw_all
+from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS, LAID_OUT, LAYOUTS_BY_NAME
 from safevar_sumo.cli.options import check_output
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import as_it_is_now, jobs_option, now_option, point_option
-from safevar_sumo.results import write_whole
+from safevar_sumo.errors import InputError
+from safevar_sumo.results import make_directory, write_whole
+
+WITHOUT_NOTES = ("csv", "json")
+"""Formats that hold the numbers alone; the notes go to the standard error."""
+
+
+@commands.command()
+@click.argument("directories", nargs=-1, required=True, metavar="DIR...")
+@click.option("--rq", "question", type=click.Choice(QUESTIONS), help="This question alone.")
+@click.option("--format", "kind", type=click.Choice(list(FORMATS)), default="text", show_default=True, help="How they are written.")
+@click.option("--layout", type=click.Choice(list(LAYOUTS_BY_NAME)), default="full", show_default=True,
+              help="Everything, or RQ1, RQ2 and the combinations as the paper has them.")
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write each table to a file of this directory.")
+def tables(directories: tuple[str, ...], question: str | None, kind: str, layout: str, out: Path | None) -> None:
+    """Answer the research questions as tables, from the results directories DIR..., one for each case."""
+    if layout != "full" and kind not in LAID_OUT:
+        raise InputError("--layout", f"{layout!r}, but --format {kind} has no layout", f"--format {', '.join(LAID_OUT)}")
+    write = partial(LAID_OUT[kind], layouts=LAYOUTS_BY_NAME[layout]) if kind in LAID_OUT else FORMATS[kind]
+    answers = answer(load_cases(directories), question)
+    if kind in WITHOUT_NOTES:
+        _warn(list(dict.fromkeys(note for one in answers for note in one.notes)))
+    if out is not None:
+        make_directory(out)
+        for one in answers:
+            if not one.frame.empty:
+                write_whole(out / f"{one.name}.{ENDINGS[kind]}", write([one]))
+        click.echo(f"Tables: {out}")
+        return
+    shown = [one for one in answers if one.name == question] if question is not None and kind in WITHOUT_NOTES else answers
+    click.echo(write(shown), nl=False)
+
+
+@commands.command()
+@click.argument("directories", nargs=-1, required=True, metavar="DIR...")
+@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory of the pictures.")
+@click.option("--format", "kind", type=click.Choice(PICTURES), default="png", show_default=True, help="Kind of the pictures.")
+def figures(directories: tuple[str, ...], out: Path, kind: str) -> None:
+    """Draw the figures of the results directories DIR..., one file for each figure and case."""
+    cases = load_cases(directories)
+    make_directory(out)
+    written, lacking = draw_all(cases, out, kind)
+    _warn([*(remark for case in cases for remark in case.remarks), *lacking])
+    for path in written:
+        click.echo(str(path))
+
+
+def _warn(messages: list[str]) -> None:
+    for message in messages:
+        click.echo(f"note: {message}", err=True)
 
 
 @commands.command()

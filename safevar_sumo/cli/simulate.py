@@ -1,30 +1,43 @@
-"""The command that simulates a study once, or as often as a sweep has values."""
+"""The command that simulates a study once or, in a sweep, many times; and what it prints."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 import numpy as np
 from rich.console import Console
+from rich.text import Text
 
 from safevar_sumo.api.settings import evaluated
 from safevar_sumo.api.simulation import Simulation, beside_the_original
-from safevar_sumo.cli.completion import complete_changes, complete_study
-from safevar_sumo.cli.display.simulation import print_matrix, print_simulation, print_sweep
-from safevar_sumo.cli.options import read_changes, refuse_inputs, settings_of
+from safevar_sumo.cli.options import (
+    PICTURES,
+    Within,
+    check_output,
+    complete_changes,
+    complete_study,
+    read_changes,
+    refuse_inputs,
+    settings_of,
+)
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.replay import Shown, showing_options
 from safevar_sumo.cli.target import Target, now_option, replay_options, target_of
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import FloatArray
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import tags
-from safevar_sumo.study import check_writable
-from safevar_sumo.sumo.matrix import at_every_point, named_point, point_record, remarks_of, vehicle_remarks
+from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable
+from safevar_sumo.sumo.matrix import AtPoint, at_every_point, at_worst, named_point, point_record, remarks_of, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.terminal import WholeTable, plain, print_meanings
+from safevar_sumo.vehicles import CharacteristicSet
+
+FILE = click.Path(path_type=Path)
 
 
 @commands.command(name="simulate")
@@ -35,7 +48,11 @@ from safevar_sumo.sumo.system import System, assemble
 @click.option("--no-filter", is_flag=True, help="Keep changes that are smaller than the filter's thresholds.")
 @click.option("--beyond", is_flag=True, help="Take values beyond the domains too.")
 @click.option("--trace", type=click.Path(path_type=Path), metavar="FILE.csv", help="Write the simulation step by step.")
-@showing_options
+@click.option("--plot", type=FILE, metavar="FILE", help="Draw it beside the original vehicle: png, pdf or svg.")
+@click.option("--animate", type=FILE, metavar="FILE", help="Show both from above, moving: gif, mp4 or html.")
+@click.option("--gui", is_flag=True, help="Show both in sumo-gui, each on its road.")
+@click.option("--slower", type=Within(0.01, 1000), default=1.0, show_default=True, metavar="TIMES",
+              help="How many times slower than real time --gui plays.")
 @now_option
 @click.option("--point", metavar="NAME", help="Of a study with a matrix: this point alone.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
@@ -100,7 +117,8 @@ def _tell(target: Target, system: System, found: Simulation, as_json: bool) -> N
     else:
         print_simulation(Console(), found)
         print_matrix(Console(), points)
-        Console().print(tags(system.points), soft_wrap=True, markup=False, highlight=False)
+        if types := tags(system.points):
+            _say(Console(), types)
     remarks = [remark for one in system.points for remark in remarks_of(one.scenario)]
     for remark in dict.fromkeys([*remarks, *system.remarks, *vehicle_remarks(system)]):
         click.echo(f"note: {remark}", err=True)
@@ -125,3 +143,173 @@ def _write_trace(path: Path, found: Simulation) -> None:
             found.trace.to_csv(file, index=False, lineterminator="\n")
     except OSError as error:
         raise InputError("--trace", f"cannot write {path}: {error.strerror or error}", "a file in a directory that exists") from None
+
+
+class Shown(NamedTuple):
+    """What is to be shown, and where."""
+
+    plot: Path | None
+    animate: Path | None
+    gui: bool = False
+    slower: float = 1.0
+
+    @property
+    def asked(self) -> bool:
+        return self.plot is not None or self.animate is not None or self.gui
+
+    @property
+    def files(self) -> list[Path]:
+        """What is written, as whole paths."""
+        return [path.resolve() for path in (self.plot, self.animate) if path is not None]
+
+    def check(self, study: str) -> None:
+        """Refuse what cannot be written or is read from `study`, before anything is simulated; raises InputError."""
+        from safevar_sumo.replay.animation import ANIMATIONS, check_animation
+
+        if self.slower != 1 and not self.gui:
+            raise InputError("--slower", f"{self.slower:g} without --gui", "together with --gui")
+        if self.plot is not None:
+            refuse_inputs(self.plot, "--plot", study)
+            check_output(self.plot, "--plot", PICTURES)
+        if self.animate is not None:
+            refuse_inputs(self.animate, "--animate", study)
+            check_output(self.animate, "--animate", tuple(ANIMATIONS))
+            check_animation(self.animate)
+
+    def show(self, study: Study, system: System, setting: FloatArray) -> None:
+        """Simulate a filtered setting, shape (n,), beside the original vehicle, and show both."""
+        from safevar_sumo.replay.animation import animate
+        from safevar_sumo.replay.comparison import compare
+        from safevar_sumo.replay.figure import draw_comparison, write_figure
+        from safevar_sumo.replay.gui import show_in_gui
+
+        comparison = compare(study, system, setting)
+        if self.plot is not None:
+            write_figure(draw_comparison(comparison), self.plot)
+        if self.animate is not None:
+            animate(comparison, self.animate)
+        if self.gui:
+            show_in_gui(comparison, at_worst(system, setting[np.newaxis]).scenario.network, slower=self.slower)
+
+
+def print_simulation(console: Console, found: Simulation) -> None:
+    """A setting beside the original vehicle: what was simulated, how it ended, metrics and objectives, a verdict."""
+    _print_setting(console, found)
+    members = CharacteristicSet.of(found.study.vehicle.characteristics)
+    print_meanings(console, [member for member in members if found.setting[member.name] != member.original])
+    records = (found.original.record(), found.record())
+    table = WholeTable()
+    table.add_column("result")
+    table.add_column("unit")
+    for head in ("original", "simulated"):
+        table.add_column(head, justify="right")
+    table.add_row("outcome", "", *(record["outcome"] for record in records))
+    for name, unit in found.units.items():
+        table.add_row(name, unit, *("undefined" if record[name] is None else f"{record[name]:.4g}" for record in records))
+    console.print(table)
+    _say(console, f"The original vehicle {found.original.verdict}.")
+    if found is not found.original and found.setting != found.original.setting:
+        _say(console, f"The changed vehicle {found.verdict}: {_against(found)}.")
+
+
+def _print_setting(console: Console, found: Simulation) -> None:
+    table = WholeTable(title=plain(found.study.title))
+    table.add_column("characteristic")
+    table.add_column("unit")
+    for head in ("original", "simulated"):
+        table.add_column(head, justify="right")
+    for member in CharacteristicSet.of(found.study.vehicle.characteristics):
+        value = found.setting[member.name]
+        changed = value != member.original
+        note = f"{value:g}" + ("" if member.lower <= value <= member.upper else " (beyond)")
+        table.add_row(plain(member.name), plain(member.unit), f"{member.original:g}", note, style="bold" if changed else None)
+    console.print(table)
+
+
+def _against(found: Simulation) -> str:
+    here, there = found.metrics[SAFETY_DEGREE], found.original.metrics[SAFETY_DEGREE]
+    if np.isnan(here) or np.isnan(there):
+        return "nothing tells whether that is less safe"
+    if here == there:
+        return "as safe as the original"
+    return f"{'less safe' if here < there else 'safer'} than the original, SD {here:.2f} against {there:.2f}"
+
+
+def print_sweep(console: Console, study: Study, names: Sequence[str], original: Evaluations, found: Evaluations) -> None:
+    """Many settings, a row each under the original vehicle's, by the values of the named characteristics."""
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    columns = [characteristics.names.index(name) for name in names]
+    table = WholeTable(title=plain(study.title))
+    for column in columns:
+        unit = characteristics.members[column].unit
+        table.add_column(plain(f"{names[columns.index(column)]}{'' if unit == '-' else f', {unit}'}"), justify="right")
+    for head in ("outcome", *(METRICS[name].heading if name in METRICS else name for name in found.metrics)):
+        table.add_column(head, justify="left" if head == "outcome" else "right")
+    for which in (original, found):
+        for row in range(len(which)):
+            metrics = [which.metrics[name][row] for name in found.metrics]
+            table.add_row(*(f"{which.settings[row, column]:g}" for column in columns), str(which.outcome[row]),
+                          *("-" if np.isnan(value) else f"{value:.3f}" for value in metrics), end_section=which is original)
+    console.print(table)
+    _say(console, "First the original vehicle. SD: least distance in m, or minus the collision's speed in m/s.")
+
+
+def _say(console: Console, sentence: str) -> None:
+    console.print(sentence, soft_wrap=True, markup=False, highlight=False)
+
+
+KMH = 3.6
+BANDS = ((5.0, "green"), (15.0, "yellow"), (25.0, "dark_orange"), (35.0, "orange4"))
+"""Relative impact speed [km/h] below which a colour holds, red above: the bands of Euro NCAP's tests of AEB between cars."""
+NAMED = 6
+"""How many of the points that fail are named."""
+ROW, COLUMN = "speed", "impact_location"
+
+
+def print_matrix(console: Console, found: Sequence[AtPoint], row: int = 0) -> None:
+    """A table for each test and weather, speed by impact location; what else varies has rows of its own."""
+    records = [point_record(one, row) for one in found]
+    tables: dict[tuple[str, str], list[tuple[dict[str, Any], dict[str, Any]]]] = {}
+    for one, told in zip(found, records, strict=True):
+        place = dict(one.point.place)
+        tables.setdefault((place.pop("test"), place.pop("weather")), []).append((place, told))
+    for (test, weather), points in tables.items():
+        _print_table(console, f"{test}, {weather}", points)
+    if records:
+        hit = [told["point"] for told in records if told["impact_speed"] is not None]
+        first = "; ".join(hit[:NAMED]) + (f" and {len(hit) - NAMED} more" if len(hit) > NAMED else "")
+        summary = f"{len(hit)} of {len(records)} points fail{': ' + first if hit else ''}."
+        invalid = sum(told["outcome"] == Outcome.INVALID_TEST for told in records)
+        if invalid:
+            summary += f" {invalid} are no valid tests: the vehicle leaves the tolerance of their speed before the ADS acts."
+        console.print(summary, soft_wrap=True, markup=False, highlight=False)
+
+
+def _print_table(console: Console, title: str, points: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> None:
+    columns = list(dict.fromkeys(place.get(COLUMN) for place, _ in points))
+    table = WholeTable(title=plain(title), title_justify="left")
+    table.add_column("speed")
+    for column in columns:
+        table.add_column("" if column is None else f"{column:g} %", justify="right")
+    cells: dict[str, dict[Any, Text]] = {}
+    for place, told in points:
+        cells.setdefault(_row(place), {})[place.get(COLUMN)] = _cell(told)
+    for name, by_column in cells.items():
+        table.add_row(plain(name), *(by_column.get(column, Text("")) for column in columns))
+    console.print(table)
+
+
+def _row(place: dict[str, Any]) -> str:
+    speed = [f"{place[ROW]:g} km/h"] if ROW in place else []
+    return ", ".join([*speed, *(f"{name} {value}" for name, value in place.items() if name not in (ROW, COLUMN))])
+
+
+def _cell(told: dict[str, Any]) -> Text:
+    if told["outcome"] == Outcome.INVALID_TEST:
+        return Text(f"{told['outcome']} ({told['test_speed_error']:+.1f} km/h)", "magenta")
+    if told["impact_speed"] is None:
+        touched = f", {told['contact']['side']} side touched" if "contact" in told else ""
+        return Text("avoided" + touched if told["outcome"] in (Outcome.STOPPED, Outcome.PASSED) else told["outcome"], "green")
+    relative = (told["relative_impact_speed"] or 0.0) * KMH
+    colour = next((colour for below, colour in BANDS if relative < below), "red")
+    return Text(f"{told['impact_speed'] * KMH:.1f} km/h", colour)

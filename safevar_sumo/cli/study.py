@@ -1,23 +1,37 @@
-"""The command that searches a study."""
+"""Commands that run a study and show how far it is: study, status; and what they print."""
 
 from __future__ import annotations
 
+import json
+import shlex
+import time
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import click
 import msgspec
-from rich.console import Console
+import numpy as np
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.markup import escape
+from rich.text import Text
 
+from safevar_sumo.analysis.research_questions.indicators import nondominated
 from safevar_sumo.api.running import carried_out, open_pool, prepared
-from safevar_sumo.campaign import BATCH, RunKey, all_runs, forecast
-from safevar_sumo.cli.completion import complete_study
-from safevar_sumo.cli.display.campaign import print_forecast, print_summary
+from safevar_sumo.campaign import BATCH, Campaign, Forecast, RunKey, all_runs, forecast
+from safevar_sumo.cli.options import Within, complete_study
 from safevar_sumo.cli.program import commands, tell_remarks
 from safevar_sumo.errors import InputError
 from safevar_sumo.progress import CampaignProgress
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import failure_lines, record, solutions_frame
+from safevar_sumo.results.status import RunStatus, Status
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import vehicle_remarks
+from safevar_sumo.terminal import WholeTable
+from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.workers.evaluation import Pool
 
 
 @commands.command()
@@ -81,3 +95,164 @@ def _selected(keys: list[RunKey], only: str | None, shard: str | None) -> list[R
             raise InputError("--shard", repr(shard), "K/N, with K in 1..N")
         keys = keys[int(first) - 1::int(number)]
     return keys
+
+
+@commands.command()
+@click.argument("directory", metavar="DIR")
+@click.option("--watch", is_flag=True, help="Look again and again until the study is finished.")
+@click.option("--every", type=Within(0.1, 86400), default=2.0, show_default=True, metavar="SECONDS",
+              help="How long --watch waits between two looks.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON; with --watch, a line for every look.")
+def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
+    """Tell how far the study in DIR is, without disturbing it: runs, front so far, collisions, time left."""
+    from safevar_sumo.results.status import status as look
+
+    told, begun = look(directory), time.monotonic()
+    first = told
+    if as_json:
+        click.echo(json.dumps(told.record(), indent=None if watch else 2))
+        while watch and not told.finished:
+            time.sleep(every)
+            told = look(directory)
+            click.echo(json.dumps(told.record()))
+        return
+    if not watch:
+        Console().print(status_view(told, None))
+        return
+    with Live(status_view(told, None), console=Console(), auto_refresh=False) as live:
+        while not told.finished:
+            time.sleep(every)
+            told = look(directory)
+            live.update(status_view(told, (told.share - first.share) / (time.monotonic() - begun)), refresh=True)
+
+
+SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\nTET, TIT: over solutions without collision."
+
+
+def print_forecast(console: Console, study: Study, runs: int, told: Forecast) -> None:
+    """What a campaign would take."""
+    console.print(study.title, soft_wrap=True, highlight=False, markup=False)
+    table = WholeTable(show_header=False)
+    table.add_row("algorithms", ", ".join(study.search.labels))
+    table.add_row("runs", str(runs))
+    table.add_row("evaluations, at the most", str(told.evaluations))
+    table.add_row("evaluations/s, measured by a short probe", f"{told.rate:.0f}")
+    table.add_row("time, at the most", f"{told.seconds / 60:.1f} min")
+    table.add_row("disk, at the most", f"{told.size / 1e6:.0f} MB")
+    console.print(table)
+
+
+def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path, pool: Pool) -> None:
+    """The answer; per algorithm what was found, beside the original vehicle; the most critical setting; what RQ1 and RQ2 say of it."""
+    from safevar_sumo.analysis.explain.summary import lead
+    from safevar_sumo.analysis.research_questions.case import case_of
+    from safevar_sumo.analysis.research_questions.over_runs import brief  # takes longer to load than all the rest
+
+    names = tuple(study.vehicle.characteristics)
+    solutions = solutions_frame(names, campaign.solutions.items())
+    if len(solutions):
+        for line in lead(study, solutions, campaign.original, pool, str(directory)):
+            console.print(line, soft_wrap=True, markup=False, highlight=False)
+    found = {"original vehicle": campaign.original}
+    for algorithm in study.search.labels:
+        group = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]
+        if group:
+            found[algorithm] = Evaluations.concatenate(group)
+    table = WholeTable("", title=escape(study.title), title_justify="left")
+    for head in found:
+        table.add_column(head, justify="right")
+    table.add_row("solutions", "-", *(str(len(one)) for one in list(found.values())[1:]))
+    table.add_row("solutions that collide", *(str(int(np.count_nonzero(one.collided))) for one in found.values()))
+    collisions = [sum(number for key, number in campaign.collisions.items() if key.algorithm == name) for name in list(found)[1:]]
+    table.add_row("collisions simulated", *map(str, [int(campaign.original.collided[0]), *collisions]))
+    for metric in campaign.scoring.metrics:
+        table.add_row(escape(f"mean {metric.heading}"), *(_mean(one.metrics[metric.name]) for one in found.values()))
+    console.print(table)
+    console.print(SAFETY_NOTE)
+    if campaign.failures:
+        console.print(f"{len(campaign.failures)} settings could not be simulated (simulator-error); they are in no result:")
+        for line in failure_lines(campaign.failures):
+            console.print(f"  {line}", soft_wrap=True, markup=False, highlight=False)
+    invalid = sum(campaign.invalid_tests.values())
+    if invalid:
+        console.print(f"{invalid} settings leave the tolerance of a test's speed before the ADS acts (invalid-test): "
+                      "neither failures nor successes, they are in no result.", soft_wrap=True, markup=False, highlight=False)
+    _print_most_critical(console, study, campaign)
+    case = case_of(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
+                   scoring=campaign.scoring)
+    for line in brief(case):
+        console.print(line, soft_wrap=True, markup=False, highlight=False)
+    console.print(f"All tables: python -m safevar_sumo tables {shlex.quote(str(directory))}", soft_wrap=True, markup=False, highlight=False)
+
+
+def _mean(values: FloatArray) -> str:
+    defined = values[~np.isnan(values)]
+    return f"{np.mean(defined):.2f}" if defined.size else "-"
+
+
+def _print_most_critical(console: Console, study: Study, campaign: Campaign) -> None:
+    if not any(map(len, campaign.solutions.values())):
+        console.print("No solution.")
+        return
+    pooled = Evaluations.concatenate(list(campaign.solutions.values()))
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    worst = pooled.take([int(np.lexsort((pooled.f_diff, pooled.f_num_diff, pooled.f_safe))[0])])
+    changes = [
+        f"{member.name} {member.original:g} -> {value:.6g} {'' if member.unit == '-' else member.unit}".rstrip()
+        for member, value in zip(characteristics, worst.settings[0].tolist(), strict=True) if value != member.original]
+    console.print(f"Most critical setting: SD {worst.f_safe[0]:.2f} ({worst.outcome[0]}), "
+                  f"the original's {campaign.original.f_safe[0]:.2f} ({campaign.original.outcome[0]}), by")
+    for change in changes or ["no change at all"]:
+        console.print(f"  {change}")
+
+
+FRONT = 5
+"""Points of the front that are shown."""
+RUNS_SHOWN = 12
+"""Runs under way that are named."""
+
+
+def status_view(told: Status, rate: float | None) -> RenderableType:
+    """A study's runs by algorithm and the front so far; `rate` is the share of the work done per second, if it is known."""
+    table = WholeTable("algorithm", title=Text(told.title), title_justify="left")
+    for head in ("runs", "under\nway", "simulated", "collisions", "simulator\nerrors", "best\nSD"):
+        table.add_column(head, justify="right")
+    for algorithm in dict.fromkeys(run.algorithm for run in told.runs):
+        group = [run for run in told.runs if run.algorithm == algorithm]
+        table.add_row(Text(algorithm), *_cells(group))
+    return Group(table, Text(_under_way(told)), Text(_left(told, rate)), _front(told))
+
+
+def _cells(runs: list[RunStatus]) -> list[str]:
+    best = [run.best for run in runs if run.best is not None]
+    return [f"{sum(run.state == 'finished' for run in runs)}/{len(runs)}", str(sum(run.state == "begun" for run in runs)),
+            str(sum(run.simulated for run in runs)), str(sum(run.collisions for run in runs)),
+            str(sum(run.simulator_errors for run in runs)), f"{min(best):.2f}" if best else "-"]
+
+
+def _under_way(told: Status) -> str:
+    begun = [f"{run.algorithm}:{run.run} {run.simulated}/{told.budget}" for run in told.runs if run.state == "begun"]
+    more = f" and {len(begun) - RUNS_SHOWN} more" if len(begun) > RUNS_SHOWN else ""
+    return f"Under way: {', '.join(begun[:RUNS_SHOWN])}{more}" if begun else ""
+
+
+def _left(told: Status, rate: float | None) -> str:
+    if told.finished:
+        return "Finished."
+    if not rate:
+        return f"{told.share:.0%} done."
+    return f"{told.share:.0%} done, {timedelta(seconds=round((1 - told.share) / rate))} left at this pace."
+
+
+def _front(told: Status) -> RenderableType:
+    """The most severe points that no other one beats in all three objectives."""
+    if not len(told.points):
+        return Text("Nothing simulated yet.")
+    front = nondominated(told.points)
+    front = front[front[:, 0].argsort(kind="stable")]
+    table = WholeTable(title=f"Front so far: {len(front)} points, the most severe ones", title_justify="left")
+    for head in ("safety degree [m, -m/s]", "f_diff [fraction]", "changed"):
+        table.add_column(head, justify="right")
+    for f_safe, f_diff, number in front[:FRONT].tolist():
+        table.add_row(f"{f_safe:.2f}", f"{f_diff:.3f}", f"{number:.0f}")
+    return table

@@ -187,11 +187,11 @@ def pre_crash_of(scenario: Any) -> str:
 
 
 def tags(points: Iterable[Point]) -> str:
-    """Pre-crash types and light of some points, in a sentence."""
+    """Pre-crash types and light of some points, in a sentence; nothing where the scenarios have no type."""
     points = tuple(points)
     types = dict.fromkeys(filter(None, (pre_crash_of(point.scenario) for point in points)))
     light = " and ".join(dict.fromkeys(f"by {point.weather.light}" for point in points))
-    return f"NHTSA's pre-crash types: {'; '.join(types)}; {light}." if types else f"It is {light}; the scenario tells no pre-crash type."
+    return f"NHTSA's pre-crash types: {'; '.join(types)}; {light}." if types else ""
 
 
 SCENARIO_CONTRACT = Contract.of(Scenario, "a scenario")
