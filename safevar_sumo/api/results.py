@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from safevar_sumo.errors import InputError, did_you_mean, one_of
-from safevar_sumo.results import begun_and_now, differences_now, manifest_of, read_later, read_manifest
-from safevar_sumo.results.manifest import MANIFEST
+from safevar_sumo.results import MANIFEST, begun_and_now, differences_now, manifest_of, read_later, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
 
 if TYPE_CHECKING:

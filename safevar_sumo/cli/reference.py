@@ -197,6 +197,9 @@ def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Pat
     if out is not None:
         refuse_inputs(out, "--out", *directories, *published, *references)
         check_writable(out)
+    for directory in published:
+        if Path(directory).resolve() in [Path(other).resolve() for other in directories]:
+            raise InputError("--published", f"{directory} is given as results too", "results that the command import has written")
     pairs = paired(load_cases(directories), load_cases(published))
     page = replication(pairs, _near(pairs.here, references))
     if out is None:

@@ -25,8 +25,7 @@ from safevar_sumo.cli.program import commands, tell_remarks
 from safevar_sumo.errors import InputError
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import failure_lines, record, solutions_frame
-from safevar_sumo.results.status import RunStatus, Status
+from safevar_sumo.results import RunStatus, Status, failure_lines, record, solutions_frame
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import vehicle_remarks
 from safevar_sumo.terminal import WholeTable
@@ -105,10 +104,12 @@ def _selected(keys: list[RunKey], only: str | None, shard: str | None) -> list[R
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; with --watch, a line for every look.")
 def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
     """Tell how far the study in DIR is, without disturbing it: runs, front so far, collisions, time left."""
-    from safevar_sumo.results.status import status as look
+    from safevar_sumo.results import status as look
 
     told, begun = look(directory), time.monotonic()
     first = told
+    for remark in told.remarks:
+        click.echo(remark, err=True)
     if as_json:
         click.echo(json.dumps(told.record(), indent=None if watch else 2))
         while watch and not told.finished:

@@ -14,8 +14,7 @@ from safevar_sumo.analysis.options import Option, Options
 from safevar_sumo.cli.options import Within
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
-from safevar_sumo.results import SolutionId, chosen_handle, position_of
-from safevar_sumo.results.imported import UNKNOWN
+from safevar_sumo.results import UNKNOWN, SolutionId, chosen_handle, position_of
 from safevar_sumo.study import SAFETY_DEGREE, Study, study_names
 
 if TYPE_CHECKING:

@@ -15,8 +15,7 @@ import tomli_w
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.reference.agreement import Agreement
-from safevar_sumo.results import write_whole
-from safevar_sumo.results.manifest import fixed
+from safevar_sumo.results import fixed, write_whole
 from safevar_sumo.study import Study, load_study, refuse_other_than_file, study_names
 
 TOTALS = Path(__file__).with_name("published.toml")

@@ -1,8 +1,7 @@
-"""Results that were not found here: solutions from elsewhere in a results directory, without runs and evaluations."""
+"""Imported results: a results directory of solutions from elsewhere, without runs and evaluations."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -14,8 +13,16 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results.files import make_directory, write_whole
-from safevar_sumo.results.inputs import digest_of_table, refuse_edited_table
-from safevar_sumo.results.manifest import DIGESTS, FORMAT, MANIFEST, RUNS, read_manifest
+from safevar_sumo.results.manifest import (
+    DIGESTS,
+    FORMAT,
+    MANIFEST,
+    RUNS,
+    digest_of_table,
+    read_manifest,
+    refuse_edited_table,
+    write_manifest,
+)
 from safevar_sumo.results.store import SOLUTIONS, solutions_frame
 from safevar_sumo.study import Study, refuse_other_than_file, tables_of
 
@@ -23,7 +30,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 UNKNOWN = "unknown"
-"""Outcome of an imported solution that did not collide: how it ended is not told."""
+"""Outcome of an imported solution that did not collide."""
 
 
 def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations],
@@ -33,13 +40,13 @@ def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations
     Parameters
     ----------
     path
-        Is made if it does not exist; what an earlier import of the same study has left there of other algorithms stays.
+        Made if it does not exist; solutions of other algorithms from an earlier import of the same study stay.
     solutions
         By algorithm.
     original
-        The original vehicle's metrics, by name; nothing keeps those of an earlier import.
+        The original vehicle's metrics, by name; None keeps those of an earlier import.
     files
-        The name of the file that the solutions come from, by algorithm.
+        Name of the solutions' file, by algorithm.
 
     Raises
     ------
@@ -51,23 +58,24 @@ def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations
     make_directory(path)
     tables, names = tables_of(study), tuple(study.vehicle.characteristics)
     earlier = _earlier(path, tables)
-    frame = solutions_frame(names, [((name, 0), found) for name, found in solutions.items()]).drop(columns="run")
+    frame = solutions_frame(names, [((name, 0), evaluations) for name, evaluations in solutions.items()]).drop(columns="run")
     if earlier:
         refuse_edited_table(path / SOLUTIONS, earlier, "the file as it was, or another directory")
         there = read_imported(path, names)
         frame = pd.concat([there[~there["algorithm"].isin(list(solutions))], frame], ignore_index=True)
         frame = frame.sort_values(["algorithm", "f_safe", "f_diff", "f_num_diff", *names], kind="stable", ignore_index=True)
-    known = earlier.get("original", {}) if original is None else original
     text = frame.to_csv(index=False, lineterminator="\n")
     manifest: dict[str, Any] = {
         "format": FORMAT, "study": tables, "imported": {"files": {**earlier.get("imported", {}).get("files", {}), **files}},
-        "versions": {"safevar_sumo": version("safevar_sumo")}, "original": dict(known), DIGESTS: {SOLUTIONS: digest_of_table(text)}}
+        "versions": {"safevar_sumo": version("safevar_sumo")},
+        "original": dict(earlier.get("original", {}) if original is None else original),
+        DIGESTS: {SOLUTIONS: digest_of_table(text)}}
     write_whole(path / SOLUTIONS, text)
-    write_whole(path / MANIFEST, json.dumps(manifest, indent=2, allow_nan=False) + "\n")
+    write_manifest(path, manifest)
 
 
 def _earlier(path: Path, study: dict[str, Any]) -> dict[str, Any]:
-    """The manifest that an earlier import of the study has left, if there is one."""
+    """The manifest of an earlier import of the study; empty if there is none."""
     if not (path / RUNS).exists() and not (path / MANIFEST).exists():
         return {}
     manifest = read_manifest(path) if (path / MANIFEST).exists() else {}
@@ -94,12 +102,12 @@ def read_imported(path: Path, characteristics: tuple[str, ...]) -> pd.DataFrame:
     refuse_other_than_file(file)
     try:
         frame = pd.read_csv(file, dtype=str, keep_default_na=False)[["algorithm", *numbers, "outcome"]]
-        found = frame.replace({name: {"": "nan"} for name in numbers}).astype(dict.fromkeys(numbers, float))
+        table = frame.replace({name: {"": "nan"} for name in numbers}).astype(dict.fromkeys(numbers, float))
     except OSError as error:
         raise InputError(file, f"cannot be read: {error.strerror or error}", "what the command import has written") from None
     except (KeyError, ValueError) as error:
         raise InputError(file, f"is damaged: {str(error).splitlines()[0]}", "what the command import has written") from None
     always = [name for name in numbers if name not in METRICS]
-    if not np.isfinite(found[always].to_numpy()).all():
+    if not np.isfinite(table[always].to_numpy()).all():
         raise InputError(file, f"is damaged: no number in one of the columns {', '.join(always)}", "what the command import has written")
-    return found.astype({"f_num_diff": int})
+    return table.astype({"f_num_diff": int})

@@ -1,37 +1,193 @@
 """The journal of one run: every evaluated batch, appended and synced before the search goes on.
 
-The first frame tells whose journal it is, the last one of a finished run which evaluations are its result. A torn tail,
-as a kill or a full disk leaves it, is cut off; damage before intact frames is an error.
+A journal is a file of frames: magic, length and CRC-32 of a payload, then the payload in MessagePack. The first frame names the
+journal's study and run, the last frame of a finished run its result. A torn tail, left by a kill or a full disk, is cut off;
+damage before intact frames is an error.
 """
 
 from __future__ import annotations
 
 import errno
 import os
+import re
+import struct
+import zlib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
+import msgspec
+import numpy as np
 import portalocker
 
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.records import Evaluations
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results.files import make_durable, sync_directory
-from safevar_sumo.results.frames import (
-    FORMAT,
-    MAGIC,
-    READABLE,
-    Batch,
-    Content,
-    Frame,
-    Owner,
-    Result,
-    Retry,
-    batch_of,
-    content_of,
-    encoded,
-    read_frames,
-)
 from safevar_sumo.study import refuse_other_than_file
+
+FORMAT = 2
+READABLE = (1, FORMAT)
+MAGIC = b"SVJ\n"
+HEAD = struct.Struct("<4sII")
+OUTCOMES = {
+    Outcome.STOPPED: 0, Outcome.PASSED: 1, Outcome.COLLISION: 2, Outcome.TIMEOUT: 3, Outcome.NEVER_MOVED: 4, Outcome.SIMULATOR_ERROR: 5,
+    Outcome.INVALID_TEST: 6}
+"""Codes of outcomes in journals; a code never changes its meaning."""
+_OUTCOME_OF = {code: outcome.value for outcome, code in OUTCOMES.items()}
+BESIDE_METRICS = ("collision_speed", "f_diff", "f_num_diff")
+SPARE = -1
+"""Position of an evaluation that the search has not asked for (again)."""
+
+
+class Owner(msgspec.Struct, frozen=True, tag="owner"):
+    """The digest of the study's identity, and the run's name."""
+
+    format: int
+    study: str
+    run: str
+
+
+class Batch(msgspec.Struct, frozen=True, tag="batch", omit_defaults=True):
+    """Evaluations; `positions` (int32) are their places in the run's order, `numbers` columns of float64, `reasons` by failed row."""
+
+    positions: bytes
+    outcome: bytes
+    settings: bytes
+    numbers: dict[str, bytes]
+    reasons: dict[int, str] = {}
+
+
+class Result(msgspec.Struct, frozen=True, tag="result", omit_defaults=True):
+    """The result of a run with a `budget` of evaluations (0 in format 1), by their positions; `asked` is how many the run asked for."""
+
+    positions: list[int]
+    asked: int
+    budget: int = 0
+
+
+class Retry(msgspec.Struct, frozen=True, tag="retry"):
+    """From here on failed evaluations do not count; evaluations after the first of them are spare."""
+
+
+Frame = Owner | Batch | Result | Retry
+
+
+class Content(NamedTuple):
+    """The contents of a journal: evaluations (None if there is none), their positions, and results by budget."""
+
+    positions: list[int]
+    evaluations: Evaluations | None
+    results: Mapping[int, Result]
+
+    def result(self, budget: int) -> Result | None:
+        """The result of the run with a budget of evaluations; None if it is unfinished."""
+        return self.results.get(budget, self.results.get(0))
+
+    def by_position(self, positions: list[int]) -> Evaluations:
+        """The evaluations at some positions."""
+        assert self.evaluations is not None
+        row_of = {position: row for row, position in enumerate(self.positions)}
+        return self.evaluations.take([row_of[position] for position in positions])
+
+    def within(self, budget: int) -> Evaluations | None:
+        """The evaluations that a run with a budget asked for; None if there is none."""
+        if self.evaluations is None:
+            return None
+        return self.evaluations.take(np.array([0 <= position < budget for position in self.positions], dtype=bool))
+
+
+NOTHING = Content([], None, {})
+
+
+def encoded(frame: Frame) -> bytes:
+    """A frame's bytes."""
+    payload = msgspec.msgpack.encode(frame)
+    return HEAD.pack(MAGIC, len(payload), zlib.crc32(payload)) + payload
+
+
+def batch_of(positions: list[int], evaluations: Evaluations) -> Batch:
+    """The frame of a batch."""
+    numbers = {**{name: getattr(evaluations, name) for name in BESIDE_METRICS}, **evaluations.metrics}
+    reasons = {row: evaluations.reasons[setting.tobytes()] for row, setting in enumerate(evaluations.settings)
+               if setting.tobytes() in evaluations.reasons}
+    return Batch(
+        positions=np.array(positions, dtype="<i4").tobytes(), outcome=bytes(OUTCOMES[one] for one in evaluations.outcome.tolist()),
+        settings=evaluations.settings.astype("<f8").tobytes(),
+        numbers={name: values.astype("<f8").tobytes() for name, values in numbers.items()}, reasons=reasons)
+
+
+def read_frames(data: bytes, path: Path) -> tuple[list[Frame], int]:
+    """All intact frames, and the end of the last one.
+
+    Raises
+    ------
+    InputError
+        If a frame is damaged and intact ones follow it.
+    """
+    frames: list[Frame] = []
+    offset = 0
+    while offset < len(data):
+        frame, end = _frame_at(data, offset, path)
+        if frame is None:
+            if any(_frame_at(data, later.start(), path)[0] is not None for later in re.compile(MAGIC).finditer(data, offset + 1)):
+                raise InputError(path, f"is damaged at byte {offset}, and intact frames follow",
+                                 "restore the file, or remove it to simulate the run again")
+            break
+        frames.append(frame)
+        offset = end
+    return frames, offset
+
+
+def content_of(frames: list[Frame]) -> Content:
+    """The contents of a journal from its frames in order."""
+    positions: list[int] = []
+    batches: list[Evaluations] = []
+    results: dict[int, Result] = {}
+    for frame in frames:
+        if isinstance(frame, Batch):
+            positions += np.frombuffer(frame.positions, dtype="<i4").tolist()
+            batches.append(_unpacked(frame))
+        elif isinstance(frame, Result):
+            results[frame.budget] = frame
+        elif isinstance(frame, Retry) and batches:
+            positions, kept = _without_failures(positions, Evaluations.concatenate(batches))
+            batches, results = [kept], {}
+    return Content(positions, Evaluations.concatenate(batches) if positions else None, results)
+
+
+def _without_failures(positions: list[int], evaluations: Evaluations) -> tuple[list[int], Evaluations]:
+    """Positions and evaluations of a run that simulates its failed settings again."""
+    simulated = ~evaluations.failed
+    first = min((position for position, fine in zip(positions, simulated, strict=True) if not fine), default=max(positions) + 1)
+    kept = [position if position < first else SPARE for position, fine in zip(positions, simulated, strict=True) if fine]
+    return kept, evaluations.take(simulated)
+
+
+def _frame_at(data: bytes, offset: int, path: Path) -> tuple[Frame | None, int]:
+    if offset + HEAD.size > len(data):
+        return None, offset
+    magic, length, checksum = HEAD.unpack_from(data, offset)
+    payload = data[offset + HEAD.size:offset + HEAD.size + length]
+    if magic != MAGIC or len(payload) != length or zlib.crc32(payload) != checksum:
+        return None, offset
+    try:
+        return msgspec.msgpack.decode(payload, type=Frame), offset + HEAD.size + length
+    except msgspec.DecodeError as error:
+        raise InputError(path, f"holds at byte {offset} a frame of another version: {error}", "the version that wrote it") from None
+
+
+def _unpacked(batch: Batch) -> Evaluations:
+    numbers = {name: _floats(values) for name, values in batch.numbers.items()}
+    speed, f_diff, f_num_diff = (numbers.pop(name) for name in BESIDE_METRICS)
+    outcome = np.array([_OUTCOME_OF[code] for code in batch.outcome], dtype="U16")
+    settings = _floats(batch.settings).reshape(len(outcome), -1)
+    reasons = {settings[row].tobytes(): reason for row, reason in batch.reasons.items()}
+    return Evaluations(settings=settings, outcome=outcome, metrics=numbers, reasons=reasons, collision_speed=speed, f_diff=f_diff,
+                       f_num_diff=f_num_diff)
+
+
+def _floats(values: bytes) -> FloatArray:
+    return np.frombuffer(values, dtype="<f8").astype(float)
 
 
 class JournalBusy(SafevarError):
@@ -39,21 +195,21 @@ class JournalBusy(SafevarError):
 
 
 class Journal:
-    """An open, locked journal; a dead process's lock is gone with it.
+    """An open, locked journal; the lock ends with the process.
 
     Parameters
     ----------
     path
-        The file; it is made if it does not exist. One without evaluations changes its owner.
+        The file, made if it does not exist. A journal without evaluations changes its owner.
     study, run
-        Whose journal it is.
+        Owner of the journal.
 
     Attributes
     ----------
     content
-        What it held when it was opened.
+        Its contents when it was opened.
     cut
-        How many bytes of a torn tail were cut off.
+        Number of bytes of a torn tail that were cut off.
 
     Raises
     ------
@@ -67,7 +223,7 @@ class Journal:
         self.path, self.cut = path, 0
         self._file = _opened(path)
         try:
-            self.content = self._take_in(Owner(format=FORMAT, study=study, run=run))
+            self.content = self._read(Owner(format=FORMAT, study=study, run=run))
         except OSError as error:
             self.close()
             raise SafevarError(f"{path}: cannot be read: {error.strerror}; what was written before stays valid") from None
@@ -84,7 +240,7 @@ class Journal:
         self._write(Result(positions=positions, asked=asked, budget=budget))
 
     def retry(self) -> None:
-        """Let failed evaluations count no more, and all that the search made of them."""
+        """Drop failed evaluations, and results based on them."""
         self._write(Retry())
         self._file.seek(0)
         self.content = content_of(read_frames(self._file.read(), self.path)[0])
@@ -93,7 +249,7 @@ class Journal:
         """Give the lock back."""
         self._file.close()
 
-    def _take_in(self, owner: Owner) -> Content:
+    def _read(self, owner: Owner) -> Content:
         data = self._file.read()
         size = len(data)
         frames, end = read_frames(data, self.path)
@@ -138,7 +294,7 @@ class Journal:
 
 
 def read_journal(path: Path, study: str, run: str) -> Content:
-    """What a journal holds that somebody may still write to.
+    """The contents of a journal that another process may be writing.
 
     Raises
     ------
@@ -148,13 +304,13 @@ def read_journal(path: Path, study: str, run: str) -> Content:
     frames = _frames_of(path)
     if frames and not (isinstance(frames[0], Owner) and frames[0].format in READABLE):
         raise InputError(path, "is of a format that this version does not read", "the version that wrote it")
-    if frames and frames[0] not in [Owner(format=known, study=study, run=run) for known in READABLE]:
+    if frames and frames[0] not in [Owner(format=number, study=study, run=run) for number in READABLE]:
         raise InputError(path, "belongs to another study, run or version than the manifest beside it", "the journals of this study alone")
     return content_of(frames)
 
 
 def owner_of(path: Path) -> str | None:
-    """The study that a journal in other hands belongs to; None while that is not written yet."""
+    """The study of a journal that another process has opened; None until that process has written it."""
     frames = _frames_of(path)
     return frames[0].study if frames and isinstance(frames[0], Owner) else None
 

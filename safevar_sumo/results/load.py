@@ -1,19 +1,17 @@
-"""Results read back as tidy frames, without SUMO."""
+"""Results read back as tidy frames or as the progress of a study, without SUMO."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.results.frames import NOTHING
 from safevar_sumo.results.imported import read_imported
-from safevar_sumo.results.inputs import refuse_edited_table
-from safevar_sumo.results.journal import read_journal
-from safevar_sumo.results.manifest import MANIFEST, RUNS, owner, read_manifest
+from safevar_sumo.results.journal import Content, read_journal
+from safevar_sumo.results.manifest import MANIFEST, RUNS, is_edited, owner, read_manifest, refuse_edited_table
 from safevar_sumo.results.store import SOLUTIONS, evaluations_frame, solutions_frame
 from safevar_sumo.study import label_of
 
@@ -22,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Failure(NamedTuple):
-    """A setting that could not be simulated: whose it was, its place in the run, and why."""
+    """A setting that could not be simulated: its algorithm and run, its place in the run, and why."""
 
     algorithm: str
     run: int
@@ -34,15 +32,15 @@ class Failure(NamedTuple):
 
 
 def failure_lines(failures: Sequence[Failure]) -> list[str]:
-    """Failures told by their reasons: of each how many, and the first of them."""
+    """A line for every reason of failures: the first failure with it, and the number of others."""
     reasons: dict[str, list[Failure]] = {}
-    for one in failures:
-        reasons.setdefault(one.reason, []).append(one)
-    return [str(found[0]) if len(found) == 1 else f"{found[0]} (and {len(found) - 1} more)" for found in reasons.values()]
+    for failure in failures:
+        reasons.setdefault(failure.reason, []).append(failure)
+    return [str(first) if not others else f"{first} (and {len(others)} more)" for first, *others in reasons.values()]
 
 
 class Results(NamedTuple):
-    """What a results directory holds.
+    """The contents of a results directory.
 
     Attributes
     ----------
@@ -66,42 +64,140 @@ class Results(NamedTuple):
     failures: tuple[Failure, ...] = ()
 
 
+class RunStatus(NamedTuple):
+    """Progress of one run: its different settings simulated, how many of them collided or failed, and its least safety degree.
+
+    `state` is waiting, begun or finished; `best` is in m, or -m/s, None before the first simulation.
+    """
+
+    algorithm: str
+    run: int
+    state: str
+    simulated: int
+    collisions: int
+    simulator_errors: int
+    best: float | None
+
+
+class Status(NamedTuple):
+    """Progress of a study.
+
+    `budget` is the largest number of evaluations of a run, `points` are (f_safe, f_diff, f_num_diff) of all settings so far, shape
+    (M, 3), `remarks` what is wrong with the directory.
+    """
+
+    study: str
+    title: str
+    budget: int
+    runs: tuple[RunStatus, ...]
+    points: np.ndarray
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def finished(self) -> bool:
+        return all(run.state == "finished" for run in self.runs)
+
+    @property
+    def simulated(self) -> int:
+        """Settings simulated in all runs."""
+        return sum(run.simulated for run in self.runs)
+
+    @property
+    def share(self) -> float:
+        """Share of the work that is done; a finished run counts with its whole budget."""
+        done = sum(self.budget if run.state == "finished" else min(run.simulated, self.budget) for run in self.runs)
+        return done / max(self.budget * len(self.runs), 1)
+
+    def record(self) -> dict[str, Any]:
+        """The object that `status --json` prints."""
+        return {"study": self.study, "finished": self.finished, "share": self.share, "simulated": self.simulated, "budget": self.budget,
+                "runs": [run._asdict() for run in self.runs]}
+
+
+class _Search(NamedTuple):
+    """The runs of a manifest's study, the evaluations of each, and the study's characteristics."""
+
+    runs: list[tuple[str, int]]
+    budget: int
+    characteristics: tuple[str, ...]
+
+
+def _search_of(place: Path, manifest: Mapping[str, Any]) -> _Search:
+    try:
+        search = manifest["study"]["search"]
+        runs = [(name, run) for name in dict.fromkeys(map(label_of, search["algorithms"])) for run in range(search["runs"])]
+        return _Search(runs, int(search["evaluations"]), tuple(manifest["study"]["vehicle"]["characteristics"]))
+    except (KeyError, TypeError, ValueError):
+        raise InputError(place / MANIFEST, "tells of no characteristics or of no search", "what the command study has written") from None
+
+
+def _journals(place: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str, int]]) -> Iterator[tuple[str, int, Content | None]]:
+    """Algorithm, run and journal of every run; None for a run without a journal."""
+    study = owner(manifest)
+    for algorithm, run in runs:
+        path = place / RUNS / f"{algorithm}-{run:02d}.journal"
+        yield algorithm, run, read_journal(path, study, path.stem) if path.exists() else None
+
+
 def load(directory: str | Path) -> Results:
-    """Read a results directory, finished or not: what its manifest's study asks for.
+    """Read a results directory, finished or not: the runs and evaluations that its manifest's study asks for.
 
     Raises
     ------
     InputError
-        If it is none, or a file in it is damaged or belongs to another study.
+        If it is none, or a file in it is damaged, was edited or belongs to another study.
     """
     place = Path(directory)
     manifest = read_manifest(place)
-    try:
-        characteristics = tuple(manifest["study"]["vehicle"]["characteristics"])
-        search = manifest["study"]["search"]
-        wanted = [(name, run) for name in dict.fromkeys(map(label_of, search["algorithms"])) for run in range(search["runs"])]
-        budget = int(search["evaluations"])
-    except (KeyError, TypeError, ValueError):
-        raise InputError(place / MANIFEST, "tells of no characteristics or of no search", "what the command study has written") from None
+    search = _search_of(place, manifest)
     again = "the same import again" if "imported" in manifest else "the same study again, which writes it from the journals"
     refuse_edited_table(place / SOLUTIONS, manifest, f"the file as it was, or {again}")
     if "imported" in manifest:
-        return Results(manifest, evaluations_frame(characteristics, []).assign(evaluation=0), read_imported(place, characteristics))
+        none = evaluations_frame(search.characteristics, []).assign(evaluation=0)
+        return Results(manifest, none, read_imported(place, search.characteristics))
     everything, solved, positions, failures = [], [], [], []
-    study = owner(manifest)
-    for algorithm, run in wanted:
-        path = place / RUNS / f"{algorithm}-{run:02d}.journal"
-        content = read_journal(path, study, path.stem) if path.exists() else NOTHING
-        if content.evaluations is None:
+    for algorithm, run, content in _journals(place, manifest, search.runs):
+        if content is None or content.evaluations is None:
             continue
-        asked = sorted((position, row) for row, position in enumerate(content.positions) if 0 <= position < budget)
+        asked = sorted((position, row) for row, position in enumerate(content.positions) if 0 <= position < search.budget)
         evaluations = content.evaluations.take([row for _, row in asked])
         everything.append(((algorithm, run), evaluations))
         positions += [position for position, _ in asked]
         failures += [Failure(algorithm, run, asked[row][0], evaluations.reason(row)) for row in np.flatnonzero(evaluations.failed).tolist()]
-        result = content.result(budget)
+        result = content.result(search.budget)
         if result is not None:
             solved.append(((algorithm, run), content.by_position(result.positions)))
-    frame = evaluations_frame(characteristics, everything)
+    frame = evaluations_frame(search.characteristics, everything)
     frame.insert(2, "evaluation", positions)
-    return Results(manifest, frame, solutions_frame(characteristics, solved), tuple(key for key, _ in solved), tuple(failures))
+    return Results(manifest, frame, solutions_frame(search.characteristics, solved), tuple(key for key, _ in solved), tuple(failures))
+
+
+def status(directory: str | Path) -> Status:
+    """Progress of the study in a results directory, whether a process works on it or not; nothing is locked or written.
+
+    Raises
+    ------
+    InputError
+        If it is no results directory, holds imported solutions, or a journal is damaged or belongs to another study.
+    """
+    place = Path(directory)
+    manifest = read_manifest(place)
+    if "imported" in manifest:
+        raise InputError(place, "holds imported solutions, which have no runs", "results of the command study")
+    search = _search_of(place, manifest)
+    runs = [_progress(*journal, search.budget) for journal in _journals(place, manifest, search.runs)]
+    remarks = [f"{place / SOLUTIONS} was edited: it does not hold what was computed"] if is_edited(place / SOLUTIONS, manifest) else []
+    return Status(str(manifest["study"].get("name")), str(manifest["study"].get("title")), search.budget, tuple(run for run, _ in runs),
+                  np.concatenate([points for _, points in runs]), tuple(remarks))
+
+
+def _progress(algorithm: str, run: int, content: Content | None, budget: int) -> tuple[RunStatus, np.ndarray]:
+    """Progress of a run, and objectives of its valid evaluations."""
+    evaluations = content.within(budget) if content is not None else None
+    if content is None or evaluations is None:
+        return RunStatus(algorithm, run, "waiting" if content is None else "begun", 0, 0, 0, None), np.zeros((0, 3))
+    valid = evaluations.take(evaluations.valid)
+    state = "finished" if content.result(budget) is not None else "begun"
+    best = float(np.min(valid.f_safe)) if len(valid) else None
+    return (RunStatus(algorithm, run, state, len(evaluations), int(np.count_nonzero(evaluations.collided)),
+                      int(np.count_nonzero(evaluations.failed)), best), valid.objectives)

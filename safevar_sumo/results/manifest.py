@@ -1,50 +1,55 @@
-"""The manifest of a results directory: whose results these are, and in what another study differs from theirs."""
+"""The manifest of a results directory: what its results depend on, digests of its files, and how another study differs."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.plugins import DIGITS, Files, digest_of, located
+from safevar_sumo.results.files import make_durable, write_whole
 from safevar_sumo.study import WORDS, Study, refuse_other_than_file, tables_of
 
 MANIFEST, RUNS = "manifest.json", "runs"
+PLACES, LATER = "places.json", "read-*.json"
+"""Files beside the journals: the folders of the study, relative to the results; and one for each file that was read later."""
 FORMAT = 3
 READABLE = (2, FORMAT)
 RESULTS = 1
-"""Stands for the package's code in whatever hangs on its results: raised whenever they change, to which tests/golden forces."""
+"""Number of the package's results, raised whenever they change (enforced by tests/golden)."""
 VERSIONED = ("safevar_sumo", "libsumo", "eclipse-sumo", "deap", "numpy")
 FREE = ("title", "published", "repeatability", "fit", "calibration", "variation", "correlations")
 """Keys of a study that change no result of a campaign."""
 FREE_OF_SEARCH = ("runs", "algorithms", "evaluations", "time_limit")
-"""Keys of its search table that change no evaluation: which runs there are, how far they go, how long one may take."""
+"""Keys of its search table that change no evaluation."""
 LAYERS = {
     "resolved": "the same study and options", "network": "the network's file as it was", "sources": "the file as it was",
     "results": "that version", "versions": "those versions", "platform": "such a machine"}
-"""What results depend on, as far as a manifest tells, and the way back where it differs."""
+"""What results depend on, and how to get back to it after a change."""
 OF_FILES = ("network", "sources")
-"""Layers of digests by file."""
+"""Layers that hold digests by file."""
 LAYERS_BEFORE = ("resolved", "network", "sources", "code", "versions", "platform")
-"""Those of format 2, which had digests of the package's files."""
+"""Layers of format 2, with digests of the package's files."""
 SIMULATORS = ("libsumo", "eclipse-sumo")
-"""Versions on which a simulation that is asked for now depends; the others are those of searches and of the package."""
+"""Versions on which a single simulation depends."""
 DIGESTS = "digests"
-"""Key of the digests of files of the directory itself."""
+"""Key of the digests of the directory's own files: of its table, and of the manifest without that digest."""
 
 
 def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
-    """The manifest of a study, but for the original vehicle.
+    """The manifest of a study, without the original vehicle.
 
     Parameters
     ----------
     study
-        As it is run, options applied.
+        The study as it is run.
     identity
-        What its results depend on beside its file, by `LAYERS`: see `safevar_sumo.workers.identity_of`.
+        What its results depend on beside its file, by `LAYERS`; see `safevar_sumo.workers.identity_of`.
     """
     return {
         "format": FORMAT, "study": tables_of(study), "seed": study.search.seed, "resolved": fixed(study), **identity,
@@ -62,7 +67,7 @@ def fixed(study: Study) -> dict[str, Any]:
 
 
 def owner(manifest: Mapping[str, Any]) -> str:
-    """The digest that the journals of a manifest's study carry."""
+    """The digest in the journals of a manifest's study."""
     if "format" in manifest:
         return _digest({layer: manifest.get(layer) for layer in (LAYERS if manifest["format"] == FORMAT else LAYERS_BEFORE)})
     search = {key: value for key, value in manifest["study"]["search"].items() if key not in ("runs", "algorithms")}
@@ -70,34 +75,41 @@ def owner(manifest: Mapping[str, Any]) -> str:
 
 
 def difference(stored: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str]:
-    """In what two manifests differ so that results may, and the way back; two empty texts if in nothing."""
+    """The first difference of two manifests that may change results, and the way back; two empty texts if there is none."""
     if stored.get("format") != FORMAT:
         return f"version {stored['versions'].get('safevar_sumo')} wrote them", "that version"
     for layer, way_back in LAYERS.items():
-        for told in _differences(layer, stored.get(layer, {}), new.get(layer, {})):
-            return told, way_back
+        for text in _differences(layer, stored.get(layer, {}), new.get(layer, {})):
+            return text, way_back
     return "", ""
 
 
 def differences_now(stored: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Everything in which what is simulated now differs from what results were computed with.
+    """All differences between a simulation now and the one that results were computed with.
 
-    Other versions of what only searches, and another machine, change no simulation; nor does another version of this package
-    with the same number `RESULTS`.
+    Other versions of search libraries, another machine, and versions of this package with the same `RESULTS` change no simulation.
     """
     if stored.get("format") != FORMAT:
         return [f"version {stored['versions'].get('safevar_sumo')} wrote them"]
-    found = [f"{key} is {there!r} there and {here!r} here" for key, there, here in _pairs(stored["resolved"], new["resolved"])
-             if there is not None]  # a key that came later: the number of results tells whether it changes any
-    found += [told for layer in (*OF_FILES, "results") for told in _differences(layer, stored.get(layer, {}), new[layer])]
-    there, here = ({name: of["versions"].get(name) for name in SIMULATORS} for of in (stored, new))
-    return [*found, *_differences("versions", there, here)]
+    texts = [f"{key} is {there!r} there and {here!r} here" for key, there, here in _pairs(stored["resolved"], new["resolved"])
+             if there is not None]  # whether a key added since changes results is up to `RESULTS`
+    texts += [text for layer in (*OF_FILES, "results") for text in _differences(layer, stored.get(layer, {}), new[layer])]
+    there, here = ({name: manifest["versions"].get(name) for name in SIMULATORS} for manifest in (stored, new))
+    return [*texts, *_differences("versions", there, here)]
 
 
 def counted(manifest: Mapping[str, Any]) -> Any:
-    """What of the journals counts: algorithms, runs, evaluations of each."""
+    """What solutions depend on beside the journals: algorithms, runs, evaluations of each run."""
     search = manifest["study"]["search"]
     return [search["algorithms"], search["runs"], search["evaluations"]]
+
+
+def write_manifest(directory: Path, manifest: Mapping[str, Any]) -> None:
+    """Write a manifest with a digest of itself, so that an edit shows."""
+    digests = {name: digest for name, digest in manifest.get(DIGESTS, {}).items() if name != MANIFEST}
+    sealed = {**manifest, DIGESTS: digests}
+    sealed[DIGESTS] = {**digests, MANIFEST: _digest(sealed)}
+    write_whole(directory / MANIFEST, json.dumps(sealed, indent=2, allow_nan=False) + "\n")
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:
@@ -106,16 +118,15 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        If there is none, or the file is something else.
+        If there is none, the file is something else or was edited.
     """
     file = directory / MANIFEST
     legal = "a directory that the command study has written"
     try:
         refuse_other_than_file(file)
         manifest = json.loads(file.read_text(encoding="utf-8"))
-        if isinstance(manifest["study"], dict) and isinstance(manifest["versions"], dict) and manifest.get("format", FORMAT) in READABLE \
-                and isinstance(manifest.get(DIGESTS, {}), dict):
-            return dict(manifest)
+        readable = isinstance(manifest["study"], dict) and isinstance(manifest["versions"], dict) \
+            and manifest.get("format", FORMAT) in READABLE and isinstance(manifest.get(DIGESTS, {}), dict)
     except FileNotFoundError:
         meant = Path("results") / directory.name
         hint = f"; did you mean {meant}?" if meant != directory and (meant / MANIFEST).is_file() else ""
@@ -123,12 +134,46 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     except OSError as error:
         raise InputError(file, f"cannot be read: {error.strerror}") from None
     except (ValueError, KeyError, TypeError, RecursionError):
-        pass
-    raise InputError(file, "is not a manifest of this version of the program", legal)
+        readable = False
+    if not readable:
+        raise InputError(file, "is not a manifest of this version of the program", legal)
+    digests = dict(manifest.get(DIGESTS, {}))
+    digest = digests.pop(MANIFEST, None)  # versions up to 0.2.0 wrote none
+    if digest is not None and digest != _digest({**manifest, DIGESTS: digests}):
+        raise InputError(file, "was edited; restore it, or remove it and run the same command again, which writes it anew")
+    return dict(manifest)
+
+
+def digest_of_table(text: str) -> str:
+    """Digest of a table, independent of its line ends."""
+    return sha256(text.replace("\r\n", "\n").encode()).hexdigest()
+
+
+def is_edited(file: Path, manifest: Mapping[str, Any]) -> bool:
+    """Whether a table is not the one that was written, as far as the manifest has its digest.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    digest = manifest.get(DIGESTS, {}).get(file.name)
+    try:
+        return digest is not None and digest_of_table(file.read_bytes().decode("utf-8", "replace")) != digest
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise InputError(file, f"cannot be read: {error.strerror or error}") from None
+
+
+def refuse_edited_table(file: Path, manifest: Mapping[str, Any], way_back: str) -> None:
+    """Refuse a table for which `is_edited` holds; `way_back` says what to do about it."""
+    if is_edited(file, manifest):
+        raise InputError(file, "was edited: it does not hold what was computed", way_back)
 
 
 def _differences(layer: str, stored: Any, new: Any) -> Iterator[str]:
-    """Everything in which a layer of two manifests differs, told for a person."""
+    """All differences between a layer of two manifests, in words."""
     for key, there, here in _pairs(stored, new):
         if layer in OF_FILES:
             what = "is not there any more" if here is None else "was not there" if there is None else "has changed"
@@ -147,5 +192,59 @@ def _pairs(stored: Any, new: Any, key: str = "") -> Iterator[tuple[str, Any, Any
         yield key, stored, new
 
 
+def write_places(directory: Path, study: Study) -> None:
+    """Write the folders of a study's files, relative to the directory; the manifest does not depend on them."""
+    if study.origin.places:
+        make_durable(directory / RUNS)
+        write_whole(directory / RUNS / PLACES, json.dumps([_relative(place, directory.resolve()) for place in study.origin.places]) + "\n")
+
+
+def places_of(directory: Path) -> tuple[str, ...]:
+    """Folders of the plug-ins and files of a directory's study: the study's own if they exist, then the two above the directory."""
+    own = [os.path.abspath(directory.resolve() / place) for place in _read(directory / RUNS / PLACES, [])]
+    return tuple(dict.fromkeys([*filter(os.path.isdir, own), *map(str, directory.resolve().parents[:2])]))
+
+
+def note_reading(directory: Path, name: str, digest: str) -> None:
+    """Note a file that was read after the study began; one note a file, because several processes may write them."""
+    make_durable(directory / RUNS)
+    write_whole(directory / RUNS / LATER.replace("*", sha256(name.encode()).hexdigest()[:DIGITS]), json.dumps({name: digest}) + "\n")
+
+
+def read_later(directory: Path) -> Files:
+    """Digests of files, by name, that were read after the study began."""
+    return {name: digest for path in sorted((directory / RUNS).glob(LATER)) for name, digest in _read(path, {}).items()}
+
+
+def begun_and_now(stored: Mapping[str, Any], now: Mapping[str, str], later: Mapping[str, str], places: Sequence[str]
+                  ) -> tuple[dict[str, Any], Files]:
+    """A stored manifest and the files that its study reads now, ready to be compared.
+
+    Of the files that were read later, those that have changed or are gone are in both, the others in neither.
+    """
+    begun, here = dict(stored.get("sources", {})), dict(now)
+    for name, digest in later.items():
+        if name not in begun:
+            present = here.pop(name, None) or digest_of(located(name, places))
+            if present != digest:
+                begun[name], here[name] = digest, present
+    return {**stored, "sources": begun}, {name: digest for name, digest in here.items() if digest}
+
+
 def _digest(what: Any) -> str:
     return sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+
+
+def _relative(place: str, directory: Path) -> str:
+    try:
+        return os.path.relpath(place, directory)
+    except ValueError:  # on another drive
+        return place
+
+
+def _read(path: Path, default: Any) -> Any:
+    """A JSON file of this package beside the journals; the default if there is none."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return default

@@ -1,8 +1,7 @@
-"""A results directory: `manifest.json`, the runs' journals and `solutions.csv`, the same for the same study and seed."""
+"""A results directory: `manifest.json`, the journals of the runs and `solutions.csv`; the same bytes for the same study and seed."""
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -16,9 +15,23 @@ from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS, SAFEVAR, Scoring
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results.files import make_directory, sync_directory, write_whole
-from safevar_sumo.results.inputs import begun_and_now, digest_of_table, note_reading, read_later, write_places
 from safevar_sumo.results.journal import Journal, JournalBusy, owner_of
-from safevar_sumo.results.manifest import DIGESTS, MANIFEST, RUNS, counted, difference, manifest_of, owner, read_manifest
+from safevar_sumo.results.manifest import (
+    DIGESTS,
+    MANIFEST,
+    RUNS,
+    begun_and_now,
+    counted,
+    difference,
+    digest_of_table,
+    manifest_of,
+    note_reading,
+    owner,
+    read_later,
+    read_manifest,
+    write_manifest,
+    write_places,
+)
 from safevar_sumo.study import Study
 
 if TYPE_CHECKING:
@@ -26,9 +39,9 @@ if TYPE_CHECKING:
 
 SOLUTIONS = "solutions.csv"
 ORIGINAL = "original"
-"""Name of the original vehicle's journal. Who writes it first owns the directory."""
+"""Name of the original vehicle's journal; the study that writes it first owns the directory."""
 SECONDS_TO_CLAIM = 10.0
-"""How long another process may take to write into a new journal whose it is."""
+"""How long another process may take to write the owner into a new journal [s]."""
 
 
 class ResultsDirectory:
@@ -37,13 +50,13 @@ class ResultsDirectory:
     Parameters
     ----------
     path
-        Is made if it does not exist.
+        Made if it does not exist.
     study
-        The study as it is run, options applied.
+        The study as it is run.
     identity
-        What its results depend on beside its file: see `safevar_sumo.workers.identity_of`.
+        What its results depend on beside its file; see `safevar_sumo.workers.identity_of`.
     scoring
-        What is measured and minimised.
+        Metrics and objectives.
 
     Raises
     ------
@@ -62,16 +75,16 @@ class ResultsDirectory:
 
     @property
     def inputs(self) -> dict[str, Any]:
-        """Digests of the files that workers must have alike, by layer: those that a study begins with, and what was read later."""
+        """Digests of the files that all workers must share, by layer: the study's files, and those read later."""
         return {"network": self.manifest.get("network", {}), "sources": self._known}
 
     def note(self, files: Mapping[str, str]) -> None:
-        """Take down files that other people's code has read since the study began, before anything that hangs on them is journalled.
+        """Record files that code from outside has read since the study began; call it before journalling results based on them.
 
         Raises
         ------
         InputError
-            If one of them is known with another content.
+            If a file has changed since it was first read.
         """
         for name, digest in files.items():
             there = self._known.get(name) or read_later(self.path).get(name, digest)
@@ -92,13 +105,13 @@ class ResultsDirectory:
             raise
 
     def begin(self, original: Evaluations) -> None:
-        """Write the manifest, with the original vehicle's evaluation; solutions of fewer or other runs are not kept beside it."""
+        """Write the manifest with the original vehicle's evaluation; remove solutions of other runs."""
         manifest = {**self.manifest, "original": record(original, 0)}
         earlier = read_manifest(self.path) if (self.path / MANIFEST).exists() else manifest
         outdated = counted(earlier) != counted(manifest)
         if not outdated and DIGESTS in earlier:
             manifest[DIGESTS] = earlier[DIGESTS]
-        self._write_manifest(manifest)
+        write_manifest(self.path, manifest)
         write_places(self.path, self._study)
         if outdated:
             self._remove(self.path / SOLUTIONS)
@@ -108,28 +121,25 @@ class ResultsDirectory:
         frame = solutions_frame(tuple(self._study.vehicle.characteristics), solutions.items())
         text = frame.to_csv(index=False, lineterminator="\n")
         write_whole(self.path / SOLUTIONS, text)
-        self._write_manifest({**read_manifest(self.path), DIGESTS: {SOLUTIONS: digest_of_table(text)}})
-
-    def _write_manifest(self, manifest: Mapping[str, Any]) -> None:
-        write_whole(self.path / MANIFEST, json.dumps(manifest, indent=2, allow_nan=False) + "\n")
+        write_manifest(self.path, {**read_manifest(self.path), DIGESTS: {SOLUTIONS: digest_of_table(text)}})
 
     def _refuse_another_study(self) -> None:
         if not (self.path / MANIFEST).exists():
-            foreign = sorted(one.name for one in self.path.iterdir() if one.name not in (RUNS, SOLUTIONS) and not one.name.startswith("."))
+            foreign = sorted(name for path in self.path.iterdir() if (name := path.name) not in (RUNS, SOLUTIONS) and name[0] != ".")
             if foreign:
                 raise InputError("out", f"{self.path} holds other things: {foreign[0]}", "an empty directory, or one of this study")
             return
         stored, later = read_manifest(self.path), read_later(self.path)
         if "imported" not in stored and later:
             stored, self.manifest["sources"] = begun_and_now(stored, self._known, later, self._study.origin.places)
-        told, way_back = ("they are imported", "") if "imported" in stored else difference(stored, self.manifest)
+        text, way_back = ("they are imported", "") if "imported" in stored else difference(stored, self.manifest)
         self._known = {**self.manifest.get("sources", {}), **later}
-        if told:
+        if text:
             legal = f"another --out, or {way_back}" if way_back else "another --out"
-            raise InputError(self.path, f"holds results of another study: {told}", legal)
+            raise InputError(self.path, f"holds results of another study: {text}", legal)
 
     def _refuse_another_owner(self, path: Path) -> None:
-        """Whose a journal in other hands is, as soon as that is written."""
+        """Wait until the process that holds a journal has written its owner; refuse another study."""
         end = time.monotonic() + SECONDS_TO_CLAIM
         while (theirs := owner_of(path)) is None and time.monotonic() < end:
             time.sleep(SECONDS_TO_CLAIM / 1000)
@@ -159,24 +169,24 @@ def evaluations_frame(characteristics: tuple[str, ...], runs: Iterable[tuple[tup
     """
     import pandas as pd
 
-    found = list(runs)
-    metrics = dict.fromkeys([*METRICS, *(name for _, one in found for name in one.metrics)])
+    all_runs = list(runs)
+    metrics = dict.fromkeys([*METRICS, *(name for _, evaluations in all_runs for name in evaluations.metrics)])
     frames = [_frame("", 0, characteristics, Evaluations.none(len(characteristics), metrics))]
-    frames += [_frame(algorithm, run, characteristics, one) for (algorithm, run), one in found]
+    frames += [_frame(algorithm, run, characteristics, evaluations) for (algorithm, run), evaluations in all_runs]
     return pd.concat(frames, ignore_index=True)
 
 
-def _frame(algorithm: str, run: int, characteristics: tuple[str, ...], found: Evaluations) -> pd.DataFrame:
+def _frame(algorithm: str, run: int, characteristics: tuple[str, ...], evaluations: Evaluations) -> pd.DataFrame:
     import pandas as pd
 
     return pd.DataFrame({
-        "algorithm": np.full(len(found), algorithm, dtype=object), "run": np.full(len(found), run),
-        **dict(zip(characteristics, found.settings.T, strict=True)), "f_safe": found.f_safe, "f_diff": found.f_diff,
-        "f_num_diff": found.f_num_diff.astype(int), **found.metrics, "outcome": found.outcome.astype(object)})
+        "algorithm": np.full(len(evaluations), algorithm, dtype=object), "run": np.full(len(evaluations), run),
+        **dict(zip(characteristics, evaluations.settings.T, strict=True)), "f_safe": evaluations.f_safe, "f_diff": evaluations.f_diff,
+        "f_num_diff": evaluations.f_num_diff.astype(int), **evaluations.metrics, "outcome": evaluations.outcome.astype(object)})
 
 
 def record(evaluations: Evaluations, row: int) -> dict[str, Any]:
-    """One evaluation as plain values; what is undefined is None."""
+    """One evaluation as plain values; undefined values are None."""
     numbers = {
         "collision_speed": evaluations.collision_speed[row],
         **{name: values[row] for name, values in evaluations.metrics.items()},

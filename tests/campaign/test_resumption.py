@@ -16,8 +16,7 @@ from safevar_sumo.campaign.run import Run
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import Journal, ResultsDirectory, load
-from safevar_sumo.results.frames import encoded, read_frames
-from safevar_sumo.results.journal import read_journal
+from safevar_sumo.results.journal import encoded, read_frames, read_journal
 from safevar_sumo.search import Search
 from safevar_sumo.study import Study
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 from safevar_sumo.results import ResultsDirectory, load
+from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers.identity import identity_of
@@ -63,7 +64,7 @@ def test_results_of_another_version_or_seed_are_refused_and_left_alone(copied: P
     assert {path: path.read_bytes() for path in copied.rglob("*.*")} == before
     manifest = json.loads((copied / "manifest.json").read_text())
     manifest["versions"]["libsumo"] = "1.20.0"
-    (copied / "manifest.json").write_text(json.dumps(manifest))
+    write_manifest(copied, manifest)
     assert "version of libsumo is '1.20.0' there and '1.28.0' here" in study("--out", "out", expect=2)
     (copied / "manifest.json").unlink()
     (copied / "runs" / "original.journal").unlink()

@@ -189,6 +189,22 @@ def test_what_is_no_result_is_refused(results: Path, in_tmp: Path) -> None:
     assert not Path("pictures").exists()
 
 
+@pytest.mark.parametrize("command", ["tables", "explain", "status"])
+@pytest.mark.parametrize(("table", "key", "value"), [("original", "safety_degree", 99.0), ("study", "title", "Another")])
+def test_an_edited_manifest_is_refused_in_one_line(command: str, table: str, key: str, value: object, results: Path, in_tmp: Path) -> None:
+    shutil.copytree(results, "out")
+    manifest = json.loads(Path("out/manifest.json").read_text())
+    manifest[table][key] = value
+    Path("out/manifest.json").write_text(json.dumps(manifest, indent=2))
+    message = run(command, "out", expect=2).stderr.strip()
+    assert "manifest.json: was edited" in message
+    assert len(message.splitlines()) == 1
+
+
+def test_results_are_no_published_data_of_themselves(results: Path) -> None:
+    refused("replicate", str(results), "--published", str(results), told=("--published", "given as results too"))
+
+
 def test_damaged_results_are_refused(imported: Path) -> None:
     text = (imported / "solutions.csv").read_text()
     for spoilt in (text.replace("f_diff", "g_diff"), text.replace(",0.", ",zero.", 1), ""):

@@ -20,6 +20,7 @@ from safevar_sumo.report import findings, limits, make_report
 from safevar_sumo.report import verdict as what
 from safevar_sumo.report.limits import LIMITS, _percent
 from safevar_sumo.report.page import PARTS, gather
+from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.scenarios import Point
 
 
@@ -28,7 +29,7 @@ def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path:
     shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))
     manifest = json.loads((slippery / "manifest.json").read_text())
     manifest["study"]["scenario"]["parameters"] = {"network": "/nowhere/gone"}
-    (tmp_path / "copy/manifest.json").write_text(json.dumps(manifest))
+    write_manifest(tmp_path / "copy", manifest)
     page = make_report([tmp_path / "copy"], only=["tested", "verdict", *PARTS, "trust", "reproduce"], jobs=1)
     told = re.findall(r"slippery: What this study is about cannot be simulated here: .*gone", page)
     assert len(told) == 1 + len(LIMITS), "each section that would take simulations says so"
@@ -40,7 +41,7 @@ def test_of_an_original_that_collides_no_change_is_called_the_cause(
     shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))
     manifest = json.loads((slippery / "manifest.json").read_text())
     manifest["original"] |= {"outcome": "collision", "collision": True, "collision_speed": 3.9, "safety_degree": -3.9, "f_safe": -3.9}
-    (tmp_path / "copy/manifest.json").write_text(json.dumps(manifest))
+    write_manifest(tmp_path / "copy", manifest)
     empty = {"changes": {}, "boundary": {}, "fraction": 0.0, "end": "safe", "outcome": "collision", "safety_degree": -3.9}
     failure = {"algorithm": "nsga2", "run": 0, "index": 0, "minimal_causes": [empty], "robustness": 1.0, "because": "it collides anyhow"}
     monkeypatch.setattr(findings, "explain", lambda *_, **__: SimpleNamespace(records=lambda: [failure]))

@@ -27,6 +27,7 @@ from safevar_sumo.report.page import gather
 from safevar_sumo.report.svg import Dot, scatter
 from safevar_sumo.report.verdict import verdict
 from safevar_sumo.results import SolutionId
+from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.sumo.system import assemble
 
 
@@ -268,7 +269,7 @@ def test_text_of_a_study_stays_text(bad: str, slippery: Path, tmp_path: Path) ->
     shutil.copytree(slippery, tmp_path / "copy")
     manifest = json.loads((slippery / "manifest.json").read_text())
     manifest["study"]["title"] = bad
-    (tmp_path / "copy/manifest.json").write_text(json.dumps(manifest))
+    write_manifest(tmp_path / "copy", manifest)
     page = make_report([tmp_path / "copy"], only=["tested", "verdict", "trust", "reproduce"])
     assert Outline(page).open == []
     assert "alert(1)</script>" not in page

@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import Journal, JournalBusy
-from safevar_sumo.results.frames import HEAD, MAGIC, SPARE, Content, Result, batch_of
-from safevar_sumo.results.journal import owner_of, read_journal
+from safevar_sumo.results.journal import HEAD, MAGIC, SPARE, Content, Result, batch_of, owner_of, read_journal
 
 BATCHES = 4
 ROWS = 3

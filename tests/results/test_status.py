@@ -68,3 +68,13 @@ def test_watching_ends_with_the_study_and_json_is_json(slippery: Path) -> None:
     told = json.loads(CliRunner().invoke(commands, ["status", str(slippery), "--json"]).output)
     assert told["finished"] is True
     assert np.isfinite(told["runs"][0]["best"])
+
+
+def test_an_edited_table_is_told(slippery: Path, tmp_path: Path) -> None:
+    shutil.copytree(slippery, tmp_path / "it")
+    file = tmp_path / "it/solutions.csv"
+    file.write_text(file.read_text().replace("nsga2,0,", "nsga2,1,", 1))
+    done = CliRunner().invoke(commands, ["status", str(tmp_path / "it"), "--json"])
+    assert done.exit_code == 0
+    assert f"{file} was edited" in done.stderr
+    json.loads(done.stdout)
