@@ -36,6 +36,11 @@ def plain(text: object, style: str = "") -> Text:
     return Text("".join(sign if sign.isprintable() else " " if sign.isspace() else "?" for sign in str(text)), style)
 
 
+def print_text(console: Console, text: str) -> None:
+    """A line of text as it is: not wrapped, without markup."""
+    console.print(text, soft_wrap=True, markup=False, highlight=False)
+
+
 def print_meanings(console: Console, members: Iterable[Characteristic]) -> None:
     """What characteristics are, a line for each that the study has words for."""
     table = Table.grid(padding=(0, 2))

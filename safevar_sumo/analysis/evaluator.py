@@ -1,12 +1,14 @@
-"""Where the settings of one study are tried out: every question asks here."""
+"""Where every question evaluates the settings of a study, and designs that cover its domain."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import msgspec
 import numpy as np
+import scipy
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
@@ -19,15 +21,15 @@ from safevar_sumo.workers.evaluation import Pool
 from safevar_sumo.workers.local import available_cores, local_pool
 
 Progress = Callable[[str, int, int], None]
-"""Is told what is going on, how many settings of it are done, and how many there are."""
+"""Called with the stage, how many of its settings are done, and how many there are."""
 
 
-def silent(what: str, done: int, total: int) -> None:
-    """Progress that nobody wants to see."""
+def silent(stage: str, done: int, total: int) -> None:
+    """Progress that is not shown."""
 
 
 class Bench:
-    """Evaluates settings of one study as they are given: nothing is filtered here.
+    """Evaluates settings of one study as they are, without the filter.
 
     Attributes
     ----------
@@ -40,19 +42,19 @@ class Bench:
         self._pool, self.progress = pool, progress
         self.simulated = 0
 
-    def evaluate(self, settings: FloatArray, what: str) -> Evaluations:
-        """Evaluate settings, shape (M, n); `what` tells the progress what they are for."""
+    def evaluate(self, settings: FloatArray, stage: str) -> Evaluations:
+        """Evaluate settings, shape (M, n); `stage` is what the progress calls them."""
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
         done, total = 0, len(np.unique(settings, axis=0))
-        self.progress(what, 0, total)
+        self.progress(stage, 0, total)
 
-        def one_more(number: int) -> None:
+        def count(number: int) -> None:
             nonlocal done
             done += number
-            self.progress(what, done, total)
+            self.progress(stage, done, total)
 
-        evaluations = evaluate_all(self.study, settings, self._pool, one_more)
+        evaluations = evaluate_all(self.study, settings, self._pool, count)
         self.simulated += total
         return evaluations
 
@@ -70,7 +72,7 @@ class Bench:
         return evaluations
 
     def with_step(self, step: float) -> Bench:
-        """The same, simulated with another time step [s]."""
+        """A bench of the same study with another time step [s]."""
         metrics = msgspec.structs.replace(self.study.metrics, sampling_interval=None)  # it need not be a multiple of this step
         return self.of(msgspec.structs.replace(self.study, step_length=step, metrics=metrics))
 
@@ -81,7 +83,7 @@ class Bench:
 
 @contextmanager
 def open_bench(study: Study, pool: Pool | None = None, jobs: int | None = None, progress: Progress = silent) -> Iterator[Bench]:
-    """A bench on somebody's pool, or on `jobs` worker processes of its own (as many as there are cores).
+    """A bench on a given pool, or on `jobs` worker processes of its own, by default one for each core.
 
     Raises
     ------
@@ -94,3 +96,20 @@ def open_bench(study: Study, pool: Pool | None = None, jobs: int | None = None, 
     assemble(study)
     with local_pool(jobs or available_cores(), study.search.time_limit) as own:
         yield Bench(study, own, progress)
+
+
+def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
+    """Scrambled Sobol points in the unit cube, shape (number, dimensions); evenly spread where number is a power of two."""
+    points = scipy.stats.qmc.Sobol(dimensions, rng=np.random.default_rng(seed)).random_base2(max(0, math.ceil(math.log2(number))))
+    return np.asarray(points[:number])
+
+
+def spread(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:
+    """Settings that cover the whole domain evenly, shape (number, n)."""
+    lower, upper = characteristics.lower, characteristics.upper
+    return np.asarray(lower + sobol_points(number, len(characteristics), seed) * (upper - lower))
+
+
+def finite_or_none(value: float) -> float | None:
+    """A value as JSON holds it: undefined (NaN) is None."""
+    return None if np.isnan(value) else float(value)

@@ -1,7 +1,7 @@
 """Options of a question: one record with defaults, legal ranges and help texts.
 
 Flags of the command, defaults of the Python function, the call of the report and the command that the report prints all derive
-from the record, which stands in `options.py` of the question's package. The help of a command reads it, so it loads nothing heavy.
+from the record, which stands in the `__init__.py` of the question's package. The help of a command reads it, so it loads nothing heavy.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Any, ClassVar, NamedTuple
 from safevar_sumo.errors import InputError
 
 RUN = "python -m safevar_sumo"
-"""How a command of this package is called."""
+"""Begins every command of this package."""
 
 
 class Option(NamedTuple):
-    """How one option is asked for: help, legal range, name and form of its flag.
+    """One option as a flag: help, legal range, name and form of its flag.
 
     `kind` is the type of one value; `form` is "one" value, "commas" between several, or "repeated" flags. The ends `low` and
     `high` belong to the range unless it is `is_open`.
@@ -35,7 +35,7 @@ class Option(NamedTuple):
     form: str = "one"
 
     def refusal(self, value: float) -> str:
-        """What would be legal, if a number is outside of the range; nothing if it is inside. NaN is outside."""
+        """What is expected, if a number is outside the range (as NaN is); empty if it is inside."""
         above = self.low is None or (value > self.low if self.is_open[0] else value >= self.low)
         below = self.high is None or (value < self.high if self.is_open[1] else value <= self.high)
         if above and below:
@@ -56,12 +56,12 @@ def unsafe_option() -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of a question; refuses values outside of their ranges.
+    """Options of a question; refuses values outside their ranges.
 
     Raises
     ------
     InputError
-        Naming the option, its value and what is legal.
+        Names the option, its value and what is expected.
     """
 
     question: ClassVar[str]
@@ -73,29 +73,25 @@ class Options:
             if value is not None and described.kind in (int, float):
                 if isinstance(value, bool) or not isinstance(value, Integral if described.kind is int else Real):
                     raise InputError(name, repr(value), "a whole number" if described.kind is int else "a number")
-                if legal := described.refusal(float(value)):
-                    raise InputError(name, repr(value), legal)
+                if expected := described.refusal(float(value)):
+                    raise InputError(name, repr(value), expected)
 
     @classmethod
     def described(cls) -> Mapping[str, Option]:
         """Every option by its name."""
-        return {one.name: one.metadata["option"] for one in fields(cls)}
+        return {item.name: item.metadata["option"] for item in fields(cls)}
 
     @classmethod
     def flags(cls) -> Mapping[str, str]:
         """The flag of every option."""
-        return {name: one.flag or f"--{name.replace('_', '-')}" for name, one in cls.described().items()}
-
-    def keywords(self) -> dict[str, Any]:
-        """The options as the function of the question takes them."""
-        return {one.name: getattr(self, one.name) for one in fields(self)}
+        return {name: option.flag or f"--{name.replace('_', '-')}" for name, option in cls.described().items()}
 
     def command_line(self, place: str, point: str = "") -> str:
         """The command that asks the same of a study or results directory: what differs from the defaults is a flag."""
         parts = [RUN, self.question, quote(place)]
-        for one in fields(self):
-            value, flag, described = getattr(self, one.name), self.flags()[one.name], one.metadata["option"]
-            if value == one.default:
+        for item in fields(self):
+            value, flag, described = getattr(self, item.name), self.flags()[item.name], item.metadata["option"]
+            if value == item.default:
                 continue
             if described.kind is bool:
                 parts.append(flag)

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec.structs import replace
 
+from safevar_sumo.analysis.criterion import clopper_pearson
 from safevar_sumo.analysis.evaluator import Bench
-from safevar_sumo.analysis.risk.compute import interval_of
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import ModelTable, Study
@@ -74,7 +74,7 @@ class Preventability:
         share = self.share(by)
         if share is None or self.looked_at == self.collisions:
             return None if share is None else (share, share)
-        return interval_of(self.numbers.get(by, 0), self.looked_at, CONFIDENCE)
+        return clopper_pearson(self.numbers.get(by, 0), self.looked_at, CONFIDENCE)
 
     def to_dict(self) -> dict[str, Any]:
         """As `explain --json` prints it; shares and interval are None without any collision."""

@@ -9,10 +9,10 @@ from typing import Any
 import click
 from rich.console import Console
 
-from safevar_sumo.analysis.explain.options import ExplainOptions
-from safevar_sumo.analysis.risk.options import RiskOptions
-from safevar_sumo.analysis.rules.options import RulesOptions
-from safevar_sumo.analysis.tolerance.options import ToleranceOptions
+from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.risk import RiskOptions
+from safevar_sumo.analysis.rules import RulesOptions
+from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.options import PICTURES, check_output
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import jobs_option, json_option, now_option, options_of, point_option, results_or_study, study_at_point
@@ -32,24 +32,24 @@ from safevar_sumo.results import make_directory, write_whole
 def explain(place: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **given: Any) -> None:
     """Explain failures of results in DIR, or all over the domain of STUDY: which changes did it, how little is enough, why."""
     from safevar_sumo.analysis.explain.compute import explain_failures
-    from safevar_sumo.analysis.explain.render import print_explained
-    from safevar_sumo.analysis.figures import necessity_figure, save
+    from safevar_sumo.analysis.explain.render import necessity_figure, print_explained
+    from safevar_sumo.analysis.figures import save
     from safevar_sumo.terminal import stages
 
     source = results_or_study(place, point)
     if out is not None:
         make_directory(out)
     with stages(Console(stderr=True)) as progress:
-        told = explain_failures(source, **ExplainOptions(**given).keywords(), jobs=jobs, progress=progress)
-    records = json.dumps(told.records(), indent=2, allow_nan=False)
+        result = explain_failures(source, ExplainOptions(**given), jobs=jobs, progress=progress)
+    records = json.dumps(result.to_dict(), indent=2, allow_nan=False)
     if as_json:
         click.echo(records)
     else:
-        print_explained(Console(), place, told, point or "", full=full)
+        print_explained(Console(), place, result, point or "", full=full)
     if out is not None:
         write_whole(out / "causes.json", records + "\n")
-        write_whole(out / "causes.csv", told.frame().to_csv(index=False, lineterminator="\n"))
-        save(necessity_figure(told), out / "necessity.png")
+        write_whole(out / "causes.csv", result.to_frame().to_csv(index=False, lineterminator="\n"))
+        save(necessity_figure(result), out / "necessity.png")
         click.echo(f"Causes: {out}", err=as_json)
 
 
@@ -64,9 +64,9 @@ def explain(place: str, full: bool, point: str | None, jobs: int | None, as_json
               help="Draw the profiles here: png, pdf or svg; with --pairs, the worst pairs in a second file beside it.")
 def tolerance(place: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **given: Any) -> None:
     """Find how far each characteristic of STUDY may go: alone, in pairs, and all together."""
-    from safevar_sumo.analysis.figures import pairs_figure, profiles_figure, save
+    from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
-    from safevar_sumo.analysis.tolerance.render import print_tolerance
+    from safevar_sumo.analysis.tolerance.render import pairs_figure, print_tolerance, profiles_figure
     from safevar_sumo.terminal import stages
 
     options, chosen = ToleranceOptions(**given), study_at_point(place, point)
@@ -75,15 +75,15 @@ def tolerance(place: str, point: str | None, jobs: int | None, as_json: bool, pl
         if path is not None:
             check_output(path, "--plot", PICTURES)
     with stages(Console(stderr=True)) as progress:
-        told = find_tolerances(chosen, **options.keywords(), jobs=jobs, progress=progress)
+        result = find_tolerances(chosen, options, jobs=jobs, progress=progress)
     if as_json:
-        click.echo(json.dumps(told.record(), indent=2, allow_nan=False))
+        click.echo(json.dumps(result.to_dict(), indent=2, allow_nan=False))
     else:
-        print_tolerance(Console(), told)
+        print_tolerance(Console(), result)
     if plot is not None and second is not None:
-        save(profiles_figure(told), plot, "--plot")
-        if told.pairs:
-            save(pairs_figure(told), second, "--plot")
+        save(profiles_figure(result), plot, "--plot")
+        if result.pairs:
+            save(pairs_figure(result), second, "--plot")
 
 
 @commands.command()
@@ -96,9 +96,9 @@ def tolerance(place: str, point: str | None, jobs: int | None, as_json: bool, pl
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help="Draw what decides here: png, pdf or svg.")
 def risk(place: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **given: Any) -> None:
     """Estimate how likely an unsafe outcome is when vehicles vary as STUDY says under [variation], and what decides."""
-    from safevar_sumo.analysis.figures import save, sensitivity_figure
+    from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.risk.compute import estimate_risk
-    from safevar_sumo.analysis.risk.render import print_risk
+    from safevar_sumo.analysis.risk.render import print_risk, sensitivity_figure
     from safevar_sumo.terminal import stages
 
     chosen = study_at_point(place, point)
@@ -107,17 +107,17 @@ def risk(place: str, point: str | None, jobs: int | None, as_json: bool, plot: P
         if chosen.correlations:
             raise InputError("--plot", "sensitivity indices of correlated characteristics are not defined", "a study without correlations")
     with stages(Console(stderr=True)) as progress:
-        told = estimate_risk(chosen, **RiskOptions(**given).keywords(), jobs=jobs, progress=progress)
-    if told.sensitivity is None:
+        result = estimate_risk(chosen, RiskOptions(**given), jobs=jobs, progress=progress)
+    if result.sensitivity is None:
         click.echo("note: characteristics are correlated, for which sensitivity indices are not defined: there are none", err=True)
-    if told.errors:
-        click.echo(f"warning: {told.errors} vehicles could not be simulated and are left out", err=True)
+    if result.errors:
+        click.echo(f"warning: {result.errors} vehicles could not be simulated and are left out", err=True)
     if as_json:
-        click.echo(json.dumps(told.record(), indent=2, allow_nan=False))
+        click.echo(json.dumps(result.to_dict(), indent=2, allow_nan=False))
     else:
-        print_risk(Console(), told)
+        print_risk(Console(), result)
     if plot is not None:
-        save(sensitivity_figure(told), plot, "--plot")
+        save(sensitivity_figure(result), plot, "--plot")
 
 
 @commands.command()
@@ -128,16 +128,16 @@ def risk(place: str, point: str | None, jobs: int | None, as_json: bool, plot: P
 @jobs_option
 @json_option
 def rules(place: str, point: str | None, jobs: int | None, as_json: bool, **given: Any) -> None:
-    """Find rules that tell where STUDY is unsafe, in physical units, from settings spread evenly and never from what a search found."""
+    """Find rules in physical units that say where STUDY is unsafe, from evenly spread settings, not from a search."""
     from safevar_sumo.analysis.rules.compute import find_rules
     from safevar_sumo.analysis.rules.render import print_rules
     from safevar_sumo.terminal import stages
 
     with stages(Console(stderr=True)) as progress:
-        told = find_rules(study_at_point(place, point), **RulesOptions(**given).keywords(), jobs=jobs, progress=progress)
+        result = find_rules(study_at_point(place, point), RulesOptions(**given), jobs=jobs, progress=progress)
     if as_json:
-        if told.remark:
-            click.echo(f"note: {told.remark}", err=True)
-        click.echo(json.dumps(told.records(), indent=2, allow_nan=False))
+        if result.remark:
+            click.echo(f"note: {result.remark}", err=True)
+        click.echo(json.dumps(result.to_dict(), indent=2, allow_nan=False))
     else:
-        print_rules(Console(), told)
+        print_rules(Console(), result)

@@ -31,8 +31,8 @@ OBJECTIVES = ["f_safe", "f_diff", "f_num_diff"]
 def explanations(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
     """The failures that matter, explained; computed once for these results."""
     def compute() -> Found:
-        return explain(material.case, **material.options["explain"].keywords(), jobs=jobs,
-                       progress=lambda what, done, total: progress(f"{material.case.name}: {what}", done, total)).records()
+        return explain(material.case, material.options["explain"], jobs=jobs,
+                       progress=lambda what, done, total: progress(f"{material.case.name}: {what}", done, total)).to_dict()
 
     return list(stored(material, "explain", compute))
 

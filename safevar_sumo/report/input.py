@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.analysis.criterion import Unsafe
-from safevar_sumo.analysis.explain.failures import points_of
-from safevar_sumo.analysis.explain.options import ExplainOptions
+from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.explain.compute import points_of
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.research_questions.case import Case, collided, load_cases
-from safevar_sumo.analysis.risk.options import RiskOptions
-from safevar_sumo.analysis.rules.options import RulesOptions
-from safevar_sumo.analysis.tolerance.options import ToleranceOptions
+from safevar_sumo.analysis.risk import RiskOptions
+from safevar_sumo.analysis.rules import RulesOptions
+from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.api.results import changes_since
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.plugins import digest_of
@@ -156,7 +156,7 @@ class ReportInput:
         return Unsafe() if collided(self.case.solutions).any() or math.isnan(degree) else Unsafe.half_of(degree)
 
     @cached_property
-    def options(self) -> dict[str, Options]:
+    def options(self) -> dict[str, Any]:
         """With which options each question is asked for the page: smaller samples than the commands' own, one criterion for all."""
         unsafe = None if self.case.solutions.empty else str(self.unsafe)
         asked: tuple[Options, ...] = (

@@ -10,8 +10,9 @@ from markupsafe import Markup
 from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.risk.compute import estimate_risk
 from safevar_sumo.analysis.rules.compute import find_rules
+from safevar_sumo.analysis.rules.render import rule_in_words
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
-from safevar_sumo.analysis.words import number_of, rule_in_words
+from safevar_sumo.analysis.words import number_of
 from safevar_sumo.replay.comparison import number, raised, spaced
 from safevar_sumo.report.input import ReportInput, stored
 from safevar_sumo.report.svg import Bar, rows
@@ -23,8 +24,8 @@ Found = dict[str, Any]
 def tolerance(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
     """Every characteristic's safe interval alone, as bars over its domain, and the factor for all together."""
     def compute() -> Found:
-        told = find_tolerances(material.case.study, **material.options["tolerance"].keywords(), jobs=jobs, progress=progress)
-        return {**told.record(), "verdict": told.verdict}
+        told = find_tolerances(material.case.study, material.options["tolerance"], jobs=jobs, progress=progress)
+        return {**told.to_dict(), "verdict": told.verdict}
 
     found = stored(material, "tolerance", compute)
     return {"verdict": found["verdict"], "unsafe": found["unsafe"], "joint": found["joint"], "chart": _bars(material, found["alone"])}
@@ -33,7 +34,7 @@ def tolerance(material: ReportInput, jobs: int | None, progress: Progress) -> Fo
 def risk(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
     """The probability of a failure with its interval, and what decides, as bars."""
     def compute() -> Found:
-        return estimate_risk(material.case.study, **material.options["risk"].keywords(), jobs=jobs, progress=progress).record()
+        return estimate_risk(material.case.study, material.options["risk"], jobs=jobs, progress=progress).to_dict()
 
     found = stored(material, "risk", compute)
     study = material.case.study
@@ -44,7 +45,7 @@ def risk(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
 def rules(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
     """Rules in words, with what they are worth on vehicles that they were not made from."""
     def compute() -> Found:
-        told = find_rules(material.case.study, **material.options["rules"].keywords(), jobs=jobs, progress=progress)
+        told = find_rules(material.case.study, material.options["rules"], jobs=jobs, progress=progress)
         sure = [rule for rule in told.rules if rule.tells_more_than(told.unsafe_share)]
         words = [raised(rule_in_words(rule, material.case.characteristics, told.unsafe)) for rule in sure]
         dropped = number_of(len(told.rules) - len(sure), "rule")

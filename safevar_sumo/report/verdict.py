@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.analysis.explain.compute import REASONS, ROBUST
 from safevar_sumo.analysis.explain.necessity import is_borderline
+from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, collided
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.records import FloatArray

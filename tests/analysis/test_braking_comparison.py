@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare, course
-from safevar_sumo.analysis.words import sentence
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare, course, sentence
 from safevar_sumo.records import Encounter, Outcome, SimulationRuns, Trace
 
 STEP, OBSTACLE = 0.002, 20.0

@@ -14,12 +14,13 @@ from click.testing import CliRunner
 from rich.console import Console
 
 from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.causes import RESOLUTION
-from safevar_sumo.analysis.explain.compute import explain_failures as explain
+from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.necessity import robustness
 from safevar_sumo.analysis.explain.render import print_explained
 from safevar_sumo.analysis.explain.result import Explained
-from safevar_sumo.analysis.explain.summary import lead
+from safevar_sumo.analysis.explain.summary import NUMBERS, lead
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
@@ -35,7 +36,7 @@ def case(slippery: Path) -> Case:
 
 @pytest.fixture(scope="module")
 def told(case: Case) -> Explained:
-    return explain(case, top=3, pool=Here())
+    return explain_failures(case, ExplainOptions(top=3), pool=Here())
 
 
 def collides(case: Case, settings: list[dict[str, float]]) -> list[bool]:
@@ -65,7 +66,7 @@ def test_every_boundary_is_unsafe_and_just_below_it_is_safe(case: Case, told: Ex
 
 def test_the_records_are_those_of_the_solutions(case: Case, told: Explained) -> None:
     assert repr(told).startswith(f"<Explained {case.study.name}, unsafe collision: {told.failures} of ")
-    *records, last = json.loads(json.dumps(told.records(), allow_nan=False))
+    *records, last = json.loads(json.dumps(told.to_dict(), allow_nan=False))
     known = [str(handle) for handle in handles(case.solutions)]
     for one in records:
         assert list(one) == ["algorithm", "run", "index", "setting", "outcome", "safety_degree", "changed", "minimal_causes", "robustness",
@@ -112,10 +113,10 @@ def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: C
 def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
     safe = case.solutions["f_safe"].idxmax()
     handle = str(handles(case.solutions)[safe])
-    (one,) = explain(case, solutions=[handle], unsafe="collision", pool=Here()).explanations
+    (one,) = explain_failures(case, ExplainOptions(solutions=(handle,), unsafe="collision"), pool=Here()).explanations
     assert (str(one.handle), one.causes, one.reasons) == (handle, (), ("asked for",))
     with pytest.raises(InputError, match="nsga2:7:0"):
-        explain(case, solutions=["nsga2:7:0"], pool=Here())
+        explain_failures(case, ExplainOptions(solutions=("nsga2:7:0",)), pool=Here())
 
 
 def test_nothing_unsafe_is_an_answer(slippery: Path) -> None:
@@ -159,10 +160,16 @@ def assert_tells_a_manager(paragraph: str, told: Explained) -> None:
     degree = float(told.original.f_safe[0])
     assert paragraph.startswith(f"In wet leaves, the original vehicle stops {degree:.2f} m short of the pedestrian. ")
     for one in (fewest, robust):
-        assert f"for a collision at {-3.6 * (one.safety_degree or 0):.0f} km/h: " in paragraph
         word = "borderline: only" if one.robustness.borderline else "robust:"
-        assert f"({word} {100 * one.robustness.share:.0f} % of its neighbours are unsafe too" in paragraph
-    assert f"The smallest robust failure ({robust.handle}): " in paragraph
+        share = f"{word} {100 * one.robustness.share:.0f} % of its neighbours are unsafe too"
+        needed, number = len(one.causes[0].changes), len(one.changed)
+        collision = f"a collision at {-3.6 * (one.safety_degree or 0):.0f} km/h ({share})"
+        if needed < number:
+            assert re.search(rf"{re.escape(collision)} was found with {NUMBERS[number]} changes: [^;]*; {NUMBERS[needed]} of them suffice",
+                             paragraph, re.IGNORECASE)
+        else:
+            assert f"for {collision}: " in paragraph
+    assert f"The robust failure with the fewest changes, {robust.handle}: " in paragraph
     members = CharacteristicSet.of(told.study.vehicle.characteristics)
     largest = max((member for member in members if member.name in fewest.changed),
                   key=lambda member: abs(fewest.setting[member.name] / member.original - 1))
@@ -177,7 +184,7 @@ def test_the_summary_of_a_study_leads_with_the_answer(case: Case, told: Explaine
     crashes = int((case.solutions["outcome"] == "collision").sum())
     assert_tells_a_manager(paragraph, told)
     assert first == f"{crashes} of {len(case.solutions)} vehicles found collide."
-    assert [line.partition(":")[0] for line in others] == ["Fewest changes", "Smallest changes", "Most severe"]
+    assert [line.partition(":")[0] for line in others] == ["Fewest changes", "Smallest largest change", "Most severe"]
     assert all(" These changes alone cause it: " in line for line in others)
     safe = case.solutions[case.solutions["f_safe"] > 2]
     assert more == "Why, and how far: python -m safevar_sumo explain 'my results'"

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from safevar_sumo import risk
 from safevar_sumo.analysis.risk.compute import Risk
-from safevar_sumo.analysis.risk.compute import estimate_risk as risk
 from safevar_sumo.analysis.risk.render import print_risk
 from safevar_sumo.analysis.risk.variation_model import VariationModel
 from safevar_sumo.errors import InputError
@@ -76,7 +76,7 @@ def test_a_share_of_the_domain_is_not_called_a_probability(variation: dict[str, 
 
 def test_the_promised_record_and_the_same_again() -> None:
     assert re.fullmatch(r"<Risk of [\w-]+, unsafe collision: 0\.\d+ \(0\.\d+ to 0\.\d+\)>", repr(of(box, samples=500)))
-    first, again = (json.dumps(of(box, samples=500).record(), allow_nan=False) for _ in range(2))
+    first, again = (json.dumps(of(box, samples=500).to_dict(), allow_nan=False) for _ in range(2))
     assert first == again
     record = json.loads(first)
     assert list(record) == ["study", "unsafe", "samples", "failures", "probability", "interval", "confidence", "sensitivity"]
@@ -115,7 +115,7 @@ def test_correlations_are_those_of_the_copula() -> None:
     assert np.corrcoef(settings.T)[0, 1] == pytest.approx(0.8, abs=0.02)
     study = load_study(made_up_study(2), correlations=[{"between": ["a", "b"], "value": 0.8}])
     told = risk(study, unsafe="collision", samples=100, pool=Plant(study, box))
-    assert told.record()["sensitivity"] == []
+    assert told.to_dict()["sensitivity"] == []
 
 
 @pytest.mark.parametrize(("changes", "says"), [

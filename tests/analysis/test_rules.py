@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from safevar_sumo import rules
 from safevar_sumo.analysis.rules.compute import Rules
-from safevar_sumo.analysis.rules.compute import find_rules as rules
-from safevar_sumo.analysis.words import rule_in_words
+from safevar_sumo.analysis.rules.render import rule_in_words
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.analysis.known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
 
@@ -58,7 +58,7 @@ def test_a_rare_box_of_four_characteristics_is_found() -> None:
 
 
 def test_nothing_everything_and_too_little() -> None:
-    assert of(nowhere).records() == []
+    assert of(nowhere).to_dict() == []
     (rule,) = of(everywhere).rules
     assert (dict(rule.limits), rule.density, rule.coverage) == ({}, 1.0, 1.0)
     few = of(lambda settings: (settings > 9.5).all(axis=1), n=2, samples=400)
@@ -68,9 +68,9 @@ def test_nothing_everything_and_too_little() -> None:
 
 def test_the_promised_record_the_same_again_and_in_words() -> None:
     first, again = (of(box), of(box))
-    assert json.dumps(first.records(), allow_nan=False) == json.dumps(again.records(), allow_nan=False)
+    assert json.dumps(first.to_dict(), allow_nan=False) == json.dumps(again.to_dict(), allow_nan=False)
     assert repr(first).endswith("settings, 1 rules>")
-    (record,) = first.records()
+    (record,) = first.to_dict()
     assert list(record) == ["conditions", "density", "coverage", "density_interval", "coverage_interval"]
     assert [list(condition) for condition in record["conditions"]] == [["characteristic", "at_least", "at_most"]] * 2
     told = rule_in_words(first.rules[0], CharacteristicSet.of(first.study.vehicle.characteristics), first.unsafe)

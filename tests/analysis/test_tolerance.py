@@ -12,12 +12,12 @@ import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from safevar_sumo import tolerance
 from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.evaluator import Bench
-from safevar_sumo.analysis.figures import profiles_figure
-from safevar_sumo.analysis.tolerance import safe_box
+from safevar_sumo.analysis.tolerance import joint as safe_box
 from safevar_sumo.analysis.tolerance.compute import Tolerance
-from safevar_sumo.analysis.tolerance.compute import find_tolerances as tolerance
+from safevar_sumo.analysis.tolerance.render import profiles_figure
 from safevar_sumo.errors import InputError
 from tests.analysis.known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
 
@@ -100,7 +100,7 @@ def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
     assert first.safe == (0.0, pytest.approx(5.75, abs=1e-4))
     assert first.not_simulated == [(pytest.approx(5.75, abs=1e-4), pytest.approx(6.75, abs=1e-4))]
     assert first.unsafe == [(pytest.approx(6.75, abs=1e-4), pytest.approx(7, abs=1e-4)), (pytest.approx(9, abs=1e-4), 10.0)]
-    assert first.record()["not_simulated"] == [list(first.not_simulated[0])]
+    assert first.to_dict()["not_simulated"] == [list(first.not_simulated[0])]
     assert told.pairs is not None
     assert told.pairs[0].not_simulated_share == pytest.approx(0.1, abs=0.026)
     assert told.pairs[0].unsafe_share == pytest.approx(1.25 / 9, abs=0.06)
@@ -153,7 +153,7 @@ def test_where_nothing_collides_half_of_the_original_is_the_limit() -> None:
 
 
 def test_the_promised_record() -> None:
-    record = json.loads(json.dumps(of(2, two_islands, pairs=True).record(), allow_nan=False))
+    record = json.loads(json.dumps(of(2, two_islands, pairs=True).to_dict(), allow_nan=False))
     assert list(record) == ["study", "unsafe", "alone", "pairs", "joint"]
     assert list(record["alone"][0]) == ["characteristic", "unit", "original", "safe", "unsafe", "not_simulated"]
     assert list(record["pairs"][0]) == ["characteristics", "unsafe_share", "not_simulated_share", "nearest"]

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from safevar_sumo.analysis.criterion import Unsafe
-from safevar_sumo.analysis.explain.failures import Where, points_in_words, where
+from safevar_sumo.analysis.explain.braking_comparison import sentence
+from safevar_sumo.analysis.explain.compute import Where, points_in_words, where
 from safevar_sumo.analysis.explain.summary import lead
-from safevar_sumo.analysis.words import command, sentence
+from safevar_sumo.analysis.words import command
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import solutions_frame
 from safevar_sumo.study import load_study

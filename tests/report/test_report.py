@@ -166,7 +166,7 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
         slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The values beside it are those of its solution: no number is another one further down."""
     (material,) = gather([shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))])
-    fewest, *_, robust = Explained(material.case).records()[:1] * 2
+    fewest, *_, robust = Explained(material.case).to_dict()[:1] * 2
     failing = [row for row in material.solutions.values() if row["outcome"] == "collision"]
     fewest = fewest | {"reasons": ["fewest changes"], "robustness": 0.79}
     robust = robust | {"reasons": ["smallest robust"], "robustness": 0.81}

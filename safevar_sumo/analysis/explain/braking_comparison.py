@@ -1,4 +1,4 @@
-"""Why a setting is less safe than the original: two drives side by side, and what the lost distance is made of.
+"""Why a setting is less safe than the original: two runs side by side, and what the lost distance is made of.
 
 A vehicle commands the brake with a gap G before it, at a speed v. A time t later its brake pedal stands where it is
 commanded to; until then it drives at a mean speed v - e and slows by d. From there on its mean deceleration is a. So it needs the distance
@@ -6,7 +6,7 @@ commanded to; until then it drives at a mean speed v - e and slows by d. From th
     D = (v - e) t + (v - d)^2 / (2 a)
 
 to stand, and its margin is G - D. Differences of products are shared among their factors at the factors' means,
-D(x y) = Dx (y1 + y2) / 2 + Dy (x1 + x2) / 2, which is exact. So the margin lost between two drives is a sum of parts,
+D(x y) = Dx (y1 + y2) / 2 + Dy (x1 + x2) / 2, which is exact. So the margin lost between two runs is a sum of parts,
 each with the sign of one difference: place (G smaller), speed (v larger), delay (t larger), slowing (e and d: less speed
 lost while the pedal moves) and deceleration (a smaller).
 """
@@ -17,7 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.records import STANDSTILL, SimulationRuns
+from safevar_sumo.analysis.words import ENDS, joined
+from safevar_sumo.records import STANDSTILL, Outcome, SimulationRuns
 
 FULL = 0.9
 """The brake pedal has followed its command where it stands at this share of it [-]: at 0.9 where full braking is commanded."""
@@ -50,7 +51,7 @@ class Braking(NamedTuple):
 
     @property
     def needed(self) -> float:
-        """Distance from the command until it stands [m]; where the drive ends before, it goes on at that deceleration."""
+        """Distance from the command until it stands [m]; where the run ends before, it goes on at that deceleration."""
         return (self.speed - self.mean_speed_lost) * self.delay + (self.speed - self.speed_lost)**2 / (2 * self.deceleration)
 
     @property
@@ -60,7 +61,7 @@ class Braking(NamedTuple):
 
 
 class Course(NamedTuple):
-    """One drive as far as it matters: how it ended, its braking (None without any), and the distance left at its closest.
+    """One run as far as it matters: how it ended, its braking (None without any), and the distance left at its closest.
 
     `safety_degree` is in m, or -m/s; NaN if undefined. `closest` is the gap at the closest place [m], NaN on a collision.
     """
@@ -91,26 +92,26 @@ class BrakingComparison(NamedTuple):
         return sum(self.parts.values())
 
 
-def course(drives: SimulationRuns, column: int, safety_degree: float) -> Course:
-    """What there is to tell of one of N drives."""
-    trace, encounter = drives.trace, drives.encounter
+def course(runs: SimulationRuns, column: int, safety_degree: float) -> Course:
+    """What there is to tell of one of N runs."""
+    trace, encounter = runs.trace, runs.encounter
     active = np.flatnonzero(trace.active[:, column])
     counted = trace.active[:, column] & encounter.in_conflict[:, column]
-    speed_then, collided = float(drives.collision_speed[column]), bool(np.isfinite(drives.collision_speed[column]))
+    speed_then, collided = float(runs.collision_speed[column]), bool(np.isfinite(runs.collision_speed[column]))
     if not active.size:
-        return Course(str(drives.outcome[column]), safety_degree, None, np.nan, speed_then)
+        return Course(str(runs.outcome[column]), safety_degree, None, np.nan, speed_then)
     last, closest = int(active[-1]), np.nan
     if counted.any() and not collided:
         last = int(np.argmin(np.where(counted, encounter.separation[:, column], np.inf)))
         closest = float(trace.gap[last, column])
     braked = (trace.brake[:last + 1, column] > 0) & (trace.speed[:last + 1, column] > STANDSTILL) & trace.active[:last + 1, column]
-    braking = _braking(drives, column, int(np.argmax(braked)), last) if braked.any() else None
-    return Course(str(drives.outcome[column]), safety_degree, braking, closest, speed_then)
+    braking = _braking(runs, column, int(np.argmax(braked)), last) if braked.any() else None
+    return Course(str(runs.outcome[column]), safety_degree, braking, closest, speed_then)
 
 
-def _braking(drives: SimulationRuns, column: int, first: int, last: int) -> Braking | None:
+def _braking(runs: SimulationRuns, column: int, first: int, last: int) -> Braking | None:
     """The braking from sample `first` to `last`; None where the vehicle does not slow down once the pedal has followed."""
-    trace = drives.trace
+    trace = runs.trace
     speed, place = trace.speed[:last + 1, column], trace.position[:last + 1, column]
     followed = trace.pedal[first:last + 1, column] >= FULL * trace.brake[first:last + 1, column]
     down = first + int(np.argmax(followed))
@@ -125,7 +126,7 @@ def _braking(drives: SimulationRuns, column: int, first: int, last: int) -> Brak
 
 
 def compare(original: Course, changed: Course, place: str = "") -> BrakingComparison:
-    """Compare a changed vehicle's drive with the original's at the same place."""
+    """Compare a changed vehicle's run with the original's at the same place."""
     one, other = original.braking, _as_the_original_would(changed, original)
     if one is None or other is None:
         return BrakingComparison(original, changed, {}, place)
@@ -155,3 +156,59 @@ def _parts(one: Braking, other: Braking) -> tuple[dict[str, float], tuple[float,
         "delay": (other.delay - one.delay) * sum(driven) / 2,
         "slowing": saved[0] - saved[1],
         "deceleration": (1 / other.deceleration - 1 / one.deceleration) * (speeds[0]**2 + speeds[1]**2) / 4}, (saved[0], saved[1])
+
+
+WORTH_A_WORD = 0.005
+"""A part of a distance that rounds to less than a centimetre is left out of a sentence [m]."""
+PARTS = {
+    "place": ("it begins to brake nearer", "it begins to brake farther away"), "speed": ("it is faster", "it is slower"),
+    "delay": ("its brake pedal follows later", "its brake pedal follows sooner"),
+    "slowing": ("it slows less while the pedal moves", "it slows more while the pedal moves"),
+    "deceleration": ("it brakes more weakly", "it brakes harder")}
+"""What costs distance, and what gains some."""
+
+
+def how(course: Course) -> str:
+    """How a run ended."""
+    if course.outcome == Outcome.COLLISION:
+        return f"hits at {course.collision_speed:.2f} m/s"
+    end = ENDS.get(Outcome(course.outcome), course.outcome)
+    return end if course.safety_degree != course.safety_degree else f"{end}, safety degree {course.safety_degree:.2f} m"
+
+
+def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
+    """Why the changed vehicle is less safe than the original, in one sentence or two; `full` says what the distance lost is."""
+    at = f"At {comparison.place}: the" if comparison.place else "The"
+    ends = f"{at} original {how(comparison.original)}; this one {how(comparison.changed)}."
+    one, other = comparison.original.braking, comparison.changed.braking
+    if one is None and other is None:
+        return f"{ends} Neither of them brakes."
+    if not comparison.parts:
+        return f"{ends} {'The original' if one is None else 'It'} does not slow down by its brake."
+    unbraked = "" if other is not None else ", without any effect of its brake"
+    costs, gains = ("", "gained ") if comparison.lost >= 0 else ("lost ", "")
+    parts, is_lost = comparison.parts, comparison.lost >= 0
+    pieces = [f"{abs(parts[name]):.2f} m {costs if parts[name] > 0 else gains}because {PARTS[name][parts[name] < 0]}"
+              f"{_numbers(comparison, name)}"
+              for name in sorted(PARTS, key=lambda name: -parts[name]) if abs(parts[name]) >= WORTH_A_WORD]
+    if abs(parts["remainder"]) > REMAINDER:
+        pieces.append(f"{parts['remainder']:+.2f} m that this does not explain")
+    if not pieces:
+        return f"{ends} They brake alike."
+    lost = f"{abs(comparison.lost):.2f} m"
+    lead = f"Of the {lost} {'lost' if is_lost else 'gained'}" if not full else (
+        f"Its margin, the gap at the first brake command less the distance needed to stop, is {lost} {'smaller' if is_lost else 'larger'}")
+    return f"{ends} {lead}{unbraked}: {joined(pieces)}."
+
+
+def _numbers(comparison: BrakingComparison, part: str) -> str:
+    """What a part was, and what it is with the original."""
+    one, other = comparison.original.braking, comparison.changed.braking
+    if one is None or other is None:
+        return ""
+    pairs = {"place": (other.gap, one.gap, "m before"), "speed": (other.speed, one.speed, "m/s at the command"),
+             "delay": (other.delay, one.delay, "s after the command"), "slowing": (comparison.slowing[1], comparison.slowing[0], "m saved"),
+             "deceleration": (other.deceleration, one.deceleration, "m/s^2")}
+    there, here, name = pairs[part]
+    decimals = next((digits for digits in range(2, 9) if f"{there:.{digits}f}" != f"{here:.{digits}f}"), 2)
+    return f" ({there:.{decimals}f} instead of {here:.{decimals}f} {name})"

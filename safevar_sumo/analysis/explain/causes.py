@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.analysis.criterion import Unsafe
-from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.evaluator import Bench, finite_or_none
 from safevar_sumo.records import FloatArray
 
 CHUNK = 20_000
@@ -49,9 +49,9 @@ def minimal_causes(bench: Bench, settings: FloatArray, unsafe: Unsafe) -> list[l
     """
     original = bench.characteristics.original
     changed = [tuple(np.flatnonzero(row).tolist()) for row in bench.characteristics.changed(settings)]
-    found: list[list[MinimalCause]] = [[] for _ in settings]
+    causes: list[list[MinimalCause]] = [[] for _ in settings]
     for size in range(max(map(len, changed), default=0) + 1):
-        subsets = [_Subset(setting, columns) for setting, group in enumerate(changed) if not found[setting]
+        subsets = [_Subset(setting, columns) for setting, group in enumerate(changed) if not causes[setting]
                    for columns in combinations(group, size)]
         for start in range(0, len(subsets), CHUNK):
             part = subsets[start:start + CHUNK]
@@ -60,14 +60,9 @@ def minimal_causes(bench: Bench, settings: FloatArray, unsafe: Unsafe) -> list[l
                 tried[row, list(columns)] = settings[setting, list(columns)]
             evaluations = bench.evaluate(tried, f"subsets of {size} changes")
             for row in np.flatnonzero(unsafe.of(evaluations)).tolist():
-                found[part[row].setting].append(
-                    MinimalCause(part[row].columns, tried[row], str(evaluations.outcome[row]), number(evaluations.f_safe[row])))
-    return found
-
-
-def number(value: float) -> float | None:
-    """A number as records hold it: what is undefined is None."""
-    return None if np.isnan(value) else float(value)
+                causes[part[row].setting].append(
+                    MinimalCause(part[row].columns, tried[row], str(evaluations.outcome[row]), finite_or_none(evaluations.f_safe[row])))
+    return causes
 
 
 def expected_cost(changes: int) -> int:

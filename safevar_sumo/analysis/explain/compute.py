@@ -1,106 +1,202 @@
-"""Explain failures: which of the changes did it, how little of them is enough, why, and whether the failure is robust."""
+"""Explains failures: which of the changes did it, how little of them is enough, why, and whether the failure is robust."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from safevar_sumo.analysis.criterion import Unsafe
-from safevar_sumo.analysis.evaluator import Bench, Progress, open_bench, silent
-from safevar_sumo.analysis.explain.causes import MinimalCause, affordable, boundaries, minimal_causes, necessary, number
-from safevar_sumo.analysis.explain.failures import Failures, failures_of, where
+from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent, spread
+from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare, course
+from safevar_sumo.analysis.explain.causes import MinimalCause, affordable, boundaries, minimal_causes, necessary
 from safevar_sumo.analysis.explain.necessity import distinct_causes, key_of, necessity, robustness, smallest_robust
-from safevar_sumo.analysis.explain.options import ExplainOptions
-from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation
+from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
 from safevar_sumo.analysis.preventability import preventability, preventable_by
 from safevar_sumo.analysis.research_questions.case import Case
-from safevar_sumo.records import Evaluations
-from safevar_sumo.results import SolutionId
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles, position_of
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.matrix import AtPoint, at_every_point, worst_points
+from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers.evaluation import Pool
 
-ROBUST = "smallest robust"
-REASONS = {"fewest": "fewest changes", "smallest": "smallest changes", "most_severe": "most severe"}
 Causes = Mapping[int, list[MinimalCause]]
 Reasons = tuple[str, ...]
 
 
-def explain_failures(source: Study | Case, *, solutions: Sequence[str] = (), unsafe: str | None = None, top: int = ExplainOptions.top,
-            limit: int = ExplainOptions.limit, pool: Pool | None = None, jobs: int | None = None, progress: Progress = silent) -> Explained:
-    """Explain the failures that matter among the solutions of results, or among settings all over a study's domain.
+LOOKED_AT = 4096
+"""Settings over the whole domain in which the failures of a study without results are looked for."""
 
-    Parameters
+
+class Failures(NamedTuple):
+    """Settings looked at, as they are evaluated today.
+
+    Attributes
     ----------
-    source
-        Results, or a study without any.
-    solutions
-        Handles of the solutions to explain; by default the smallest robust failure, those with the fewest and the smallest
-        changes, the most severe one, and one of each distinct minimal cause, the most frequent first.
+    evaluations
+        Of filtered settings; solutions of several runs that are the same setting are there once.
+    handles
+        What they are called as solutions; None for what did not come from results.
     unsafe
-        `collision` or `below=X`; by default a collision if there is one, else half of the original's safety degree.
-    top
-        How many failures are explained in full at the most.
-    limit
-        Simulations, about, that the minimal causes of all failures may take: of more, a random sample is looked into. So
-        many may the search for the smallest robust failure take again.
-    pool, jobs
-        Where to simulate: a pool, or that many worker processes (by default one for each core).
-    progress
-        Is told what is done.
+        What counts as unsafe.
+    rows
+        Those to explain: the unsafe ones, or the ones asked for by name.
+    otherwise
+        How many of them do not end as the results say.
+    """
+
+    evaluations: Evaluations
+    handles: list[SolutionId | None]
+    unsafe: Unsafe
+    rows: list[int]
+    otherwise: int
+
+    def least(self, choice: str) -> int:
+        """The row asked for by a name of `CHOICES`: fewest, smallest or most_severe."""
+        among = self.evaluations.take(self.rows)
+        return self.rows[int(np.lexsort([getattr(among, name) for name in reversed(CHOICES[choice])])[0])]
+
+
+def failures_of(source: Study | Case, bench: Bench, original: Evaluations, named: Sequence[SolutionId], unsafe: Unsafe | None) -> Failures:
+    """Look at all solutions of results and evaluate them, or at settings all over a study's domain.
+
+    Raises
+    ------
+    InputError
+        If `named` holds what is no solution of the results.
+    """
+    if isinstance(source, Study):
+        if named:
+            raise InputError("solution", f"{source.name!r} is a study and has no solutions", "a results directory")
+        settings = bench.characteristics.filter(spread(bench.characteristics, LOOKED_AT, source.search.seed))
+        called: list[SolutionId | None] = [None] * len(settings)
+        recorded = None
+        rows = None
+    else:
+        solutions = source.solutions
+        every, whole = handles(solutions), solutions[list(bench.characteristics.names)].to_numpy(dtype=float)
+        asked = list(dict.fromkeys(position_of(solutions, handle) for handle in named))
+        kept = [*asked, *(row for row in _each_once(whole) if row not in set(asked))]
+        settings, called = whole[kept], [every[row] for row in kept]
+        recorded = solutions["outcome"].to_numpy(dtype=str)[kept]
+        rows = list(range(len(asked))) if named else None
+    evaluations = bench.evaluate(settings, "settings to explain")
+    means = unsafe or Unsafe.usual(evaluations, original)
+    if rows is None:
+        rows = np.flatnonzero(means.of(evaluations)).tolist()
+    otherwise = 0 if recorded is None else int(np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN)))
+    return Failures(evaluations, called, means, rows, otherwise)
+
+
+def _each_once(settings: np.ndarray) -> list[int]:
+    """The first row of every distinct setting, in their order."""
+    return sorted(np.unique(settings, axis=0, return_index=True)[1].tolist())
+
+
+NAMED = 6
+"""How many of the points that fail are named in a sentence."""
+
+
+class Where(NamedTuple):
+    """A failure at the points of a study.
+
+    Attributes
+    ----------
+    because
+        Original and failure side by side at the point at which the failure comes off worst.
+    points
+        Names of the points of a matrix at which it is unsafe, in the study's order.
+    """
+
+    because: BrakingComparison
+    points: tuple[str, ...]
+
+
+def where(system: System, original: FloatArray, settings: FloatArray, unsafe: Unsafe) -> tuple[list[Where], float]:
+    """Settings, shape (M, n), beside the original, shape (1, n); and the time step that they were simulated with [s]."""
+    at_points = at_every_point(system, np.concatenate([original, settings]))
+    names, worst = points_of(system, at_points, unsafe)[1:], worst_points(at_points)[1:]
+    places = []
+    for row, (failing, at) in enumerate(zip(names, worst.tolist(), strict=True), 1):
+        one = at_points[at]
+        first, other = (course(one.drives, column, float(one.evaluations.f_safe[column])) for column in (0, row))
+        places.append(Where(compare(first, other, one.point.name), failing))
+    return places, at_points[0].drives.trace.step
+
+
+def points_of(system: System, at_points: list[AtPoint], unsafe: Unsafe) -> list[tuple[str, ...]]:
+    """For every setting the names of a matrix's points at which it is unsafe; none of a study without one."""
+    if not system.matrix:
+        return [() for _ in at_points[0].evaluations.settings]
+    at = np.stack([unsafe.of(one.evaluations) for one in at_points])
+    return [tuple(one.point.name for one, is_unsafe in zip(at_points, column, strict=True) if is_unsafe) for column in at.T]
+
+
+def points_in_words(points: tuple[str, ...], number: int, most: int = NAMED) -> str:
+    """Such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25, night; CPLA, speed 60, clear.`"""
+    first, more = "; ".join(points[:most]), len(points) - most
+    others = f" and {more} more" if more > 0 else ""
+    return f"Fails at {len(points)} of {number} points{': ' + first if points else ''}{others}."
+
+
+def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Pool | None = None, jobs: int | None = None,
+                     progress: Progress = silent) -> Explained:
+    """Explain the failures that matter among the solutions of results, or among settings all over a study's domain.
 
     Raises
     ------
     InputError
         If `unsafe` or a handle cannot be read, or the study cannot be assembled.
     """
-    ExplainOptions(solutions=tuple(solutions), unsafe=unsafe, top=top, limit=limit)
     study = source if isinstance(source, Study) else source.study
-    means, named = Unsafe.given(unsafe), [SolutionId.parse(text) for text in solutions]
-    limit //= len(assemble(study).points)
+    unsafe = None if options.unsafe is None else Unsafe.parse(options.unsafe)
+    named = [SolutionId.parse(text) for text in options.solutions]
+    limit = options.limit // len(assemble(study).points)
     with open_bench(study, pool, jobs, progress) as bench:
         original = bench.original()
-        found = failures_of(source, bench, original, named, means)
-        sample = found.rows if solutions else [found.rows[i] for i in affordable(found.evaluations.settings[found.rows], bench, limit)]
-        robust = None if solutions else _robust(found, bench, original, limit)
-        reasons = dict.fromkeys(found.rows[:len(solutions)], ("asked for",)) if solutions else _that_matter(found, robust)
-        rows = sorted({*sample, *reasons})
-        causes = dict(zip(rows, minimal_causes(bench, found.evaluations.settings[rows], found.unsafe), strict=True))
-        if not solutions:
-            reasons = _with_one_of_each_cause(found, bench, {row: causes[row] for row in sample}, reasons, causes, top)
-        explanations = _explained(found, bench, original, causes, reasons)
-        preventable = preventability(bench, found.evaluations.settings[found.evaluations.collided])
-    changed = bench.characteristics.changed(found.evaluations.settings[sample])
+        failures = failures_of(source, bench, original, named, unsafe)
+        settings, rows = failures.evaluations.settings, failures.rows
+        sample = rows if named else [rows[i] for i in affordable(settings[rows], bench, limit)]
+        robust = None if named else _robust(failures, bench, original, limit)
+        reasons = dict.fromkeys(rows[:len(named)], ("asked for",)) if named else _that_matter(failures, robust)
+        explained = sorted({*sample, *reasons})
+        causes = dict(zip(explained, minimal_causes(bench, settings[explained], failures.unsafe), strict=True))
+        if not named:
+            reasons = _with_one_of_each_cause(failures, bench, {row: causes[row] for row in sample}, reasons, causes, options.top)
+        explanations = _explained(failures, bench, original, causes, reasons)
+        preventable = preventability(bench, settings[failures.evaluations.collided])
     of_sample = [causes[row] for row in sample]
     return Explained(
-        study=study, unsafe=found.unsafe, original=original, explanations=explanations,
-        necessity=necessity(bench.characteristics, changed, of_sample, len(found.rows)),
-        distinct=distinct_causes(bench.characteristics, of_sample),
-        looked_at=len(found.evaluations), failures=len(found.rows), analysed=len(sample), otherwise=found.otherwise,
-        preventability=preventable)
+        study=study, unsafe=failures.unsafe, original=original, explanations=explanations,
+        necessity=necessity(bench.characteristics, bench.characteristics.changed(settings[sample]), of_sample, len(rows)),
+        distinct=distinct_causes(bench.characteristics, of_sample), looked_at=len(failures.evaluations), failures=len(rows),
+        analysed=len(sample), otherwise=failures.otherwise, preventability=preventable)
 
 
-def _robust(found: Failures, bench: Bench, original: Evaluations, limit: int) -> int | None:
+def _robust(failures: Failures, bench: Bench, original: Evaluations, limit: int) -> int | None:
     """The smallest robust failure, if there is one among those that may be tried; none where the original vehicle is unsafe itself."""
-    if not found.rows or found.unsafe.of(original)[0]:
+    if not failures.rows or failures.unsafe.of(original)[0]:
         return None
-    _, step = where(assemble(bench.study), original.settings, original.settings[:0], found.unsafe)
-    row = smallest_robust(bench, found.evaluations.take(found.rows), step, found.unsafe, limit)
-    return None if row is None else found.rows[row]
+    _, step = where(assemble(bench.study), original.settings, original.settings[:0], failures.unsafe)
+    row = smallest_robust(bench, failures.evaluations.take(failures.rows), step, failures.unsafe, limit)
+    return None if row is None else failures.rows[row]
 
 
-def _that_matter(found: Failures, robust: int | None) -> dict[int, Reasons]:
+def _that_matter(failures: Failures, robust: int | None) -> dict[int, Reasons]:
     """The smallest robust failure, the one of the fewest changes, the most severe and the one of the smallest changes, by row."""
     reasons: dict[int, Reasons] = {} if robust is None else {robust: (ROBUST,)}
     for choice in ("fewest", "most_severe", "smallest"):
-        if found.rows:
-            row = found.least(choice)
+        if failures.rows:
+            row = failures.least(choice)
             reasons[row] = (*reasons.get(row, ()), REASONS[choice])
     return reasons
 
 
-def _with_one_of_each_cause(found: Failures, bench: Bench, sample: Causes, reasons: Mapping[int, Reasons], causes: Causes,
+def _with_one_of_each_cause(failures: Failures, bench: Bench, sample: Causes, reasons: Mapping[int, Reasons], causes: Causes,
                             top: int) -> dict[int, Reasons]:
     """Add one failure of each distinct minimal cause that is not there yet, the simplest that has it, up to `top` in all."""
     chosen = dict(list(reasons.items())[:top])
@@ -110,21 +206,21 @@ def _with_one_of_each_cause(found: Failures, bench: Bench, sample: Causes, reaso
             break
         if not any(key in keys[row] for row in chosen):
             group = [row for row in sample if key in keys[row]]
-            simplest = min(group, key=lambda row: (found.evaluations.f_num_diff[row], found.evaluations.f_diff[row], row))
+            simplest = min(group, key=lambda row: (failures.evaluations.f_num_diff[row], failures.evaluations.f_diff[row], row))
             chosen[simplest] = ("a cause of its own",)
     return chosen
 
 
-def _explained(found: Failures, bench: Bench, original: Evaluations, causes: Causes,
+def _explained(failures: Failures, bench: Bench, original: Evaluations, causes: Causes,
                reasons: Mapping[int, Reasons]) -> tuple[Explanation, ...]:
     """The chosen failures explained in full."""
     if not reasons:
         return ()
     rows = list(reasons)
-    here, names = found.evaluations.take(rows), bench.characteristics.names
-    beside, step = where(assemble(bench.study), original.settings, here.settings, found.unsafe)
-    robust = robustness(bench, here.settings, step, found.unsafe)
-    shrunk = iter(boundaries(bench, [cause for row in rows for cause in causes[row]], found.unsafe))
+    here, names = failures.evaluations.take(rows), bench.characteristics.names
+    beside, step = where(assemble(bench.study), original.settings, here.settings, failures.unsafe)
+    robust = robustness(bench, here.settings, step, failures.unsafe)
+    shrunk = iter(boundaries(bench, [cause for row in rows for cause in causes[row]], failures.unsafe))
     collided = np.flatnonzero(here.collided)
     avoided = dict(zip(collided.tolist(), preventable_by(bench, here.settings[collided]), strict=True))
     explanations = []
@@ -140,8 +236,8 @@ def _explained(found: Failures, bench: Bench, original: Evaluations, causes: Cau
                 at_threshold=None if boundary.at_threshold is None else names[boundary.at_threshold]))
         changed = bench.characteristics.changed(here.settings[i])
         explanations.append(Explanation(
-            handle=found.handles[row], reasons=reasons[row], setting=dict(zip(names, here.settings[i].tolist(), strict=True)),
-            outcome=str(here.outcome[i]), safety_degree=number(here.f_safe[i]),
+            handle=failures.handles[row], reasons=reasons[row], setting=dict(zip(names, here.settings[i].tolist(), strict=True)),
+            outcome=str(here.outcome[i]), safety_degree=finite_or_none(here.f_safe[i]),
             changed=tuple(name for name, is_changed in zip(names, changed, strict=True) if is_changed),
             necessary=tuple(names[column] for column in sorted(necessary(causes[row]))), causes=tuple(group), robustness=robust[i],
             because=beside[i].because, preventable=str(avoided.get(i) or ""), points=beside[i].points))

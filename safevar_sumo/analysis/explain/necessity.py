@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.criterion import Unsafe
+from safevar_sumo.analysis.criterion import Unsafe, clopper_pearson
 from safevar_sumo.analysis.evaluator import Bench
 from safevar_sumo.analysis.explain.causes import MinimalCause, involved, necessary
-from safevar_sumo.analysis.risk.compute import interval_of
 from safevar_sumo.analysis.words import direction
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
@@ -49,10 +48,11 @@ def necessity(characteristics: CharacteristicSet, changed: BoolArray, causes: Se
         the share itself where all failures were analysed. Ordered by necessary, involved, changed; without rows if there is no failure.
     """
     columns = range(len(characteristics) if len(changed) else 0)
-    counts = {"changed": _count(frozenset(np.flatnonzero(row).tolist()) for row in changed),
-              "necessary": _count(map(necessary, causes)), "involved": _count(map(involved, causes))}
+    counts = {"changed": Counter(np.nonzero(changed)[1].tolist()),
+              "necessary": Counter(column for group in causes for column in necessary(group)),
+              "involved": Counter(column for group in causes for column in involved(group))}
     sampled = len(changed) < failures
-    intervals = [interval_of(counts["necessary"][column], len(changed), CONFIDENCE) if sampled
+    intervals = [clopper_pearson(counts["necessary"][column], len(changed), CONFIDENCE) if sampled
                  else (counts["necessary"][column] / len(changed),) * 2 for column in columns]
     frame = pd.DataFrame({
         "characteristic": pd.Series([characteristics.names[column] for column in columns], dtype=object),
@@ -77,15 +77,11 @@ def distinct_causes(characteristics: CharacteristicSet, causes: Sequence[Sequenc
         "share": pd.Series([counts[key] / len(causes) for key in order], dtype=float)})
 
 
-def _count(sets: Iterable[frozenset[int]]) -> Counter[int]:
-    return Counter(column for columns in sets for column in columns)
-
-
 NEIGHBOURS = 64
 STEP_FACTORS = (1.0, 0.5, 2.0)
 """Of the study's time step: itself, half of it, and twice."""
 BORDERLINE = 0.8
-"""A share of unsafe outcomes below which a finding is called borderline."""
+"""Share of unsafe neighbours below which a failure is called borderline."""
 TOGETHER = 8
 """Failures, the smallest first, that are tried at a time."""
 
@@ -105,7 +101,7 @@ class Robustness(NamedTuple):
 
 
 def is_borderline(share: float) -> bool:
-    """Whether so few of a finding's neighbours are unsafe too that small perturbations remove it."""
+    """Whether small perturbations remove a failure: too few of its neighbours are unsafe too."""
     return share < BORDERLINE
 
 
@@ -137,7 +133,7 @@ def smallest_robust(bench: Bench, failures: Evaluations, step: float, unsafe: Un
     most = max(TOGETHER, limit // (NEIGHBOURS * len(STEP_FACTORS)))
     for first in range(0, min(len(order), most), TOGETHER):
         rows = order[first:first + TOGETHER]
-        for row, found in zip(rows.tolist(), robustness(bench, failures.settings[rows], step, unsafe), strict=True):
-            if not found.borderline:
+        for row, result in zip(rows.tolist(), robustness(bench, failures.settings[rows], step, unsafe), strict=True):
+            if not result.borderline:
                 return int(row)
     return None

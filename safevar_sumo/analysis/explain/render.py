@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
 
-from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison
-from safevar_sumo.analysis.explain.compute import REASONS, ROBUST
-from safevar_sumo.analysis.explain.failures import points_in_words
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
+from safevar_sumo.analysis.explain.compute import points_in_words
 from safevar_sumo.analysis.explain.necessity import CONFIDENCE
-from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation
-from safevar_sumo.analysis.explain.summary import Finding, in_short
-from safevar_sumo.analysis.words import ask, changes, command, number_of, sentence
+from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
+from safevar_sumo.analysis.explain.summary import LABELS, Finding, in_short
+from safevar_sumo.analysis.figures import CHANGED, FONT, INVOLVED, NECESSARY, new_figure, plain
+from safevar_sumo.analysis.words import ask, changes, command, decimal, number_of
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import WholeTable, print_meanings
+from safevar_sumo.terminal import WholeTable, print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CAUSES_SHOWN = 3
 """Minimal causes of a failure, and distinct ones of all failures, that a table has room for."""
@@ -29,59 +31,60 @@ Again = Callable[[Mapping[str, float]], str]
 """The command that simulates these changes."""
 
 
-def print_explained(console: Console, place: str, told: Explained, point: str = "", *, full: bool = False) -> None:
-    """The answer in about ten lines; `full` explains every chosen failure. Commands that are told are about `place`, and its `point`."""
-    members = CharacteristicSet.of(told.study.vehicle.characteristics)
-    _say(console, told.study.title)
-    _say(console, f"Unsafe: {told.unsafe}. {number_of(told.failures, 'failure')} among {told.looked_at} different settings.")
-    if told.otherwise:
-        _say(console, f"note: {number_of(told.otherwise, 'setting')} not as the results say when simulated again: another version or code?")
-    if not told.explanations:
-        _say(console, f"Nothing unsafe found. How far each characteristic may go: {ask('tolerance', place, point)}")
+def print_explained(console: Console, place: str, result: Explained, point: str = "", *, full: bool = False) -> None:
+    """The answer in about ten lines; `full` explains every chosen failure. The commands name `place` and `point`."""
+    members = CharacteristicSet.of(result.study.vehicle.characteristics)
+    print_text(console, result.study.title)
+    print_text(console, f"Unsafe: {result.unsafe}. {number_of(result.failures, 'failure')} among {result.looked_at} different settings.")
+    if result.otherwise:
+        print_text(console, f"note: {number_of(result.otherwise, 'setting')} not as the results say; another version or code?")
+    if not result.explanations:
+        print_text(console, f"Nothing unsafe found. How far each characteristic may go: {ask('tolerance', place, point)}")
         return
     again: Again = partial(command, place, point=point)
-    _print_answer(console, again, told, members)
+    _print_answer(console, again, result, members)
     if not full:
-        _say(console, f"{number_of(len(told.explanations), 'failure')} explained in full: {ask('explain', place, point)} --full")
+        print_text(console, f"{number_of(len(result.explanations), 'failure')} explained in full: {ask('explain', place, point)} --full")
         return
-    _say(console, _sawtooth(told))
-    for one in told.explanations:
-        _print_one(console, again, one, members, told)
-    if told.preventability.looked_at:
-        _say(console, str(told.preventability))
-    _print_common(console, told)
+    print_text(console, _sawtooth(result))
+    for failure in result.explanations:
+        _print_one(console, again, failure, members, result)
+    if result.preventability.looked_at:
+        print_text(console, str(result.preventability))
+    _print_common(console, result)
 
 
-def _print_answer(console: Console, again: Again, told: Explained, members: CharacteristicSet) -> None:
+def _print_answer(console: Console, again: Again, result: Explained, members: CharacteristicSet) -> None:
     """The paragraph; of the failure that leads, why and how little is enough; which changes and causes are common."""
-    first = told.explanations[0]
-    by_reason = {reason: one for one in told.explanations for reason in one.reasons}
+    first = result.explanations[0]
+    by_reason = {reason: failure for failure in result.explanations for reason in failure.reasons}
     smallest, robust = by_reason.get(REASONS["fewest"], first), by_reason.get(ROBUST)
-    _say(console, in_short(assemble(told.study), told.original, _finding(smallest), _finding(robust), told.preventability))
+    print_text(console, in_short(assemble(result.study), result.original, _finding(smallest), _finding(robust), result.preventability))
     name = str(first.handle or "the first setting")
-    _say(console, f"Why, of {name}: {sentence(first.because)}")
-    for cause in [one for one in first.causes if one.changes][:1]:
+    print_text(console, f"Why {name} fails: {sentence(first.because, full=True)}")
+    for cause in [cause for cause in first.causes if cause.changes][:1]:
         limits = [f"{_named(member)} {member.original:g} -> {member.text(cause.boundary[member.name])}{member.suffix}"
                   for member in members if member.name in cause.boundary]
-        _say(console, f"How little is enough: {', '.join(limits)}. {again(cause.boundary)}")
-    if told.analysed and len(told.distinct):
-        _say(console, f"Necessary most often ({_looked_at(told)}): {_most_necessary(told, members)}.")
-        common = told.distinct.iloc[0]
-        _say(console, f"{number_of(len(told.distinct), 'distinct minimal cause')}; the most frequent: "
+        print_text(console, f"How little is enough: {', '.join(limits)}. {again(cause.boundary)}")
+    if result.analysed and len(result.distinct):
+        print_text(console, f"Necessary most often ({_looked_at(result)}): {_most_necessary(result, members)}.")
+        common = result.distinct.iloc[0]
+        print_text(console, f"{number_of(len(result.distinct), 'distinct minimal cause')}; the most frequent: "
                       f"{', '.join(common['cause']) or 'none'} ({common['share']:.0%} of the failures).")
 
 
-def _finding(one: Explanation | None) -> Finding | None:
+def _finding(failure: Explanation | None) -> Finding | None:
     """A failure as the paragraph tells of it; None for what is not unsafe."""
-    if one is None or not one.causes:
+    if failure is None or not failure.causes:
         return None
-    return Finding(str(one.handle or "a setting of its own"), {name: one.setting[name] for name in one.changed}, one.outcome,
-                   one.safety_degree, one.robustness, len(one.causes[0].changes))
+    changes = {name: failure.setting[name] for name in failure.changed}
+    return Finding(str(failure.handle or "a setting of its own"), changes, failure.outcome, failure.safety_degree, failure.robustness,
+                   len(failure.causes[0].changes))
 
 
-def _most_necessary(told: Explained, members: CharacteristicSet) -> str:
+def _most_necessary(result: Explained, members: CharacteristicSet) -> str:
     called = {member.name: _named(member) for member in members}
-    rows = told.necessity[told.necessity["necessary"] > 0].head(NECESSARY_SHOWN).to_dict("records")
+    rows = result.necessity[result.necessity["necessary"] > 0].head(NECESSARY_SHOWN).to_dict("records")
     return ", ".join(f"{called[row['characteristic']]} {_necessary(row)}" for row in rows) or "none, causes differ"
 
 
@@ -96,10 +99,10 @@ def _named(member: Characteristic) -> str:
     return member.name if member.short_name == member.name else f"{member.name} ({member.short_name})"
 
 
-def _sawtooth(told: Explained) -> str:
+def _sawtooth(result: Explained) -> str:
     """How exact a value along a characteristic can be: the way that the vehicle covers between two decisions."""
-    step = next(iter(told.explanations[0].robustness.by_step), None)
-    braking = told.explanations[0].because.original.braking
+    step = next(iter(result.explanations[0].robustness.by_step), None)
+    braking = result.explanations[0].because.original.braking
     if step is None or braking is None:
         return ""
     return (f"How exact: decisions fall into frames of {step:g} s, in which the vehicle covers {braking.speed * step:.2f} m at "
@@ -107,37 +110,37 @@ def _sawtooth(told: Explained) -> str:
             "a value mean nothing.")
 
 
-def _print_one(console: Console, again: Again, one: Explanation, members: CharacteristicSet, told: Explained) -> None:
-    title = f"{', '.join(one.reasons)}: {one.handle or 'a setting of its own'}"
+def _print_one(console: Console, again: Again, failure: Explanation, members: CharacteristicSet, result: Explained) -> None:
+    title = f"{', '.join(LABELS.get(reason, reason) for reason in failure.reasons)}: {failure.handle or 'a setting of its own'}"
     console.rule(escape(title), align="left")
-    ends = f"{one.outcome}, SD {_decimal(one.safety_degree)} with {number_of(len(one.changed), 'change')}"
-    _say(console, f"{ends}: {changes(members, one.setting)}")
-    if not one.causes:
-        _say(console, "It is not unsafe.")
-    for cause in one.causes[:CAUSES_SHOWN]:
+    ends = f"{failure.outcome}, SD {decimal(failure.safety_degree)} with {number_of(len(failure.changed), 'change')}"
+    print_text(console, f"{ends}: {changes(members, failure.setting)}")
+    if not failure.causes:
+        print_text(console, "It is not unsafe.")
+    for cause in failure.causes[:CAUSES_SHOWN]:
         _print_cause(console, again, cause, members)
-    if len(one.causes) > CAUSES_SHOWN:
-        _say(console, f"... and {len(one.causes) - CAUSES_SHOWN} more of the same number of changes (--json has all).")
-    if len(one.causes) > 1:
-        _say(console, f"Needed by all of them: {', '.join(one.necessary) or 'nothing'}.")
-    _say(console, f"Because: {sentence(one.because)}")
-    if one.because.place:
-        number = len(assemble(told.study).matrix)
-        _say(console, points_in_words(one.points, number, most=len(one.points)))
-    if one.preventable:
-        _say(console, f"In the same vehicle: {one.preventable}.")
-    console.print(_side_by_side(one.because))
-    if one.causes:
-        shares = ", ".join(f"{share:.0%} at {step:g} s a step" for step, share in one.robustness.by_step.items())
-        word = "borderline" if one.robustness.borderline else "robust"
-        _say(console, f"Neighbours within the filter's thresholds that are unsafe too: {shares}; {word} ({one.robustness.share:.0%}).")
+    if len(failure.causes) > CAUSES_SHOWN:
+        print_text(console, f"... and {len(failure.causes) - CAUSES_SHOWN} more of the same number of changes (--json has all).")
+    if len(failure.causes) > 1:
+        print_text(console, f"Needed by all of them: {', '.join(failure.necessary) or 'nothing'}.")
+    print_text(console, f"Because: {sentence(failure.because, full=True)}")
+    if failure.because.place:
+        number = len(assemble(result.study).matrix)
+        print_text(console, points_in_words(failure.points, number, most=len(failure.points)))
+    if failure.preventable:
+        print_text(console, f"In the same vehicle: {failure.preventable}.")
+    console.print(_side_by_side(failure.because))
+    if failure.causes:
+        shares = ", ".join(f"{share:.0%} at {step:g} s a step" for step, share in failure.robustness.by_step.items())
+        word = "borderline" if failure.robustness.borderline else "robust"
+        print_text(console, f"Unsafe neighbours within the filter's thresholds: {shares}; {word} ({failure.robustness.share:.0%}).")
 
 
 def _print_cause(console: Console, again: Again, cause: Cause, members: CharacteristicSet) -> None:
     if not cause.changes:
-        _say(console, "No change is needed: the original vehicle itself is unsafe.")
+        print_text(console, "No change is needed: the original vehicle itself is unsafe.")
         return
-    _say(console, f"Minimal cause: {changes(members, cause.changes)}: {cause.outcome}, SD {_decimal(cause.safety_degree)}")
+    print_text(console, f"Minimal cause: {changes(members, cause.changes)}: {cause.outcome}, SD {decimal(cause.safety_degree)}")
     table = WholeTable("characteristic", "unit")
     for head in ("original", "here", "limit (all scaled)", "limit (this one only)"):
         table.add_column(head, justify="right")
@@ -147,55 +150,64 @@ def _print_cause(console: Console, again: Again, cause: Cause, members: Characte
             table.add_row(escape(member.name), escape(member.unit), f"{member.original:g}", *(member.text(value) for value in values))
     console.print(table)
     print_meanings(console, [member for member in members if member.name in cause.changes])
-    _say(console, f"{cause.limit} {again(cause.changes)}")
+    print_text(console, f"{cause.limit} {again(cause.changes)}")
 
 
-def _side_by_side(told: BrakingComparison) -> WholeTable:
+def _side_by_side(comparison: BrakingComparison) -> WholeTable:
     """Original and changed vehicle, and what each line explains of the lost distance."""
     table = WholeTable("", "unit")
     for head in ("original", "changed", "explains, m"):
         table.add_column(head, justify="right")
-    one, other = told.original.braking, told.changed.braking
+    parts = comparison.parts
+    brakings = comparison.original.braking, comparison.changed.braking
     rows = (("brakes first at", "s", "time", None), ("distance there", "m", "gap", "place"), ("speed there", "m/s", "speed", "speed"),
             ("until the pedal has followed", "s", "delay", "delay"), ("speed lost meanwhile", "m/s", "speed_lost", "slowing"),
             ("mean deceleration from then", "m/s^2", "deceleration", "deceleration"), ("distance needed", "m", "needed", None),
             ("distance there - needed", "m", "margin", "all"))
     for head, unit, field, part in rows:
-        cells = [_decimal(getattr(braking, field)) if braking else "-" for braking in (one, other)]
-        explains = {"all": told.lost - told.parts.get("remainder", 0.0), **told.parts}.get(part) if part and told.parts else None
-        table.add_row(head, unit, *cells, "" if explains is None else f"{explains:.2f}")
-    if told.parts:
-        table.add_row("not explained", "m", "", "", f"{told.parts['remainder']:.2f}")
+        cells = [decimal(getattr(braking, field)) if braking else "-" for braking in brakings]
+        explains = {"all": comparison.lost - parts["remainder"], **parts}[part] if part and parts else None
+        table.add_row(head, unit, *cells, "" if explains is None else decimal(explains))
+    if parts:
+        table.add_row("not explained", "m", "", "", decimal(parts["remainder"]))
     return table
 
 
-def _print_common(console: Console, told: Explained) -> None:
-    table = WholeTable("characteristic", title=f"Changed vs. necessary ({_looked_at(told)})", title_justify="left")
+def _print_common(console: Console, result: Explained) -> None:
+    table = WholeTable("characteristic", title=f"Changed vs. necessary ({_looked_at(result)})", title_justify="left")
     for head in ("changed", "necessary", "in some cause"):
         table.add_column(head, justify="right")
-    for row in told.necessity.to_dict("records"):
+    for row in result.necessity.to_dict("records"):
         table.add_row(escape(row["characteristic"]), f"{row['changed']:.0%}", _necessary(row), f"{row['involved']:.0%}")
     console.print(table)
-    sampled = "" if told.analysed == told.failures else (
-        f" In brackets: {CONFIDENCE:.0%} intervals for all {told.failures} (Clopper and Pearson's, a little too wide for a finite number).")
-    _say(console, f"necessary: in every minimal cause of a failure; shares of the failures.{sampled}")
-    causes = WholeTable("minimal cause", title=f"Distinct minimal causes: {len(told.distinct)}", title_justify="left")
+    sampled = "" if result.analysed == result.failures else (
+        f" In brackets: {CONFIDENCE:.0%} intervals for all {result.failures} (Clopper and Pearson's, slightly too wide).")
+    print_text(console, f"necessary: in every minimal cause of a failure; shares of the failures.{sampled}")
+    causes = WholeTable("minimal cause", title=f"Distinct minimal causes: {len(result.distinct)}", title_justify="left")
     for head in ("failures", "share"):
         causes.add_column(head, justify="right")
-    for row in told.distinct.head(DISTINCT_SHOWN).to_dict("records"):
+    for row in result.distinct.head(DISTINCT_SHOWN).to_dict("records"):
         causes.add_row(escape(", ".join(row["cause"]) or "none: the original vehicle"), str(row["failures"]), f"{row['share']:.0%}")
     console.print(causes)
 
 
-def _looked_at(told: Explained) -> str:
-    if told.analysed == told.failures:
-        return f"all {told.failures} failures"
-    return f"random sample: {told.analysed} of {told.failures} failures"
+def _looked_at(result: Explained) -> str:
+    if result.analysed == result.failures:
+        return f"all {result.failures} failures"
+    return f"random sample: {result.analysed} of {result.failures} failures"
 
 
-def _decimal(value: float | None) -> str:
-    return "-" if value is None or math.isnan(value) else f"{value:.2f}"
-
-
-def _say(console: Console, text: str) -> None:
-    console.print(text, soft_wrap=True, markup=False, highlight=False)
+def necessity_figure(result: Explained) -> Figure:
+    """How often each characteristic is necessary, beside how often it is changed (RQ3.2 asked again)."""
+    frame = result.necessity.iloc[::-1]
+    figure, ((axis,),) = new_figure(f"{result.study.name}: changed is not needed", 1, 1, (6.4, 1.4 + 0.3 * max(len(frame), 4)))
+    names = [plain(name) for name in frame["characteristic"]]
+    for column, label, colour, height in (
+            ("changed", "changed", CHANGED, 0.8), ("involved", "in some minimal cause", INVOLVED, 0.5),
+            ("necessary", "necessary: in every minimal cause", NECESSARY, 0.24)):
+        axis.barh(names, 100 * frame[column], height=height, color=colour, label=label)
+    axis.set_xlim(0, 100)
+    axis.set_xlabel(f"share of {result.analysed} failures [%]")
+    axis.grid(visible=False, axis="y")
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=FONT)
+    return figure

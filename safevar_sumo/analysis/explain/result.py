@@ -8,15 +8,18 @@ from typing import Any
 import pandas as pd
 
 from safevar_sumo.analysis.criterion import Unsafe
-from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
 from safevar_sumo.analysis.explain.causes import End
 from safevar_sumo.analysis.explain.necessity import Robustness
 from safevar_sumo.analysis.preventability import Preventability
-from safevar_sumo.analysis.words import sentence
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import SolutionId
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
+
+ROBUST = "smallest robust"
+REASONS = {"fewest": "fewest changes", "smallest": "smallest changes", "most_severe": "most severe"}
+"""Why a failure was chosen, as JSON has it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,8 +79,8 @@ class Explanation:
     preventable: str = ""
     points: tuple[str, ...] = ()
 
-    def record(self) -> dict[str, Any]:
-        """As `explain --json` prints it."""
+    def to_dict(self) -> dict[str, Any]:
+        """An entry of `explain --json`."""
         return {
             "algorithm": self.handle.algorithm if self.handle else None, "run": self.handle.run if self.handle else None,
             "index": self.handle.row if self.handle else None, "setting": self.setting, "outcome": self.outcome,
@@ -119,19 +122,18 @@ class Explained:
     otherwise: int
     preventability: Preventability
 
-    def records(self) -> list[dict[str, Any]]:
-        """As `explain --json` prints them: one for each failure, and a summary."""
-        group = self.necessity.set_index("characteristic")
-        shares: dict[str, Any] = {
-            name: dict(zip(group.index, group[name].tolist(), strict=True)) for name in ("necessary", "changed")}
-        ends = zip(group["necessary_lower"].tolist(), group["necessary_upper"].tolist(), strict=True)
-        shares["necessary_interval"] = dict(zip(group.index, map(list, ends), strict=True))
-        return [*(one.record() for one in self.explanations), {"summary": {**shares, "preventable": self.preventability.to_dict()}}]
+    def to_dict(self) -> list[dict[str, Any]]:
+        """The JSON of `explain`: a list with an entry for each explained failure, and a summary."""
+        frame = self.necessity.set_index("characteristic")
+        shares: dict[str, Any] = {name: frame[name].to_dict() for name in ("necessary", "changed")}
+        shares["necessary_interval"] = {name: list(ends) for name, *ends in frame[["necessary_lower", "necessary_upper"]].itertuples()}
+        summary = {**shares, "preventable": self.preventability.to_dict()}
+        return [*(failure.to_dict() for failure in self.explanations), {"summary": summary}]
 
     def __repr__(self) -> str:
         return f"<Explained {self.study.name}, unsafe {self.unsafe}: {self.failures} of {self.looked_at}, {len(self.explanations)} in full>"
 
-    def frame(self) -> pd.DataFrame:
+    def to_frame(self) -> pd.DataFrame:
         """One row for each change of each minimal cause of each explanation.
 
         Columns: `failure`, counted from 0, `algorithm`, `run`, `index`, `cause`, counted from 0, `characteristic`, `unit`,
@@ -139,13 +141,13 @@ class Explained:
         `whose`, and `points`, separated by semicolons.
         """
         rows = []
-        for i, one in enumerate(self.explanations):
-            algorithm, run, index = one.handle or (None, None, None)
-            for j, cause in enumerate(one.causes):
+        for i, failure in enumerate(self.explanations):
+            algorithm, run, index = failure.handle or (None, None, None)
+            for j, cause in enumerate(failure.causes):
                 for member in CharacteristicSet.of(self.study.vehicle.characteristics):
                     if member.name in cause.changes:
                         rows.append((i, algorithm, run, index, j, member.name, member.unit, member.original, cause.changes[member.name],
                                      cause.boundary[member.name], cause.alone[member.name], cause.fraction, cause.outcome,
-                                     cause.safety_degree, one.robustness.share, one.preventable, "; ".join(one.points)))
+                                     cause.safety_degree, failure.robustness.share, failure.preventable, "; ".join(failure.points)))
         return pd.DataFrame(rows, columns=["failure", "algorithm", "run", "index", "cause", "characteristic", "unit", "original", "value",
                                            "boundary", "alone", "fraction", "outcome", SAFETY_DEGREE, "robustness", "whose", "points"])

@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.analysis.criterion import Unsafe
-from safevar_sumo.analysis.evaluator import Bench
-from safevar_sumo.analysis.explain.causes import MinimalCause, minimal_causes, number
-from safevar_sumo.analysis.explain.compute import REASONS
-from safevar_sumo.analysis.explain.failures import points_in_words, points_of, where
+from safevar_sumo.analysis.evaluator import Bench, finite_or_none
+from safevar_sumo.analysis.explain.causes import MinimalCause, minimal_causes
+from safevar_sumo.analysis.explain.compute import points_in_words, points_of, where
 from safevar_sumo.analysis.explain.necessity import Robustness, robustness, smallest_robust
+from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, preventability
 from safevar_sumo.analysis.words import ENDS, ask, changes, joined, number_of
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
@@ -26,6 +26,8 @@ from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
+LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smallest largest change"}
+"""What a reader sees where the bare word `smallest` would leave open what of it is small."""
 LIMIT = 4000
 """Simulations, about, in which the smallest robust failure is looked for at the end of a study; `explain` takes more."""
 
@@ -58,14 +60,14 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
     chosen = {reason: chosen_handle(solutions, degree, choice, study.name) for choice, reason in REASONS.items()}
     rows = solutions.iloc[[position_of(solutions, handle) for handle in chosen.values()]]
     settings = rows[list(bench.characteristics.names)].to_numpy(dtype=float)
-    found, (places, worst) = minimal_causes(bench, settings, means), _places(study, settings, means)
+    causes_of, (places, worst) = minimal_causes(bench, settings, means), _places(study, settings, means)
     counted = f"{int(unsafe.sum())} of {number_of(len(solutions), 'vehicle')} found"
     lines = [_paragraph(bench, solutions, unsafe, original, means, worst),
              f"{counted} collide." if hits else f"No collision. {counted} keep less than half of the original's {degree:.2f} m."]
-    for (reason, handle), row, causes, fails in zip(chosen.items(), rows.to_dict("records"), found, places, strict=True):
+    for (reason, handle), row, causes, fails in zip(chosen.items(), rows.to_dict("records"), causes_of, places, strict=True):
         size = f"{number_of(int(row['f_num_diff']), 'change')} of up to {row['f_diff']:.0%}"
         end = f"{row['outcome']}, SD {row['f_safe']:.2f}"
-        lines.append(f"{reason.capitalize()}: {handle}, {end}, {size}. {_in_words(bench, causes)}{fails}")
+        lines.append(f"{LABELS.get(reason, reason).capitalize()}: {handle}, {end}, {size}. {_in_words(bench, causes)}{fails}")
     at_worst = f"at the worst point of the first (without --point: at all {len(assemble(study).points)}, which takes long)"
     return [*lines, f"Why, and how far{f', {at_worst}' if worst else ''}: {ask('explain', place, worst)}"]
 
@@ -88,14 +90,14 @@ def _paragraph(bench: Bench, solutions: pd.DataFrame, is_unsafe: pd.Series[bool]
     robust = smallest_robust(bench, failures, step, unsafe, LIMIT // len(system.points))
     fewest = int(np.lexsort([getattr(failures, name) for name in reversed(CHOICES["fewest"])])[0])
     rows = [fewest] if robust is None else [fewest, robust]
-    told, here = [], failures.take(rows)
+    findings, here = [], failures.take(rows)
     causes, shares = minimal_causes(bench, here.settings, unsafe), robustness(bench, here.settings, step, unsafe)
     for i, row in enumerate(rows):
         changed = np.flatnonzero(bench.characteristics.changed(here.settings[i]))
         changes = {names[column]: float(here.settings[i, column]) for column in changed}
-        told.append(Finding(str(every[kept[failing[row]]]), changes, str(here.outcome[i]), number(here.f_safe[i]), shares[i],
+        findings.append(Finding(str(every[kept[failing[row]]]), changes, str(here.outcome[i]), finite_or_none(here.f_safe[i]), shares[i],
                             len(causes[i][0].columns)))
-    return in_short(system, original, told[0], told[1] if len(told) > 1 else None, preventable)
+    return in_short(system, original, findings[0], findings[1] if len(findings) > 1 else None, preventable)
 
 
 def _places(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple[list[str], str]:
@@ -103,9 +105,9 @@ def _places(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple[list[st
     system = assemble(study)
     if not system.matrix:
         return [""] * len(settings), ""
-    found = at_every_point(system, settings)
-    told = [f" {points_in_words(points, len(system.matrix), most=3)}" for points in points_of(system, found, unsafe)]
-    return told, found[worst_points(found)[0]].point.name
+    at_points = at_every_point(system, settings)
+    words = [f" {points_in_words(points, len(system.matrix), most=3)}" for points in points_of(system, at_points, unsafe)]
+    return words, at_points[worst_points(at_points)[0]].point.name
 
 
 def _in_words(bench: Bench, causes: list[MinimalCause]) -> str:
@@ -166,18 +168,19 @@ def in_short(system: System, original: Evaluations, smallest: Finding | None, ro
     robust
         The smallest robust failure, None if there is none among those that were tried.
     preventable
-        Who avoids the collisions found.
+        Who avoids the collisions failure.
     """
     parts = [f"{_conditions(system)} the original vehicle {_end(system, original)}."]
     if smallest is None:
-        return " ".join([*parts, "Nothing unsafe was found."])
+        return " ".join([*parts, "Nothing unsafe was failure."])
     members = CharacteristicSet(system.characteristics.members)
     if not smallest.needed:
         return " ".join([*parts, "No change is needed for it to be unsafe."])
-    parts.append(f"{_suffice(members, smallest)} ({_how_robust(smallest)}).")
+    suffices = _with_changes(members, smallest)
+    parts.append(f"{suffices[0].upper()}{suffices[1:]}")
     if smallest.robustness.borderline:
-        parts.append("No robust failure was found among the smallest ones." if robust is None else
-                     f"The smallest robust failure ({robust.name}): {_lower(_suffice(members, robust))} ({_how_robust(robust)}).")
+        parts.append("None of the failures that were tried is robust." if robust is None else
+                     f"The robust failure with the fewest changes, {robust.name}: {_with_changes(members, robust)}")
     return " ".join([*parts, *_avoided(preventable)])
 
 
@@ -204,22 +207,29 @@ def _end(system: System, original: Evaluations) -> str:
     return f"{ENDS.get(outcome, outcome)}" + ("" if degree != degree else f" with a safety degree of {degree:.2f} m")
 
 
-def _suffice(members: CharacteristicSet, found: Finding) -> str:
-    number = len(found.changes)
-    suffice = "change suffices" if number == 1 else "changes suffice"
-    return f"{_count(number).capitalize()} {suffice} for {_outcome(found)}: {_changes(members, found.changes)}"
+def _with_changes(members: CharacteristicSet, failure: Finding) -> str:
+    """Such as `a collision at 5 km/h (robust: ...) was found with ten changes: ...; three of them suffice`."""
+    number, needed, what = len(failure.changes), failure.needed, f"{_outcome(failure)} ({_how_robust(failure)})"
+    listed = _changes(members, failure.changes)
+    if needed < number:
+        return f"{what} was found with {_count(number)} changes: {listed}; {_count(needed)} of them {_suffice(needed)}."
+    return f"{_count(number)} {'change' if number == 1 else 'changes'} {_suffice(number)} for {what}: {listed}."
+
+
+def _suffice(number: int) -> str:
+    return "suffices" if number == 1 else "suffice"
 
 
 def _count(number: int) -> str:
     return NUMBERS[number] if number < len(NUMBERS) else str(number)
 
 
-def _outcome(found: Finding) -> str:
-    if found.safety_degree is None:
-        return found.outcome
-    if found.outcome == Outcome.COLLISION:
-        return f"a collision at {_speed(found.safety_degree)}"
-    return f"a safety degree of only {found.safety_degree:.2f} m"
+def _outcome(failure: Finding) -> str:
+    if failure.safety_degree is None:
+        return failure.outcome
+    if failure.outcome == Outcome.COLLISION:
+        return f"a collision at {_speed(failure.safety_degree)}"
+    return f"a safety degree of only {failure.safety_degree:.2f} m"
 
 
 def _speed(degree: float) -> str:
@@ -237,10 +247,9 @@ def _changes(members: CharacteristicSet, values: Mapping[str, float]) -> str:
     return ", ".join(parts) + (f" and {len(shares) - NAMED} more" if len(shares) > NAMED else "")
 
 
-def _how_robust(found: Finding) -> str:
-    share = f"{100 * found.robustness.share:.0f} % of its neighbours are unsafe too"
-    alone = f"; {_count(found.needed)} of the changes would do" if found.needed < len(found.changes) else ""
-    return f"{'borderline: only ' if found.robustness.borderline else 'robust: '}{share}{alone}"
+def _how_robust(failure: Finding) -> str:
+    share = f"{100 * failure.robustness.share:.0f} % of its neighbours are unsafe too"
+    return f"{'borderline: only ' if failure.robustness.borderline else 'robust: '}{share}"
 
 
 def _avoided(preventable: Preventability) -> list[str]:
@@ -252,7 +261,3 @@ def _avoided(preventable: Preventability) -> list[str]:
     parts = [text.format(f"{100 * (preventable.share(by) or 0.0):.0f} %") for by, text in words.items() if preventable.numbers.get(by)]
     sample = "" if preventable.looked_at == preventable.collisions else f"{preventable.looked_at} drawn at random from "
     return [f"In the same vehicle, of {sample}{preventable.collisions} collisions, {joined(parts)}."]
-
-
-def _lower(text: str) -> str:
-    return text[:1].lower() + text[1:]

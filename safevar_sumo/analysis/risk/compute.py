@@ -1,4 +1,4 @@
-"""How likely is an unsafe outcome when vehicles vary as a study says, and which characteristic decides?"""
+"""Estimates how likely an unsafe outcome is from sampled vehicles, and Sobol indices of the characteristics."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import scipy
 
-from safevar_sumo.analysis.criterion import Unsafe, usual_in
-from safevar_sumo.analysis.evaluator import Bench, Progress, open_bench, silent
-from safevar_sumo.analysis.explain.causes import number
-from safevar_sumo.analysis.risk.options import RiskOptions
+from safevar_sumo.analysis.criterion import Unsafe, clopper_pearson, criterion_of
+from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent
+from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.risk.variation_model import VariationModel
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.records import FloatArray
-from safevar_sumo.study import Study
+from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.workers.evaluation import Pool
 
 CHUNK = 1000
@@ -32,7 +30,7 @@ class Risk:
     samples, failures
         Vehicles that were drawn, and how many of them were unsafe; those that could not be simulated are `errors`.
     sensitivity, sensitivity_of_unsafe
-        Frames of `safevar_sumo.analysis.risk.compute`, of the safety degree and of being unsafe; None where
+        Frames of `sensitivities`, of the safety degree and of being unsafe; None where
         characteristics are correlated, for which they are not defined.
     """
 
@@ -56,74 +54,66 @@ class Risk:
 
     @property
     def interval(self) -> tuple[float, float]:
-        return interval_of(self.failures, self.samples, self.confidence)
+        return clopper_pearson(self.failures, self.samples, self.confidence)
 
-    def record(self) -> dict[str, Any]:
-        """As `risk --json` prints it."""
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON of `risk`."""
         rows = [] if self.sensitivity is None else self.sensitivity.to_dict("records")
         return {
             "study": self.study.name, "unsafe": str(self.unsafe), "samples": self.samples, "failures": self.failures,
             "probability": self.probability, "interval": list(self.interval), "confidence": self.confidence,
             "sensitivity": [{
-                "characteristic": row["characteristic"], "first_order": number(row["first_order"]), "total": number(row["total"]),
-                **{f"{name}_interval": [number(row[f"{name}_lower"]), number(row[f"{name}_upper"])] for name in ("first_order", "total")}}
-                for row in rows]}
+                "characteristic": row["characteristic"],
+                **{name: finite_or_none(row[name]) for name in ("first_order", "total")},
+                **{f"{name}_interval": [finite_or_none(row[f"{name}_{end}"]) for end in ("lower", "upper")]
+                   for name in ("first_order", "total")}} for row in rows]}
+
+    def to_frame(self) -> pd.DataFrame:
+        """Sensitivity of the safety degree and of being unsafe, one row per output and characteristic; empty if correlated.
+
+        Columns: `output` (safety_degree or unsafe), and those of `sensitivities`.
+        """
+        frames = {SAFETY_DEGREE: self.sensitivity, "unsafe": self.sensitivity_of_unsafe}
+        tables = [frame.assign(output=name) for name, frame in frames.items() if frame is not None]
+        columns = ["output", "characteristic", *(f"{index}{end}" for index in ("first_order", "total") for end in ("", "_lower", "_upper"))]
+        return pd.concat(tables, ignore_index=True)[columns] if tables else pd.DataFrame(columns=columns)
 
     def __repr__(self) -> str:
         low, high = self.interval
         return f"<Risk of {self.study.name}, unsafe {self.unsafe}: {self.probability:.4g} ({low:.4g} to {high:.4g})>"
 
 
-def interval_of(count: int, number: int, confidence: float) -> tuple[float, float]:
-    """Clopper and Pearson's exact interval of a share."""
-    found = scipy.stats.binomtest(count, number).proportion_ci(confidence, method="exact")
-    return float(found.low), float(found.high)
-
-
-def estimate_risk(study: Study, *, samples: int = RiskOptions.samples, confidence: float = RiskOptions.confidence,
-                  width: float | None = None, unsafe: str | None = None, pool: Pool | None = None, jobs: int | None = None,
+def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = None, jobs: int | None = None,
                   progress: Progress = silent) -> Risk:
     """Estimate the probability of an unsafe outcome. Nothing is filtered: this is about vehicles, not about a search.
-
-    Parameters
-    ----------
-    samples
-        Vehicles to draw at the most.
-    confidence
-        Of the intervals.
-    width
-        Stop as soon as the interval of the probability is no wider.
-    unsafe
-        As in `tolerance`.
-    pool, jobs, progress
-        As in `tolerance`.
 
     Raises
     ------
     InputError
-        If a distribution of the study is impossible, or as in `tolerance`.
+        If a distribution of the study is impossible or `unsafe` cannot be used, or the study cannot be assembled.
+    SimulationError
+        If no vehicle can be simulated.
     """
-    RiskOptions(samples=samples, confidence=confidence, width=width, unsafe=unsafe)
-    means, world = Unsafe.given(unsafe), VariationModel(study)
+    model = VariationModel(study)
     rng = np.random.default_rng(study.search.seed)
     count = failures = errors = 0
     with open_bench(study, pool, jobs, progress) as bench:
-        means = means or usual_in(bench, bench.original())
-        chunk = CHUNK if width is not None else samples
-        while count + errors < samples:
-            drawn = rng.random((min(chunk, samples - count - errors), len(bench.characteristics)))
-            evaluations = bench.evaluate(world.settings(drawn), "vehicles as they vary")
+        unsafe = criterion_of(options.unsafe, bench)
+        chunk = CHUNK if options.width is not None else options.samples
+        while count + errors < options.samples:
+            probabilities = rng.random((min(chunk, options.samples - count - errors), len(bench.characteristics)))
+            evaluations = bench.evaluate(model.settings(probabilities), "vehicles as they vary")
             valid = int(np.count_nonzero(evaluations.valid))
-            count, errors = count + valid, errors + len(drawn) - valid
-            failures += int(np.count_nonzero(means.of(evaluations)))
-            low, high = interval_of(failures, count, confidence) if count else (0.0, 1.0)
-            if width is not None and high - low <= width:
+            count, errors = count + valid, errors + len(probabilities) - valid
+            failures += int(np.count_nonzero(unsafe.of(evaluations)))
+            low, high = clopper_pearson(failures, count, options.confidence) if count else (0.0, 1.0)
+            if options.width is not None and high - low <= options.width:
                 break
         if not count:
             raise SimulationError(f"study {study.name!r}: not one of {errors} vehicles could be simulated")
-        decides = (None, None) if world.correlated else sensitivities(bench, world, means, confidence)
-    return Risk(study=study, unsafe=means, samples=count, failures=failures, errors=errors, confidence=confidence, sensitivity=decides[0],
-                sensitivity_of_unsafe=decides[1])
+        of_degree, of_unsafe = (None, None) if model.correlated else sensitivities(bench, model, unsafe, options.confidence)
+    return Risk(study=study, unsafe=unsafe, samples=count, failures=failures, errors=errors, confidence=options.confidence,
+                sensitivity=of_degree, sensitivity_of_unsafe=of_unsafe)
 
 
 BASE = 512
@@ -134,7 +124,7 @@ RESAMPLES = 200
 """Bootstrap samples that the intervals come from."""
 
 
-def sensitivities(bench: Bench, world: VariationModel, unsafe: Unsafe, confidence: float) -> tuple[pd.DataFrame, pd.DataFrame]:
+def sensitivities(bench: Bench, model: VariationModel, unsafe: Unsafe, confidence: float) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Sensitivity of the safety degree, and of being unsafe.
 
     Returns
@@ -149,7 +139,7 @@ def sensitivities(bench: Bench, world: VariationModel, unsafe: Unsafe, confidenc
     seed, names = bench.study.search.seed % 2**32, bench.characteristics.names
     problem = {"num_vars": len(names), "names": list(names), "bounds": [[0.0, 1.0]] * len(names)}
     points = sobol.sample(problem, BASE, calc_second_order=False, seed=seed)
-    evaluations = bench.evaluate(world.settings(np.asarray(points)), "what decides")
+    evaluations = bench.evaluate(model.settings(np.asarray(points)), "what decides")
     degree = np.where(evaluations.valid, evaluations.f_safe, np.nan)
     is_unsafe = np.where(evaluations.valid, unsafe.of(evaluations).astype(float), np.nan)
     if min(np.count_nonzero(is_unsafe == outcome) for outcome in (0, 1)) < FEWEST:
@@ -165,11 +155,11 @@ def _indices(problem: dict[str, Any], output: FloatArray, confidence: float, see
     whole = blocks[np.isfinite(blocks).all(axis=1)].ravel()
     names = problem["names"]
     if not whole.size or np.ptp(whole) == 0:
-        found = {name: np.full(len(names), np.nan) for name in ("S1", "ST", "S1_conf", "ST_conf")}
+        indices = {name: np.full(len(names), np.nan) for name in ("S1", "ST", "S1_conf", "ST_conf")}
     else:
-        found = sobol.analyze(problem, whole, calc_second_order=False, num_resamples=RESAMPLES, conf_level=confidence, seed=seed)
-    frame = pd.DataFrame({"characteristic": names, "first_order": found["S1"], "total": found["ST"]})
+        indices = sobol.analyze(problem, whole, calc_second_order=False, num_resamples=RESAMPLES, conf_level=confidence, seed=seed)
+    frame = pd.DataFrame({"characteristic": names, "first_order": indices["S1"], "total": indices["ST"]})
     for name, key in (("first_order", "S1"), ("total", "ST")):
         for end, sign in (("lower", -1), ("upper", 1)):
-            frame[f"{name}_{end}"] = frame[name] + sign * found[f"{key}_conf"]
+            frame[f"{name}_{end}"] = frame[name] + sign * indices[f"{key}_conf"]
     return frame

@@ -1,44 +1,51 @@
-"""How likely an unsafe outcome is, for a reader."""
+"""How likely an unsafe outcome is, as text on the terminal and as a figure."""
 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
+from safevar_sumo.analysis.figures import CHANGED, FONT, NECESSARY, new_figure, plain
 from safevar_sumo.analysis.risk.compute import Risk
+from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study
 from safevar_sumo.study.variation import Uniform
-from safevar_sumo.terminal import WholeTable, print_meanings
+from safevar_sumo.terminal import WholeTable, print_meanings, print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-def print_risk(console: Console, told: Risk) -> None:
+
+def print_risk(console: Console, result: Risk) -> None:
     """The probability with its interval, how vehicles vary, and what decides."""
-    low, high = told.interval
-    _say(console, told.study.title)
-    _say(console, f"Unsafe: {told.unsafe}. {told.failures} of {told.samples} vehicles.")
-    name = "Share of the domain that is unsafe:" if told.of_domain else "Probability"
-    _say(console, f"{name} {told.probability:.4g}, with {told.confidence:.0%} confidence from {low:.4g} to {high:.4g}.")
-    if told.of_domain:
-        _say(console, "warning: this is no probability in the field: the study has no [variation] table that says how real vehicles vary.")
-    _say(console, _variation(told.study))
-    if told.sensitivity is None or told.sensitivity_of_unsafe is None:
+    low, high = result.interval
+    print_text(console, result.study.title)
+    print_text(console, f"Unsafe: {result.unsafe}. {result.failures} of {result.samples} vehicles.")
+    name = "Share of the domain that is unsafe:" if result.of_domain else "Probability"
+    print_text(console, f"{name} {result.probability:.4g}, with {result.confidence:.0%} confidence from {low:.4g} to {high:.4g}.")
+    if result.of_domain:
+        print_text(console, "warning: no probability in the field: the study has no [variation] table that says how real vehicles vary.")
+    print_text(console, _variation(result.study))
+    if result.sensitivity is None or result.sensitivity_of_unsafe is None:
         return
     table = WholeTable("characteristic", title="What decides: share of the variance", title_justify="left")
     for what in ("SD", "unsafe"):
         table.add_column(f"{what}: alone", justify="right")
         table.add_column("in all", justify="right")
-    second = told.sensitivity_of_unsafe.set_index("characteristic")
-    for row in told.sensitivity.sort_values("total", ascending=False, kind="stable").to_dict("records"):
+    second = result.sensitivity_of_unsafe.set_index("characteristic")
+    for row in result.sensitivity.sort_values("total", ascending=False, kind="stable").to_dict("records"):
         other = second.loc[row["characteristic"]]
         table.add_row(escape(row["characteristic"]), *(_index(one, name) for one in (row, other) for name in ("first_order", "total")))
     console.print(table)
-    if told.sensitivity_of_unsafe["total"].isna().all():
-        _say(console, "Too few settings are unsafe, or safe, to tell what decides that; the safety degree tells more.")
-    print_meanings(console, CharacteristicSet.of(told.study.vehicle.characteristics))
-    console.print(f"Sobol indices, first order and total, with half of their {told.confidence:.0%} intervals.", highlight=False)
+    if result.sensitivity_of_unsafe["total"].isna().all():
+        print_text(console, "Too few settings are unsafe, or safe, to tell what decides that; the safety degree tells more.")
+    print_meanings(console, CharacteristicSet.of(result.study.vehicle.characteristics))
+    console.print(f"Sobol indices, first order and total, with half of their {result.confidence:.0%} intervals.", highlight=False)
 
 
 def _variation(study: Study) -> str:
@@ -54,5 +61,33 @@ def _index(row: object, name: str) -> str:
     return "-" if math.isnan(value) else f"{value:.2f} ±{(high - low) / 2:.2f}"
 
 
-def _say(console: Console, text: str) -> None:
-    console.print(text, soft_wrap=True, markup=False, highlight=False)
+def sensitivity_figure(result: Risk) -> Figure:
+    """First-order and total Sobol indices of every characteristic with their intervals, of the safety degree and of being unsafe.
+
+    Raises
+    ------
+    InputError
+        If there are none, because characteristics are correlated.
+    """
+    if result.sensitivity is None or result.sensitivity_of_unsafe is None:
+        raise InputError("correlations", "there are no sensitivity indices of correlated characteristics", "a study without correlations")
+    names = result.sensitivity.sort_values("total", kind="stable")["characteristic"].to_list()
+    title = f"{result.study.name}: what decides ({result.confidence:.0%} intervals)"
+    figure, (axes,) = new_figure(title, 1, 2, (7.2, 1.5 + 0.28 * max(len(names), 4)))
+    of_what = {"safety degree": result.sensitivity, f"unsafe ({result.unsafe})": result.sensitivity_of_unsafe}
+    for axis, (what, frame) in zip(axes, of_what.items(), strict=True):
+        rows = frame.set_index("characteristic").loc[names]
+        for column, label, colour, shift in (("total", "total: with all others", CHANGED, 0.2), ("first_order", "alone", NECESSARY, -0.2)):
+            width = (rows[f"{column}_upper"] - rows[column]).clip(lower=0)
+            axis.barh(np.arange(len(names)) + shift, rows[column], height=0.36, color=colour, xerr=width, label=label,
+                      error_kw={"elinewidth": 0.8, "ecolor": "black"})
+        axis.set_yticks(np.arange(len(names)), [plain(name) for name in names])
+        axis.set_title(plain(what), fontsize=FONT)
+        axis.set_xlabel("share of the variance [-]")
+        axis.set_xlim(0, 1)
+        if rows["total"].isna().all():
+            axis.text(0.5, 0.5, "too few settings are unsafe,\nor safe, to tell", transform=axis.transAxes, ha="center", fontsize=FONT)
+        axis.grid(visible=False, axis="y")
+    axes[1].set_yticklabels([])
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=FONT)
+    return figure

@@ -121,5 +121,5 @@ class VariationModel:
         try:
             return np.asarray(np.linalg.cholesky(matrix), dtype=float)
         except np.linalg.LinAlgError:
-            told = ", ".join(f"{' and '.join(one.between)} {one.value:g}" for one in correlations)
-            raise InputError(self._source, f"correlations contradict each other: {told}", "a positive definite matrix") from None
+            pairs = ", ".join(f"{' and '.join(one.between)} {one.value:g}" for one in correlations)
+            raise InputError(self._source, f"correlations contradict each other: {pairs}", "a positive definite matrix") from None

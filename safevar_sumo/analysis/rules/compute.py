@@ -1,4 +1,4 @@
-"""Rules that tell where it is unsafe, in physical units, from an unbiased design and judged on another one.
+"""Finds rules in physical units that say where a study is unsafe, from an unbiased design, judged on another one.
 
 A classification tree (CART, by scikit-learn) cuts the domain into boxes. It is pruned to the smallest one that
 cross-validation does not tell from the best, its boxes that are more often unsafe than not become rules, and conditions
@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from safevar_sumo.analysis.criterion import Unsafe, spread, usual_in
-from safevar_sumo.analysis.evaluator import Bench, Progress, open_bench, silent
-from safevar_sumo.analysis.risk.compute import interval_of
-from safevar_sumo.analysis.rules.options import RulesOptions
+from safevar_sumo.analysis.criterion import Unsafe, clopper_pearson, criterion_of
+from safevar_sumo.analysis.evaluator import Bench, Progress, open_bench, silent, spread
+from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -66,18 +66,18 @@ class Rule:
 
     @property
     def density_interval(self) -> tuple[float, float] | None:
-        return interval_of(self.unsafe_inside, self.inside, self.confidence) if self.inside else None
+        return clopper_pearson(self.unsafe_inside, self.inside, self.confidence) if self.inside else None
 
     @property
     def coverage_interval(self) -> tuple[float, float] | None:
-        return interval_of(self.unsafe_inside, self.unsafe_everywhere, self.confidence) if self.unsafe_everywhere else None
+        return clopper_pearson(self.unsafe_inside, self.unsafe_everywhere, self.confidence) if self.unsafe_everywhere else None
 
     def tells_more_than(self, share: float) -> bool:
         """Whether what lies inside is surely unsafe more often than that share of all; what has no limits tells of all."""
         return not self.limits or (self.density_interval is not None and self.density_interval[0] > share)
 
-    def record(self) -> dict[str, Any]:
-        """As `rules --json` prints it."""
+    def to_dict(self) -> dict[str, Any]:
+        """An entry of `rules --json`."""
         return {
             "conditions": [{"characteristic": name, "at_least": low, "at_most": high} for name, (low, high) in self.limits.items()],
             "density": self.density, "coverage": self.coverage,
@@ -96,50 +96,51 @@ class Rules:
     unsafe_share: float
     remark: str = ""
 
-    def records(self) -> list[dict[str, Any]]:
-        """As `rules --json` prints them."""
-        return [rule.record() for rule in self.rules]
+    def to_dict(self) -> list[dict[str, Any]]:
+        """The JSON of `rules`: a list with an entry for each rule."""
+        return [rule.to_dict() for rule in self.rules]
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row for each condition of each rule; a rule without conditions, which holds everywhere, has one row.
+
+        Columns: `rule`, counted from 0, `characteristic`, `at_least`, `at_most` [unit], `density`, `coverage` [fraction].
+        """
+        return pd.DataFrame(
+            [(number, name, low, high, rule.density, rule.coverage) for number, rule in enumerate(self.rules)
+             for name, (low, high) in rule.limits.items() or [(None, (None, None))]],
+            columns=["rule", "characteristic", "at_least", "at_most", "density", "coverage"])
 
     def __repr__(self) -> str:
         share = f"{self.unsafe_share:.2%} of {self.samples}"
         return f"<Rules of {self.study.name}, unsafe {self.unsafe}: {share} settings, {len(self.rules)} rules>"
 
 
-def find_rules(study: Study, *, samples: int = RulesOptions.samples, unsafe: str | None = None, pool: Pool | None = None,
-          jobs: int | None = None, progress: Progress = silent) -> Rules:
-    """Find rules that tell where a study is unsafe, from settings spread evenly over the whole domain.
-
-    Parameters
-    ----------
-    samples
-        Settings: half of them make the rules, the other half judges them.
-    unsafe, pool, jobs, progress
-        As in `safevar_sumo.analysis.tolerance.compute`.
+def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None, jobs: int | None = None,
+               progress: Progress = silent) -> Rules:
+    """Find rules that say where a study is unsafe, from settings spread evenly over the whole domain.
 
     Raises
     ------
     InputError
-        As in `safevar_sumo.analysis.tolerance.compute`.
+        If `unsafe` cannot be used, or the study cannot be assembled.
     """
-    RulesOptions(samples=samples, unsafe=unsafe)
-    means, members = Unsafe.given(unsafe), CharacteristicSet.of(study.vehicle.characteristics)
+    members = CharacteristicSet.of(study.vehicle.characteristics)
     with open_bench(study, pool, jobs, progress) as bench:
-        means = means or usual_in(bench, bench.original())
-        first, second = (_design(bench, samples // 2, study.search.seed + half) for half in (1, 2))
-    made, judged = means.of(first), means.of(second)
-    fewer = min(np.count_nonzero(made), np.count_nonzero(~made))
-    remark, found = "", list[Limits]()
-    if made.all() and made.size:
-        found = [{}]
-    elif fewer < FEWEST:
-        remark = (f"{np.count_nonzero(made)} of {len(made)} settings are unsafe: rules need at least {FEWEST} unsafe and as many safe ones "
-                  "(--samples looks at more)")
+        unsafe = criterion_of(options.unsafe, bench)
+        training, validation = (_design(bench, options.samples // 2, study.search.seed + half) for half in (1, 2))
+    is_unsafe, is_unsafe_there = unsafe.of(training), unsafe.of(validation)
+    number = int(np.count_nonzero(is_unsafe))
+    remark, boxes = "", list[Limits]()
+    if number == len(is_unsafe) > 0:
+        boxes = [{}]
+    elif min(number, len(is_unsafe) - number) < FEWEST:
+        remark = (f"{number} of {len(is_unsafe)} settings are unsafe: rules need at least {FEWEST} unsafe and as many safe ones "
+                  "(run `rules --samples N` for more)")
     else:
-        found = _boxes(first.settings, made, members)
-    named = [_judged(limits, second.settings, judged, members) for limits in found]
-    both = np.concatenate([made, judged])
-    return Rules(study=study, unsafe=means, rules=sorted(named, key=lambda rule: -rule.unsafe_inside), samples=len(both),
-                 unsafe_share=float(np.mean(both)), remark=remark)
+        boxes = _boxes(training.settings, is_unsafe, members)
+    rules = [_judged(limits, validation.settings, is_unsafe_there, members) for limits in boxes]
+    return Rules(study=study, unsafe=unsafe, rules=sorted(rules, key=lambda rule: -rule.unsafe_inside), remark=remark,
+                 samples=len(training) + len(validation), unsafe_share=float(np.mean(np.concatenate([is_unsafe, is_unsafe_there]))))
 
 
 def _design(bench: Bench, number: int, seed: int) -> Evaluations:
@@ -176,42 +177,42 @@ def _pruned_tree(shares: FloatArray, unsafe: BoolArray) -> Any:
 
 def _leaves(tree: Any, members: CharacteristicSet) -> list[tuple[Limits, float]]:
     """The boxes of a tree, and the density of the unsafe in each."""
-    inner, found = tree.tree_, []
+    inner, boxes = tree.tree_, []
     places: list[tuple[int, Limits]] = [(0, {})]
     while places:
         node, limits = places.pop()
         if inner.children_left[node] < 0:
             counts = inner.value[node][0]
-            found.append((limits, float(counts[-1] / counts.sum())))
+            boxes.append((limits, float(counts[-1] / counts.sum())))
             continue
         column = int(inner.feature[node])
         cut = float(members.lower[column] + inner.threshold[node] * (members.upper - members.lower)[column])
         low, high = limits.get(column, (None, None))
         places.append((int(inner.children_left[node]), {**limits, column: (low, cut)}))
         places.append((int(inner.children_right[node]), {**limits, column: (cut, high)}))
-    return found
+    return boxes
 
 
 def _rounded(limits: Limits, members: CharacteristicSet) -> Limits:
-    """Limits as one tells them, in the order of the characteristics."""
-    def told(value: float | None, width: float) -> float | None:
+    """Limits rounded to `DIGITS` of the domain's width, in the order of the characteristics."""
+    def rounded(value: float | None, width: float) -> float | None:
         return None if value is None else round(value, DIGITS - 1 - math.floor(math.log10(width)))
 
     widths = members.upper - members.lower
-    return {column: (told(limits[column][0], widths[column]), told(limits[column][1], widths[column])) for column in sorted(limits)}
+    return {column: (rounded(limits[column][0], widths[column]), rounded(limits[column][1], widths[column])) for column in sorted(limits)}
 
 
 def _without_idle_conditions(limits: Limits, settings: FloatArray, unsafe: BoolArray) -> Limits:
-    """Drop conditions as long as the density that one can be sure of does not get less."""
-    def sure_of(some: Limits) -> float:
+    """Drop conditions as long as the lower bound of the density does not fall."""
+    def least_density(some: Limits) -> float:
         inside = within(some, settings)
         count = int(np.count_nonzero(inside))
-        return interval_of(int(np.count_nonzero(unsafe & inside)), count, CONFIDENCE)[0] if count else 0.0
+        return clopper_pearson(int(np.count_nonzero(unsafe & inside)), count, CONFIDENCE)[0] if count else 0.0
 
     while limits:
         shorter = [{column: ends for column, ends in limits.items() if column != dropped} for dropped in limits]
-        best = max(shorter, key=sure_of)
-        if sure_of(best) < sure_of(limits):
+        best = max(shorter, key=least_density)
+        if least_density(best) < least_density(limits):
             break
         limits = best
     return limits
@@ -221,7 +222,7 @@ def _that_add_something(boxes: list[Limits], settings: FloatArray, unsafe: BoolA
     """The boxes that cover unsafe settings which those that cover more do not; at least the first."""
     kept: list[Limits] = []
     left = unsafe.copy()
-    for limits in sorted(boxes, key=lambda one: -np.count_nonzero(unsafe & within(one, settings))):
+    for limits in sorted(boxes, key=lambda box: -np.count_nonzero(unsafe & within(box, settings))):
         inside = within(limits, settings)
         if not kept or np.count_nonzero(left & inside) >= LEAST_ADDED * np.count_nonzero(unsafe):
             kept.append(limits)
@@ -240,6 +241,5 @@ def within(limits: Limits, settings: FloatArray) -> BoolArray:
 def _judged(limits: Limits, settings: FloatArray, unsafe: BoolArray, members: CharacteristicSet) -> Rule:
     """A rule with what it is worth on settings that it was not made from."""
     inside = within(limits, settings)
-    within_it, unsafe_in_it, unsafe_at_all = (int(np.count_nonzero(one)) for one in (inside, inside & unsafe, unsafe))
-    named = {members.names[column]: ends for column, ends in limits.items()}
-    return Rule(named, within_it, unsafe_in_it, unsafe_at_all, CONFIDENCE)
+    return Rule({members.names[column]: ends for column, ends in limits.items()}, int(np.count_nonzero(inside)),
+                int(np.count_nonzero(inside & unsafe)), int(np.count_nonzero(unsafe)), CONFIDENCE)

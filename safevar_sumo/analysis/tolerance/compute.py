@@ -1,28 +1,134 @@
-"""How far may each characteristic go, alone, in pairs, and all together?"""
+"""Computes how far each characteristic may go alone, by scans of whole domains, in pairs, and all together."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 
-from safevar_sumo.analysis.criterion import Unsafe, usual_in
-from safevar_sumo.analysis.evaluator import Bench, Progress, open_bench, silent
-from safevar_sumo.analysis.tolerance.one_at_a_time import OneAtATimeScan, scan
-from safevar_sumo.analysis.tolerance.pairs import Pair, planes
-from safevar_sumo.analysis.tolerance.safe_box import SafeBox, no_box, safe_box
+from safevar_sumo.analysis.criterion import Unsafe, criterion_of
+from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent
+from safevar_sumo.analysis.tolerance import ToleranceOptions
+from safevar_sumo.analysis.tolerance.joint import Pair, SafeBox, no_box, planes, safe_box
 from safevar_sumo.errors import unknown
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.study import Study
+from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.vehicles import Characteristic
 from safevar_sumo.workers.evaluation import Pool
+
+VALUES = 201
+"""Values over the domain; the original comes on top."""
+FINER, ROUNDS = 8, 4
+"""Into how many parts the place of a change is divided, and how often: to a 4096th of the distance of two values."""
+SAFE, UNSAFE, NOT_SIMULATED = range(3)
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneAtATimeScan:
+    """One characteristic varies, all others are the original's.
+
+    Attributes
+    ----------
+    profile
+        Columns `value` [unit], `safety_degree` [m, or -m/s], `outcome`, `unsafe`, `valid`, in the order of the values; closer
+        together where the state changes. What is not valid could not be simulated: it is neither safe nor unsafe.
+    """
+
+    characteristic: Characteristic
+    profile: pd.DataFrame
+
+    def _intervals(self, state: int) -> list[pd.DataFrame]:
+        """The parts of the profile in one state, in the order of the values."""
+        runs = groupby(enumerate(_states(self.profile).tolist()), key=lambda row: row[1])
+        return [self.profile.iloc[[place for place, _ in run]] for value, run in runs if value == state]
+
+    @property
+    def _around(self) -> pd.DataFrame | None:
+        """The safe values around the original."""
+        return next((part for part in self._intervals(SAFE) if (part["value"] == self.characteristic.original).any()), None)
+
+    @property
+    def safe(self) -> Interval | None:
+        """The safe interval around the original; None if the original itself is unsafe."""
+        return None if self._around is None else _ends(self._around)
+
+    @property
+    def margins(self) -> tuple[float | None, float | None]:
+        """Safety degrees at the ends of the safe interval [m]."""
+        if self._around is None:
+            return None, None
+        low, high = self._around[SAFETY_DEGREE].iloc[[0, -1]]
+        return finite_or_none(low), finite_or_none(high)
+
+    @property
+    def unsafe(self) -> list[Interval]:
+        """All unsafe intervals, from the first to the last unsafe value of each."""
+        return [_ends(part) for part in self._intervals(UNSAFE)]
+
+    @property
+    def not_simulated(self) -> list[Interval]:
+        """All intervals that could not be simulated, as `unsafe`."""
+        return [_ends(part) for part in self._intervals(NOT_SIMULATED)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The entry of `alone` in `tolerance --json`."""
+        return {"characteristic": self.characteristic.name, "unit": self.characteristic.unit, "original": self.characteristic.original,
+                "safe": None if self.safe is None else list(self.safe), "unsafe": [list(interval) for interval in self.unsafe],
+                "not_simulated": [list(interval) for interval in self.not_simulated]}
+
+
+def _ends(part: pd.DataFrame) -> Interval:
+    return float(part["value"].iloc[0]), float(part["value"].iloc[-1])
+
+
+def scan(bench: Bench, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATimeScan]:
+    """Scan the domains of some characteristics, one at a time."""
+    members = bench.characteristics.members
+    values = [np.union1d(np.linspace(members[column].lower, members[column].upper, VALUES), members[column].original) for column in columns]
+    profiles = _evaluated(bench, columns, values, unsafe)
+    for _ in range(ROUNDS):
+        between = [_where_it_changes(profile) for profile in profiles]
+        if not any(map(len, between)):
+            break
+        finer = _evaluated(bench, columns, between, unsafe)
+        profiles = [pd.concat([profile, more], ignore_index=True).sort_values("value", ignore_index=True)
+                    for profile, more in zip(profiles, finer, strict=True)]
+    return [OneAtATimeScan(characteristic=members[column], profile=profile) for column, profile in zip(columns, profiles, strict=True)]
+
+
+def _where_it_changes(profile: pd.DataFrame) -> FloatArray:
+    """Values between two neighbours of different states."""
+    values, states = profile["value"].to_numpy(), _states(profile)
+    changes = np.flatnonzero(states[1:] != states[:-1])
+    inner = values[changes][:, np.newaxis] + np.diff(values)[changes][:, np.newaxis] * np.arange(1, FINER) / FINER
+    return np.setdiff1d(inner, values)
+
+
+def _states(profile: pd.DataFrame) -> npt.NDArray[np.int_]:
+    return np.where(profile["valid"], np.where(profile["unsafe"], UNSAFE, SAFE), NOT_SIMULATED)
+
+
+def _evaluated(bench: Bench, columns: Sequence[int], values: Sequence[FloatArray], unsafe: Unsafe) -> list[pd.DataFrame]:
+    """Profiles of characteristics at some values each."""
+    ends = np.cumsum([len(group) for group in values])
+    settings = np.tile(bench.characteristics.original, (ends[-1], 1))
+    for column, group, end in zip(columns, values, ends, strict=True):
+        settings[end - len(group):end, column] = group
+    evaluations = bench.evaluate(settings, "one characteristic at a time")
+    frame = pd.DataFrame({"value": np.concatenate(values), SAFETY_DEGREE: evaluations.f_safe, "outcome": evaluations.outcome,
+                          "unsafe": unsafe.of(evaluations), "valid": evaluations.valid})
+    return [frame.iloc[end - len(group):end].reset_index(drop=True) for group, end in zip(values, ends, strict=True)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerance:
-    """How far characteristics may go; `pairs` is None if nobody asked for them."""
+    """How far characteristics may go; `pairs` is None if the options do not ask for pairs."""
 
     study: Study
     unsafe: Unsafe
@@ -34,7 +140,7 @@ class Tolerance:
     @property
     def verdict(self) -> str:
         """What is unsafe by itself, in one sentence."""
-        single = [one.characteristic.name for one in self.alone if one.unsafe]
+        single = [scan.characteristic.name for scan in self.alone if scan.unsafe]
         double = [" with ".join(member.name for member in pair.characteristics) for pair in self.pairs or [] if pair.nearest is not None]
         if self.unsafe.of(self.original)[0]:
             return "The original vehicle itself is unsafe."
@@ -46,60 +152,46 @@ class Tolerance:
             return f"No single characteristic makes it unsafe, but {len(double)} of {len(self.pairs)} pairs: {', '.join(double)}."
         return "No single characteristic and no pair makes it unsafe."
 
-    def frame(self) -> pd.DataFrame:
+    def to_frame(self) -> pd.DataFrame:
         """One row for each characteristic alone.
 
         Columns: `characteristic`, `unit`, `original`, `lower` and `upper` of the domain, `safe_from`, `safe_to` [unit],
         `margin_from`, `margin_to`, the safety degrees there [m], and `unsafe` and `not_simulated`, lists of intervals.
         """
         return pd.DataFrame([{
-            "characteristic": one.characteristic.name, "unit": one.characteristic.unit, "original": one.characteristic.original,
-            "lower": one.characteristic.lower, "upper": one.characteristic.upper,
-            **dict(zip(("safe_from", "safe_to"), one.safe or (None, None), strict=True)),
-            **dict(zip(("margin_from", "margin_to"), one.margins, strict=True)), "unsafe": one.unsafe,
-            "not_simulated": one.not_simulated} for one in self.alone])
+            "characteristic": scan.characteristic.name, "unit": scan.characteristic.unit, "original": scan.characteristic.original,
+            "lower": scan.characteristic.lower, "upper": scan.characteristic.upper,
+            **dict(zip(("safe_from", "safe_to"), scan.safe or (None, None), strict=True)),
+            **dict(zip(("margin_from", "margin_to"), scan.margins, strict=True)), "unsafe": scan.unsafe,
+            "not_simulated": scan.not_simulated} for scan in self.alone])
 
-    def record(self) -> dict[str, Any]:
-        """As `tolerance --json` prints it."""
-        return {"study": self.study.name, "unsafe": str(self.unsafe), "alone": [one.record() for one in self.alone],
-                "pairs": [pair.record() for pair in self.pairs or []], "joint": self.joint.record()}
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON of `tolerance`."""
+        return {"study": self.study.name, "unsafe": str(self.unsafe), "alone": [scan.to_dict() for scan in self.alone],
+                "pairs": [pair.to_dict() for pair in self.pairs or []], "joint": self.joint.to_dict()}
 
     def __repr__(self) -> str:
         return f"<Tolerance of {self.study.name}, unsafe {self.unsafe}: {self.verdict}>"
 
 
-def find_tolerances(study: Study, *, unsafe: str | None = None, characteristics: Sequence[str] | None = None, pairs: bool = False,
-              pool: Pool | None = None, jobs: int | None = None, progress: Progress = silent) -> Tolerance:
+def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | None = None, jobs: int | None = None,
+                    progress: Progress = silent) -> Tolerance:
     """Find how far the characteristics of a study may go. Nothing is filtered: this is about the vehicle, not about a search.
-
-    Parameters
-    ----------
-    unsafe
-        `collision` or `below=X`; by default a collision if one of many settings all over the domain is one, else half of
-        the original's safety degree.
-    characteristics
-        Which ones vary, by default all: alone, in pairs, and together in the joint box; the others are the original's.
-    pairs
-        Whether pairs are looked at too.
-    pool, jobs
-        Where to simulate: a pool, or that many worker processes (by default one for each core).
-    progress
-        Is told what is done.
 
     Raises
     ------
     InputError
         If `unsafe` or a name cannot be used, or the study cannot be assembled.
     """
-    means, columns = Unsafe.given(unsafe), _columns(study, characteristics)
+    columns = _columns(study, options.characteristics)
     with open_bench(study, pool, jobs, progress) as bench:
         original = bench.original()
-        means = means or usual_in(bench, original)
-        alone = scan(bench, columns, means)
-        both = planes(bench, columns, means) if pairs else None
-        is_safe = not means.of(original)[0]
-        box = safe_box(bench, columns, means, _known(bench, alone, both or [])) if is_safe else no_box(bench, columns)
-    return Tolerance(study=study, unsafe=means, original=original, alone=alone, pairs=both, joint=box)
+        unsafe = criterion_of(options.unsafe, bench, original)
+        alone = scan(bench, columns, unsafe)
+        pairs = planes(bench, columns, unsafe) if options.pairs else None
+        is_safe = not unsafe.of(original)[0]
+        box = safe_box(bench, columns, unsafe, _unsafe_settings(bench, alone, pairs or [])) if is_safe else no_box(bench, columns)
+    return Tolerance(study=study, unsafe=unsafe, original=original, alone=alone, pairs=pairs, joint=box)
 
 
 def _columns(study: Study, characteristics: Sequence[str] | None) -> list[int]:
@@ -110,13 +202,9 @@ def _columns(study: Study, characteristics: Sequence[str] | None) -> list[int]:
     return [column for column, name in enumerate(names) if characteristics is None or name in characteristics]
 
 
-def _known(bench: Bench, alone: Sequence[OneAtATimeScan], pairs: Sequence[Pair]) -> FloatArray:
-    """The unsafe settings that are known, shape (K, n)."""
-    names, original = bench.characteristics.names, bench.characteristics.original
-    known = [{one.characteristic.name: value} for one in alone for interval in one.unsafe for value in interval]
-    known += [dict(zip((member.name for member in pair.characteristics), pair.nearest, strict=True)) for pair in pairs if pair.nearest]
-    settings = np.tile(original, (len(known), 1))
-    for row, values in enumerate(known):
-        for name, value in values.items():
-            settings[row, names.index(name)] = value
-    return settings
+def _unsafe_settings(bench: Bench, alone: Sequence[OneAtATimeScan], pairs: Sequence[Pair]) -> FloatArray:
+    """The unsafe settings of scans and pairs, shape (K, n)."""
+    changes = [{scan.characteristic.name: value} for scan in alone for interval in scan.unsafe for value in interval]
+    changes += [dict(zip((member.name for member in pair.characteristics), pair.nearest, strict=True)) for pair in pairs if pair.nearest]
+    original = dict(zip(bench.characteristics.names, bench.characteristics.original.tolist(), strict=True))
+    return np.array([list({**original, **values}.values()) for values in changes]).reshape(-1, len(original))

@@ -1,64 +1,75 @@
-"""How far characteristics may go, for a reader."""
+"""How far characteristics may go, as text on the terminal and as figures."""
 
 from __future__ import annotations
 
-import math
+from typing import TYPE_CHECKING
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from safevar_sumo.analysis.tolerance.compute import Tolerance
-from safevar_sumo.analysis.tolerance.one_at_a_time import OneAtATimeScan
-from safevar_sumo.terminal import WholeTable, print_meanings
+from safevar_sumo.analysis.figures import DEGREE, FONT, NECESSARY, UNSAFE, new_figure, plain, raised
+from safevar_sumo.analysis.tolerance.compute import OneAtATimeScan, Tolerance
+from safevar_sumo.analysis.tolerance.joint import Pair
+from safevar_sumo.analysis.words import decimal
+from safevar_sumo.errors import InputError
+from safevar_sumo.study import SAFETY_DEGREE
+from safevar_sumo.terminal import WholeTable, print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
+    from matplotlib.figure import Figure
 
 PAIRS_SHOWN = 12
 
 
-def print_tolerance(console: Console, told: Tolerance) -> None:
+def print_tolerance(console: Console, result: Tolerance) -> None:
     """The verdict, each characteristic alone, the worst pairs, and all together."""
-    degree = "-" if math.isnan(told.original.f_safe[0]) else f"{told.original.f_safe[0]:.2f}"
-    _say(console, told.study.title)
-    _say(console, f"Unsafe: {told.unsafe}. The original vehicle: {told.original.outcome[0]}, SD {degree}.")
-    _say(console, told.verdict)
-    console.print(_alone(told))
-    _say(console, "* the end of the domain: nothing beyond was looked at.")
-    print_meanings(console, [one.characteristic for one in told.alone])
-    if told.pairs:
-        _print_pairs(console, told)
-    _say(console, _together(told))
+    print_text(console, result.study.title)
+    original = result.original
+    print_text(console, f"Unsafe: {result.unsafe}. The original vehicle: {original.outcome[0]}, SD {decimal(original.f_safe[0])}.")
+    print_text(console, result.verdict)
+    console.print(_alone(result))
+    print_text(console, "* the end of the domain: nothing beyond was looked at.")
+    print_meanings(console, [scan.characteristic for scan in result.alone])
+    if result.pairs:
+        _print_pairs(console, result)
+    print_text(console, _together(result))
 
 
-def _together(told: Tolerance) -> str:
-    box = told.joint
-    subset = len(box.characteristics) < len(told.study.vehicle.characteristics)
+def _together(result: Tolerance) -> str:
+    box = result.joint
+    subset = len(box.characteristics) < len(result.study.vehicle.characteristics)
     who = f"{', '.join(box.characteristics)} together, the others as in the original" if subset else "All together"
     if not box.factor:
         return f"{who}: no box around the original is safe."
     failed = f"; {box.failed} of them could not be simulated and count as unsafe in what follows" if box.failed else ""
     bad = "are unsafe or cannot be simulated" if box.failed else "are unsafe"
-    return (f"{who}: within {box.factor:.1%} of the domain around the original, none of {box.samples} settings drawn at random is unsafe"
-            f"{failed}. With {box.confidence:.0%} confidence at most {box.unsafe_at_most:.2%} of all settings in there {bad}.")
+    return (f"{who}: each may go {box.factor:.1%} of the way from its original value to either end of its domain. None of {box.samples} "
+            f"settings drawn at random in this box is unsafe{failed}. With {box.confidence:.0%} confidence at most "
+            f"{box.unsafe_at_most:.2%} of all settings in the box {bad}.")
 
 
-def _alone(told: Tolerance) -> WholeTable:
+def _alone(result: Tolerance) -> WholeTable:
     table = WholeTable("characteristic", title="Each alone", title_justify="left")
-    failing = any(one.not_simulated for one in told.alone)
+    failing = any(scan.not_simulated for scan in result.alone)
     for head in ("original", "safe from", "to", "SD at the ends", "unsafe", *(["could not be simulated"] if failing else [])):
         table.add_column(head, justify="right")
-    for one in told.alone:
-        member = one.characteristic
-        table.add_row(escape(f"{member.name} [{member.unit}]"), f"{member.original:g}", *_ends(one),
+    for scan in result.alone:
+        member = scan.characteristic
+        table.add_row(escape(f"{member.name} [{member.unit}]"), f"{member.original:g}", *_ends(scan),
                       *(", ".join(f"{low:.5g} to {high:.5g}" for low, high in intervals) or "nowhere"
-                        for intervals in (one.unsafe, *([one.not_simulated] if failing else []))))
+                        for intervals in (scan.unsafe, *([scan.not_simulated] if failing else []))))
     return table
 
 
-def _ends(one: OneAtATimeScan) -> tuple[str, str, str]:
-    if one.safe is None:
+def _ends(scan: OneAtATimeScan) -> tuple[str, str, str]:
+    if scan.safe is None:
         return "nowhere", "nowhere", "-"
-    low, high = (_end(one.characteristic, value) for value in one.safe)
-    return low, high, " / ".join("-" if degree is None else f"{degree:.2f}" for degree in one.margins)
+    low, high = (_end(scan.characteristic, value) for value in scan.safe)
+    return low, high, " / ".join(map(decimal, scan.margins))
 
 
 def _end(member: Characteristic, value: float) -> str:
@@ -67,22 +78,99 @@ def _end(member: Characteristic, value: float) -> str:
     return f"{value:.5g} ({(value - member.original) / abs(member.original):+.1%}){at_end}"
 
 
-def _print_pairs(console: Console, told: Tolerance) -> None:
-    found = sorted((pair for pair in told.pairs or [] if pair.nearest is not None), key=lambda pair: -pair.unsafe_share)
-    if not found:
+def _print_pairs(console: Console, result: Tolerance) -> None:
+    unsafe_pairs = sorted((pair for pair in result.pairs or [] if pair.nearest is not None), key=lambda pair: -pair.unsafe_share)
+    if not unsafe_pairs:
         return
-    table = WholeTable("pair", title=f"Pairs with unsafe settings: {len(found)} of {len(told.pairs or [])}", title_justify="left")
+    table = WholeTable("pair", title=f"Pairs with unsafe settings: {len(unsafe_pairs)} of {len(result.pairs or [])}", title_justify="left")
     for head in ("unsafe share", "nearest unsafe setting"):
         table.add_column(head, justify="right")
-    for pair in found[:PAIRS_SHOWN]:
+    for pair in unsafe_pairs[:PAIRS_SHOWN]:
         names = [member.name for member in pair.characteristics]
         nearest = ", ".join(f"{name} {value:.5g}" for name, value in zip(names, pair.nearest or (), strict=True))
         failed = f" ({pair.not_simulated_share:.1%} could not be simulated)" if pair.not_simulated_share else ""
         table.add_row(escape(" with ".join(names)), f"{pair.unsafe_share:.1%}{failed}", escape(nearest))
     console.print(table)
-    if len(found) > PAIRS_SHOWN:
-        _say(console, f"... and {len(found) - PAIRS_SHOWN} more (--json has all).")
+    if len(unsafe_pairs) > PAIRS_SHOWN:
+        print_text(console, f"... and {len(unsafe_pairs) - PAIRS_SHOWN} more (--json has all).")
 
 
-def _say(console: Console, text: str) -> None:
-    console.print(text, soft_wrap=True, markup=False, highlight=False)
+def profiles_figure(result: Tolerance) -> Figure:
+    """The safety degree over the domain of each characteristic alone; the original marked, what is unsafe shaded."""
+    columns = min(4, len(result.alone))
+    rows = -(-len(result.alone) // columns)
+    title = f"{result.study.name}: one characteristic at a time (unsafe: {result.unsafe})"
+    figure, axes = new_figure(title, rows, columns, (max(2.3 * columns, 4.6), 1.0 + 1.75 * rows))
+    degrees = np.concatenate([scan.profile[SAFETY_DEGREE].dropna() for scan in result.alone])
+    margin = 0.05 * (np.ptp(degrees) if degrees.size else 0.0) or 0.5
+    for axis, scan in zip(axes.flat, result.alone, strict=False):
+        _profile(axis, scan)
+        if degrees.size:
+            axis.set_ylim(degrees.min() - margin, degrees.max() + margin)  # the same for all: a steep one is one that matters
+    for axis in list(axes.flat)[len(result.alone):]:
+        axis.set_axis_off()
+    figure.supylabel(DEGREE, fontsize=FONT)
+    notes = {"dot: the original vehicle": True, "hatched: unsafe": any(scan.unsafe for scan in result.alone),
+               "below the dashed line: collisions": bool(degrees.size) and degrees.min() <= 0}
+    figure.supxlabel(";\n".join(words for words, is_drawn in notes.items() if is_drawn), fontsize=FONT)
+    return figure
+
+
+def _profile(axis: Axes, scan: OneAtATimeScan) -> None:
+    member, profile = scan.characteristic, scan.profile
+    axis.plot(profile["value"], profile[SAFETY_DEGREE], color=NECESSARY, linewidth=1.2)
+    for low, high in scan.unsafe:
+        axis.axvspan(low, high, facecolor=UNSAFE, alpha=0.35, hatch="////", edgecolor="white", linewidth=0)
+    at_original = profile.loc[profile["value"] == member.original, SAFETY_DEGREE]
+    axis.plot([member.original], at_original, marker="o", color="black", markersize=4)
+    if profile[SAFETY_DEGREE].min() <= 0:
+        axis.axhline(0, color="black", linewidth=0.8, linestyle="--")
+    axis.set_xlim(member.lower, member.upper)
+    axis.set_title(plain(member.name), fontsize=FONT)
+    axis.set_xlabel(f"[{raised(member.unit)}]")
+    axis.locator_params(axis="x", nbins=4)
+
+
+def pairs_figure(result: Tolerance, most: int = 6) -> Figure:
+    """The planes of the worst pairs: those with the largest unsafe share, or the least safety degree where nothing is unsafe.
+
+    Raises
+    ------
+    InputError
+        If pairs were not looked at.
+    """
+    if not result.pairs:
+        raise InputError("pairs", "there is no pair to draw", "at least two characteristics, looked at in pairs")
+    worst = sorted(result.pairs, key=lambda pair: (-pair.unsafe_share, np.nanmin(pair.safety_degree)))[:most]
+    degrees = np.concatenate([pair.safety_degree.ravel() for pair in worst])
+    columns = min(3, len(worst))
+    rows = -(-len(worst) // columns)
+    title = f"{result.study.name}: the worst pairs (unsafe: {result.unsafe})"
+    figure, axes = new_figure(title, rows, columns, (max(3.0 * columns, 4.6), 1.1 + 2.4 * rows))
+    for axis, pair in zip(axes.flat, worst, strict=False):
+        colours = _plane(axis, pair, (float(np.nanmin(degrees)), float(np.nanmax(degrees))))
+    for axis in list(axes.flat)[len(worst):]:
+        axis.set_axis_off()
+    bar = figure.colorbar(colours, ax=axes, shrink=0.9)
+    bar.set_label(DEGREE, fontsize=FONT)
+    bar.ax.tick_params(labelsize=FONT)
+    figure.supxlabel("dot: the original vehicle; hatched: unsafe;\ncross: the unsafe setting nearest to the original", fontsize=FONT)
+    return figure
+
+
+def _plane(axis: Axes, pair: Pair, limits: tuple[float, float]) -> QuadMesh:
+    """One plane, the first characteristic across."""
+    first, second = pair.characteristics
+    colours = axis.pcolormesh(*pair.values, pair.safety_degree.T, cmap="cividis", vmin=limits[0], vmax=limits[1], shading="nearest")
+    if pair.unsafe.any():
+        axis.contourf(*pair.values, pair.unsafe.T.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
+        axis.contour(*pair.values, pair.unsafe.T.astype(float), levels=[0.5], colors=UNSAFE, linewidths=1.2)
+    axis.plot(first.original, second.original, marker="o", color="white", markeredgecolor="black", markersize=5)
+    if pair.nearest is not None:
+        axis.plot(*pair.nearest, marker="X", color=UNSAFE, markeredgecolor="white", markersize=7)
+    axis.set_xlabel(f"{plain(first.name)} [{raised(first.unit)}]")
+    axis.set_ylabel(f"{plain(second.name)} [{raised(second.unit)}]")
+    axis.set_xlim(first.lower, first.upper)
+    axis.set_ylim(second.lower, second.upper)
+    axis.grid(visible=False)
+    return colours

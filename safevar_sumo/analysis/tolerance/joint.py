@@ -1,0 +1,243 @@
+"""Several characteristics together: the plane of every pair on a grid, and the largest safe box of all around the original."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from safevar_sumo.analysis.criterion import Unsafe
+from safevar_sumo.analysis.evaluator import Bench, sobol_points
+from safevar_sumo.analysis.explain.causes import Line, first_unsafe
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.vehicles import Characteristic
+
+SIDE = 21
+"""Values of each of the two, evenly spaced over its domain, ends included."""
+PARTS, ROUNDS, SQUARES = 4, 4, 12
+"""Into how many parts a side of a square is divided on the way to the nearest unsafe setting, how often (to a 5120th of the domain), and
+how many squares of a plane at a time."""
+
+_WEIGHT = np.outer(*[np.where(np.isin(np.arange(SIDE), (0, SIDE - 1)), 0.5, 1.0)] * 2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pair:
+    """The plane of two characteristics while all others are the original's.
+
+    Attributes
+    ----------
+    values
+        Of either, shape (2, SIDE), in its unit.
+    safety_degree, unsafe, valid
+        On the grid, shape (SIDE, SIDE): the first characteristic down, the second across [m, or -m/s]. What is not valid could not be
+        simulated and is neither safe nor unsafe.
+    nearest
+        The two values of the unsafe setting that is nearest to the original, in widths of the domains, to a 5120th of each; None if the
+        grid has none. What is unsafe between safe values of the grid alone is not seen.
+    """
+
+    characteristics: tuple[Characteristic, Characteristic]
+    values: FloatArray
+    safety_degree: FloatArray
+    unsafe: BoolArray
+    valid: BoolArray
+    nearest: tuple[float, float] | None
+
+    @property
+    def unsafe_share(self) -> float:
+        """Share of the plane that is unsafe, of what could be simulated of it, by the trapezoidal rule."""
+        simulated = np.sum(_WEIGHT * self.valid)
+        return float(np.sum(_WEIGHT * self.unsafe) / simulated) if simulated else 0.0
+
+    @property
+    def not_simulated_share(self) -> float:
+        """Share of the plane that could not be simulated, by the same rule."""
+        return float(np.sum(_WEIGHT * ~self.valid) / np.sum(_WEIGHT))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The entry of `pairs` in `tolerance --json`."""
+        names = [member.name for member in self.characteristics]
+        return {"characteristics": names, "unsafe_share": self.unsafe_share, "not_simulated_share": self.not_simulated_share,
+                "nearest": None if self.nearest is None else dict(zip(names, self.nearest, strict=True))}
+
+
+def planes(bench: Bench, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
+    """Every pair of some characteristics; where one is unsafe, with its nearest unsafe setting."""
+    members, original = bench.characteristics.members, bench.characteristics.original
+    chosen = list(combinations(columns, 2))
+    axes = {column: np.linspace(members[column].lower, members[column].upper, SIDE) for column in columns}
+    settings = np.tile(original, (len(chosen), SIDE, SIDE, 1))
+    for group, (first, second) in zip(settings, chosen, strict=True):
+        group[:, :, first], group[:, :, second] = axes[first][:, np.newaxis], axes[second]
+    evaluations = bench.evaluate(settings.reshape(-1, len(original)), "two characteristics at a time")
+    shape = (len(chosen), SIDE, SIDE)
+    degrees, valid = evaluations.f_safe.reshape(shape), evaluations.valid.reshape(shape)
+    is_unsafe = unsafe.of(evaluations).reshape(shape)
+    nearest = _nearest(bench, chosen, is_unsafe, unsafe)
+    return [Pair(characteristics=(members[first], members[second]), values=np.stack([axes[first], axes[second]]), safety_degree=degrees[i],
+                 unsafe=is_unsafe[i], valid=valid[i], nearest=nearest.get(i)) for i, (first, second) in enumerate(chosen)]
+
+
+def _nearest(bench: Bench, chosen: Sequence[tuple[int, int]], is_unsafe: BoolArray, unsafe: Unsafe) -> dict[int, tuple[float, float]]:
+    """Of every plane that has one, the unsafe setting nearest to the original, in widths of the domains.
+
+    A branch and bound search: squares with an unsafe corner are divided into smaller ones, as long as a place in them is nearer than
+    the nearest unsafe setting so far; of each plane the `SQUARES` nearest ones at a time.
+    """
+    members = bench.characteristics
+    which = np.array(chosen, dtype=int).reshape(-1, 2)
+    original, width = members.original[which], (members.upper - members.lower)[which]
+    lower, size = members.lower[which], width / (SIDE - 1)
+    best, place = np.full(len(chosen), np.inf), np.zeros((len(chosen), 2))
+
+    def improve(plane: npt.NDArray[np.intp], values: FloatArray) -> None:
+        distances = np.sqrt(np.sum(((values - original[plane]) / width[plane]) ** 2, axis=1))
+        for row in np.lexsort((distances, plane)):  # of each plane the nearest first
+            if distances[row] < best[plane[row]]:
+                best[plane[row]], place[plane[row]] = distances[row], values[row]
+
+    plane, i, j = np.nonzero(is_unsafe)
+    improve(plane, lower[plane] + np.stack([i, j], axis=1) * size[plane])
+    square_of, i, j = np.nonzero(_with_unsafe_corner(is_unsafe))  # the plane of every square, shape (K,)
+    corner = lower[square_of] + np.stack([i, j], axis=1) * size[square_of]  # its lower corner, shape (K, 2)
+    steps = np.stack(np.meshgrid(np.arange(PARTS + 1), np.arange(PARTS + 1), indexing="ij"), axis=-1).reshape(-1, 2)
+    for _ in range(ROUNDS):
+        beyond = corner - original[square_of]
+        gap = np.maximum(np.maximum(beyond, -beyond - size[square_of]), 0.0)
+        bound = np.sqrt(np.sum((gap / width[square_of]) ** 2, axis=1))
+        rows = np.flatnonzero(bound < best[square_of])
+        groups = [rows[square_of[rows] == k] for k in np.unique(square_of[rows])]
+        kept = np.array([row for group in groups for row in group[np.argsort(bound[group], kind="stable")[:SQUARES]]], dtype=np.intp)
+        if not len(kept):
+            break
+        square_of, corner, size = square_of[kept], corner[kept], size / PARTS
+        plane = np.repeat(square_of, len(steps))
+        values = np.minimum(np.repeat(corner, len(steps), axis=0) + np.tile(steps, (len(kept), 1)) * size[plane], (lower + width)[plane])
+        settings = np.tile(members.original, (len(values), 1))
+        np.put_along_axis(settings, which[plane], values, axis=1)
+        hits = unsafe.of(bench.evaluate(settings, "nearest unsafe settings"))
+        improve(plane[hits], values[hits])
+        square, i, j = np.nonzero(_with_unsafe_corner(hits.reshape(len(kept), PARTS + 1, PARTS + 1)))
+        square_of, corner = square_of[square], corner[square] + np.stack([i, j], axis=1) * size[square_of[square]]
+    return {int(k): (float(place[k, 0]), float(place[k, 1])) for k in np.flatnonzero(np.isfinite(best))}
+
+
+def _with_unsafe_corner(grids: BoolArray) -> BoolArray:
+    """Squares of grids, shape (K, S, S), that have an unsafe corner; shape (K, S - 1, S - 1)."""
+    return np.asarray(grids[:, 1:, 1:] | grids[:, :-1, 1:] | grids[:, 1:, :-1] | grids[:, :-1, :-1])
+
+
+CONFIDENCE = 0.95
+UNSAFE_AT_MOST = 0.003
+"""Share of a box that may be unsafe, with that confidence, if every sampled setting is safe."""
+PROBE, SEARCHED = 256, 1024
+"""Sobol points, and as many corners, that look for unsafe settings: in every box that is tried, and in one in which the first find none."""
+FOLLOWED = 16
+"""Unsafe settings, the nearest, that are followed back towards the original."""
+STEP_BACK = 0.999
+"""Share at which the box ends before the nearest unsafe setting."""
+SMALLEST = 1e-6
+"""A box that would have to be smaller is none."""
+
+
+class SafeBox(NamedTuple):
+    """Within `factor` times the domain around the original, no setting of a random sample is unsafe.
+
+    With `confidence`, at most `unsafe_at_most` of all settings in the box are unsafe or cannot be simulated: `failed` of the `samples`
+    settings could not be, and count as unsafe in that bound. `attempts` boxes were tested. Only `characteristics` vary, the others
+    are the original's. Where no box is safe, `factor` is 0 and the bound 1.
+    """
+
+    factor: float
+    confidence: float
+    samples: int
+    failed: int
+    attempts: int
+    unsafe_at_most: float
+    characteristics: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The entry `joint` of `tolerance --json`."""
+        return {**self._asdict(), "characteristics": list(self.characteristics)}
+
+
+def no_box(bench: Bench, columns: Sequence[int], attempts: int = 0) -> SafeBox:
+    """The result where the original vehicle itself is unsafe, or settings however near to it."""
+    return SafeBox(0.0, CONFIDENCE, 0, 0, attempts, 1.0, tuple(bench.characteristics.names[column] for column in columns))
+
+
+def safe_box(bench: Bench, columns: Sequence[int], unsafe: Unsafe, beyond: FloatArray) -> SafeBox:
+    """The largest safe box around an original vehicle that is safe itself.
+
+    Parameters
+    ----------
+    columns
+        The characteristics that vary.
+    beyond
+        Unsafe settings, shape (K, n); the box ends before all of them.
+
+    Notes
+    -----
+    A box is searched with Sobol points and, because it is there that all changes add up, with corners of the same number. The unsafe
+    ones are followed back towards the original, the box ends before them, and so on until there are none. These points chose the box:
+    they prove nothing about it.
+
+    The box is then tested with settings drawn independently and uniformly in it, by a random generator of their own. If one is unsafe,
+    the box shrinks and is searched and tested again. Test k, k = 1, 2, ..., may be wrong with probability alpha_k = alpha / 2^k, alpha
+    = 1 - `confidence`: if test k accepts, the bound is Clopper and Pearson's upper one at confidence 1 - alpha_k for the share of the
+    box that is unsafe or cannot be simulated. Box k depends on earlier samples alone, so given box k the bound fails with probability
+    alpha_k at the most; all tests together fail with probability sum alpha_k <= alpha, whichever of them accepts. Later tests draw more
+    settings, so that the bound stays `UNSAFE_AT_MOST` if all of them can be simulated.
+    """
+    factor = min(1.0, STEP_BACK * float(np.min(_reach(bench, beyond), initial=np.inf)))
+    attempt = 0
+    for search in range(10**6):
+        if factor < SMALLEST:
+            break
+        for number in (PROBE, SEARCHED):
+            sobol = sobol_points(number, len(columns), bench.study.search.seed + search)
+            hits, _ = _unsafe_within(bench, columns, factor, np.concatenate([sobol, np.round(sobol)]), unsafe)  # and corners
+            if len(hits):
+                break
+        else:
+            attempt += 1
+            error = (1 - CONFIDENCE) / 2**attempt
+            samples = math.ceil(math.log(error) / math.log1p(-UNSAFE_AT_MOST))
+            points = np.random.default_rng((bench.study.search.seed, attempt)).random((samples, len(columns)))
+            hits, failed = _unsafe_within(bench, columns, factor, points, unsafe)
+            if not len(hits):
+                share = float(scipy.stats.beta.ppf(1 - error, failed + 1, samples - failed)) if failed < samples else 1.0
+                return SafeBox(factor, CONFIDENCE, samples, failed, attempt, share,
+                               tuple(bench.characteristics.names[column] for column in columns))
+        near = hits[np.argsort(_reach(bench, hits), kind="stable")[:FOLLOWED]]
+        lines = [Line(bench.characteristics.original, end, 0.0) for end in near]
+        shares = first_unsafe(bench, lines, unsafe, "nearest unsafe settings")
+        edge = np.stack([line.at(np.array([share]))[0] for line, share in zip(lines, shares, strict=True)])
+        factor = min(factor, float(np.min(_reach(bench, edge)))) * STEP_BACK
+    return no_box(bench, columns, attempt)
+
+
+def _unsafe_within(bench: Bench, columns: Sequence[int], factor: float, points: FloatArray, unsafe: Unsafe) -> tuple[FloatArray, int]:
+    """Unsafe settings, shape (K, n), at points of the unit cube that stands for a box around the original; and how many failed."""
+    members, which = bench.characteristics, list(columns)
+    lower = members.original - factor * (members.original - members.lower)
+    upper = members.original + factor * (members.upper - members.original)
+    settings = np.tile(members.original, (len(points), 1))
+    settings[:, which] = lower[which] + points * (upper - lower)[which]
+    evaluations = bench.evaluate(settings, f"all characteristics within {factor:.0%} of the domain")
+    return settings[unsafe.of(evaluations)], int(np.count_nonzero(~evaluations.valid))
+
+
+def _reach(bench: Bench, settings: FloatArray) -> FloatArray:
+    """By which factor a box must be smaller than the domain to have a setting on its surface, shape (K,)."""
+    members = bench.characteristics
+    change = settings - members.original
+    room = np.where(change < 0, members.original - members.lower, members.upper - members.original)
+    return np.asarray(np.max(np.divide(np.abs(change), room, out=np.zeros_like(change), where=room > 0), axis=1, initial=0.0))
