@@ -44,7 +44,7 @@ def test_of_an_original_that_collides_no_change_is_called_the_cause(
     write_manifest(tmp_path / "copy", manifest)
     empty = {"changes": {}, "boundary": {}, "fraction": 0.0, "end": "safe", "outcome": "collision", "safety_degree": -3.9}
     failure = {"algorithm": "nsga2", "run": 0, "index": 0, "minimal_causes": [empty], "robustness": 1.0, "because": "it collides anyhow"}
-    monkeypatch.setattr(findings, "explain", lambda *_, **__: SimpleNamespace(records=lambda: [failure]))
+    monkeypatch.setattr(findings, "explain", lambda *_, **__: SimpleNamespace(to_dict=lambda: [failure]))
     page = make_report([tmp_path / "copy"], only=["verdict", "causes"], jobs=1)
     assert "No change is needed: the original vehicle itself collides." in page
     assert "No change is a cause" in page

@@ -83,7 +83,7 @@ class Explained:
             {"summary": {**{name: dict.fromkeys(changes, 1.0) for name in ("necessary", "changed")},
                          "necessary_interval": {name: [0.8, 1.0] for name in changes}}}]
 
-    def records(self) -> list[dict[str, Any]]:
+    def to_dict(self) -> list[dict[str, Any]]:
         return self._records
 
 
@@ -96,7 +96,7 @@ class Limit:
     def __init__(self, name: str) -> None:
         self._name = name
 
-    def record(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         if self._name == "risk":
             return {"study": "it", "unsafe": "collision", "samples": 32, "failures": 8, "probability": 0.25, "interval": [0.1, 0.4],
                     "confidence": 0.95, "sensitivity": [
@@ -114,7 +114,7 @@ COMPUTED_BY = {"tolerance": "find_tolerances", "risk": "estimate_risk", "rules":
 @pytest.fixture(scope="module")
 def page(slippery: Path) -> str:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(findings, "explain", lambda case, **_: Explained(case))
+        patch.setattr(findings, "explain", lambda case, *_, **__: Explained(case))
         patch.setattr(material, "SAMPLES", 32)
         for name in LIMITS:
             patch.setattr(limits, COMPUTED_BY[name], lambda *_, name=name, **__: Limit(name))
@@ -215,7 +215,7 @@ def test_what_was_explained_of_other_results_is_not_taken(
     file = tmp_path / "copy/answers/explain.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), "identity": "of something else"}))
     asked = []
-    monkeypatch.setattr(findings, "explain", lambda case, **_: asked.append(case) or Explained(case))
+    monkeypatch.setattr(findings, "explain", lambda case, *_, **__: asked.append(case) or Explained(case))
     make_report([tmp_path / "copy"], only=["causes"], jobs=1)
     assert len(asked) == 1
 
