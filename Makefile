@@ -1,34 +1,40 @@
-# Everything happens in .venv; `make study` and `make test` need Python 3.11, git and make, nothing else.
+# Everything happens in .venv, and each target installs only what it needs. Needed beforehand: Python 3.11, git and make.
 PYTHON ?= python3
 RUN := .venv/bin/python
+PACKAGE := setup.cfg pyproject.toml constraints.txt
+INSTALL = $(RUN) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
 
 .PHONY: study test test-all lint docs benchmark clean
 
 study: .venv/installed
 	$(RUN) -m safevar_sumo study rain
 
-test: .venv/installed
+test: .venv/installed-test
 	$(RUN) -m pytest
 
 test-all: test
 	$(RUN) -m pytest -m slow
 
-lint: .venv/installed
+lint: .venv/installed-test
 	$(RUN) -m ruff check .
 	$(RUN) -m mypy
 	.venv/bin/lint-imports --no-logo
 
-docs: .venv/installed
+docs: .venv/installed-docs
 	$(RUN) -m mkdocs build --quiet --strict
 
-benchmark: .venv/installed
+benchmark: .venv/installed-test
 	$(RUN) benchmarks/evaluation.py
 	$(RUN) benchmarks/campaign.py
 	$(RUN) benchmarks/growth.py
 
-.venv/installed: setup.cfg pyproject.toml constraints.txt
+.venv/installed: $(PACKAGE)
 	$(PYTHON) -m venv .venv
-	$(RUN) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[test,docs]"
+	$(INSTALL) .
+	touch $@
+
+.venv/installed-%: .venv/installed
+	$(INSTALL) ".[$*]"
 	touch $@
 
 clean:
