@@ -1,0 +1,116 @@
+"""MkDocs hook: fills `<!-- generated: NAME -->` in a page with tables made from the code, so that they cannot differ from it."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, get_args
+
+import msgspec
+from msgspec.inspect import type_info
+
+from safevar_sumo.ads import ADS
+from safevar_sumo.metrics import METRICS, SAFEVAR
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import VEHICLES
+
+PLAIN = {"StrType": "text", "IntType": "integer", "FloatType": "number", "BoolType": "true or false", "AnyType": "any value"}
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Called by MkDocs for every page."""
+    return re.sub(r"<!-- generated: (\w+) -->", lambda match: TABLES[match[1]](), markdown)
+
+
+def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    heads = list(heads)
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads), *rows)) + "\n"
+
+
+def _default(value: Any) -> str:
+    if value is msgspec.NODEFAULT or value is inspect.Parameter.empty:
+        return "required"
+    if value is None:
+        return "none"
+    return "its own defaults" if isinstance(value, msgspec.Struct) else f"`{msgspec.json.encode(value).decode()}`"
+
+
+def _range(kind: Any) -> str:
+    bounds = [f"{sign} {value:g}" for name, sign in (("gt", ">"), ("ge", "at least"), ("lt", "<"), ("le", "at most"))
+              if (value := getattr(kind, name, None)) is not None]
+    return f", {', '.join(bounds)}" if bounds else ""
+
+
+def _words(kind: Any) -> str:
+    """A type in words."""
+    name = type(kind).__name__
+    if name == "StructType":
+        return f"[{kind.cls.__name__}](#{kind.cls.__name__.lower()})"
+    if name == "UnionType":
+        return " or ".join(_words(one) for one in kind.types if type(one).__name__ != "NoneType")
+    if name == "LiteralType":
+        return " or ".join(f'`"{value}"`' for value in kind.values)
+    if name in ("ListType", "VarTupleType"):
+        return f"list of {_words(kind.item_type)}"
+    if name == "TupleType":
+        return f"list of {', '.join(map(_words, kind.item_types))}"
+    if name == "DictType":
+        return f"table of {_words(kind.value_type)} by name"
+    return PLAIN[name] + _range(kind)
+
+
+def _structs(kind: Any) -> Iterator[Any]:
+    """A table of a study file, then all tables that stand in it."""
+    if type(kind).__name__ == "StructType":
+        yield kind
+        for field in kind.fields:
+            yield from _structs(field.type)
+    parts = (getattr(kind, name) for name in ("item_type", "value_type") if hasattr(kind, name))
+    for part in [*getattr(kind, "types", ()), *getattr(kind, "item_types", ()), *parts]:
+        yield from _structs(part)
+
+
+def study_keys() -> str:
+    """Every table of a study file with its keys."""
+    parts = []
+    for kind in {one.cls: one for one in _structs(type_info(Study)) if one.cls.__name__ != "Origin"}.values():
+        rows = [(f"`{field.encode_name}`", _words(field.type),
+                 _default(field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()))
+                for field in kind.fields if field.name != "origin"]
+        parts.append(f"### {kind.cls.__name__}\n\n{inspect.getdoc(kind.cls)}\n\n{_table(('key', 'value', 'default'), rows)}")
+    return "\n".join(parts)
+
+
+def models(classes: dict[str, Any]) -> Callable[[], str]:
+    """Every model of a kind with its parameters."""
+    def text() -> str:
+        parts = []
+        for name, model in classes.items():
+            doc = inspect.getdoc(model) or ""
+            described = {key.strip(): " ".join(meaning.split()) for keys, meaning in
+                         re.findall(r"^(\w[\w, ]*)\n((?:    .*\n?)+)", doc.partition("Parameters\n----------\n")[2], flags=re.MULTILINE)
+                         for key in keys.split(",")}
+            rows = [(f"`{one.name}`", described.get(one.name, ""), _bounds(one.annotation), _default(one.default))
+                    for one in inspect.signature(model).parameters.values()]
+            table = _table(("parameter", "meaning", "range", "default"), rows) if rows else "No parameters.\n"
+            parts.append(f"### {name}\n\n{doc.partition('Parameters')[0].strip()}\n\n{table}")
+        return "\n".join(parts)
+    return text
+
+
+def _bounds(annotation: Any) -> str:
+    """The range of an annotated number, or of the number that may be None."""
+    metas = [meta for kind in (annotation, *get_args(annotation)) for meta in getattr(kind, "__metadata__", ())]
+    return _range(metas[0]).removeprefix(", ") if metas else ""
+
+
+def metric_columns() -> str:
+    """Columns of metrics and objectives in solutions.csv."""
+    objectives = [(f"`{one.name}`", one.unit, f"objective: {one.title}") for one in SAFEVAR.objectives]
+    metrics = [(f"`{name}`", metric.unit, metric.description) for name, metric in METRICS.items()]
+    return _table(("column", "unit", "content"), [*objectives, *metrics])
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "study_keys": study_keys, "vehicles": models(VEHICLES), "ads": models(ADS), "metric_columns": metric_columns}
