@@ -20,8 +20,6 @@ REPLACED = ("calibration", "published", "repeatability")
 """Tables that a study does not inherit in part from the one that it extends."""
 OF_ONE_SYSTEM = ("title", "published", "repeatability")
 """What holds for one vehicle, ADS, scenario (its network too), weather and matrix alone: with another one it is not inherited."""
-LARGEST_FILE = 10_000_000
-"""Bytes."""
 
 
 class _Raw(NamedTuple):
@@ -84,8 +82,6 @@ def _read(path: Path, seen: tuple[Path, ...]) -> _Raw:
     if path in seen:
         raise InputError(path, f"extends = {path.stem!r} leads back to this file", "a study that does not extend this one")
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise InputError(path, f"has {path.stat().st_size} bytes", f"a study file of up to {LARGEST_FILE} bytes")
         tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except tomllib.TOMLDecodeError as error:
         raise InputError(path, f"is not TOML: {error}") from None

@@ -13,10 +13,11 @@ from msgspec import Struct
 
 from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.study.schema import CharacteristicTable, Study
+from safevar_sumo.study.variation import variation_mistakes
 
 T = TypeVar("T")
-MOST_TOLD = 8
-"""Mistakes of one file that are told."""
+MOST_SHOWN = 8
+"""Largest number of mistakes of a file that an error lists."""
 
 
 def converted(source: object, raw: object, table: type[T], prefix: str = "") -> T:
@@ -40,9 +41,9 @@ def refuse(found: Iterable[InputError]) -> None:
     if len(several) == 1:
         raise several[0]
     if several:
-        told = [f"{one.problem}{f' (legal: {one.legal})' if one.legal else ''}" for one in several[:MOST_TOLD]]
-        if len(several) > MOST_TOLD:
-            told.append(f"and {len(several) - MOST_TOLD} more")
+        told = [f"{one.problem}{f' (legal: {one.legal})' if one.legal else ''}" for one in several[:MOST_SHOWN]]
+        if len(several) > MOST_SHOWN:
+            told.append(f"and {len(several) - MOST_SHOWN} more")
         raise InputError(several[0].source, f"{len(several)} mistakes: {'; '.join(told)}")
 
 
@@ -102,41 +103,21 @@ def _short(value: object) -> str:
 
 
 LARGEST = 1e12
-"""Of what a characteristic may be, in its unit."""
-DEEPEST = 12
-"""Tables inside each other."""
-MOST_VALUES = 100_000
-"""In all tables together."""
-LONGEST_KEY = 200
-MOST_CHARACTERISTICS = 1000
+"""Largest magnitude of a characteristic, in its unit."""
 
-
-def unusable(source: object, raw: Mapping[str, Any]) -> Iterator[InputError]:
-    """Values anywhere in a study's tables that nobody can use the same way everywhere."""
-    waiting: list[tuple[str, Any, int]] = [("", raw, 0)]
-    seen = 0
-    while waiting:
-        where, value, depth = waiting.pop()
-        seen += 1
-        if depth > DEEPEST or seen > MOST_VALUES:
-            legal = f"up to {DEEPEST} tables inside each other and {MOST_VALUES} values"
-            yield InputError(source, f"{where[:80]}: is nested too deeply, or there is too much of it", legal)
-            return
-        if isinstance(value, Mapping | list | tuple):
-            inner = value.items() if isinstance(value, Mapping) else enumerate(value)
-            entries = [(str(key), one) for key, one in inner]
-            for key, _ in entries:
-                if len(key) > LONGEST_KEY or not key.isprintable():
-                    yield InputError(source, f"{where or 'a key'}: {key[:40]!r} is no name", f"up to {LONGEST_KEY} printable characters")
-            waiting += reversed([(f"{where}.{key}" if where else key, one, depth + 1) for key, one in entries])
-        else:
-            reason = _unusable(value, where)
-            if reason:
-                yield InputError(source, f"{where} = {reason[0]}", reason[1])
+def unusable(source: object, value: object, where: str = "") -> Iterator[InputError]:
+    """Values anywhere in a study's tables that cannot be used the same way everywhere."""
+    if isinstance(value, Mapping | list | tuple):
+        for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
+            if not str(key).isprintable():
+                yield InputError(source, f"{where or 'a key'}: {key!r} is no name", "printable characters")
+            yield from unusable(source, inner, f"{where}.{key}" if where else str(key))
+    elif reason := _unusable(value, where):
+        yield InputError(source, f"{where} = {reason[0]}", reason[1])
 
 
 def _unusable(value: object, where: str) -> tuple[str, str] | None:
-    """How a value is told, and what would be legal instead; None where it can be used."""
+    """An unusable value in words, and what is legal instead; None for others."""
     if isinstance(value, datetime.date | datetime.time):
         return f"{value}, a date or time", "a number, or a text in quotes"
     if isinstance(value, float) and not math.isfinite(value):
@@ -151,10 +132,11 @@ def _unusable(value: object, where: str) -> tuple[str, str] | None:
 def implausible(source: object, study: Study) -> Iterator[InputError]:
     """Numbers of a study that contradict each other."""
     rows = study.vehicle.characteristics
-    if not 1 <= len(rows) <= MOST_CHARACTERISTICS:
-        yield InputError(source, f"vehicle.characteristics: {len(rows)} of them", f"1 to {MOST_CHARACTERISTICS}")
+    if not rows:
+        yield InputError(source, "vehicle.characteristics: none", "at least one")
     for name, row in rows.items():
         yield from _characteristic(source, f"vehicle.characteristics.{name}", row)
+    yield from variation_mistakes(source, rows, study.variation, study.correlations)
     for name, free in study.calibration.items():
         if free.lower >= free.upper:
             yield InputError(source, f"calibration.{name!r}: lower = {free.lower} and upper = {free.upper}", "numbers, lower < upper")

@@ -1,10 +1,22 @@
-"""How characteristics vary in the world, as a study's `[variation]` table gives it: data only, quantities in the unit of each."""
+"""How characteristics vary in the world: the distributions and correlations of a study, in the characteristics' units, and their checks."""
 
 from __future__ import annotations
 
-from typing import Annotated
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated
 
+import msgspec
 from msgspec import Meta, Struct
+
+from safevar_sumo.errors import InputError, unknown
+
+if TYPE_CHECKING:
+    from safevar_sumo.study.schema import CharacteristicTable
+
+WIDEST = 100
+"""Largest standard deviation of a normal law cut off at the domain, in widths of the domain; beyond, the law is uniform to a 20,000th
+and cannot be computed reliably."""
 
 
 class Uniform(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="uniform"):
@@ -50,3 +62,50 @@ class Correlation(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     between: tuple[str, str]
     value: Annotated[float, Meta(gt=-1, lt=1)]
+
+
+def variation_mistakes(source: object, rows: Mapping[str, CharacteristicTable], variation: Mapping[str, Distribution],
+                       correlations: Sequence[Correlation]) -> Iterator[InputError]:
+    """Distributions and correlations that do not fit the characteristics' domains, or each other."""
+    for name, law in variation.items():
+        if name in rows:
+            yield from _law_mistakes(source, f"variation.{name}", rows[name], law)
+        else:
+            yield unknown(source, f"variation.{name}: there is no such characteristic", name, rows)
+    yield from _correlation_mistakes(source, list(rows), correlations)
+
+
+def _law_mistakes(source: object, key: str, row: CharacteristicTable, law: Distribution) -> Iterator[InputError]:
+    low, high, unit = row.lower, row.upper, "" if row.unit == "-" else f" {row.unit}"
+    for field, value in msgspec.structs.asdict(law).items():
+        if field not in ("deviation", "sigma") and value is not None and not low <= value <= high:
+            yield InputError(source, f"{key}.{field} = {value:g}", f"a number in [{low:g}, {high:g}]{unit}")
+    if isinstance(law, Uniform | Triangular):
+        lower, upper = low if law.lower is None else law.lower, high if law.upper is None else law.upper
+        if lower >= upper:
+            yield InputError(source, f"{key}: lower = {lower:g} and upper = {upper:g}", "lower < upper")
+        elif isinstance(law, Triangular) and not lower <= (mode := row.original if law.mode is None else law.mode) <= upper:
+            yield InputError(source, f"{key}.mode = {mode:g}", f"a number in [{lower:g}, {upper:g}]{unit}")
+    elif isinstance(law, Lognormal) and low <= 0:
+        yield InputError(source, f"{key}: lognormal, with a domain from {low:g} on", "a domain above 0")
+    elif isinstance(law, Normal | Lognormal) and high > low:
+        field, spread, width = ("deviation", law.deviation, high - low) if isinstance(law, Normal) else (
+            "sigma", law.sigma, math.log(high / low))
+        if spread > WIDEST * width:
+            yield InputError(source, f"{key}.{field} = {spread:g}", f"at most {WIDEST * width:g}, {WIDEST} times the domain's width; "
+                             "for more take distribution = \"uniform\"")
+
+
+def _correlation_mistakes(source: object, names: Sequence[str], correlations: Sequence[Correlation]) -> Iterator[InputError]:
+    values: dict[frozenset[str], float] = {}
+    for correlation in correlations:
+        between, pair = correlation.between, frozenset(correlation.between)
+        strange = [name for name in between if name not in names]
+        if strange:
+            yield unknown(source, f"correlations.between: there is no characteristic {strange[0]!r}", strange[0], names)
+        elif len(pair) == 1:
+            yield InputError(source, f"correlations.between = {list(between)}", "two different characteristics")
+        elif pair in values:
+            yield InputError(source, f"correlations: {between[0]} and {between[1]} stand twice, "
+                             f"with {values[pair]:g} and {correlation.value:g}", "each pair once")
+        values.setdefault(pair, correlation.value)
