@@ -11,41 +11,58 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from safevar_sumo.analysis.criterion import Criterion, Unsafe
+    from safevar_sumo.analysis.evaluator import Progress
+    from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation
+    from safevar_sumo.analysis.risk.compute import Risk
+    from safevar_sumo.analysis.rules.compute import Rule, Rules
+    from safevar_sumo.analysis.tolerance.compute import Tolerance
     from safevar_sumo.api.questions import Figures, Tables, explain, figures, risk, rules, tables, tolerance
     from safevar_sumo.api.results import Results, load
     from safevar_sumo.api.running import run
-    from safevar_sumo.api.settings import evaluate
-    from safevar_sumo.api.simulation import Simulation, simulate
+    from safevar_sumo.api.simulation import Simulation, evaluate, simulate
+    from safevar_sumo.campaign import Observer
     from safevar_sumo.errors import InputError, SafevarError, SimulationError
+    from safevar_sumo.records import Outcome
     from safevar_sumo.replay.animation import animate
     from safevar_sumo.replay.comparison import Comparison, compare
     from safevar_sumo.replay.figure import draw_comparison
     from safevar_sumo.replay.gui import show_in_gui
     from safevar_sumo.report import make_report
+    from safevar_sumo.report import report as report
     from safevar_sumo.results import Status, status
-    from safevar_sumo.study import Study, Weather, load_study, study_names
+    from safevar_sumo.study import Study, StudyLike, Weather, load_study, study_names
+    from safevar_sumo.workers.evaluation import Pool
 
     __version__: str
 
-_ROOM_OF = {
-    "load_study": "study", "study_names": "study", "Study": "study", "Weather": "study",
-    "simulate": "api", "Simulation": "api",
-    "evaluate": "api",
-    "run": "api", "load": "api", "Results": "api",
-    "tables": "api", "Tables": "api",
-    "figures": "api", "Figures": "api",
-    "explain": "api", "tolerance": "api", "risk": "api", "rules": "api",
-    "Comparison": "replay", "compare": "replay", "draw_comparison": "replay", "animate": "replay", "show_in_gui": "replay",
-    "make_report": "report",
-    "status": "results", "Status": "results",
-    "SafevarError": "errors", "InputError": "errors", "SimulationError": "errors",
+_ROOMS = {
+    "study": ("load_study", "study_names", "Study", "StudyLike", "Weather"),
+    "api": ("simulate", "Simulation", "evaluate", "run", "load", "Results", "tables", "Tables", "figures", "Figures", "explain",
+            "tolerance", "risk", "rules"),
+    "analysis.criterion": ("Criterion", "Unsafe"),
+    "analysis.evaluator": ("Progress",),
+    "analysis.explain.result": ("Cause", "Explained", "Explanation"),
+    "analysis.tolerance.compute": ("Tolerance",),
+    "analysis.risk.compute": ("Risk",),
+    "analysis.rules.compute": ("Rule", "Rules"),
+    "campaign": ("Observer",),
+    "workers.evaluation": ("Pool",),
+    "records": ("Outcome",),
+    "replay": ("Comparison", "compare", "draw_comparison", "animate", "show_in_gui"),
+    "report": ("make_report",),
+    "results": ("status", "Status"),
+    "errors": ("SafevarError", "InputError", "SimulationError"),
 }
-"""Every public name and the room that it comes from."""
+"""Every room with the public names that come from it."""
+_ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = [
-    "Comparison", "Figures", "InputError", "Results", "SafevarError", "Simulation", "SimulationError", "Status", "Study", "Tables",
-    "Weather", "__version__", "animate", "compare", "draw_comparison", "evaluate", "explain", "figures", "load", "load_study",
-    "make_report", "risk", "rules", "run", "show_in_gui", "simulate", "status", "study_names", "tables", "tolerance",
+    "Cause", "Comparison", "Criterion", "Explained", "Explanation", "Figures", "InputError", "Observer", "Outcome", "Pool", "Progress",
+    "Results", "Risk", "Rule", "Rules", "SafevarError", "Simulation", "SimulationError", "Status", "Study", "StudyLike", "Tables",
+    "Tolerance", "Unsafe", "Weather", "__version__", "animate", "compare", "draw_comparison", "evaluate", "explain", "figures", "load",
+    "load_study", "make_report", "report", "risk", "rules", "run", "show_in_gui", "simulate", "status", "study_names", "tables",
+    "tolerance",
 ]
 
 if not TYPE_CHECKING:  # a type checker is to know the names above, and no others
@@ -56,6 +73,8 @@ if not TYPE_CHECKING:  # a type checker is to know the names above, and no other
             from importlib.metadata import version
 
             return version("safevar_sumo")
+        if name == "report":  # the package is callable: function and package share the name
+            return importlib.import_module(f"{__name__}.report")
         if name not in _ROOM_OF:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         return getattr(importlib.import_module(f"{__name__}.{_ROOM_OF[name]}"), name)

@@ -3,8 +3,7 @@
 from safevar_sumo.api.questions import Figures, Tables, explain, figures, risk, rules, tables, tolerance
 from safevar_sumo.api.results import Results, load
 from safevar_sumo.api.running import run
-from safevar_sumo.api.settings import evaluate
-from safevar_sumo.api.simulation import Simulation, simulate
+from safevar_sumo.api.simulation import Simulation, evaluate, simulate
 
 __all__ = ["Figures", "Results", "Simulation", "Tables", "evaluate", "explain", "figures", "load", "risk", "rules", "run",
            "simulate", "tables", "tolerance"]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from safevar_sumo.analysis.research_questions.case import Case
 
 MOST = 3
-"""So many things that have changed are named in one line."""
+"""Changes that are named in one line."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class Results:
     Attributes
     ----------
     directory
-        Where it is.
+        The directory.
     case
-        The same as the research questions take it.
+        Study, solutions and evaluations, as the research questions take them.
     """
 
     directory: Path
@@ -40,7 +40,7 @@ class Results:
 
     @property
     def study(self) -> Study:
-        """As it was run."""
+        """The study as it was run."""
         return self.case.study
 
     @cached_property
@@ -74,6 +74,11 @@ class Results:
 def load(directory: str | Path) -> Results:
     """Read a results directory as `run` or a command has left it, finished or not.
 
+    Parameters
+    ----------
+    directory
+        The directory.
+
     Raises
     ------
     InputError
@@ -85,7 +90,7 @@ def load(directory: str | Path) -> Results:
 
 
 def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False) -> Study | Case:
-    """What a question is about: a study, or the case that results or their directory hold, whose settings are simulated anew.
+    """The study, or the case of results or of their directory, that a question is about.
 
     Warns
     -----
@@ -105,20 +110,20 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False) ->
             problem = f"is no results directory, no study and no file{did_you_mean(source, study_names())}"
             raise InputError(source, problem, legal)
     if isinstance(source, Results):
-        for told in changes_since(source.directory, source.case, as_it_is_now=as_it_is_now):
-            warnings.warn(f"{source.directory}: {told}", stacklevel=3)
+        for change in changes_since(source.directory, source.case, as_it_is_now=as_it_is_now):
+            warnings.warn(f"{source.directory}: {change}", stacklevel=3)
         return source.case
     return load_study(source)
 
 
 def study_of(source: StudyLike | Results, *, as_it_is_now: bool = False) -> Study:
     """The study itself, or the one of the results; raises as `study_or_case`."""
-    found = study_or_case(source, as_it_is_now=as_it_is_now)
-    return found if isinstance(found, Study) else found.study
+    subject = study_or_case(source, as_it_is_now=as_it_is_now)
+    return subject if isinstance(subject, Study) else subject.study
 
 
 def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) -> list[str]:
-    """In what that is simulated now differs from what results were computed with; of imported results nobody knows.
+    """Differences between what is simulated now and what results were computed with; none of imported results, which record nothing.
 
     Raises
     ------
@@ -143,4 +148,4 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
         more = f" (and {len(changed) - MOST} more)" if len(changed) > MOST else ""
         raise InputError(directory / MANIFEST, f"{'; '.join(changed[:MOST])}{more}: what is simulated now is not what these results hold",
                          "what was there then; or --as-it-is-now (as_it_is_now=True), which simulates with what is there now and says so")
-    return [f"{one}; simulated as it is now" for one in changed]
+    return [f"{difference}; simulated as it is now" for difference in changed]

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -15,6 +15,7 @@ from safevar_sumo.api.simulation import assembled
 from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, read_by_algorithms, run_campaign
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.progress import CampaignProgress
+from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo.system import System
@@ -24,10 +25,13 @@ from safevar_sumo.workers.identity import identity_of
 from safevar_sumo.workers.local import available_cores, local_pool
 from safevar_sumo.workers.sources import sources_of
 
+if TYPE_CHECKING:
+    from safevar_sumo.analysis.evaluator import Progress
+
 
 def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = None, cluster: str | None = None,
-        progress: bool | Observer = False, only: Sequence[tuple[str, int]] | None = None, batch: int | None = None,
-        retry_failed: bool = False) -> Results:
+        pool: Pool | None = None, progress: bool | Progress | Observer = False, only: Sequence[tuple[str, int]] | None = None,
+        batch: int | None = None, retry_failed: bool = False) -> Results:
     """Search a study; called again with the same study and directory, it goes on where it was stopped.
 
     Parameters
@@ -37,11 +41,14 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     out
         Directory of the results, by default `results/NAME`.
     jobs
-        Worker processes, by default the cores of this machine.
+        Worker processes, by default one for each core.
     cluster
         Compute on the workers of the Dask scheduler at this address instead.
+    pool
+        Where to simulate, if not in worker processes of its own or on a cluster.
     progress
-        Show bars, or whom to tell.
+        True for a bar on the terminal; a function called with the study's name, how many evaluations are done, and how many there
+        are at the most; or an `Observer`.
     only
         These runs alone, as (algorithm, number from 0); the results are whole once every run is finished.
     batch
@@ -59,10 +66,9 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     chosen, system = prepared(study)
     keys = all_runs(chosen) if only is None else [RunKey(*key) for key in only]
     directory = Path(out) if out is not None else Path("results") / chosen.name
-    bars: Any = CampaignProgress(Console(stderr=True), chosen, keys, quiet=False)
-    showing = bars if progress is True else nullcontext(progress or NullObserver())
-    with open_pool(chosen, jobs, cluster) as pool, showing as observer:
-        carried_out(chosen, system, keys, directory, pool, observer, batch, retry_failed=retry_failed)
+    where = nullcontext(pool) if pool is not None else open_pool(chosen, jobs, cluster)
+    with where as opened, _observed(progress, chosen, keys) as observer:
+        carried_out(chosen, system, keys, directory, opened, observer, batch, retry_failed=retry_failed)
     return load(directory)
 
 
@@ -105,15 +111,38 @@ def open_pool(study: Study, jobs: int | None = None, cluster: str | None = None)
     return cluster_pool(cluster, limit) if cluster is not None else local_pool(jobs or available_cores(), limit)
 
 
-class NullObserver:
-    """Nobody looks on; warnings alone are told."""
+def _observed(progress: bool | Progress | Observer, study: Study, keys: list[RunKey]) -> AbstractContextManager[Observer]:
+    """The observer that `progress` stands for."""
+    if progress is True:
+        return CampaignProgress(Console(stderr=True), study, keys, quiet=False)
+    if progress is False:
+        return nullcontext(NullObserver())
+    return nullcontext(CallingObserver(progress, study, keys) if callable(progress) else progress)
 
-    def evaluated(self, *_: object) -> None:
+
+class NullObserver:
+    """Shows nothing; warnings are Python's."""
+
+    def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
         """A population is evaluated."""
 
-    def finished(self, *_: object) -> None:
+    def finished(self, key: RunKey, asked: int) -> None:
         """A run is over."""
 
     def warned(self, message: str) -> None:
-        """Something happened that the user should know."""
+        """The campaign warns."""
         warnings.warn(message, stacklevel=2)
+
+
+class CallingObserver(NullObserver):
+    """Calls a function with the study's name, how many evaluations are done, and how many there are at the most."""
+
+    def __init__(self, progress: Progress, study: Study, keys: list[RunKey]) -> None:
+        self._progress, self._name = progress, study.name
+        self._done, self._total = 0, len(keys) * study.search.evaluations
+        progress(self._name, 0, self._total)
+
+    def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
+        """A population is evaluated."""
+        self._done += len(evaluations)
+        self._progress(self._name, self._done, self._total)

@@ -1,27 +1,35 @@
-"""What happened in one simulation, step by step, and what the ADS saw of it."""
+"""Settings simulated: one with its trace, step by step, beside the original vehicle, or many at once."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from safevar_sumo.ads import Ads
+from safevar_sumo.analysis.words import ENDS
+from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.metrics import Scoring, time_to_collision
+from safevar_sumo.progress import shown
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns
-from safevar_sumo.results import record
+from safevar_sumo.results import evaluations_frame, record
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import simulate as drive
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from safevar_sumo.analysis.evaluator import Progress
+    from safevar_sumo.workers.evaluation import Pool
 
 
 SEEN = {"speed": "seen speed [m/s]", "gap": "seen gap [m]", "closing_speed": "seen closing speed [m/s]", "lateral": "seen lateral [m]",
@@ -44,7 +52,7 @@ class RecordingAds:
         return self._ads.drive(seen, memory)
 
 
-def trace_frame(drives: SimulationRuns, witness: RecordingAds) -> pd.DataFrame:
+def trace_frame(runs: SimulationRuns, recording: RecordingAds) -> pd.DataFrame:
     """One row per step of the only vehicle while its simulation counts.
 
     Where the obstacle was (`gap` along the vehicle's path, `lateral` from the middle of its lane) and what the ADS saw of
@@ -52,23 +60,18 @@ def trace_frame(drives: SimulationRuns, witness: RecordingAds) -> pd.DataFrame:
     """
     import pandas as pd  # takes longer to load than the simulation
 
-    trace = drives.trace
-    shown = trace.active[:, 0]
-    closing = np.where(trace.speed > STANDSTILL, time_to_collision(drives), np.inf)
+    trace = runs.trace
+    counting = trace.active[:, 0]
+    closing = np.where(trace.speed > STANDSTILL, time_to_collision(runs), np.inf)
     columns = {
         "time [s]": trace.time, "position [m]": trace.position[:, 0], "speed [m/s]": trace.speed[:, 0],
         "acceleration [m/s^2]": np.diff(trace.speed[:, 0], prepend=trace.speed[:1, 0]) / trace.step, "gap [m]": trace.gap[:, 0],
         "ttc [s]": closing[:, 0], "throttle [-]": trace.throttle[:, 0], "brake [-]": trace.brake[:, 0],
         "gear [-]": trace.gear[:, 0], "lateral [m]": trace.lateral[:, 0], "lateral speed [m/s]": trace.lateral_speed[:, 0]}
-    frame = pd.DataFrame({name: values[shown] for name, values in columns.items()})
+    frame = pd.DataFrame({name: values[counting] for name, values in columns.items()})
     seen = pd.DataFrame([{"time [s]": round(float(one.time), TIME_DECIMALS),
-                          **{head: float(getattr(one, name)[0]) for name, head in SEEN.items()}} for one in witness.observations])
+                          **{head: float(getattr(one, name)[0]) for name, head in SEEN.items()}} for one in recording.observations])
     return frame.merge(seen, how="left", on="time [s]").replace([np.inf, -np.inf], np.nan)
-
-
-WORDS = {
-    Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is under way when the time is up",
-    Outcome.NEVER_MOVED: "never moves", Outcome.INVALID_TEST: "leaves the tolerance of the test's speed before the system acts"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,11 +81,11 @@ class Simulation:
     Attributes
     ----------
     study
-        That it was simulated in.
+        The study that it was simulated in.
     setting
         What was simulated: every characteristic in its table unit, after the filter.
     put_back
-        What was asked for and is too small a change for the filter: the value asked for, by name.
+        Values asked for that the filter put back to the original, by name.
     evaluation
         Its outcome, metrics and objectives as arrays of one row.
     drives
@@ -118,25 +121,25 @@ class Simulation:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """Safety metrics by name, in the units that `list` tells; NaN where undefined."""
+        """Safety metrics by name, in the units that `list` prints; NaN where undefined."""
         return {name: float(values[0]) for name, values in self.evaluation.metrics.items()}
 
     @property
     def objectives(self) -> dict[str, float]:
         """f_safe [m, or -m/s on a collision], f_diff [fraction], f_num_diff [characteristics]; all are minimised."""
-        told = self.record()
-        return {name: float(told[name]) if told[name] is not None else np.nan for name in told if name.startswith("f_")}
+        values = self.to_dict()
+        return {name: float(value) if value is not None else np.nan for name, value in values.items() if name.startswith("f_")}
 
     @property
     def units(self) -> dict[str, str]:
-        """The unit of every number of `record`, by its name."""
+        """The unit of every number of `to_dict`, by its name."""
         measured = {metric.name: metric.unit for metric in self.scoring.metrics}
-        measured |= {one.name: one.unit for one in self.scoring.objectives if one.name in self.metrics}
+        measured |= {objective.name: objective.unit for objective in self.scoring.objectives if objective.name in self.metrics}
         return {"collision_speed": "m/s", **measured, "f_safe": "m, or -m/s", "f_diff": "fraction", "f_num_diff": "characteristics"}
 
     @cached_property
     def trace(self) -> pd.DataFrame:
-        """Step by step, one row each, units in the columns' names; empty (NaN) is what there is nothing to tell of."""
+        """One row per step, units in the columns' names; NaN where a value does not exist."""
         return trace_frame(self.drives, self._seen)
 
     @property
@@ -145,15 +148,15 @@ class Simulation:
         if self.outcome is Outcome.COLLISION:
             return f"collides at {self.collision_speed:.2f} m/s"
         least = self.metrics[SAFETY_DEGREE]
-        return WORDS[self.outcome] + ("" if np.isnan(least) else f", with a safety degree of {least:.2f} m")
+        return ENDS[self.outcome] + ("" if np.isnan(least) else f", with a safety degree of {least:.2f} m")
 
-    def record(self) -> dict[str, Any]:
-        """As plain values, as `simulate --json` prints it; undefined is None."""
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON of `simulate`: plain values, None where undefined."""
         return {"study": self.study.name, "vcs": dict(self.setting), **record(self.evaluation, 0)}
 
     def __repr__(self) -> str:
-        told = ", ".join(f"{name}={value:.4g}" for name, value in self.metrics.items())
-        return f"<Simulation of {self.study.name}: {self.outcome}, {told}>"
+        metrics = ", ".join(f"{name}={value:.4g}" for name, value in self.metrics.items())
+        return f"<Simulation of {self.study.name}: {self.outcome}, {metrics}>"
 
 
 def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, filtered: bool = True, beyond: bool = False,
@@ -213,3 +216,105 @@ def _simulated(study: Study, system: System, asked: FloatArray, setting: FloatAr
 
 def _put_back(system: System, asked: FloatArray, setting: FloatArray) -> dict[str, float]:
     return {name: float(value) for name, value, used in zip(system.characteristics.names, asked, setting, strict=True) if value != used}
+
+
+LEGAL = ("a list of mappings such as [{'mass': 2500}], a pandas.DataFrame with a column for each characteristic that is changed, "
+         "or an array of numbers, shape (M, n)")
+
+
+def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, float | None]] | npt.ArrayLike, *, filtered: bool = True,
+             beyond: bool = False, pool: Pool | None = None, jobs: int | None = None, progress: bool | Progress = False) -> pd.DataFrame:
+    """Simulate many settings of a study in worker processes.
+
+    Parameters
+    ----------
+    study
+        A study, or what `load_study` makes one of.
+    settings
+        A mapping for each setting with the characteristics that are changed, or a frame with a column for each of them: a value
+        that is missing (no key, None or NaN) is the original's. Or an array of shape (M, n), n characteristics in the study's
+        order, without missing values. In the characteristics' table units.
+    filtered
+        Put changes that are smaller than their thresholds back to the original, as every search does.
+    beyond
+        Take values outside the domains too.
+    pool
+        Where to simulate, if not in worker processes of its own.
+    jobs
+        Worker processes, by default one for each core.
+    progress
+        True for a bar on the terminal, or a function called with the stage, how many settings are done, and how many there are.
+
+    Returns
+    -------
+    pandas.DataFrame
+        One row per setting, in their order and with a frame's index: the characteristics as simulated, f_safe [m or -m/s],
+        f_diff [fraction], f_num_diff, the metrics in their units (NaN where undefined), collision_speed [m/s], outcome.
+        A setting that cannot be simulated has the outcome simulator-error, one that leaves a test's speed before the system acts
+        invalid-test: neither is a failure or a success, and neither has metrics.
+
+    Raises
+    ------
+    InputError
+        If the study, a column or a value cannot be used.
+    SafevarError
+        If nothing can be simulated.
+    """
+    chosen, system = assembled(study)
+    characteristics = system.characteristics
+    asked, index = _table(settings, characteristics)
+    _check(asked, characteristics, beyond)
+    rows = characteristics.filter(asked) if filtered else asked
+    with shown(progress) as tell:
+        evaluations = evaluated(chosen, rows, pool, jobs, tell)
+    frame = evaluations_frame(characteristics.names, [(("", 0), evaluations)]).drop(columns=["algorithm", "run"])
+    frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
+    return frame.set_axis(index)
+
+
+def evaluated(study: Study, rows: FloatArray, pool: Pool | None = None, jobs: int | None = None,
+              progress: Progress | None = None) -> Evaluations:
+    """Simulate settings, shape (M, n), in worker processes."""
+    from safevar_sumo.analysis.evaluator import open_bench, silent
+
+    with open_bench(study, pool, jobs, progress or silent) as bench:
+        return bench.evaluate(rows, "settings")
+
+
+def _table(settings: Any, characteristics: CharacteristicSet) -> tuple[FloatArray, Any]:
+    """Settings as an array of shape (M, n), and the index of their rows."""
+    import pandas as pd
+
+    names = list(characteristics.names)
+    if isinstance(settings, Sequence) and not isinstance(settings, str) and all(isinstance(one, Mapping) for one in settings):
+        settings = pd.DataFrame(list(settings), index=range(len(settings)))
+    if isinstance(settings, pd.DataFrame):
+        for name in settings.columns:
+            if name not in names:
+                raise unknown("settings", f"column {name!r} is no characteristic", name, names)
+        if settings.columns.has_duplicates:
+            raise InputError("settings", "a column is there twice", "each characteristic once")
+        table = pd.DataFrame(dict(zip(names, characteristics.original, strict=True)), index=settings.index)
+        for name in settings.columns:
+            given = settings[name].astype(object)
+            table[name] = given.where(given.notna(), table[name])
+        return _numbers(table), settings.index
+    if isinstance(settings, Mapping):
+        raise InputError("settings", f"is a {type(settings).__name__}", LEGAL)
+    array = _numbers(settings)
+    if array.ndim != 2 or array.shape[1] != len(names):
+        raise InputError("settings", f"an array of shape {array.shape}", f"shape (M, {len(names)}): {', '.join(names)}")
+    return array, pd.RangeIndex(len(array))
+
+
+def _numbers(settings: Any) -> FloatArray:
+    try:
+        return np.array(settings, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError("settings", str(error), LEGAL) from None
+
+
+def _check(asked: FloatArray, characteristics: CharacteristicSet, beyond: bool) -> None:
+    legal = np.column_stack([member.is_legal(values, beyond=beyond) for member, values in zip(characteristics, asked.T, strict=True)])
+    for row, column in np.argwhere(~legal)[:1]:
+        characteristics.members[column].check(float(asked[row, column]), f"settings, row {row}", beyond=beyond)

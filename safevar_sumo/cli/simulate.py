@@ -12,8 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from safevar_sumo.api.settings import evaluated
-from safevar_sumo.api.simulation import Simulation, beside_the_original
+from safevar_sumo.api.simulation import Simulation, beside_the_original, evaluated
 from safevar_sumo.cli.options import (
     PICTURES,
     Within,
@@ -32,7 +31,7 @@ from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import tags
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable
-from safevar_sumo.sumo.matrix import AtPoint, at_every_point, at_worst, named_point, point_record, remarks_of, vehicle_remarks
+from safevar_sumo.sumo.matrix import AtPoint, at_every_point, named_point, point_record, remarks_of, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import WholeTable, plain, print_meanings
 from safevar_sumo.vehicles import CharacteristicSet
@@ -113,7 +112,7 @@ def _tell(target: Target, system: System, found: Simulation, as_json: bool) -> N
     if as_json:
         replayed = {} if target.handle is None else {"solution": str(target.handle)}
         matrix = {"points": [point_record(one) for one in points]} if points else {}
-        click.echo(json.dumps({**found.record(), **replayed, **matrix}, indent=2, allow_nan=False))
+        click.echo(json.dumps({**found.to_dict(), **replayed, **matrix}, indent=2, allow_nan=False))
     else:
         print_simulation(Console(), found)
         print_matrix(Console(), points)
@@ -179,17 +178,17 @@ class Shown(NamedTuple):
     def show(self, study: Study, system: System, setting: FloatArray) -> None:
         """Simulate a filtered setting, shape (n,), beside the original vehicle, and show both."""
         from safevar_sumo.replay.animation import animate
-        from safevar_sumo.replay.comparison import compare
+        from safevar_sumo.replay.comparison import compare_setting
         from safevar_sumo.replay.figure import draw_comparison, write_figure
         from safevar_sumo.replay.gui import show_in_gui
 
-        comparison = compare(study, system, setting)
+        comparison = compare_setting(study, system, setting)
         if self.plot is not None:
             write_figure(draw_comparison(comparison), self.plot)
         if self.animate is not None:
             animate(comparison, self.animate)
         if self.gui:
-            show_in_gui(comparison, at_worst(system, setting[np.newaxis]).scenario.network, slower=self.slower)
+            show_in_gui(comparison, slower=self.slower)
 
 
 def print_simulation(console: Console, found: Simulation) -> None:
@@ -197,7 +196,7 @@ def print_simulation(console: Console, found: Simulation) -> None:
     _print_setting(console, found)
     members = CharacteristicSet.of(found.study.vehicle.characteristics)
     print_meanings(console, [member for member in members if found.setting[member.name] != member.original])
-    records = (found.original.record(), found.record())
+    records = (found.original.to_dict(), found.to_dict())
     table = WholeTable()
     table.add_column("result")
     table.add_column("unit")

@@ -9,9 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from safevar_sumo.analysis.words import ENDS
+from safevar_sumo.api.simulation import assembled
 from safevar_sumo.records import STANDSTILL, Evaluations, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.results import UNKNOWN
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.film import Film, film
 from safevar_sumo.sumo.matrix import at_worst
@@ -58,21 +60,19 @@ def divergence(drives: SimulationRuns, one: int = 0, other: int = 1) -> int | No
 
 ORIGINAL, CHANGED = 0, 1
 """Rows of a comparison."""
-WORDS = {Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is still driving at the end",
-         Outcome.NEVER_MOVED: "never moves", Outcome.SIMULATOR_ERROR: "cannot be simulated",
-         Outcome.INVALID_TEST: "leaves the test's speed"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
     """Runs of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is changed).
 
-    `title` is the study's, `evaluations` and `film` have one row for each vehicle.
+    `title` is the study's, `network` the scenario's; `evaluations` and `film` have one row for each vehicle.
     """
 
     title: str
     characteristics: CharacteristicSet
     ttc_threshold: float
+    network: str
     evaluations: Evaluations
     film: Film
 
@@ -96,7 +96,7 @@ class Comparison:
         if not math.isnan(drives.collision_speed[row]):
             return f"hits at {drives.collision_speed[row]:.1f} m/s"
         nearest = moments(drives, row).nearest
-        word = WORDS[Outcome(str(drives.outcome[row]))]
+        word = ENDS[Outcome(str(drives.outcome[row]))]
         if nearest is None or drives.outcome[row] != Outcome.STOPPED:
             return word
         return f"{word} with {drives.trace.gap[nearest, row]:.2f} m to spare"
@@ -124,7 +124,33 @@ def raised(text: str) -> str:
     return text.replace("^2", "²").replace("^3", "³")
 
 
-def compare(study: Study, system: System, setting: FloatArray) -> Comparison:
+def compare(study: StudyLike, changes: Mapping[str, float] | None = None, *, filtered: bool = True, beyond: bool = False) -> Comparison:
+    """Simulate one setting beside the original vehicle, in this process; in a matrix, at the point where the setting comes off worst.
+
+    Parameters
+    ----------
+    study
+        A study, or what `load_study` makes one of.
+    changes
+        Values by characteristic, in their table units; all others are the original's.
+    filtered
+        Put changes that are smaller than their thresholds back to the original, as every search does.
+    beyond
+        Take values outside the domains too.
+
+    Raises
+    ------
+    InputError
+        If the study or a change cannot be used.
+    SimulationError
+        If SUMO fails.
+    """
+    chosen, system = assembled(study)
+    setting = system.characteristics.setting(changes or {}, "changes", beyond=beyond)
+    return compare_setting(chosen, system, system.characteristics.filter(setting) if filtered else setting)
+
+
+def compare_setting(study: Study, system: System, setting: FloatArray) -> Comparison:
     """Simulate a filtered setting, shape (n,), beside the original vehicle; in a matrix, where the setting comes off worst.
 
     Raises
@@ -138,7 +164,8 @@ def compare(study: Study, system: System, setting: FloatArray) -> Comparison:
     where = [f" ({point.name})" for point in system.matrix if (point.scenario, point.weather) == (there.scenario, there.weather)]
     taken = film(there, settings)
     return Comparison(title=study.title + "".join(where[:1]), characteristics=system.characteristics,
-                      ttc_threshold=system.metrics.ttc_threshold, evaluations=score(there, settings, taken.drives),
+                      ttc_threshold=system.metrics.ttc_threshold, network=there.scenario.network,
+                      evaluations=score(there, settings, taken.drives),
                       film=replace(taken, drives=_up_to_impacts(taken.drives)))
 
 

@@ -25,13 +25,14 @@ ASIDE = 1.8
 """Where the words stand above the lower end of what is shown [m]."""
 
 
-def show_in_gui(comparison: Comparison, network: str, *, slower: float = 1.0, rest: float = REST, pictures: Path | None = None) -> None:
+def show_in_gui(comparison: Comparison, network: str | None = None, *, slower: float = 1.0, rest: float = REST,
+                pictures: Path | None = None) -> None:
     """Play a comparison in SUMO's own window, rest at the nearest moments and at the end.
 
     Parameters
     ----------
     network
-        The scenario's.
+        The network to play it on, by default the comparison's own.
     slower
         So many times slower than real time.
     rest
@@ -46,7 +47,7 @@ def show_in_gui(comparison: Comparison, network: str, *, slower: float = 1.0, re
     """
     scene = scene_of(comparison)
     turn = _Turn(scene)
-    with open_window(network, scene.step) as window:
+    with open_window(network or comparison.network, scene.step) as window:
         for row in comparison.rows:
             _furnish(window, scene, row, turn)
         rests = {told.nearest for told in scene.moments if told.nearest is not None} | {scene.length - 1}

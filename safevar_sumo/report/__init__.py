@@ -1,5 +1,70 @@
-"""One page that tells a study's findings to somebody who was not there."""
+"""One page that tells a study's findings to somebody who was not there. The package is callable: `safevar_sumo.report(...)`."""
 
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from safevar_sumo.api.results import Results
+from safevar_sumo.progress import shown
 from safevar_sumo.report.page import SECTIONS, make_report
+from safevar_sumo.results import write_whole
 
-__all__ = ["SECTIONS", "make_report"]
+if TYPE_CHECKING:
+    from safevar_sumo.analysis.evaluator import Progress
+
+
+def report(*results: Results | str | Path, out: str | Path | None = None, only: Sequence[str] = (), point: str = "",
+           jobs: int | None = None, progress: bool | Progress = False, as_it_is_now: bool = False) -> str:
+    """Make one self-contained HTML page about the results of one or several studies; the same results give the same page.
+
+    Parameters
+    ----------
+    results
+        Results, or their directories.
+    out
+        File that the page is written to, if any.
+    only
+        Names of `SECTIONS`, such as "verdict"; all of them by default.
+    point
+        Name of a point of a matrix, to be asked about alone; the research questions are about whole studies and left out.
+    jobs
+        Worker processes for what is to be simulated, by default one for each core.
+    progress
+        True for a bar on the terminal, or a function called with the stage, how much of it is done, and how much there is.
+    as_it_is_now
+        Simulate with what is there now where results were computed with something else; the page says so.
+
+    Returns
+    -------
+    str
+        The page.
+
+    Warns
+    -----
+    UserWarning
+        Of solutions that, simulated again, are not what the results say; with `as_it_is_now` of what has changed.
+
+    Raises
+    ------
+    InputError
+        If a directory holds no results, there is no such section or point, or the file cannot be written.
+    """
+    directories = [item.directory if isinstance(item, Results) else item for item in results]
+    with shown(progress) as tell:
+        page = make_report(directories, only, jobs, tell, point=point, as_it_is_now=as_it_is_now)
+    if out is not None:
+        write_whole(Path(out), page)
+    return page
+
+
+class _CallableModule(ModuleType):
+    __call__ = staticmethod(report)
+
+
+sys.modules[__name__].__class__ = _CallableModule
+
+__all__ = ["SECTIONS", "make_report", "report"]

@@ -26,7 +26,7 @@ from safevar_sumo.api.results import changes_since
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.plugins import digest_of
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare
+from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
 from safevar_sumo.replay.page import player_data
 from safevar_sumo.replay.scene import scene_of
 from safevar_sumo.results import RESULTS, SolutionId, handles, write_whole
@@ -135,7 +135,7 @@ class ReportInput:
         assert self.system is not None
         key = setting.tobytes()
         if key not in self._compared:
-            self._compared[key] = compare(self.case.study, self.system, setting)
+            self._compared[key] = compare_setting(self.case.study, self.system, setting)
         return self._compared[key]
 
     def again(self, settings: Sequence[FloatArray]) -> list[Again]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 import subprocess
 import sys
 import warnings
@@ -14,6 +16,7 @@ import pandas as pd
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo import report
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.api.results import study_of, study_or_case
 from safevar_sumo.study import load_study, tables_of
@@ -141,10 +144,54 @@ def test_evaluate_is_simulate_row_by_row() -> None:
     pd.testing.assert_frame_equal(again, frame.reset_index(drop=True))
 
 
+def test_a_value_that_is_missing_is_the_originals() -> None:
+    """Mappings name only what is changed; an empty mapping is the original vehicle."""
+    stages: list[tuple[str, int, int]] = []
+    asked: list[dict[str, float | None]] = [{"tireFric": 1.2}, {}, {"mass": 2500.0, "tireFric": None}]
+    frame = sv.evaluate("sun", asked, jobs=1, progress=lambda *stage: stages.append(stage))
+    assert frame["tireFric"].tolist() == [1.2, 3.5, 3.5]
+    assert frame["mass"].tolist() == [2404.0, 2404.0, 2500.0]
+    assert stages[-1] == ("settings", 3, 3)
+    table = pd.DataFrame({"tireFric": [1.2, None, np.nan], "mass": pd.array([None, None, 2500], dtype="Int64")})
+    pd.testing.assert_frame_equal(sv.evaluate("sun", table, jobs=1), frame)
+
+
+def test_the_functions_share_one_convention_and_its_types_are_public() -> None:
+    """Every argument is documented where it stands, every class of a signature is a name of the package."""
+    several = [sv.run, sv.evaluate, sv.explain, sv.tolerance, sv.risk, sv.rules, report.report]
+    others = ["None", "str", "int", "float", "bool", "Path", "Sequence", "Mapping", "tuple", "list", "pd", "DataFrame", "npt", "ArrayLike"]
+    for function in (*several, sv.simulate, sv.compare, sv.load, sv.tables, sv.figures):
+        signature = inspect.signature(function)
+        annotations = [*(str(one.annotation) for one in signature.parameters.values()), signature.return_annotation]
+        assert set(re.findall(r"\w+", " ".join(annotations))) <= {*others, *sv.__all__}
+        assert set(signature.parameters) <= set(re.findall(r"^(\w+)$", inspect.getdoc(function) or "", re.MULTILINE))
+        if function in several:
+            assert [signature.parameters[name].default for name in ("jobs", "progress")] == [None, False]
+
+
+def test_a_criterion_is_a_number_a_word_or_an_object() -> None:
+    criteria: list[sv.Criterion] = [1.5, "below=1.5", sv.Unsafe(below=1.5)]
+    assert {sv.Unsafe.parse(criterion) for criterion in criteria} == {sv.Unsafe(1.5)}
+    assert sv.Unsafe.parse("collision") == sv.Unsafe()
+    with pytest.raises(sv.InputError, match=r"unsafe: 'above=2'"):
+        sv.tolerance("sun", unsafe="above=2")
+
+
+def test_compare_needs_a_study_and_changes_alone() -> None:
+    comparison = sv.compare("sun", {"tireFric": 1.2})
+    assert comparison.changes == ["tireFric 3.5 → 1.2 (-66\N{NO-BREAK SPACE}%)"]
+    assert comparison.evaluations.f_safe.tolist() == sv.evaluate("sun", [{}, {"tireFric": 1.2}], jobs=1)["f_safe"].tolist()
+
+
+def test_a_report_of_results_is_a_page(results: sv.Results, tmp_path: Path) -> None:
+    page = sv.report(results, out=tmp_path / "page.html", only=["tested", "reproduce"], jobs=1)
+    assert (tmp_path / "page.html").read_text(encoding="utf-8") == page == sv.make_report([results.directory], ["tested", "reproduce"], 1)
+
+
 @pytest.mark.parametrize(("settings", "told"), [
     (pd.DataFrame({"weight": [1.0]}), "weight"), (pd.DataFrame({"mass": ["heavy"]}), "heavy"), ([[1.0, 2.0]], r"shape \(1, 2\)"),
-    ({"mass": [2500.0]}, "a dict\nlegal: a pandas.DataFrame"),
-    (pd.DataFrame({"mass": [2404.0, 9999.0]}), "row 1: mass = 9999"), (pd.DataFrame({"mass": [float("nan")]}), "mass = nan"),
+    ({"mass": [2500.0]}, "a dict\nlegal: a list of mappings"), ([{"mass": 2500.0}, {"weight": 1.0}], "weight"),
+    (pd.DataFrame({"mass": [2404.0, 9999.0]}), "row 1: mass = 9999"), (np.full((1, 17), np.nan), "shape|= nan"),
 ])
 def test_settings_that_cannot_be_used_are_told_before_any_is_simulated(settings: object, told: str) -> None:
     with pytest.raises(sv.InputError, match=told):

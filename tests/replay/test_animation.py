@@ -15,7 +15,7 @@ from PIL import Image
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.animation import animate, check_animation
-from safevar_sumo.replay.comparison import Comparison, compare
+from safevar_sumo.replay.comparison import Comparison, compare_setting
 from safevar_sumo.replay.page import animation_page
 from safevar_sumo.replay.raster import PANEL, VEHICLES, WIDTH, pictures
 from safevar_sumo.replay.scene import scene_of
@@ -25,7 +25,7 @@ from safevar_sumo.sumo.system import assemble
 @pytest.fixture(scope="module")
 def crash(slippery: Path) -> Comparison:
     (case,) = load_cases([slippery])
-    return compare(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
+    return compare_setting(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
 
 
 def where(picture: Image.Image, colour: str) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.analysis.research_questions.case import load_cases
-from safevar_sumo.replay.comparison import Comparison, compare
+from safevar_sumo.replay.comparison import Comparison, compare_setting
 from safevar_sumo.replay.figure import draw_comparison, write_figure
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate, study_at
@@ -20,7 +20,7 @@ from safevar_sumo.sumo.system import assemble
 @pytest.fixture(scope="module")
 def comparison(slippery: Path) -> Comparison:
     (case,) = load_cases([slippery])
-    return compare(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
+    return compare_setting(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
 
 
 def test_it_draws_both_drives_as_far_as_they_go(comparison: Comparison) -> None:
@@ -77,7 +77,7 @@ def test_at_an_impact_the_pedals_are_those_that_were_in_force() -> None:
     setting = system.characteristics.original.copy()
     for name, value in (("tireFric", 1.0), ("mass", 2600.0)):
         setting[system.characteristics.names.index(name)] = value
-    shown, drives = compare(study, system, setting), simulate(system, setting[np.newaxis])
+    shown, drives = compare_setting(study, system, setting), simulate(system, setting[np.newaxis])
     trace, end = shown.film.drives.trace, shown.film.last[-1]
     assert shown.verdict(1).startswith("hits")
     assert drives.trace.brake[end, 0] == 0

@@ -14,7 +14,7 @@ from PIL import Image
 
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.errors import InputError
-from safevar_sumo.replay.comparison import compare, moments
+from safevar_sumo.replay.comparison import compare_setting, moments
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.sumo.system import assemble
 
@@ -44,7 +44,7 @@ def of_colour(picture: np.ndarray, red: int, green: int, blue: int) -> np.ndarra
 def test_both_vehicles_are_in_the_window_at_the_nearest_moment(slippery: Path, tmp_path: Path) -> None:
     (case,) = load_cases([slippery])
     system = assemble(case.study)
-    comparison = compare(case.study, system, case.solutions[list(case.characteristics.names)].to_numpy()[0])
+    comparison = compare_setting(case.study, system, case.solutions[list(case.characteristics.names)].to_numpy()[0])
     show_in_gui(comparison, system.scenario.network, slower=0.01, rest=0.0, pictures=tmp_path)
     told = [moments(comparison.film.drives, row) for row in comparison.rows]
     assert {path.stem for path in tmp_path.iterdir()} == {f"{sample:04d}" for sample in (told[0].nearest, told[1].nearest, told[0].end)}
@@ -63,6 +63,6 @@ def test_without_a_display_it_is_refused(slippery: Path, monkeypatch: pytest.Mon
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     (case,) = load_cases([slippery])
     system = assemble(case.study)
-    comparison = compare(case.study, system, case.characteristics.original)
+    comparison = compare_setting(case.study, system, case.characteristics.original)
     with pytest.raises(InputError, match="no display"):
         show_in_gui(comparison, system.scenario.network)

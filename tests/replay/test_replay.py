@@ -14,7 +14,7 @@ from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.replay.comparison import compare, differences, divergence, moments
+from safevar_sumo.replay.comparison import compare_setting, differences, divergence, moments
 from safevar_sumo.results import handles
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.batch import score
@@ -36,7 +36,7 @@ def test_every_solution_replays_to_the_bit(case: Case) -> None:
     system = assemble(case.study)
     settings = case.solutions[list(case.characteristics.names)].to_numpy()
     for setting, (_, row) in zip(settings, case.solutions.iterrows(), strict=True):
-        comparison = compare(case.study, system, setting)
+        comparison = compare_setting(case.study, system, setting)
         here = comparison.evaluations.take([1])
         assert differences(here, row.to_dict()) == []
         assert here.f_safe[0] == row["f_safe"]
@@ -69,7 +69,7 @@ def test_what_set_says_comes_over_the_solution(slippery: Path) -> None:
 
 
 def test_a_row_that_was_not_found_here_is_told(slippery: Path, case: Case) -> None:
-    comparison = compare(case.study, assemble(case.study), case.characteristics.original)
+    comparison = compare_setting(case.study, assemble(case.study), case.characteristics.original)
     told = differences(comparison.evaluations, {"safety_degree": 1.0, "tet": np.nan, "outcome": "collision"})
     assert [one.split(" is ")[0] for one in told] == ["the outcome", "safety_degree", "tet"]
 
@@ -111,7 +111,7 @@ def test_a_film_of_the_crossing_has_its_pedestrian_and_its_crossing(sun: System)
 
 
 def test_moments_of_a_drive(case: Case) -> None:
-    comparison = compare(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
+    comparison = compare_setting(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
     drives = comparison.film.drives
     trace, original, hit = drives.trace, moments(drives, 0), moments(drives, 1)
     assert original.brake is not None

@@ -14,7 +14,7 @@ from selenium.webdriver.common.by import By
 
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.replay.animation import animate
-from safevar_sumo.replay.comparison import compare
+from safevar_sumo.replay.comparison import compare_setting
 from safevar_sumo.report import input as material
 from safevar_sumo.report import make_report
 from safevar_sumo.sumo.system import assemble
@@ -78,7 +78,8 @@ def try_player(browser: Chrome, player: object) -> None:
 
 def test_an_animation_plays_and_scrubs_as_a_file(browser: Chrome, slippery: Path, tmp_path: Path) -> None:
     (case,) = load_cases([slippery])
-    animate(compare(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0]), tmp_path / "it.html")
+    setting = case.solutions[list(case.characteristics.names)].to_numpy()[0]
+    animate(compare_setting(case.study, assemble(case.study), setting), tmp_path / "it.html")
     opened(browser, tmp_path / "it.html")
     try_player(browser, browser.find_element(By.CSS_SELECTOR, ".player"))
     assert [entry["message"] for entry in browser.get_log("browser")] == []
