@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.ads.base import Positive
-from safevar_sumo.ads.following import Following
+from safevar_sumo.ads.driver import Following
 from safevar_sumo.records import FloatArray
 
 # Gains of the modes [1/s for speeds, 1/s^2 for gaps] and thresholds: defaults of MSCFModel_ACC.

@@ -9,7 +9,7 @@ from msgspec import Struct
 
 from safevar_sumo.ads.acc import KEEPING
 from safevar_sumo.ads.base import NotNegative, Positive
-from safevar_sumo.ads.reaction import HARDEST, TIME_ROUNDING, Reaction, Start, in_the_way, react, time_to_reach, unaware
+from safevar_sumo.ads.driver import HARDEST, TIME_ROUNDING, Reaction, Start, in_the_way, react, time_to_reach, unaware
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 
@@ -65,7 +65,7 @@ class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         ahead = perceived & in_the_way(seen, self.corridor)
         command, reaction = react(
             seen, memory.reaction, ahead & (time_to_reach(seen) < self.critical_ttc), np.full_like(seen.speed, HARDEST),
-            reaction_time=self.reaction_time, corridor=self.corridor, lets_go=self.lets_go, cruise_speed=self.cruise_speed,
+            reaction_time=self.reaction_time, corridor=self.corridor, coasting_deceleration=self.lets_go, cruise_speed=self.cruise_speed,
             start=self.start_throttle, following=self._following(seen, ahead))
         return command, memory._replace(reaction=reaction)
 

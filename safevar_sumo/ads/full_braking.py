@@ -6,7 +6,7 @@ import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.ads.base import Positive
-from safevar_sumo.ads.reaction import Reaction, Start, in_the_way, react, unaware
+from safevar_sumo.ads.driver import Reaction, Start, in_the_way, react, unaware
 from safevar_sumo.records import Command, Nominal, Observation
 
 AS_HARD_AS_CAN_BE = 1e6

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.ads.base import Positive
-from safevar_sumo.ads.following import Following
+from safevar_sumo.ads.driver import Following
 from safevar_sumo.records import FloatArray
 
 LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO

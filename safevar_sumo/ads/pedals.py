@@ -1,4 +1,4 @@
-"""From the acceleration that a driver wants to the pedals, through what is known of the original vehicle."""
+"""Pedals for the acceleration that a driver wants, from the tables of the original vehicle."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
 
 def looked_up(speeds: FloatArray, speed: FloatArray, *tables: FloatArray) -> list[FloatArray]:
-    """Linear between the rows of tables over equally spaced speeds."""
+    """Tables over equally spaced speeds, interpolated linearly at `speed`."""
     place = np.minimum(speed / speeds[1], len(speeds) - 1.001)
     row = place.astype(np.intp)
     share, next_row = place - row, row + 1
@@ -19,14 +19,14 @@ def looked_up(speeds: FloatArray, speed: FloatArray, *tables: FloatArray) -> lis
 
 
 class Trim(NamedTuple):
-    """How much farther the pedals of a rolling vehicle stand than the original's would on a level road to hold its speed [-]."""
+    """Pedal positions of a rolling vehicle beyond those that hold the original vehicle's speed on a level road [-]."""
 
     throttle: FloatArray
     brake: FloatArray
 
 
 def trim(nominal: Nominal, seen: Observation) -> Trim:
-    """Who has driven at a speed for a while has found the pedals that hold it."""
+    """The trim of a driver who already holds the speed of a rolling vehicle."""
     rolls = seen.speed > 0
     throttle = np.where(rolls, seen.throttle - _throttle(nominal, seen.speed, np.zeros_like(seen.speed)), 0.0)
     (coasting,) = looked_up(nominal.speeds, seen.speed, nominal.coasting)

@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.ads.base import Positive
-from safevar_sumo.ads.reaction import Reaction, in_the_way, react, time_to_reach, unaware
+from safevar_sumo.ads.driver import Reaction, in_the_way, react, time_to_reach, unaware
 from safevar_sumo.records import Command, Nominal, Observation
 
 

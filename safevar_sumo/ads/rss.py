@@ -6,7 +6,7 @@ import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.ads.base import NotNegative, Positive
-from safevar_sumo.ads.reaction import HARDEST, Reaction, in_the_way, react, unaware
+from safevar_sumo.ads.driver import HARDEST, Reaction, in_the_way, react, unaware
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
 

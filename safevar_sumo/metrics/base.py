@@ -1,4 +1,4 @@
-"""Samples of a trace, and sums over them that do not depend on how many vehicles there are."""
+"""Records of metrics, objectives and scorings, and what metrics share."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Guard, read_only_copy
-from safevar_sumo.records import FloatArray, SimulationRuns
-from safevar_sumo.study import MetricsTable
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, SimulationRuns
+from safevar_sumo.study import SAFETY_DEGREE, MetricsTable
 
 ROUNDING = 1e-6
-"""Two times that differ by less are the same [s]."""
+"""Times with a smaller difference are equal [s]."""
 
 
-def every(step: float, interval: float | None) -> int:
-    """How many simulation steps lie between two samples that are `interval` seconds apart.
+def sampling_stride(step: float, interval: float | None) -> int:
+    """Number of simulation steps between two samples that are `interval` seconds apart; 1 without an interval.
 
     Raises
     ------
@@ -35,7 +35,7 @@ def every(step: float, interval: float | None) -> int:
 
 
 def total(samples: FloatArray) -> FloatArray:
-    """Sum over the first axis, one after the other: numpy's own sum would group by the shape of the array."""
+    """Sum over the first axis in order: numpy's own sum groups by the shape of the array, so results would depend on N."""
     return np.asarray(np.add.accumulate(samples, axis=0)[-1]) if len(samples) else np.zeros(samples.shape[1:])
 
 
@@ -45,22 +45,22 @@ Function = Callable[[SimulationRuns, MetricsTable], FloatArray]
 
 
 class MetricFacts(Struct, frozen=True, kw_only=True):
-    """What tables and figures need to know of a metric.
+    """Facts on a metric for tables and figures.
 
     Attributes
     ----------
     name
-        Its column in results, and what a study calls it.
+        Its column in results, and its name in a study.
     title, unit
-        As tables head it.
+        Title and unit in tables.
     more_is_unsafe
-        Whether a larger value is the more unsafe one.
+        Whether larger values are more unsafe.
     over_collisions
-        Whether solutions that are collisions count.
+        Whether colliding solutions count.
     description
-        In one sentence.
+        One sentence.
     head
-        What stands above a column, by default title and unit.
+        Heading of a column, by default title and unit.
     """
 
     name: Name
@@ -78,24 +78,24 @@ class MetricFacts(Struct, frozen=True, kw_only=True):
 
 
 class Metric(MetricFacts, frozen=True, kw_only=True):
-    """A metric: `function` takes drives and thresholds and returns an array of shape (N,), NaN where it is undefined.
+    """A metric: `function` takes N simulation runs and thresholds and returns an array of shape (N,), NaN where it is undefined.
 
-    Element i of it depends on drive i alone, to the bit.
+    Element i depends on run i alone, to the bit.
     """
 
     function: Function
 
-    def __call__(self, drives: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-        return self.function(drives, thresholds)
+    def __call__(self, runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+        return self.function(runs, thresholds)
 
     @property
     def facts(self) -> MetricFacts:
-        """The record without the function, as results keep it."""
+        """The record without the function, for results."""
         return MetricFacts(**{name: getattr(self, name) for name in MetricFacts.__struct_fields__})
 
 
 def foreign_metric(metric: Any, guard: Guard) -> Metric:
-    """A metric from outside the package: its record checked, its function given copies and its result checked.
+    """A metric from outside: its record and its results are checked, its function gets read-only copies.
 
     Raises
     ------
@@ -106,15 +106,59 @@ def foreign_metric(metric: Any, guard: Guard) -> Metric:
     if not isinstance(metric, Metric):
         raise InputError(guard.source, f"{guard.name} is of type {type(metric).__name__}, not Metric", legal)
     if not callable(metric.function):
-        raise InputError(guard.source, f"{guard.name}: function = {metric.function!r}", "a function of drives and thresholds")
+        raise InputError(guard.source, f"{guard.name}: function = {metric.function!r}", "a function of simulation runs and thresholds")
     try:
         facts = msgspec.convert(msgspec.to_builtins(metric.facts), MetricFacts)
     except (msgspec.ValidationError, TypeError) as error:
         raise InputError(guard.source, f"{guard.name}: {error}", legal) from None
 
-    def checked(drives: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-        given = guard.call(facts.name, metric.function, read_only_copy(drives), thresholds)
-        return guard.numbers(facts.name, "values", np.asarray(given) if isinstance(given, list) else given, (len(drives.outcome),),
-                             undefined=True)
+    def checked(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+        values = guard.call(facts.name, metric.function, read_only_copy(runs), thresholds)
+        return guard.numbers(facts.name, "values", values, (len(runs.outcome),), undefined=True)
 
     return Metric(**{name: getattr(facts, name) for name in MetricFacts.__struct_fields__}, function=checked)
+
+
+class Objective(Struct, frozen=True, kw_only=True):
+    """A column of results that is minimised, or `maximised`."""
+
+    name: str
+    title: str
+    unit: str
+    maximised: bool = False
+
+    @classmethod
+    def of(cls, metric: MetricFacts) -> Objective:
+        """The objective that makes a metric as unsafe as possible."""
+        if metric.name == SAFETY_DEGREE:
+            return F_SAFE
+        return cls(name=metric.name, title=metric.title, unit=metric.unit, maximised=metric.more_is_unsafe)
+
+    @property
+    def sign(self) -> float:
+        """Factor on its values that makes less better."""
+        return -1.0 if self.maximised else 1.0
+
+
+class Scoring(Struct, frozen=True, kw_only=True):
+    """The metrics of a study and the objectives of its searches; results keep it beside the study."""
+
+    metrics: tuple[MetricFacts, ...]
+    objectives: tuple[Objective, ...]
+
+    def values(self, evaluations: Evaluations) -> FloatArray:
+        """The objectives, all to be minimised, shape (M, objectives)."""
+        return np.stack([objective.sign * evaluations.column(objective.name) for objective in self.objectives], axis=1)
+
+    def valid(self, evaluations: Evaluations) -> BoolArray:
+        """Where the simulation succeeded and every objective is defined; shape (M,)."""
+        return np.asarray(evaluations.valid & np.isfinite(self.values(evaluations)).all(axis=1))
+
+    def metric(self, name: str) -> MetricFacts:
+        """A metric by name."""
+        return next(metric for metric in self.metrics if metric.name == name)
+
+
+F_SAFE = Objective(name="f_safe", title="safety degree", unit="m, -m/s")
+F_DIFF = Objective(name="f_diff", title="largest change", unit="fraction")
+F_NUM_DIFF = Objective(name="f_num_diff", title="characteristics changed", unit="-")

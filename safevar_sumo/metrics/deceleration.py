@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from safevar_sumo.metrics.base import Metric, every, total
+from safevar_sumo.metrics.base import Metric, sampling_stride, total
 from safevar_sumo.records import STANDSTILL, FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 
 
-def average_deceleration(drives: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Mean loss of speed per time over the samples in which the brake is commanded and the vehicle moves.
 
     In m/s^2, positive when slowing down; shape (N,); NaN for a vehicle that never braked.
     """
-    stride = every(drives.trace.step, thresholds.sampling_interval)
-    interval = stride * drives.trace.step
-    speed, active = drives.trace.speed[::stride], drives.trace.active[::stride]
-    braking = active & (drives.trace.brake[::stride] > 0) & (np.abs(speed) > STANDSTILL)
+    stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
+    interval = stride * runs.trace.step
+    speed, active = runs.trace.speed[::stride], runs.trace.active[::stride]
+    braking = active & (runs.trace.brake[::stride] > 0) & (np.abs(speed) > STANDSTILL)
     lost = (speed[:-1] - speed[1:]) / interval
     counts = braking[1:]
     number = np.count_nonzero(counts, axis=0)

@@ -9,15 +9,15 @@ from safevar_sumo.records import FloatArray, SimulationRuns
 from safevar_sumo.study import SAFETY_DEGREE, MetricsTable
 
 
-def safety_degree(drives: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+def safety_degree(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Least separation during the encounter [m, > 0], or minus the speed of the collision [m/s, <= 0].
 
     Shape (N,); NaN where there was neither an encounter nor a collision.
     """
-    counts = drives.trace.active & drives.encounter.in_conflict
-    least = np.min(np.where(counts, drives.encounter.separation, np.inf), axis=0)
+    counts = runs.trace.active & runs.encounter.in_conflict
+    least = np.min(np.where(counts, runs.encounter.separation, np.inf), axis=0)
     least = np.where(np.isfinite(least), least, np.nan)
-    return np.where(np.isnan(drives.collision_speed), least, -drives.collision_speed)
+    return np.where(np.isnan(runs.collision_speed), least, -runs.collision_speed)
 
 
 SAFETY_DEGREE_METRIC = Metric(

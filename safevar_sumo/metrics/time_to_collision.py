@@ -4,42 +4,42 @@ from __future__ import annotations
 
 import numpy as np
 
-from safevar_sumo.metrics.base import Metric, every, total
+from safevar_sumo.metrics.base import Metric, sampling_stride, total
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 
 
-def time_to_collision(drives: SimulationRuns) -> FloatArray:
+def time_to_collision(runs: SimulationRuns) -> FloatArray:
     """TTC(t) = L_s / v_L, distance projected over closing speed [s]; shape (T, N).
 
     Infinite while not closing, out of the encounter, and after the vehicle first stood still again.
     """
-    moved = np.logical_or.accumulate(drives.trace.speed > STANDSTILL, axis=0)
-    stood = np.logical_or.accumulate(moved & (drives.trace.speed <= STANDSTILL), axis=0)
-    closing, distance = drives.encounter.closing_speed, drives.encounter.distance
-    counts = drives.trace.active & drives.encounter.in_conflict & ~stood & (closing > 0) & (distance >= 0)
+    moved = np.logical_or.accumulate(runs.trace.speed > STANDSTILL, axis=0)
+    stood = np.logical_or.accumulate(moved & (runs.trace.speed <= STANDSTILL), axis=0)
+    closing, distance = runs.encounter.closing_speed, runs.encounter.distance
+    counts = runs.trace.active & runs.encounter.in_conflict & ~stood & (closing > 0) & (distance >= 0)
     return np.divide(distance, closing, out=np.full_like(distance, np.inf), where=counts)
 
 
-def time_exposed(drives: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+def time_exposed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s]; shape (N,), NaN on a collision."""
-    critical, interval = _critical(drives, thresholds)
+    critical, interval = _critical(runs, thresholds)
     exposed = np.round(np.count_nonzero(np.isfinite(critical), axis=0) * interval, TIME_DECIMALS)
-    return np.where(np.isnan(drives.collision_speed), exposed, np.nan)
+    return np.where(np.isnan(runs.collision_speed), exposed, np.nan)
 
 
-def time_integrated(drives: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+def time_integrated(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """TIT* = sum of (TTC* - TTC(t)) dt over the same samples [s^2]; shape (N,), NaN on a collision."""
-    critical, interval = _critical(drives, thresholds)
+    critical, interval = _critical(runs, thresholds)
     deficit = np.where(np.isfinite(critical), thresholds.ttc_threshold - critical, 0.0)
-    return np.where(np.isnan(drives.collision_speed), total(deficit) * interval, np.nan)
+    return np.where(np.isnan(runs.collision_speed), total(deficit) * interval, np.nan)
 
 
-def _critical(drives: SimulationRuns, thresholds: MetricsTable) -> tuple[FloatArray, float]:
+def _critical(runs: SimulationRuns, thresholds: MetricsTable) -> tuple[FloatArray, float]:
     """TTC where it is critical, infinite elsewhere, at the samples; and the time between two samples."""
-    stride = every(drives.trace.step, thresholds.sampling_interval)
-    ttc = time_to_collision(drives)[::stride]
-    return np.where(ttc <= thresholds.ttc_threshold, ttc, np.inf), stride * drives.trace.step
+    stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
+    ttc = time_to_collision(runs)[::stride]
+    return np.where(ttc <= thresholds.ttc_threshold, ttc, np.inf), stride * runs.trace.step
 
 
 TET = Metric(

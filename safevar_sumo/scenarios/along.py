@@ -6,9 +6,8 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from safevar_sumo.scenarios.ahead import Ahead, BehindSomebody, right_of
 from safevar_sumo.scenarios.base import Actors, PreCrash, Roads
-from safevar_sumo.scenarios.euro_ncap import BODIES, KMH, Body, Range, Walk
+from safevar_sumo.scenarios.euro_ncap import BODIES, KMH, Ahead, BehindSomebody, Body, Range, Walk, lateral_of
 
 PROTOCOL = Range(10, 60, (50, 10, 25, 75, 90))
 
@@ -63,4 +62,4 @@ class Along(BehindSomebody, frozen=True, kw_only=True):
     def _ahead(self) -> Ahead:
         walk = Walk(0.0, self.target_speed * KMH, self.acceleration_distance)
         gap = self.speed * KMH * self.time_to_impact - walk.travelled(self.time_to_impact)
-        return Ahead(BODIES[self.target], gap, right_of(self.impact_location, self.vut_width), walk.pace)
+        return Ahead(BODIES[self.target], gap, lateral_of(self.impact_location, self.vut_width), walk.pace)

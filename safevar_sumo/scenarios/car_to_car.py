@@ -8,9 +8,8 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.scenarios.ahead import Ahead, BehindSomebody, right_of
 from safevar_sumo.scenarios.base import Actors, PreCrash, Roads
-from safevar_sumo.scenarios.euro_ncap import KMH, Body, Range
+from safevar_sumo.scenarios.euro_ncap import KMH, Ahead, BehindSomebody, Body, Range, lateral_of
 
 CAR = Body(4.023, 1.712)
 """Euro NCAP's global vehicle target [m]."""
@@ -82,7 +81,7 @@ class CarToCar(BehindSomebody, frozen=True, kw_only=True):
 
     @property
     def _ahead(self) -> Ahead:
-        return Ahead(CAR, self._gap, right_of(self.impact_location, self.vut_width), self._speed_at)
+        return Ahead(CAR, self._gap, lateral_of(self.impact_location, self.vut_width), self._speed_at)
 
     @property
     def _gap(self) -> float:

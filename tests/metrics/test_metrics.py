@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import METRICS, time_to_collision
-from safevar_sumo.metrics.scoring import F_DIFF, F_SAFE, Objective, Scoring
+from safevar_sumo.metrics import F_DIFF, F_SAFE, METRICS, Objective, Scoring, time_to_collision
 from safevar_sumo.records import Encounter, Evaluations, Outcome, SimulationRuns, Trace
 from safevar_sumo.study import MetricsTable
 

@@ -1,31 +1,31 @@
-"""Whether somebody is, or will be, in the way of a vehicle that keeps its lane."""
+"""What reference drivers share: perception of an obstacle in their way, reaction to a danger, and car following."""
 
 from __future__ import annotations
 
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from msgspec import Meta
+from msgspec import Meta, Struct
 
 from safevar_sumo.ads.pedals import Trim, pedals, trim
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 SLOWEST_CLOSING = 0.1
-"""A gap that shrinks more slowly counts as if it shrank so fast [m/s]: everything stays finite."""
+"""Lower bound of a positive closing speed [m/s]; keeps times finite."""
 FARTHEST = 1e6
-"""Nobody is farther away [m]: everything stays finite."""
+"""Upper bound of gaps [m]; keeps times finite."""
 
 
 def time_to_reach(seen: Observation) -> FloatArray:
-    """Time to collision, gap over closing speed [s]; very long while the gap does not shrink."""
+    """Time to collision, gap over closing speed [s], shape (N,); `FARTHEST` while the gap does not shrink."""
     gap = np.minimum(np.maximum(seen.gap, 0.0), FARTHEST)
     return np.where(seen.closing_speed > 0, gap / np.maximum(seen.closing_speed, SLOWEST_CLOSING), FARTHEST)
 
 
 def in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> BoolArray:
-    """Whether somebody detected, not past yet, is within `corridor` of the lane's middle [m], or will be when he is reached.
+    """Whether a detected obstacle ahead is within `corridor` of the lane's middle [m], or will be when the vehicle gets there.
 
-    Nobody is detected beyond a gap of `reach` times the visibility [m].
+    `reach` is the sensors' range in clear weather [m].
     """
     detected = np.isfinite(seen.gap) & (seen.gap <= reach * seen.visibility) & (seen.gap > 0)
     lateral = np.where(detected, seen.lateral, FARTHEST)
@@ -34,7 +34,7 @@ def in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> Boo
 
 
 def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
-    """Whether somebody detected, not past yet, is within `corridor` of the lane's middle [m] or on the way into it, and not driving off."""
+    """Whether a detected obstacle ahead that does not move away is within `corridor` of the lane's middle [m] or on its way there."""
     ahead = np.isfinite(seen.gap) & (seen.gap > 0) & (seen.closing_speed >= 0)
     return np.asarray(ahead & ((np.abs(seen.lateral) <= corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0)))
 
@@ -43,13 +43,13 @@ GRAVITY = 9.81  # m/s^2
 HARDEST = 0.774 * GRAVITY
 """Deceleration of the competent and careful driver [m/s^2] (UN R157, annex 4, appendix 3)."""
 JERK = 12.65
-"""By how much it rises a second [m/s^3] (ibid.)."""
+"""Rise of that deceleration per second [m/s^3] (ibid.)."""
 CRUISE_GAIN = 1.0
-"""Acceleration per error of the speed that is held [1/s]."""
+"""Acceleration per error of the speed to hold [1/s]."""
 TIME_ROUNDING = 1e-9
-"""Times that differ by less are the same [s]."""
+"""Times with a smaller difference are equal [s]."""
 Start = tuple[Annotated[float, Meta(ge=0, le=1)], ...]
-"""Throttle from the run's start on, one value a simulation step [-]: another driver's start, replayed."""
+"""Throttle in the run's first steps, one value per step [-]: the replayed start of another driver."""
 
 
 class Reaction(NamedTuple):
@@ -66,33 +66,33 @@ class Reaction(NamedTuple):
 
 
 def unaware(n: int, nominal: Nominal, step: float) -> Reaction:
-    """Nobody has seen a danger yet."""
+    """The state before a danger appears."""
     return Reaction(nominal, step, None, np.full(n, -1.0), np.zeros(n))
 
 
 def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration: FloatArray, *, reaction_time: float, corridor: float,
-          jerk: float = JERK, lets_go: float = 0.0, cruise_speed: float | None = None, start: Start = (),
+          jerk: float = JERK, coasting_deceleration: float = 0.0, cruise_speed: float | None = None, start: Start = (),
           following: FloatArray | float = np.inf) -> tuple[Command, Reaction]:
-    """Pedals of drivers in a danger, which passes when nobody is ahead and nearing, or stands in the way.
+    """Pedals of drivers who may face a danger; it is over when no obstacle ahead comes nearer or blocks the way.
 
     Parameters
     ----------
     danger
-        Whether it is seen now; shape (N,).
+        Whether the driver sees a danger now; shape (N,).
     deceleration
-        What is braked with once they react, shape (N,) [m/s^2]; it rises at `jerk` [m/s^3].
+        Braking after the reaction time, shape (N,) [m/s^2]; it rises at `jerk` [m/s^3].
     reaction_time
-        From the first sight of the danger to the brake [s].
+        Time from the first sight of the danger to braking [s].
     corridor
-        Half the width of their way [m].
-    lets_go
-        Deceleration while they react [m/s^2].
+        Half the width of the way [m].
+    coasting_deceleration
+        Deceleration during the reaction time [m/s^2].
     cruise_speed
-        Speed that they hold [m/s], by default the one that they started with.
+        Speed to hold [m/s], by default the initial speed.
     start
-        Throttle that they start with as long as they see no danger.
+        Throttle in the first steps without a danger.
     following
-        Acceleration that they do not exceed, shape (N,) [m/s^2]: of those who follow somebody.
+        Upper limit of the acceleration when following a leader, shape (N,) [m/s^2].
     """
     held = reaction.held
     if held is None:
@@ -105,10 +105,45 @@ def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration
     brakes = waited >= reaction_time - TIME_ROUNDING
     asked = np.where(brakes, np.minimum(reaction.asked + jerk * reaction.step, deceleration), 0.0)
     holding = np.minimum(CRUISE_GAIN * (held[0] - seen.speed), following)
-    acceleration = np.where(brakes, -asked, np.where((waited >= 0) & (lets_go > 0), -lets_go, holding))
+    acceleration = np.where(brakes, -asked, np.where((waited >= 0) & (coasting_deceleration > 0), -coasting_deceleration, holding))
     command = pedals(reaction.nominal, seen.speed, acceleration, held[1])
     sample = round(seen.time / reaction.step)
     if sample < len(start):
         starts = waited < 0
         command = Command(np.where(starts, start[sample], command.throttle), np.where(starts, 0.0, command.brake))
     return command, reaction._replace(held=held, waited=waited, asked=asked)
+
+
+class FollowingMemory(NamedTuple):
+    """The original vehicle; time between calls [s]; trim of the pedals, of the first look."""
+
+    nominal: Nominal
+    step: float
+    trimmed: Trim | None
+
+
+class Following(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of a car-following model as a driver: an acceleration from gap and speeds, through the pedals.
+
+    An obstacle beside the way is no leader.
+
+    Parameters
+    ----------
+    corridor
+        Half the width of its way [m].
+    """
+
+    corridor: float
+
+    def start(self, n: int, nominal: Nominal, step: float) -> FollowingMemory:
+        return FollowingMemory(nominal, step, None)
+
+    def drive(self, seen: Observation, memory: FollowingMemory) -> tuple[Command, FollowingMemory]:
+        trimmed = trim(memory.nominal, seen) if memory.trimmed is None else memory.trimmed
+        gap = np.where(in_the_way(seen, self.corridor), seen.gap, FARTHEST)
+        wanted = self.acceleration_at(gap, seen.speed, seen.obstacle_speed)
+        return pedals(memory.nominal, seen.speed, wanted, trimmed), memory._replace(trimmed=trimmed)
+
+    def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
+        """Acceleration asked for [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""
+        raise NotImplementedError
