@@ -12,9 +12,9 @@ import numpy as np
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.reference.agreement import Agreement, agreement
 from safevar_sumo.reference.fit import LARGEST, Search, check_bound, original_cost, reference_cost, value_of, with_values
 from safevar_sumo.reference.rows import ReferenceData
+from safevar_sumo.reference.validation import Agreement, agreement
 from safevar_sumo.study import SAFETY_DEGREE, FreeParameter, Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet

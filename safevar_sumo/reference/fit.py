@@ -11,8 +11,8 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.reference.agreement import Agreement
 from safevar_sumo.reference.rows import ReferenceData
+from safevar_sumo.reference.validation import Agreement
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import FitTable, Study, invalid
 from safevar_sumo.sumo.system import models_of

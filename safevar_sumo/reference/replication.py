@@ -12,8 +12,21 @@ import scipy
 
 from safevar_sumo.analysis.research_questions.case import NSGA2, Case, collided
 from safevar_sumo.records import FloatArray
-from safevar_sumo.reference.beside import HERE, THERE, Beside, Pairs, paired, tables_beside
-from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, RULES, Conclusion, conclusions
+from safevar_sumo.reference.conclusions import (
+    DIFFERS,
+    DIRECTION,
+    HERE,
+    HOLDS,
+    OPEN,
+    RULES,
+    THERE,
+    Beside,
+    Conclusion,
+    Pairs,
+    conclusions,
+    paired,
+    tables_beside,
+)
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.study import SAFETY_DEGREE
 

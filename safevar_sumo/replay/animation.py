@@ -1,17 +1,168 @@
-"""A comparison that moves: as a gif, a film, or a page that plays in a browser."""
+"""A comparison that moves: as a gif, a film, or a page that plays in a browser; and the pictures of pixels that these are made of."""
 
 from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.replay.comparison import Comparison
-from safevar_sumo.replay.raster import pictures
-from safevar_sumo.replay.scene import Scene, scene_of
+from safevar_sumo.records import FloatArray
+from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison
+from safevar_sumo.replay.scene import SEAM_WIDTH, Body, Scene, scene_of
+from safevar_sumo.sumo.film import Lane
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+    from PIL.ImageDraw import ImageDraw
+
+Points = list[tuple[float, float]]
+
+WIDTH = 880
+"""Of a picture [pixels]."""
+FINER = 2
+"""Drawn so much larger, then made smaller: smooth edges."""
+COLUMNS = (164, 250, 340, 450)
+"""Where the words begin [pixels]."""
+PANEL = 62
+"""Height of the words above the road [pixels]."""
+GROUND, ROAD, SEAM, PATH, WHITE, INK, FAINT = "#eef0ec", "#9aa1a9", "#e8eaec", "#cfd3cf", "#ffffff", "#1d2329", "#5d666f"
+VEHICLES = {ORIGINAL: "#0072b2", CHANGED: "#d55e00"}
+OTHER, PERSON, BRAKE = "#3f464d", "#1d2329", "#e60000"
+STRIPE = 0.5
+"""Length of a crossing's stripe and of the space between two [m]."""
+
+
+def pictures(scene: Scene, stride: int) -> Iterator[Image]:
+    """Every `stride`-th sample of a scene, and the last one."""
+    canvas = _Canvas(scene)
+    for sample in [*range(0, scene.length - 1, stride), scene.length - 1]:
+        yield canvas.picture(sample)
+
+
+class _Canvas:
+    """Draws the samples of one scene."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene, self._scale = scene, FINER * WIDTH / scene.view.width
+        self._size = (FINER * WIDTH, FINER * PANEL + round(self._scale * scene.view.height / 2 / FINER) * 2 * FINER)
+
+    def picture(self, sample: int) -> Image:
+        from PIL import Image, ImageDraw
+
+        image = Image.new("RGB", self._size, GROUND)
+        draw = ImageDraw.Draw(image, "RGBA")
+        for kind in ("area", "path", "road", "crossing"):
+            for lane in self._scene.road:
+                if lane.kind == kind:
+                    self._lane(draw, lane, sample)
+        there = [body for body in self._scene.bodies if not np.isnan(body.x[sample])]
+        for body in sorted(there, key=lambda one: (one.is_vut, one.row)):
+            self._body(draw, body, sample)
+        for body in there:
+            if body.is_vut and body.row == ORIGINAL:  # once more, over a changed vehicle that hides it
+                draw.polygon(self._pixels(body.corners(sample), sample), outline=VEHICLES[ORIGINAL], width=2 * FINER)
+        self._scale_marks(draw, sample)
+        draw.rectangle((0, 0, self._size[0], FINER * PANEL), fill=WHITE)
+        self._words(draw, sample)
+        return image.resize((WIDTH, self._size[1] // FINER), Image.Resampling.BOX)
+
+    def _pixels(self, points: FloatArray, sample: int) -> Points:
+        view = self._scene.view
+        grid = FINER / self._scale  # a following camera moves by whole pixels: what stands still stays as sharp as it is
+        x, y = points[:, 0] - np.round(view.left[sample] / grid) * grid, points[:, 1] - view.bottom
+        return list(zip((x * self._scale).tolist(), (self._size[1] - y * self._scale).tolist(), strict=True))
+
+    def _scale_marks(self, draw: ImageDraw, sample: int) -> None:
+        """A mark at every ten metres from where the front bumper sets off."""
+        view = self._scene.view
+        for mark in self._scene.tens(sample):
+            (x, y), = self._pixels(np.array([[mark, view.bottom]]), sample)
+            draw.line((x, y - 12 * FINER, x, y), fill=FAINT, width=FINER)
+            self._word(draw, (round(x / FINER) + 4, round(y / FINER) - 16), f"{mark:g} m", FAINT, 12)
+
+    def _lane(self, draw: ImageDraw, lane: Lane, sample: int) -> None:
+        if lane.kind == "area":
+            draw.polygon(self._pixels(lane.line, sample), fill=PATH)
+            return
+        if lane.kind == "crossing":
+            for stripe in stripes(lane):
+                draw.polygon(self._pixels(stripe, sample), fill=WHITE)
+            return
+        self._strip(draw, lane.line, lane.width, SEAM if lane.kind == "road" else PATH, sample)
+        if lane.kind == "road":
+            self._strip(draw, lane.line, lane.width - SEAM_WIDTH, ROAD, sample)
+
+    def _strip(self, draw: ImageDraw, line: FloatArray, width: float, colour: str, sample: int) -> None:
+        for start, end in pairwise(line):
+            draw.polygon(self._pixels(quad(start, end, width), sample), fill=colour)
+
+    def _body(self, draw: ImageDraw, body: Body, sample: int) -> None:
+        if body.is_person:
+            radius = max(body.length, body.width) / 2 * self._scale
+            (x, y), = self._pixels(np.array([[body.x[sample], body.y[sample]]]), sample)
+            draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=PERSON, outline=WHITE, width=FINER)
+            return
+        colour = VEHICLES[body.row] if body.is_vut else OTHER
+        corners = body.corners(sample)
+        see_through = "99" if body.is_vut and body.row == ORIGINAL and len(self._scene.moments) > 1 else "e6"
+        draw.polygon(self._pixels(corners, sample), fill=colour + see_through, outline=colour, width=2 * FINER)
+        window = corners[[0, 1]] * [[0.72], [0.72]] + corners[[3, 2]] * 0.28
+        back = corners[[0, 1]] * 0.56 + corners[[3, 2]] * 0.44
+        draw.polygon(self._pixels(np.concatenate([window, back[::-1]]), sample), fill="#ffffff90")
+        if body.is_vut and self._brakes(body.row, sample):
+            for inner, outer in ((3, 2), (2, 3)):
+                side = corners[outer] - corners[inner]
+                light = np.array([corners[inner], corners[inner] + 0.3 * side])
+                forward = (corners[0] - corners[3]) / body.length * 0.28
+                draw.polygon(self._pixels(np.concatenate([light, light[::-1] + forward]), sample), fill=BRAKE)
+
+    def _brakes(self, row: int, sample: int) -> bool:
+        trace = self._scene.comparison.film.drives.trace
+        return bool(trace.brake[min(sample, self._scene.moments[row].end), row] > 0)
+
+    def _words(self, draw: ImageDraw, sample: int) -> None:
+        """Time, and for each vehicle its speed and distance, and at last how it ended."""
+        trace = self._scene.comparison.film.drives.trace
+        self._word(draw, (12, 14), f"{sample * self._scene.step:.2f} s", INK, 26)
+        for row in self._scene.comparison.rows:
+            told = self._scene.moments[row]
+            at = min(sample, told.end)
+            gap = trace.gap[at, row]
+            over = sample >= (told.end if told.nearest is None else told.nearest)
+            state = self._scene.comparison.verdict(row) if over else "brakes" if self._brakes(row, at) else ""
+            y = 8 + 26 * row
+            draw.rectangle((FINER * 132, FINER * (y + 3), FINER * 154, FINER * (y + 17)), fill=VEHICLES[row])
+            told_gap = f"gap {max(gap, 0):.1f} m" if np.isfinite(gap) else ""
+            words = (self._scene.comparison.name(row), f"{trace.speed[at, row]:.1f} m/s", told_gap, state)
+            for x, word in zip(COLUMNS, words, strict=True):
+                self._word(draw, (x, y), word, INK, 17)
+
+    def _word(self, draw: ImageDraw, place: tuple[int, int], text: str, colour: str, size: int) -> None:
+        from PIL import ImageFont
+
+        draw.text((FINER * place[0], FINER * place[1]), text, fill=colour, font=ImageFont.load_default(FINER * size))
+
+
+def quad(start: FloatArray, end: FloatArray, width: float) -> FloatArray:
+    """A straight strip from start to end, shape (4, 2)."""
+    along = end - start
+    side = np.array([-along[1], along[0]]) / (np.hypot(*along) or 1.0) * width / 2
+    return np.array([start + side, end + side, end - side, start - side])
+
+
+def stripes(lane: Lane) -> Iterator[FloatArray]:
+    for start, end in pairwise(lane.line):
+        along = (end - start) / (np.hypot(*(end - start)) or 1.0)
+        for place in np.arange(STRIPE / 2, np.hypot(*(end - start)) - STRIPE, 2 * STRIPE):
+            yield quad(start + along * place, start + along * (place + STRIPE), lane.width)
+
 
 SECONDS_PER_PICTURE = 0.1
 """Of a gif; it knows hundredths of a second only."""

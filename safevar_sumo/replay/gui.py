@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from safevar_sumo.replay.animation import OTHER, PERSON, VEHICLES, quad, stripes
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison
-from safevar_sumo.replay.raster import OTHER, PERSON, VEHICLES, quad, stripes
 from safevar_sumo.replay.scene import Scene, scene_of
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.film import Lane

@@ -10,8 +10,7 @@ import numpy as np
 
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL
-from safevar_sumo.replay.raster import SEAM_WIDTH
-from safevar_sumo.replay.scene import TEN, Body, Scene
+from safevar_sumo.replay.scene import SEAM_WIDTH, TEN, Body, Scene
 
 if TYPE_CHECKING:
     from jinja2 import Environment

@@ -13,6 +13,8 @@ from safevar_sumo.replay.comparison import CHANGED, Comparison, Moments, moments
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.film import Film, Lane, Track
 
+SEAM_WIDTH = 0.12
+"""Of the line between two lanes, as it is drawn [m]."""
 MARGIN = 4.0
 """What is shown around everybody [m]."""
 LEAST_HEIGHT = 11.0

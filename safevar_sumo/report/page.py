@@ -1,23 +1,139 @@
-"""The page: which sections it has, what each study gives to them, and the template that they are set in."""
+"""The page: its sections, the research questions in it, the commands that make its numbers again, and the template."""
 
 from __future__ import annotations
 
+import json
+import re
+import shlex
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
+import msgspec
+import numpy as np
 from markupsafe import Markup
 
 from safevar_sumo.analysis.evaluator import Progress, silent
+from safevar_sumo.analysis.options import RUN
+from safevar_sumo.analysis.research_questions.answer import answer
+from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
+from safevar_sumo.analysis.research_questions.figures import draw
+from safevar_sumo.analysis.research_questions.layout import Bold, Table, lay_out
 from safevar_sumo.errors import InputError, did_you_mean
+from safevar_sumo.replay.comparison import raised
 from safevar_sumo.replay.page import environment, player_parts
-from safevar_sumo.report.findings import causes, explanations, necessity, replays
+from safevar_sumo.report.findings import best_of, causes, explanations, necessity, replays, spread
 from safevar_sumo.report.input import ReportInput, gather
 from safevar_sumo.report.limits import LIMITS
-from safevar_sumo.report.questions import figures, front, tables
-from safevar_sumo.report.trust import reproduce, trust
-from safevar_sumo.report.verdict import tested, verdict
+from safevar_sumo.report.svg import Dot, scatter
+from safevar_sumo.report.verdict import tested, trust, verdict
+from safevar_sumo.study import Study, load_study, study_names
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DIGITS = re.compile(r"(\d\.\d\d)\d+")
+"""Of a number in a picture, what is too fine to be seen."""
+DOTS = 150
+"""Points of a scatter chart, at the most."""
+TEXT = {"svg.fonttype": "none", "svg.hashsalt": "safevar_sumo", "font.family": ["sans-serif"]}
+
+
+def tables(cases: Sequence[Case]) -> list[dict[str, Any]]:
+    """Every table, as the template takes it; nothing where no question can be answered."""
+    try:
+        answers = answer(cases)
+    except Unanswerable as error:
+        return [{"title": "RQ1 to RQ3", "heads": (), "spans": (), "rows": [], "labels": 0, "notes": [f"{error.source}: {error.problem}."]}]
+    return [_plain(table) for one in answers for table in lay_out(one)]
+
+
+def _plain(table: Table) -> dict[str, Any]:
+    rows = [[{"text": raised(str(cell)), "bold": isinstance(cell, Bold)} for cell in row] for row in table.rows]
+    spans = [("", table.labels), *((raised(name), width) for name, width in table.spans)] if table.spans else []
+    heads, notes = ([raised(text) for text in texts] for texts in (table.heads, table.notes))
+    return {"title": raised(table.title), "heads": heads, "spans": spans, "rows": rows, "labels": table.labels, "notes": notes}
+
+
+def figures(cases: Sequence[Case]) -> list[dict[str, str]]:
+    """Every figure as a picture that stands in the page."""
+    try:
+        drawn, _ = draw(cases)
+    except Unanswerable:
+        return []
+    return [{"name": name, "alt": _words(figure), "source": _inline(figure)} for name, figure in drawn.items()]
+
+
+def _words(figure: Figure) -> str:
+    axis = figure.axes[0]
+    return f"{figure.get_suptitle()}: {axis.get_ylabel() or 'values'} over {axis.get_xlabel() or 'characteristics'}".replace("\n", " ")
+
+
+def _inline(figure: Figure) -> str:
+    import matplotlib
+
+    buffer = BytesIO()
+    with matplotlib.rc_context(TEXT):  # type: ignore[arg-type]
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    picture = DIGITS.sub(r"\1", buffer.getvalue().decode())
+    return "data:image/svg+xml," + quote(picture, safe=" =:/;,()'!?@&+$*")
+
+
+def front(material: ReportInput, shown: Sequence[str]) -> Markup:
+    """The solutions that no other one beats, by largest change and safety degree; those that are replayed lead there."""
+    rows = [row for row in material.solutions.values() if not np.isnan([row["f_safe"], row["f_diff"]]).any()]
+    best = best_of(rows)
+    kept = [best[place] for place in spread(len(best), DOTS)] + [row for row in rows if row["handle"] in shown]
+    dots = {row["handle"]: _dot(material, row, row["handle"] in shown) for row in kept}
+    return scatter(f"{material.case.name}: safety degree over the largest change of the solutions that no other beats",
+                   list(dots.values()), "largest change [% of the original]", "safety degree [m, or -m/s]", 0.0, "collision below")
+
+
+def _dot(material: ReportInput, row: dict[Any, Any], is_shown: bool) -> Dot:
+    words = (f"{row['handle']}: {row['outcome']}, safety degree {row['f_safe']:.2f}, largest change {row['f_diff']:.0%}, "
+             f"{row['f_num_diff']} changed")
+    look = "hit" if row["outcome"] == "collision" else "miss"
+    return Dot(100 * row["f_diff"], row["f_safe"], words, look, material.anchor("replay", row["handle"]) if is_shown else "")
+
+
+def reproduce(materials: Sequence[ReportInput], parts: Sequence[str]) -> list[dict[str, str]]:
+    """Commands that make the numbers of this page again."""
+    places = " ".join(shlex.quote(str(material.place)) for material in materials)
+    commands = []
+    for material in materials:
+        place, study = shlex.quote(str(material.place)), material.case.study
+        now = " --as-it-is-now" if material.changed else ""
+        if material.case.has_runs:
+            commands.append({"what": f"The study {study.name}, as its manifest.json records it whole, into another directory",
+                             "command": _again(study, f"{material.place}-again", material.place)})
+        commands += [{"what": f"The part {part}", "command": material.options[part].command_line(str(material.place), material.point) + now}
+                     for part in parts]
+        if material.point:
+            continue
+        commands.append({"what": "A replay, with figure and animation",
+                         "command": f"{RUN} simulate {place} --most-severe --plot it.png --animate it.html{now}"})
+    if any(material.point for material in materials):
+        return commands
+    commands.append({"what": "The tables of RQ1 to RQ3", "command": f"{RUN} tables {places}"})
+    commands.append({"what": "The figures", "command": f"{RUN} figures {places} --out figures"})
+    return commands
+
+
+def _again(study: Study, out: str, place: Path) -> str:
+    """What carries a study out: the command where it is a shipped one with other options, else what the results record of it."""
+    search = study.search
+    if study.name in study_names():
+        options = {name: getattr(search, name) for name in ("seed", "runs", "evaluations", "algorithms")}
+        shipped = load_study(study.name)
+        if msgspec.structs.replace(shipped, search=msgspec.structs.replace(shipped.search, **options), origin=study.origin) == study:
+            told = {**options, "algorithms": shlex.quote(",".join(search.algorithms)), "out": shlex.quote(out)}
+            return " ".join([f"{RUN} study {study.name}", *(f"--{name} {value}" for name, value in told.items())])
+    script = f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(str(place))}).study, out={json.dumps(out)}, progress=True)"
+    return f"python -c {shlex.quote(script)}"
+
 
 WEB = Path(__file__).parent / "web"
 SECTIONS = {

@@ -1,7 +1,8 @@
-"""What was tested: vehicle, driving system, scenario, weather, search and versions."""
+"""What was tested, the verdict, and how far to trust it."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.analysis.explain.necessity import is_borderline
+from safevar_sumo.analysis.explain.necessity import BORDERLINE, is_borderline
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, collided
 from safevar_sumo.analysis.words import number_of
-from safevar_sumo.records import FloatArray
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.records import FloatArray, Outcome
 from safevar_sumo.reference import Totals, quoted
 from safevar_sumo.replay.comparison import number, raised
 from safevar_sumo.report.findings import Found, handle_of
@@ -250,3 +252,35 @@ def _row(one: Totals) -> dict[str, str]:
     return {"file": one.file, "vehicles": str(one.rows), "rho": decimal(one.spearman.get(SAFETY_DEGREE)),
             "error": decimal(one.mean_absolute_error.get(SAFETY_DEGREE)), "reference": str(one.reference), "here": str(one.here),
             "both": str(one.both), "recall": decimal(one.recall), "precision": decimal(one.precision)}
+
+
+NOT_MODELLED = (
+    "A search finds failures; that it finds none proves nothing about what it did not try.",
+    "One vehicle in its lane: no steering beyond lane keeping, no single wheels and axles, no suspension, no wind, no sensor "
+    "noise, no traffic beyond the scenario's own, unless the study says otherwise.",
+    "Driving system and vehicle are models: the tables below show how far they agree with published data, where there is any.",
+)
+
+
+def trust(material: ReportInput, explained: Found | None) -> dict[str, Any]:
+    """What a reader should hold against the findings of one study."""
+    case = material.case
+    rows = [{"name": name, "published": case.study.published[name], "here": case.original[name]}
+            for name in METRICS if name in case.study.published and not math.isnan(case.original[name])]
+    told = []
+    failed = int((case.evaluations["outcome"] == str(Outcome.SIMULATOR_ERROR)).sum())
+    if failed:
+        told.append(f"{failed} of {len(case.evaluations)} settings could not be simulated; they are in no result.")
+    invalid = int((case.evaluations["outcome"] == str(Outcome.INVALID_TEST)).sum())
+    if invalid:
+        told.append(f"{invalid} of {len(case.evaluations)} settings left the tolerance of a test's speed before the driving system acted: "
+                    "they are neither failures nor successes.")
+    if explained:
+        shares = [failure["robustness"] for failure in explained if failure.get("robustness") is not None]
+        if shares:
+            fragile = sum(map(is_borderline, shares))
+            told.append(f"{fragile} of {len(shares)} failures analysed are borderline: "
+                        f"fewer than {BORDERLINE:.0%} of their neighbours are unsafe too.")
+    if not rows:
+        told.append("No published values of the original vehicle are known to hold the study against.")
+    return {"published": rows, "told": told, "general": NOT_MODELLED, "agreement": agreement(material)["rows"]}

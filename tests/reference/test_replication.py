@@ -11,8 +11,7 @@ from click.testing import CliRunner, Result
 
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
-from safevar_sumo.reference.beside import paired, tables_beside
-from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, conclusions, grade
+from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, conclusions, grade, paired, tables_beside
 from safevar_sumo.reference.replication import nearness
 from safevar_sumo.reference.rows import read_reference
 from safevar_sumo.study import load_study
@@ -46,7 +45,7 @@ def sides(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rs = rows(place / "rs.csv", ("mass", "radius"), 2.0, 0)
     here = rows(place / "here.csv", ("mass", "tireFric", "radius", "max_rpm"), 1.0, 20)
     there = rows(place / "there.csv", ("maxBrakeTorque", "dragCoeff", "dampRate"), 1.5, 0)
-    for name, study, nsga2 in (("one", "sun", here), ("same", "sun", here), ("other", "sun", there), ("rain", "rain", here)):
+    for name, study, nsga2 in (("one", "sun", here), ("same", "sun", here), ("other", "sun", there), ("rain", "rain", here), ("wet", "rain", there)):
         assert typed("import", study, "--out", place / name, "--nsga2", nsga2, "--rs", rs).exit_code == 0
     return place
 
@@ -115,7 +114,7 @@ def test_the_nearest_published_rows_are_told(sides: Path) -> None:
 @pytest.mark.parametrize(("arguments", "problem"), [
     (("one", "--published", "rain"), "none of sun"),
     (("one", "same", "--published", "other"), "two results of the study"),
-    (("one", "rain", "--published", "other", "rain", "--reference", "rs.csv"), "may belong to each of sun, rain"),
+    (("one", "rain", "--published", "other", "wet", "--reference", "rs.csv"), "may belong to each of sun, rain"),
     (("one", "--published", "other", "--reference", "nonsense=rs.csv"), "belongs to none of"),
     (("one", "--published", "other", "--reference", "nowhere.csv"), "cannot be read"),
 ])

@@ -14,10 +14,9 @@ from PIL import Image
 
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.errors import InputError
-from safevar_sumo.replay.animation import animate, check_animation
+from safevar_sumo.replay.animation import PANEL, VEHICLES, WIDTH, animate, check_animation, pictures
 from safevar_sumo.replay.comparison import Comparison, compare_setting
 from safevar_sumo.replay.page import animation_page
-from safevar_sumo.replay.raster import PANEL, VEHICLES, WIDTH, pictures
 from safevar_sumo.replay.scene import scene_of
 from safevar_sumo.sumo.system import assemble
 

@@ -20,7 +20,7 @@ from safevar_sumo.cli import study as command
 from safevar_sumo.cli.program import commands
 from safevar_sumo.report import input as material
 from safevar_sumo.report import make_report
-from safevar_sumo.report.trust import reproduce
+from safevar_sumo.report.page import reproduce
 from safevar_sumo.study import Study, load_study
 
 
