@@ -45,7 +45,8 @@ def sides(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rs = rows(place / "rs.csv", ("mass", "radius"), 2.0, 0)
     here = rows(place / "here.csv", ("mass", "tireFric", "radius", "max_rpm"), 1.0, 20)
     there = rows(place / "there.csv", ("maxBrakeTorque", "dragCoeff", "dampRate"), 1.5, 0)
-    for name, study, nsga2 in (("one", "sun", here), ("same", "sun", here), ("other", "sun", there), ("rain", "rain", here), ("wet", "rain", there)):
+    for name, study, nsga2 in (("one", "sun", here), ("same", "sun", here), ("other", "sun", there), ("rain", "rain", here),
+                               ("wet", "rain", there)):
         assert typed("import", study, "--out", place / name, "--nsga2", nsga2, "--rs", rs).exit_code == 0
     return place
 
