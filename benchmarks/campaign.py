@@ -25,11 +25,12 @@ import psutil
 from evaluation import bare
 from measuring import Record, clock_seconds, processor_seconds, told
 
-from safevar_sumo.campaign import BATCH, RunKey, all_runs, run_campaign
+from safevar_sumo.campaign import RunKey, all_runs, run_campaign
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, load_study
-from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.engine import Engine
+from safevar_sumo.sumo.matrix import LARGEST_BATCH, simulate
 from safevar_sumo.sumo.staging import staged
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
@@ -94,11 +95,12 @@ def drawn(study: Study, n: int, seed: int = 1) -> FloatArray:
 def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
     """Carry out a study in a pool that is at work already."""
     with tempfile.TemporaryDirectory() as folder, opened as pool:
-        for future in [pool.submit(packed(study), drawn(study, BATCH)) for _ in range(4 * pool.workers)]:
+        for future in [pool.submit(packed(study), drawn(study, LARGEST_BATCH)) for _ in range(4 * pool.workers)]:
             future.result()
         recording = Recording(pool)
         before = processors()
-        clock = clock_seconds(lambda: run_campaign(study, all_runs(study), ResultsDirectory(Path(folder), study), recording, Silent()))
+        clock = clock_seconds(lambda: run_campaign(study, all_runs(study), ResultsDirectory(Path(folder), study), recording, Silent(),
+                                                   LARGEST_BATCH, engine=Engine.RECORDED))
         return Cost(clock, processors() - before, recording.batches)
 
 

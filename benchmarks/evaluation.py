@@ -26,7 +26,6 @@ import traci
 from measuring import Record, clock_seconds, medians_in_turn, processor_seconds, told
 
 from safevar_sumo.ads import PerVehicle, ScalarAds
-from safevar_sumo.campaign import BATCH
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import FloatArray, Observation
 from safevar_sumo.study import load_study
@@ -38,7 +37,7 @@ from safevar_sumo.sumo.staging import staged
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.world import SumoWorld
 
-POPULATIONS = (50, 200, 1000)
+POPULATIONS = (50, 200, 1000, 4000)
 SOCKET_SETTINGS = 10
 """So many settings go through the socket."""
 
@@ -136,7 +135,7 @@ def records_of(study: str, populations: tuple[int, ...] = POPULATIONS) -> Iterat
         stepping = statistics.median(alone for _, alone in floors[2:])
         yield Record(study, "bare_libsumo", n, ours / loading)
         yield Record(study, "stepping_alone", n, ours / stepping)
-        if n <= BATCH:
+        if n <= 200:
             replayed = replace(system, vehicle=Replayed(system.vehicle, "prepare", "advance"), ads=Replayed(system.ads, "start", "drive"))
             loading, ours = medians_in_turn(floor, partial(warm, replayed, settings))
             yield Record(study, "replayed", n, ours / loading)

@@ -13,11 +13,12 @@ from rich.console import Console
 from safevar_sumo.api.results import Results, load
 from safevar_sumo.api.simulation import assembled
 from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, read_by_algorithms, run_campaign
-from safevar_sumo.errors import SafevarError
+from safevar_sumo.errors import InputError, SafevarError, one_of
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, StudyLike
+from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.system import System
 from safevar_sumo.workers.cluster import cluster_pool
 from safevar_sumo.workers.evaluation import Pool
@@ -25,13 +26,15 @@ from safevar_sumo.workers.identity import identity_of
 from safevar_sumo.workers.local import available_cores, local_pool
 from safevar_sumo.workers.sources import sources_of
 
+ENGINES = {Engine.RECORDED: "recorded", Engine.LIBSUMO: "sumo"}
+"""What a command and a manifest call who moves the vehicles."""
 if TYPE_CHECKING:
     from safevar_sumo.analysis.evaluator import Progress
 
 
 def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = None, cluster: str | None = None,
         pool: Pool | None = None, progress: bool | Progress | Observer = False, only: Sequence[tuple[str, int]] | None = None,
-        batch: int | None = None, retry_failed: bool = False) -> Results:
+        batch: int | None = None, engine: str = Engine.RECORDED, retry_failed: bool = False) -> Results:
     """Search a study; called again with the same study and directory, it goes on where it was stopped.
 
     Parameters
@@ -52,7 +55,10 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     only
         These runs alone, as (algorithm, number from 0); the results are whole once every run is finished.
     batch
-        Settings per SUMO simulation, at the most, gathered from several runs; never changes a result.
+        Settings per batch, at the most, gathered from several runs; never changes a result.
+    engine
+        "recorded": in a recorded scene where nobody reacts to the vehicle under test, else in SUMO; "sumo": in SUMO always. Never
+        changes a result.
     retry_failed
         Whether settings that could not be simulated before are tried again.
 
@@ -68,7 +74,7 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     directory = Path(out) if out is not None else Path("results") / chosen.name
     where = nullcontext(pool) if pool is not None else open_pool(chosen, jobs, cluster)
     with where as opened, _observed(progress, chosen, keys) as observer:
-        carried_out(chosen, system, keys, directory, opened, observer, batch, retry_failed=retry_failed)
+        carried_out(chosen, system, keys, directory, opened, observer, batch, engine, retry_failed=retry_failed)
     return load(directory)
 
 
@@ -87,7 +93,7 @@ def prepared(study: StudyLike, source: str = "") -> tuple[Study, System]:
 
 
 def carried_out(study: Study, system: System, keys: list[RunKey], directory: Path, pool: Pool, observer: Observer,
-                batch: int | None, *, retry_failed: bool = False) -> Campaign:
+                batch: int | None, engine: str = Engine.RECORDED, *, retry_failed: bool = False) -> Campaign:
     """Carry out runs of a study in a directory; with all of them finished, its solutions are written. See `run_campaign`.
 
     Raises
@@ -97,12 +103,25 @@ def carried_out(study: Study, system: System, keys: list[RunKey], directory: Pat
     """
     sources = {**sources_of(study, pool), **read_by_algorithms(study)}
     results = ResultsDirectory(directory, study, identity_of(study, system, sources), system.measuring.scoring)
-    campaign = run_campaign(study, keys, results, pool, observer, batch, retry_failed=retry_failed)
+    chosen, reason = engine_for(system, engine)
+    results.manifest["engine"] = {"name": ENGINES[chosen], "reason": reason}
+    campaign = run_campaign(study, keys, results, pool, observer, batch or settings_per_batch(system, chosen), engine=chosen,
+                            retry_failed=retry_failed)
     if campaign.busy:
         raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: the same again later finishes the study")
     if keys == all_runs(study):
         results.finish(campaign.solutions)
     return campaign
+
+
+def engine_for(system: System, asked: str) -> tuple[Engine, str]:
+    """Who moves a system's vehicles, and why; raises InputError for an engine that there is not."""
+    if asked not in ENGINES.values():
+        raise InputError("--engine", repr(asked), one_of(ENGINES.values()))
+    if asked == ENGINES[Engine.LIBSUMO]:
+        return Engine.LIBSUMO, "asked for"
+    reason = reason_for_sumo(system)
+    return (Engine.LIBSUMO, reason) if reason else (Engine.RECORDED, "nobody reacts to the vehicle under test")
 
 
 def open_pool(study: Study, jobs: int | None = None, cluster: str | None = None) -> AbstractContextManager[Pool]:

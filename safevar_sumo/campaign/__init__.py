@@ -5,14 +5,12 @@ new, journals the answers and sends them in: so a resumed run is a replayed one.
 batches for a pool: a lost worker costs a batch, and no result depends on who computed what with whom.
 """
 
-from safevar_sumo.campaign.batcher import BATCH
 from safevar_sumo.campaign.campaign import Campaign, run_campaign
 from safevar_sumo.campaign.forecast import Forecast, forecast
 from safevar_sumo.campaign.keys import RunKey, algorithm_member, algorithm_of, all_runs, read_by_algorithms, run_generator
 from safevar_sumo.campaign.run import Observer
 
 __all__ = [
-           "BATCH",
            "Campaign",
            "Forecast",
            "Observer",

@@ -13,8 +13,6 @@ from safevar_sumo.campaign.run import Run
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.workers.retrying import RetryingPool
 
-BATCH = 200
-"""Settings per SUMO simulation where there are enough: an evaluation costs half of one among 50, beyond it nothing is gained."""
 LEAST_BATCH = 10
 """A smaller simulation takes as long as one of so many: what few runs ask for is shared out among idle workers down to this."""
 BATCHES_PER_WORKER = 2

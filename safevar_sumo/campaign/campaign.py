@@ -8,16 +8,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.campaign.batcher import BATCH, Batcher
-from safevar_sumo.campaign.isolation_check import IsolationCheck
+from safevar_sumo.campaign.batcher import Batcher
 from safevar_sumo.campaign.keys import RunKey, search_of
 from safevar_sumo.campaign.run import Observer, Run
+from safevar_sumo.campaign.verification import Verification
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import SAFEVAR, Scoring
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ORIGINAL, Failure, JournalBusy, ResultsDirectory
 from safevar_sumo.search import Problem, Search
 from safevar_sumo.study import Study
+from safevar_sumo.sumo import Engine
+from safevar_sumo.sumo.matrix import LARGEST_WORLD
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.isolation import check_isolation
@@ -43,7 +45,7 @@ class Campaign(NamedTuple):
 
 
 def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, pool: Pool, observer: Observer,
-              batch: int | None = None, *, retry_failed: bool = False) -> Campaign:
+                 batch: int = LARGEST_WORLD, *, engine: Engine = Engine.LIBSUMO, retry_failed: bool = False) -> Campaign:
     """Carry out runs of a study, or finish what of them is unfinished.
 
     Parameters
@@ -55,7 +57,9 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     pool
         Computes batches.
     batch
-        Settings per SUMO simulation at the most, gathered from several runs.
+        Settings per batch at the most, gathered from several runs.
+    engine
+        Who moves the vehicles; what moves in a recorded scene is verified in SUMO before a run counts as finished.
     retry_failed
         Whether settings that could not be simulated before are tried again.
 
@@ -65,7 +69,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
         If a journal cannot be written or the study itself is at fault.
     """
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    persistent, work = RetryingPool(pool, study, results.note), packed(study, results.inputs)
+    persistent, work = RetryingPool(pool, study, results.note), packed(study, results.inputs, engine=engine)
     original = _original(study, work, characteristics, results, persistent, observer)
     if not original.valid[0]:
         raise InputError(f"study {study.name!r}", "the original vehicle leaves the tolerance of a test's speed before the ADS acts "
@@ -81,13 +85,13 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     def begun(key: RunKey) -> Search:
         return search_of(key, study, problem, results.note)
 
-    gathering, rechecking = Batcher(persistent, work, batch or BATCH), IsolationCheck(study, results, persistent, begun)
+    batcher, verification = Batcher(persistent, work, batch), Verification(study, results, persistent, begun, engine)
 
     def go_on(run: Run) -> None:
         """Let a run go as far as it can, then ask for what it misses."""
         if not run.advance():
-            gathering.ask(run, run.missing)
-        elif run.finished or not rechecking.ask(run):
+            batcher.ask(run, run.missing)
+        elif run.finished or not verification.ask(run):
             finish(run)
 
     def finish(run: Run) -> None:
@@ -100,22 +104,22 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
 
     try:
         while waiting or runs:
-            while waiting and len(runs) < gathering.runs_wanted(study.search.population):
+            while waiting and len(runs) < batcher.runs_wanted(study.search.population):
                 key = waiting.popleft()
                 try:
                     journal = results.journal(str(key))
                 except JournalBusy:
                     campaign.busy.append(key)
                     continue
-                runs.add(run := Run(key, rechecking.search(key), journal, observer, study.search.evaluations, retry=retry_failed))
+                runs.add(run := Run(key, verification.search(key), journal, observer, study.search.evaluations, retry=retry_failed))
                 go_on(run)
-            gathering.send()
-            for future in first_of([*gathering.under_way, *rechecking.under_way]):
-                if future in rechecking.under_way:
-                    if ended := rechecking.take(future):
+            batcher.send()
+            for future in first_of([*batcher.under_way, *verification.under_way]):
+                if future in verification.under_way:
+                    if ended := verification.take(future):
                         finish(ended)
                     continue
-                for run, evaluations in gathering.take(future):
+                for run, evaluations in batcher.take(future):
                     if run.take(evaluations):
                         go_on(run)
     finally:

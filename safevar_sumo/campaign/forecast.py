@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.campaign.batcher import BATCH
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.study import Study
+from safevar_sumo.sumo import Engine
+from safevar_sumo.sumo.matrix import LARGEST_WORLD
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.local import result_of
@@ -30,10 +31,10 @@ class Forecast(NamedTuple):
     size: int
 
 
-def forecast(study: Study, runs: int, pool: Pool, batch: int | None = None) -> Forecast:
+def forecast(study: Study, runs: int, pool: Pool, batch: int = LARGEST_WORLD, engine: Engine = Engine.LIBSUMO) -> Forecast:
     """What carrying out `runs` runs takes at the most, after a short probe of the pool that will do it."""
-    characteristics, size = CharacteristicSet.of(study.vehicle.characteristics), batch or min(BATCH, max(runs, 1) * study.search.population)
-    persistent, work, rng = RetryingPool(pool, study), packed(study), np.random.default_rng(study.search.seed)
+    characteristics, size = CharacteristicSet.of(study.vehicle.characteristics), min(batch, max(runs, 1) * study.search.population)
+    persistent, work, rng = RetryingPool(pool, study), packed(study, engine=engine), np.random.default_rng(study.search.seed)
 
     def probe(number: int) -> float:
         """Seconds that `number` batches on every worker take."""

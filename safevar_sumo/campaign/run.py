@@ -18,6 +18,10 @@ BY_CHANCE = 10
 of 1 - 0.99^300 = 95 % in a study of 30 runs."""
 
 
+VERIFIED = 50
+"""Evaluations of a run, beside its solutions, that are driven in SUMO again."""
+
+
 class Observer(Protocol):
     """Is told how a campaign goes on."""
 
@@ -127,6 +131,17 @@ class Run:
         by_chance = [scored[place] for place in rng.permutation(len(scored))[:BY_CHANCE].tolist()]
         chosen = {known[0]: known for known in (severe, scored[-1], *by_chance)}
         return [evaluations.take([i]) for _, evaluations, i in chosen.values()]
+
+    def solutions_and_others(self, rng: np.random.Generator) -> Evaluations:
+        """What is driven in SUMO itself: all solutions, and `VERIFIED` other evaluations by chance."""
+        solutions = {row.tobytes() for row in self.result.settings}
+        scored = [known for known in self._known.values() if 0 <= known[0] < self._budget and not known[1].failed[known[2]]]
+        scored.sort(key=lambda known: known[0])
+        mine = [known[1].settings[known[2]].tobytes() in solutions for known in scored]
+        others = [known for known, is_solution in zip(scored, mine, strict=True) if not is_solution]
+        chosen = [known for known, is_solution in zip(scored, mine, strict=True) if is_solution]
+        chosen += [others[place] for place in rng.permutation(len(others))[:VERIFIED].tolist()]
+        return self._recalled(np.array([known[1].settings[known[2]] for known in chosen])) if chosen else self.result.take([])
 
     def is_repeated_by(self, search: Search) -> bool:
         """Whether a search, told what this run knows, asks for the same in the same places and returns the same."""

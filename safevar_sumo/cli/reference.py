@@ -286,6 +286,4 @@ def print_calibration(console: Console, study: Study, found: Calibration) -> Non
         console.print(both)
     for name in on_a_bound(found.values, study.calibration):
         console.print(f"{name} stands on its bound: a wider one may fit better.", markup=False)
-    if not found.alone:
-        console.print("SUMO simulated every trial in copies of the network: beside one copy, vehicles do something else in this scenario.")
     console.print(cost_line(found))

@@ -18,8 +18,8 @@ from rich.markup import escape
 from rich.text import Text
 
 from safevar_sumo.analysis.research_questions.indicators import nondominated
-from safevar_sumo.api.running import carried_out, open_pool, prepared
-from safevar_sumo.campaign import BATCH, Campaign, Forecast, RunKey, all_runs, forecast
+from safevar_sumo.api.running import ENGINES, carried_out, engine_for, open_pool, prepared
+from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
 from safevar_sumo.cli.options import Within, complete_study
 from safevar_sumo.cli.program import commands, tell_remarks
 from safevar_sumo.errors import InputError
@@ -27,7 +27,7 @@ from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import RunStatus, Status, failure_lines, record, solutions_frame
 from safevar_sumo.study import Study, load_study
-from safevar_sumo.sumo.matrix import vehicle_remarks
+from safevar_sumo.sumo import Engine, settings_per_batch, vehicle_remarks
 from safevar_sumo.terminal import WholeTable
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
@@ -40,7 +40,10 @@ from safevar_sumo.workers.evaluation import Pool
 @click.option("--algorithms", help="Which algorithms, separated by commas.")
 @click.option("--seed", type=click.IntRange(min=0, max=2**63 - 1), help="Seed of the whole study.")
 @click.option("--batch", type=click.IntRange(1, 10_000),
-              help=f"Settings per SUMO simulation at the most, of several runs; never changes a result.  [default: {BATCH}]")
+              help="Settings per batch at the most, of several runs; never changes a result.  [default: what is fastest]")
+@click.option("--engine", type=click.Choice(list(ENGINES.values())), default=ENGINES[Engine.RECORDED], show_default=True,
+              help="Who moves the vehicles: numpy in a scene that SUMO has played once, where nobody reacts to them, verified in SUMO; "
+                   "or SUMO always.")
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the results.  [default: results/STUDY]")
 @click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes.  [default: the cores of this machine]")
 @click.option("--cluster", metavar="ADDRESS", help="Compute on the workers of this Dask scheduler instead.")
@@ -49,8 +52,8 @@ from safevar_sumo.workers.evaluation import Pool
 @click.option("--retry-failed", is_flag=True, help="Simulate again what could not be simulated before (simulator-error).")
 @click.option("--quiet", is_flag=True, help="Print errors and warnings alone.")
 @click.option("--dry-run", is_flag=True, help="Tell what would run, how long and how much disk it would take.")
-def study(study: str, batch: int | None, out: Path | None, jobs: int | None, cluster: str | None, only: str | None, shard: str | None,
-          retry_failed: bool, quiet: bool, dry_run: bool, **options: Any) -> None:
+def study(study: str, batch: int | None, engine: str, out: Path | None, jobs: int | None, cluster: str | None, only: str | None,
+          shard: str | None, retry_failed: bool, quiet: bool, dry_run: bool, **options: Any) -> None:
     """Search STUDY; the same command again goes on where it was stopped."""
     chosen, system = prepared(_with_options(load_study(study), **options), study)
     tell_remarks(chosen, [*system.remarks, *vehicle_remarks(system)])
@@ -58,11 +61,13 @@ def study(study: str, batch: int | None, out: Path | None, jobs: int | None, clu
     directory = out or Path("results") / chosen.name
     with open_pool(chosen, jobs, cluster) as pool:
         if dry_run:
-            print_forecast(Console(), chosen, len(keys), forecast(chosen, len(keys), pool, batch))
+            driven, reason = engine_for(system, engine)
+            size = batch or settings_per_batch(system, driven)
+            print_forecast(Console(), chosen, len(keys), forecast(chosen, len(keys), pool, size, driven), f"{ENGINES[driven]}: {reason}")
             return
         try:
             with CampaignProgress(Console(stderr=True), chosen, keys, quiet) as progress:
-                campaign = carried_out(chosen, system, keys, directory, pool, progress, batch, retry_failed=retry_failed)
+                campaign = carried_out(chosen, system, keys, directory, pool, progress, batch, engine, retry_failed=retry_failed)
         except KeyboardInterrupt:
             click.echo(f"what is computed is kept in {directory}: the same command goes on from there", err=True)
             raise
@@ -130,12 +135,13 @@ def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
 SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\nTET, TIT: over solutions without collision."
 
 
-def print_forecast(console: Console, study: Study, runs: int, told: Forecast) -> None:
+def print_forecast(console: Console, study: Study, runs: int, told: Forecast, engine: str) -> None:
     """What a campaign would take."""
     console.print(study.title, soft_wrap=True, highlight=False, markup=False)
     table = WholeTable(show_header=False)
     table.add_row("algorithms", ", ".join(study.search.labels))
     table.add_row("runs", str(runs))
+    table.add_row("engine", engine)
     table.add_row("evaluations, at the most", str(told.evaluations))
     table.add_row("evaluations/s, measured by a short probe", f"{told.rate:.0f}")
     table.add_row("time, at the most", f"{told.seconds / 60:.1f} min")

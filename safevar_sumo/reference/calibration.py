@@ -16,9 +16,10 @@ from safevar_sumo.reference.fit import LARGEST, Search, check_bound, original_co
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.reference.validation import Agreement, agreement
 from safevar_sumo.study import SAFETY_DEGREE, FreeParameter, Study
+from safevar_sumo.sumo import Engine, settings_per_batch
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.batches import BATCH, evaluate_all
+from safevar_sumo.workers.batches import evaluate_all
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.local import result_of
 from safevar_sumo.workers.retrying import RetryingPool
@@ -71,24 +72,18 @@ def _rho(told: Agreement) -> str:
 
 NEAR, WIDE = 0.05, 0.3
 """Standard deviation of the first trials around known values, and around a random place, as a share of a parameter's bounds."""
-HELD = 40
-"""So many settings show whether vehicles beside one copy do as they do in copies of their own."""
-SAME = 1e-6
-"""By so much their metrics may differ."""
 
 
 class Calibration(NamedTuple):
     """Found values by parameter, the study with them, its cost, and both parts of every reference by its name.
 
-    `reached` is the lowest cost that each search came to, the last one from the study's own values unless these were forgotten;
-    `alone` whether vehicles were tried beside one copy of the network.
+    `reached` is the lowest cost that each search came to, the last one from the study's own values unless these were forgotten.
     """
 
     values: dict[str, float]
     study: Study
     cost: float
     reached: list[float]
-    alone: bool
     used: dict[str, Agreement]
     held_back: dict[str, Agreement]
 
@@ -130,7 +125,7 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
     assert search.best is not None, "there is a trial at least"
     values = {name: value_of(search.best, name) for name in study.calibration}
     best = with_values(study, values)
-    return Calibration(values, best, search.cost, [one.lowest for one in searches if one.lowest < np.inf], trial.alone,
+    return Calibration(values, best, search.cost, [one.lowest for one in searches if one.lowest < np.inf],
                        _told(best, used, pool), _told(best, held_back, pool))
 
 
@@ -167,16 +162,7 @@ class _Trial:
         self._pool = RetryingPool(pool, study)
         settings = [self._characteristics.original[np.newaxis], *(data.settings for data in references.values())]
         self._settings, self._row_of = np.unique(np.concatenate(settings), axis=0, return_inverse=True)
-        self.alone = self._may_be_alone(pool)
-
-    def _may_be_alone(self, pool: Pool) -> bool:
-        """Whether vehicles beside one copy of the network do what they do in copies of their own."""
-        if assemble(self.study).matrix:
-            return False
-        some = self._settings[np.linspace(0, len(self._settings) - 1, min(HELD, len(self._settings))).astype(int)]
-        copies, alone = (evaluate_all(self.study, some, pool, alone=way) for way in (False, True))
-        return np.array_equal(copies.outcome, alone.outcome) and all(
-            np.allclose(alone.metrics[name], values, rtol=0, atol=SAME, equal_nan=True) for name, values in copies.metrics.items())
+        self._size = min(settings_per_batch(assemble(study), Engine.RECORDED), len(self._settings))
 
     def at(self, shares: FloatArray) -> Study:
         """The study at a place in the unit cube of the bounds."""
@@ -193,7 +179,7 @@ class _Trial:
         return [self._cost(Evaluations.concatenate([result_of(part) for part in parts])) for parts in submitted]
 
     def _submit(self, study: Study) -> list[Future[Evaluations]]:
-        work, size = packed(study, self._inputs, alone=self.alone), len(self._settings) if self.alone else BATCH
+        work, size = packed(study, self._inputs), self._size
         return [self._pool.submit(work, self._settings[start:start + size]) for start in range(0, len(self._settings), size)]
 
     def _cost(self, unique: Evaluations) -> float:

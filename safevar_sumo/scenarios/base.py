@@ -118,7 +118,8 @@ class Scene(NamedTuple):
 class Scenario(Protocol):
     """A scenario. Its fields are the parameters that a study gives under `scenario.parameters`.
 
-    `network` is a folder of `sumo_nets/`, or the path of a folder with the same files;
+    `reactive_actors` says whether anybody may react to the vehicle under test, as they do unless it is False: only where nobody does
+    can SUMO play the scene once, for all vehicles. `network` is a folder of `sumo_nets/`, or the path of a folder with the same files;
     `duration` is the length of a run [s].
 
     It may have a `grade`, by how much its road rises over the way [%]: SUMO's plane is then that road, and gravity acts in the
@@ -216,6 +217,7 @@ class GuardedScenario:
         speed = getattr(scenario, "test_speed", None)
         self.test_speed = speed if speed is None else float(
             guard.numbers("__init__", "test_speed", speed, (), 0.0, FASTEST_TEST, above=True))
+        self.reactive_actors = bool(getattr(scenario, "reactive_actors", True))
         self.grade, self.pre_crash = float(grade), str(getattr(scenario, "pre_crash", ""))
 
     def actors(self, roads: Roads) -> Actors:

@@ -107,6 +107,7 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
     grade: Grade = 0.0
     network: str = "crossing"
+    reactive_actors = False
     pre_crash = PreCrash.PEDESTRIAN
 
     @property

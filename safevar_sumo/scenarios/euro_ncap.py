@@ -163,6 +163,7 @@ class BehindSomebody(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
     vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
     grade: Grade = 0.0
+    reactive_actors = False
 
     def begin(self, world: World) -> AheadMemory:
         return self._ahead.begin(world)

@@ -40,6 +40,7 @@ class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_field
     network: str = "lead_vehicle_stopped"
     duration: Annotated[float, Meta(gt=0, le=3600)] = 16.0
     grade: Grade = 0.0
+    reactive_actors = False
     pre_crash = PreCrash.LEAD_STOPPED
 
     def begin(self, world: World) -> _Memory:

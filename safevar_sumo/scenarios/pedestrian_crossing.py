@@ -51,6 +51,7 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
     turns_after: float | None = 0.7
     lane_width: Positive = 3.5
     grade: Grade = 0.0
+    reactive_actors = False
     pre_crash = PreCrash.PEDESTRIAN_AFTER_MANOEUVRE
 
     def begin(self, world: World) -> _Memory:

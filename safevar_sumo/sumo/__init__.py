@@ -1,8 +1,7 @@
 """Simulation: many settings of a study in one SUMO process."""
 
-from safevar_sumo.sumo.batch import score
+from safevar_sumo.sumo.batch import reason_for_sumo, score
 from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.kinematic import simulate_alone
 from safevar_sumo.sumo.matrix import (
     AtPoint,
     aggregated,
@@ -12,6 +11,7 @@ from safevar_sumo.sumo.matrix import (
     named_point,
     point_record,
     remarks_of,
+    settings_per_batch,
     simulate,
     study_at,
     vehicle_remarks,
@@ -22,5 +22,5 @@ from safevar_sumo.sumo.system import System, assemble, models_of
 
 __all__ = [
     "AtPoint", "Engine", "System", "aggregated", "assemble", "at_every_point", "at_worst", "evaluate", "models_of", "named_point",
-    "network_files", "network_fingerprint", "point_record", "remarks_of", "score", "simulate", "simulate_alone", "study_at",
-    "vehicle_remarks", "worst_points"]
+    "network_files", "network_fingerprint", "point_record", "reason_for_sumo", "remarks_of", "score", "settings_per_batch", "simulate",
+    "study_at", "vehicle_remarks", "worst_points"]

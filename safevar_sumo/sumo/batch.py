@@ -17,6 +17,7 @@ from safevar_sumo.sumo.contact import Contacts
 from safevar_sumo.sumo.driving_robot import DrivingRobot
 from safevar_sumo.sumo.engine import Engine, world_on
 from safevar_sumo.sumo.perception import Parts
+from safevar_sumo.sumo.recording import RecordedWorld, reason_for_copies, recording_of
 from safevar_sumo.sumo.staging import staged
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
@@ -45,9 +46,17 @@ def score(system: System, settings: FloatArray, run: SimulationRuns) -> Evaluati
         f_num_diff=system.characteristics.number_changed(settings))
 
 
-def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = (),
-             watch: Watcher | None = None) -> SimulationRuns:
-    """Drive every setting, shape (N, n), at every one of the points, which share a network; `watch` is shown the world at every sample.
+def reason_for_sumo(system: System) -> str:
+    """Why a system's vehicles are driven in SUMO, each in a copy of the network; "" where they drive in a recorded scene."""
+    if isinstance(system.ads, TraciController):
+        return "a controller written for TraCI reads the running simulation"
+    reasons = (reason_for_copies(point.scenario, step_options(system)) for point in system.points)
+    return next((reason for reason in reasons if reason), "")
+
+
+def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = (),
+              watch: Watcher | None = None) -> SimulationRuns:
+    """Drive every setting, shape (N, n), at every one of the points, which share a network; `watch` is shown SUMO at every sample.
 
     The drives at the first point come first, then those at the second, and so on.
 
@@ -59,6 +68,11 @@ def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.LIBS
         If a user's ADS fails.
     """
     options = (*step_options(system), *options)
+    if engine is Engine.RECORDED:
+        if watch is None and not reason_for_sumo(system):
+            scenes = [recording_of(point.scenario, options) for point in system.points]
+            return drive(system, np.tile(settings, (len(system.points), 1)), RecordedWorld(scenes, len(settings)))
+        engine = Engine.LIBSUMO
     first, *others = [staged(point.scenario) for point in system.points]
     with world_on(first, len(settings), engine, options, others) as world:
         return drive(system, np.tile(settings, (len(system.points), 1)), world, watch)
@@ -70,7 +84,7 @@ def step_options(system: System) -> tuple[str, ...]:
 
 
 @np.errstate(all="ignore")
-def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher | None = None) -> SimulationRuns:
+def drive(system: System, settings: FloatArray, world: SumoWorld | RecordedWorld, watch: Watcher | None = None) -> SimulationRuns:
     """Drive the vehicles of an open world that nobody has stepped yet; see `drive_all`.
 
     With several points the k-th part of the settings is in the k-th of them.
@@ -80,7 +94,7 @@ def drive(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher
         return _driven(system, settings, world, watch)
 
 
-def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watcher | None) -> SimulationRuns:
+def _driven(system: System, settings: FloatArray, world: Any, watch: Watcher | None) -> SimulationRuns:
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_surface(system.points, n))
@@ -94,11 +108,7 @@ def _driven(system: System, settings: FloatArray, world: SumoWorld, watch: Watch
     if isinstance(system.ads, TraciController):  # any other is given what is sensed
         world.sensors = _sensors(system, prepared, n)
     driver = system.ads.start(n, system.nominal, step)
-    try:
-        parts = Parts(system.points, world, n, own_reactions=_own_reactions(system))
-    except world.api.TraCIException as error:
-        raise InputError("scenario.parameters.network", f"the scenario does not find what it looks for: {str(error).strip()}",
-                         "a network and traffic with the ids that the scenario names") from None
+    parts = Parts(system.points, world, n, own_reactions=_own_reactions(system))
     log = _Log(n, int(parts.last.max()) + 1, way)
     verdict, robot = _Verdict(n), DrivingRobot(system.points, vehicle, prepared, state, step)
     contacts = Contacts(n, robot.tested)

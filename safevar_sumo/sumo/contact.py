@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from safevar_sumo.records import BoolArray, Contact
 from safevar_sumo.scenarios import Scene
-from safevar_sumo.sumo.world import Body, SumoWorld
+from safevar_sumo.sumo.world import Body
 
 FRONT, LEFT, RIGHT, REAR = "front", "left", "right", "rear"
 
@@ -27,12 +27,13 @@ class Contacts:
     def __init__(self, n: int, tested: BoolArray) -> None:
         self._tested, self._side, self._place = tested, np.full(n, "", dtype="U5"), np.full(n, np.nan)
 
-    def collisions(self, world: SumoWorld, open_: BoolArray, scene: Scene) -> dict[int, float]:
+    def collisions(self, world: Any, open_: BoolArray, scene: Scene) -> dict[int, float]:
         """Take in one sample; returns the vehicles of open runs that collide, and their speeds [m/s]."""
-        found = {copy: speed for copy, speed in world.collisions().items() if open_[copy]}
+        found = world.collisions(open_)
         for copy in found:
             if not self._side[copy]:
-                self._take(copy, *world.bodies(copy), scene)
+                own, other = world.bodies(copy)
+                self._take(copy, own, other, scene)
         return {copy: speed for copy, speed in found.items() if not self._tested[copy] or self._side[copy] == FRONT}
 
     def _take(self, copy: int, own: Body, other: Body, scene: Scene) -> None:

@@ -26,8 +26,11 @@ CONNECTION_ATTEMPTS = 15
 
 
 class Engine(StrEnum):
-    """Which SUMO simulates: in this process, or another process without or with a window."""
+    """Who moves the vehicles: numpy in a recorded scene where nobody reacts to them (else as LIBSUMO), or SUMO in this process, in
+    another one, or in another one with a window.
+    """
 
+    RECORDED = "recorded"
     LIBSUMO = "libsumo"
     TRACI = "traci"
     GUI = "gui"

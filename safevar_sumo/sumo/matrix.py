@@ -16,7 +16,7 @@ from safevar_sumo.records import Contact, Encounter, Evaluations, FloatArray, Ou
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.study import SAFETY_DEGREE, Study
-from safevar_sumo.sumo.batch import Watcher, drive_all, score
+from safevar_sumo.sumo.batch import Watcher, drive_all, reason_for_sumo, score
 from safevar_sumo.sumo.engine import Engine, standing_network
 from safevar_sumo.sumo.network import empty_fingerprint, lanes_of
 from safevar_sumo.sumo.staging import staged
@@ -24,6 +24,8 @@ from safevar_sumo.sumo.system import System, assemble
 
 LARGEST_WORLD = 200
 """Copies of a network in one simulation; more cost more each, as SUMO then works beyond the processor's caches."""
+LARGEST_BATCH = 2000
+"""Vehicles in recorded scenes at once; two hundred steps of so many take some 100 MB."""
 LARGEST_ROADS = 100_000
 """Lanes of all copies in one simulation: beyond, loading takes minutes and gigabytes."""
 NEAREST = 4
@@ -72,23 +74,31 @@ def vehicle_remarks(system: System) -> list[str]:
             "accelerator released"]
 
 
-def evaluate(system: System, settings: FloatArray) -> Evaluations:
+def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> Evaluations:
     """Simulate filtered settings, shape (N, n), in one batch and score them.
 
     A pure function: row i of the result depends on row i of `settings` alone, to the bit. In a matrix a setting's row is that
     of the point in which it comes off worst.
     """
-    most = _most_copies(system)
+    most = _most_vehicles(system, engine)
     parts = [settings[first:first + most] for first in range(0, len(settings), most)] or [settings]
-    found = [aggregated(system, at_every_point(system, part)) if system.matrix else score(system, part, simulate(system, part))
-             for part in parts]
+    found = [aggregated(system, at_every_point(system, part, engine)) if system.matrix
+             else score(system, part, simulate(system, part, engine)) for part in parts]
     return found[0] if len(found) == 1 else Evaluations.concatenate(found)
 
 
-def _most_copies(system: System) -> int:
-    """How many copies of the largest of the networks one simulation may have."""
+def settings_per_batch(system: System, engine: Engine) -> int:
+    """How many settings a batch pays to have."""
+    recorded = engine is Engine.RECORDED and not reason_for_sumo(system)
+    return max(LARGEST_BATCH // len(system.points), LARGEST_WORLD) if recorded else LARGEST_WORLD
+
+
+def _most_vehicles(system: System, engine: Engine) -> int:
+    """How many vehicles one simulation may have: in a recorded scene, or in copies of the largest of the networks."""
+    if engine is Engine.RECORDED and not reason_for_sumo(system):
+        return LARGEST_BATCH
     lanes = max(lanes_of(network) for network in {point.scenario.network for point in system.points})
-    return max(LARGEST_ROADS // max(lanes, 1), 1)
+    return min(max(LARGEST_ROADS // max(lanes, 1), 1), LARGEST_WORLD)
 
 
 def aggregated(system: System, found: Sequence[AtPoint]) -> Evaluations:
@@ -99,7 +109,7 @@ def aggregated(system: System, found: Sequence[AtPoint]) -> Evaluations:
     return every.take(row_of * len(settings) + columns)
 
 
-def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = (),
+def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = (),
              watch: Watcher | None = None) -> SimulationRuns:
     """Run the scenario once for every setting; shape (N, n). `watch` is shown the world at every sample.
 
@@ -121,10 +131,10 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.LIBSU
     return _picked([one.drives for one in found], worst_points(found))
 
 
-def at_every_point(system: System, settings: FloatArray, engine: Engine = Engine.LIBSUMO, options: tuple[str, ...] = ()) -> list[AtPoint]:
+def at_every_point(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = ()) -> list[AtPoint]:
     """Settings, shape (N, n), at every point, in the points' order; raises as `simulate`."""
     n, found = len(settings), dict[str, AtPoint]()
-    for points in _together(system.points, max(min(LARGEST_WORLD, _most_copies(system)) // max(n, 1), 1)):
+    for points in _together(system.points, max(_most_vehicles(system, engine) // max(n, 1), 1)):
         drives = drive_all(replace(system, matrix=points), settings, engine, options)
         evaluations = score(system, np.tile(settings, (len(points), 1)), drives)
         for k, point in enumerate(points):

@@ -12,7 +12,7 @@ from safevar_sumo.records import EVERYWHERE, Command, Encounter, FloatArray, Obs
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather
-from safevar_sumo.sumo.world import SumoWorld
+from safevar_sumo.sumo.world import begin
 
 STEP_DECIMALS = 6  # of a delay in steps: a whole number of steps is whole
 HIDDEN = np.array([[np.inf], [np.inf], [0.0], [0.0]])
@@ -67,7 +67,7 @@ R = TypeVar("R", Scene, Observation)
 class Parts:
     """A batch whose k-th part of equally many vehicles is in the k-th point; of drivers with reactions of their own, or not."""
 
-    def __init__(self, points: Sequence[Point], world: SumoWorld, n: int, own_reactions: bool = False) -> None:
+    def __init__(self, points: Sequence[Point], world: Any, n: int, own_reactions: bool = False) -> None:
         self._size = size = n // len(points)
         self._points, self._step = points, world.step_length
         self._rows = [slice(k * size, (k + 1) * size) for k in range(len(points))]
@@ -76,7 +76,7 @@ class Parts:
         self._perceptions = [(Perception(weather, self._step), np.repeat([one == weather for one in weathers], size).nonzero()[0])
                              for k, weather in enumerate(weathers) if weather not in weathers[:k]]
         self._order = np.argsort(np.concatenate([rows for _, rows in self._perceptions]))
-        self._memories = [point.scenario.begin(part) for point, part in zip(points, self._worlds, strict=True)]
+        self._memories = [begin(point.scenario, part) for point, part in zip(points, self._worlds, strict=True)]
         self.last = np.repeat([round(point.scenario.duration / self._step) for point in points], size)
 
     def scene(self) -> Scene:

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import SimulationError
-from safevar_sumo.records import FloatArray
-from safevar_sumo.scenarios import VUT, Lane
+from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.scenarios import VUT, Lane, Scenario
 from safevar_sumo.scenarios.base import lane_through
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.sumo.reusable import ReusableSumo
@@ -124,9 +124,10 @@ class SumoWorld:
         if self._pause:
             time.sleep(self._pause)
 
-    def collisions(self) -> dict[int, float]:
-        """Copies whose vehicle under test collides in this step, and its speed [m/s]."""
-        reported = [one for one in self._api.simulation.getCollisions() if one.collider in self._copy_of]
+    def collisions(self, open_: BoolArray) -> dict[int, float]:
+        """Copies of open runs whose vehicle under test collides in this step, and its speed [m/s]."""
+        reported = [one for one in self._api.simulation.getCollisions()
+                    if one.collider in self._copy_of and open_[self._copy_of[one.collider]]]
         self._struck = {self._copy_of[one.collider]: one.victim for one in reported}
         return {self._copy_of[one.collider]: one.colliderSpeed for one in reported}
 
@@ -176,6 +177,11 @@ class SumoWorld:
                 found[self._rows] = on_the_road
             self._positions[actor] = found
         return self._positions[actor]
+
+    @property
+    def lookup_errors(self) -> tuple[type[Exception], ...]:
+        """What is raised when somebody asks for an actor or a lane that there is not."""
+        return (self._api.TraCIException,)
 
     @property
     def api(self) -> Any:
@@ -243,6 +249,21 @@ class SumoWorld:
             back = [api.getRoadID(name), api.getEdges(name)[0]]
             api.appendWalkingStage(name, back, 0.0, speed=api.getSpeed(name))
             api.removeStage(name, 0)
+
+
+def begin(scenario: Scenario, world: Any) -> Any:
+    """What a scenario remembers of a world before the first step.
+
+    Raises
+    ------
+    InputError
+        If the network does not have what the scenario looks for.
+    """
+    try:
+        return scenario.begin(world)
+    except world.lookup_errors as error:
+        raise InputError("scenario.parameters.network", f"the scenario does not find what it looks for: {str(error).strip()}",
+                         "a network and traffic with the ids that the scenario names") from None
 
 
 _present: SumoWorld | None = None

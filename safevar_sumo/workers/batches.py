@@ -2,42 +2,60 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
+from safevar_sumo.sumo import Engine, assemble, reason_for_sumo, settings_per_batch
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
-from safevar_sumo.workers.isolation import check_isolation
-from safevar_sumo.workers.local import first_of
+from safevar_sumo.workers.isolation import check_isolation, refuse_unlike_sumo
+from safevar_sumo.workers.local import first_of, result_of
 from safevar_sumo.workers.retrying import RetryingPool
 from safevar_sumo.workers.sources import inputs_of
 
-BATCH = 100
-"""Settings per SUMO simulation."""
+SHARES = 4
+"""Batches for each worker, so that none waits long for another."""
+LEAST_BATCH = 100
+"""A smaller one costs as much."""
+VERIFIED = 50
+"""Settings that are driven in SUMO, too."""
+_verified: set[bytes] = set()
+"""Packed studies whose recorded scene was seen to be SUMO's."""
 _isolated: set[bytes] = set()
 """Packed studies whose models have been seen to keep settings apart."""
 
 
-def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[[int], None] = lambda number: None, *,
-                 alone: bool = False) -> Evaluations:
-    """Evaluate many filtered settings, shape (M, n), row by row; equal rows are simulated once, `alone` as in `packed`.
+def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[[int], None] = lambda number: None) -> Evaluations:
+    """Evaluate many filtered settings, shape (M, n), row by row; equal rows are simulated once.
 
-    Models that are not ours are first seen to keep settings apart (`check_isolation`). `done` is called with the number of
+    Models that are not ours are first seen to keep settings apart (`check_isolation`), and a sample of what is driven in a recorded
+    scene is driven in SUMO too. `done` is called with the number of
     settings of every batch that is finished.
     """
-    persistent, work = RetryingPool(pool, study), packed(study, inputs_of(study, pool), alone=alone)
+    persistent, work = RetryingPool(pool, study), packed(study, inputs := inputs_of(study, pool))
     if work not in _isolated:
         check_isolation(study, CharacteristicSet.of(study.vehicle.characteristics), lambda rows: persistent.submit(work, rows))
         _isolated.add(work)
     unique, row_of = np.unique(settings, axis=0, return_inverse=True)
-    starts = range(0, len(unique), BATCH)
-    futures = {persistent.submit(work, unique[start:start + BATCH]): start for start in starts}
+    system = assemble(study)
+    size = min(settings_per_batch(system, Engine.RECORDED), max(math.ceil(len(unique) / (SHARES * pool.workers)), LEAST_BATCH))
+    starts = range(0, len(unique), size)
+    futures = {persistent.submit(work, unique[start:start + size]): start for start in starts}
+    verified = np.linspace(0, len(unique) - 1, min(VERIFIED, len(unique))).astype(int)
+    in_sumo = None
+    if work not in _verified and not reason_for_sumo(system):
+        in_sumo = persistent.submit(packed(study, inputs, engine=Engine.LIBSUMO), unique[verified])
     parts: dict[int, Evaluations] = {}
     while len(parts) < len(futures):
         for future in first_of([future for future, start in futures.items() if start not in parts]):
             parts[futures[future]] = future.result()
             done(len(parts[futures[future]]))
-    return Evaluations.concatenate([parts[start] for start in starts]).take(row_of.ravel())
+    found = Evaluations.concatenate([parts[start] for start in starts])
+    if in_sumo is not None:
+        refuse_unlike_sumo(study, found.take(verified[~found.failed[verified]]), result_of(in_sumo).take(~found.failed[verified]))
+        _verified.add(work)
+    return found.take(row_of.ravel())

@@ -14,8 +14,7 @@ from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.plugins import Files, changes, digests, forget_foreign, noted_reading
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, foreign_packages
-from safevar_sumo.sumo.batch import score
-from safevar_sumo.sumo.kinematic import simulate_alone
+from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers.identity import Inputs, networks_of
@@ -48,7 +47,7 @@ class _Work(msgspec.Struct, frozen=True):
 
     study: Study
     inputs: Inputs
-    alone: bool
+    engine: Engine
     afresh: bool
 
 
@@ -58,7 +57,7 @@ class _How(msgspec.Struct, frozen=True):
     afresh: bool
 
 
-def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, alone: bool = False, afresh: bool = False) -> bytes:
+def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Engine = Engine.RECORDED, afresh: bool = False) -> bytes:
     """A study as it travels to a worker.
 
     Parameters
@@ -66,14 +65,14 @@ def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, alone: bool
     inputs
         Layers of the study's identity by name: workers that have other files compute nothing, and tell which files other
         people's code reads that are not among the `sources`. By default the networks as they are now.
-    alone
-        To be simulated beside one copy of the network for all settings (`simulate_alone`).
+    engine
+        Who moves the vehicles.
     afresh
         By models that are loaded anew, with nothing in their modules and classes that earlier batches left there.
     """
     if inputs is None:
         inputs = {"network": networks_of(assemble(study))}
-    return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED if layer in inputs}, alone, afresh))
+    return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED if layer in inputs}, engine, afresh))
 
 
 def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
@@ -92,8 +91,7 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
     with noted_reading() as reading:
         this, system = assembled(work)
         _refuse_changes(this.inputs, system)
-        beside = this.alone and not system.matrix
-        evaluations = score(system, settings, simulate_alone(system, settings)) if beside else evaluate(system, settings)
+        evaluations = evaluate(system, settings, this.engine)
     _refuse_changes(this.inputs, system)
     return replace(evaluations, files=_unknown(this, digests(reading.files(foreign_packages(this.study)), this.study.origin.places)))
 

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.errors import ForeignError
+from safevar_sumo.errors import ForeignError, InputError
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, foreign_names
 from safevar_sumo.vehicles import CharacteristicSet
@@ -17,6 +17,9 @@ from safevar_sumo.workers.local import result_of
 
 LEGAL = ("what happens to vehicle i depends on vehicle i alone: nothing kept in a class, a module or the model itself from one call or "
          "setting to another, no mean or sum over the batch, nothing random")
+
+ROUNDING = 1e-9
+"""Most by which a metric in a recorded scene may differ from SUMO's."""
 
 
 class Submit(Protocol):
@@ -64,6 +67,27 @@ def refuse_difference(study: Study, ways: dict[str, Evaluations], again: str = "
         raise ForeignError(f"study {study.name!r}", f"{problem}{again and f'; again by: {again}'}", LEGAL)
 
 
+def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations) -> None:
+    """Refuse settings that came out otherwise in a recorded scene than in SUMO itself.
+
+    Raises
+    ------
+    InputError
+        With the setting and both values.
+    """
+    for row, setting in enumerate(recorded.settings):
+        one, other = recorded.take([row]), in_sumo.take([row])
+        if other.failed[0]:
+            difference: tuple[str, object, object] | None = ("outcome", str(one.outcome[0]), f"{other.outcome[0]} ({other.reason(0)})")
+        else:
+            difference = _difference(one, other, ROUNDING)
+        if difference:
+            name, here, there = difference
+            values = ", ".join(f"{key} = {value:.17g}" for key, value in zip(study.vehicle.characteristics, setting, strict=True))
+            raise InputError(f"study {study.name!r}", f"{name} is {here} in the recorded scene and {there} in SUMO with {values}",
+                             "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or --engine sumo")
+
+
 def _far_apart(characteristics: CharacteristicSet) -> FloatArray:
     """The original setting and corners of the domains, filtered; shape (5, n)."""
     lower, upper, number = characteristics.lower, characteristics.upper, np.arange(len(characteristics))
@@ -71,14 +95,14 @@ def _far_apart(characteristics: CharacteristicSet) -> FloatArray:
     return characteristics.filter(np.array(corners))
 
 
-def _difference(one: Evaluations, other: Evaluations) -> tuple[str, object, object] | None:
-    """The first number in which two evaluations of a setting differ, and both values; failures tell nothing."""
+def _difference(one: Evaluations, other: Evaluations, most: float = 0.0) -> tuple[str, object, object] | None:
+    """The first number in which two evaluations of a setting differ, and both values, by more than `most`; failures tell nothing."""
     if one.failed[0] or other.failed[0]:
         return None
     if one.outcome[0] != other.outcome[0]:
         return "outcome", str(one.outcome[0]), str(other.outcome[0])
     for name in ("collision_speed", *one.metrics):
         here, there = (of.metrics.get(name, of.collision_speed) for of in (one, other))
-        if not np.array_equal(here, there, equal_nan=True):
+        if not np.allclose(here, there, rtol=0, atol=most, equal_nan=True):
             return name, float(here[0]), float(there[0])
     return None

@@ -43,7 +43,6 @@ def test_a_fit_from_scratch_finds_the_truth_and_forgets_what_the_study_says(data
     truth = load_study("sun").ads.parameters["brake_gap"]
     found = [calibrate(mine(gap, starts=1, trials=36), {"mine": data}, Here(), from_scratch=True) for gap in (0.4, 1.5)]
     assert found[0].values == found[1].values == {GAP: pytest.approx(truth, rel=0.05)}
-    assert found[0].alone
     assert found[0].reached == [found[0].cost]
     assert (found[0].used["mine"].rows, found[0].held_back["mine"].rows) == (12, 12)
 

@@ -1,9 +1,10 @@
-"""Parts of a run done once more as if there were nothing else: what leaks in rare states alone, or from run to run, shows there."""
+"""Parts of a run done once more: in SUMO itself what was driven in a recorded scene, and alone what other people's code had a part in."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future
+from functools import partial
 
 import numpy as np
 
@@ -15,16 +16,19 @@ from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.search import Search
 from safevar_sumo.study import Study, foreign_names
+from safevar_sumo.sumo import Engine
 from safevar_sumo.workers.evaluation import packed
-from safevar_sumo.workers.isolation import refuse_difference
+from safevar_sumo.workers.isolation import refuse_difference, refuse_unlike_sumo
 from safevar_sumo.workers.retrying import RetryingPool, reproducing
 
+Refusal = Callable[[Evaluations, Evaluations], None]
+"""Refuses two evaluations of settings that differ."""
 LEGAL = ("what a run asks for depends on its problem, its evaluations and `rng` alone: nothing kept in a class or a module between runs, "
          "no clock, no random numbers of its own")
 
 
-class IsolationCheck:
-    """Runs that have ended, and settings of theirs under way, each alone and with other people's models loaded afresh.
+class Verification:
+    """Runs that have ended, and settings of theirs under way: in SUMO, or alone and with other people's models loaded afresh.
 
     Attributes
     ----------
@@ -32,11 +36,13 @@ class IsolationCheck:
         By what computes it, a run and what it holds of a setting.
     """
 
-    def __init__(self, study: Study, results: ResultsDirectory, pool: RetryingPool, begun: Callable[[RunKey], Search]) -> None:
+    def __init__(self, study: Study, results: ResultsDirectory, pool: RetryingPool, begun: Callable[[RunKey], Search],
+                 engine: Engine) -> None:
         self._study, self._pool, self._begun = study, pool, begun
-        self._work = packed(study, results.inputs, afresh=True) if foreign_names(study) else None
+        self._alone = packed(study, results.inputs, engine=engine, afresh=True) if foreign_names(study) else None
+        self._in_sumo = packed(study, results.inputs, engine=Engine.LIBSUMO) if engine is Engine.RECORDED else None
         self._begun_twice: set[str] = set()
-        self.under_way: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}
+        self.under_way: dict[Future[Evaluations], tuple[Run, Evaluations, Refusal]] = {}
 
     def search(self, key: RunKey) -> Search:
         """The search of a run.
@@ -54,7 +60,7 @@ class IsolationCheck:
         return self._begun(key)
 
     def ask(self, run: Run) -> bool:
-        """Have settings of a run simulated once more; whether there are any, and models that are not ours.
+        """Have settings of a run simulated once more; whether there are any to verify.
 
         Raises
         ------
@@ -62,12 +68,16 @@ class IsolationCheck:
             If it is the last run of an algorithm from outside, and the same run, alone and loaded afresh, asks for other settings.
         """
         self._refuse_unrepeatable(run)
-        if self._work is None:
-            return False
-        samples = run.samples(run_generator(self._study, run.key._replace(algorithm=f"recheck {run.key.algorithm}")))
-        for known in samples:
-            self.under_way[self._pool.submit(self._work, known.settings)] = run, known
-        return bool(samples)
+        rng = run_generator(self._study, run.key._replace(algorithm=f"recheck {run.key.algorithm}"))
+        batches = [] if self._alone is None else [(self._alone, known, self._refuse_leak) for known in run.samples(rng)]
+        if self._in_sumo is not None and len(known := run.solutions_and_others(rng)):
+            batches.append((self._in_sumo, known, partial(refuse_unlike_sumo, self._study)))
+        for work, known, refuse in batches:
+            self.under_way[self._pool.submit(work, known.settings)] = run, known, refuse
+        return bool(batches)
+
+    def _refuse_leak(self, known: Evaluations, alone: Evaluations) -> None:
+        refuse_difference(self._study, {"in its run": known, "alone": alone}, reproducing(self._study, known.settings[0]))
 
     def _refuse_unrepeatable(self, run: Run) -> None:
         name = self._from_outside(run.key)
@@ -86,14 +96,13 @@ class IsolationCheck:
         return ForeignError(f"study {self._study.name!r}", problem, LEGAL)
 
     def take(self, done: Future[Evaluations]) -> Run | None:
-        """The run of a setting, if that was its last one.
+        """The run of settings, if those were its last ones.
 
         Raises
         ------
-        ForeignError
-            If the setting's result is another one alone.
+        InputError
+            If a setting's result is another one alone, or in SUMO.
         """
-        run, known = self.under_way.pop(done)
-        again = reproducing(self._study, known.settings[0])
-        refuse_difference(self._study, {f"in run {run.key}": known, "alone": done.result()}, again)
-        return None if any(run is other for other, _ in self.under_way.values()) else run
+        run, known, refuse = self.under_way.pop(done)
+        refuse(known, done.result())
+        return None if any(run is other for other, *_ in self.under_way.values()) else run

@@ -1,0 +1,102 @@
+"""Vehicles in a recorded scene, held against as many copies in SUMO."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+import safevar_sumo as sv
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import Outcome
+from safevar_sumo.scenarios import SCENARIOS
+from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo import Engine, at_every_point, reason_for_sumo
+from safevar_sumo.sumo.recording import reason_for_copies
+from safevar_sumo.sumo.system import System, assemble
+
+CLAIM = """
+from safevar_sumo.scenarios import PedestrianCrossing
+
+
+class Claims(PedestrianCrossing, frozen=True, kw_only=True):
+    reactive_actors = False
+"""
+
+
+def assert_same(system: System, number: int, seed: int) -> list[str]:
+    """The same bits everywhere; returns all outcomes."""
+    characteristics, rng = system.characteristics, np.random.default_rng(seed)
+    settings = characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (number, len(characteristics))))
+    settings[0] = characteristics.original
+    outcomes = []
+    for recorded, copies in zip(*(at_every_point(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO)), strict=True):
+        here, there = recorded.evaluations, copies.evaluations
+        assert here.outcome.tolist() == there.outcome.tolist()
+        np.testing.assert_array_equal(here.collision_speed, there.collision_speed)
+        for name, values in there.metrics.items():
+            np.testing.assert_array_equal(here.metrics[name], values, err_msg=name)
+        for ours, theirs in zip(recorded.drives.contact, copies.drives.contact, strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+        outcomes += here.outcome.tolist()
+    return outcomes
+
+
+def test_vehicles_in_a_recorded_scene_do_what_they_do_in_sumo_to_the_last_bit(any_system: System) -> None:
+    assert reason_for_sumo(any_system) == ""
+    assert_same(any_system, 60, 5)
+
+
+def test_contacts_are_those_that_sumo_finds() -> None:
+    """Brakes that come at every gap: hit by the front, by a corner, by the side, and missed."""
+    study, rng, outcomes = load_study("sun"), np.random.default_rng(6), []
+    for gap in rng.uniform(3.0, 9.0, 6):
+        ads = {**study.ads.parameters, "brake_gap": float(gap), "brake_gap_before": 1.0, "first_command": float(rng.uniform(0, 1.5))}
+        outcomes += assert_same(assemble(msgspec.structs.replace(study, ads=msgspec.structs.replace(study.ads, parameters=ads))), 40, 6)
+    assert 40 < outcomes.count(Outcome.COLLISION) < 220
+
+
+def test_points_of_different_length_share_a_batch() -> None:
+    system = assemble(load_study("euro_ncap_car_to_car"))
+    lengths = {point.scenario.duration for point in system.points}
+    assert len(lengths) > 2
+    assert_same(system, 3, 8)
+
+
+def test_a_shipped_scenario_on_somebody_elses_network_is_driven_in_sumo() -> None:
+    scenario = SCENARIOS["crossing"](network="my_town")
+    assert "my_town" in reason_for_copies(scenario, ())
+
+
+@pytest.fixture
+def reacting(in_tmp: Path) -> Path:
+    """A network whose pedestrian does not walk into a vehicle: what SUMO's pedestrians do unless they are told not to."""
+    shutil.copytree(NETWORKS / "pedestrian_crossing", in_tmp / "reacting")
+    options = in_tmp / "reacting" / "scenario.sumocfg"
+    lines = options.read_text().splitlines()
+    options.write_text("\n".join(line for line in lines if "mingap-to-vehicle" not in line))
+    return in_tmp
+
+
+def test_a_pedestrian_who_reacts_is_driven_in_sumo_without_being_asked(reacting: Path) -> None:
+    study = load_study("smoke", scenario={"parameters": {"network": "reacting"}},
+                       search={"runs": 1, "algorithms": ["rs"], "evaluations": 20},
+                       title="", published={})
+    sv.run(study, out="results/it", jobs=1)
+    engine = json.loads(Path("results/it/manifest.json").read_text())["engine"]
+    assert engine["name"] == "sumo"
+    assert "'reacting'" in engine["reason"]
+
+
+def test_a_scenario_that_claims_that_nobody_reacts_although_he_does_is_found_out(reacting: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(reacting)
+    Path("claims.py").write_text(CLAIM)
+    study = load_study("native", scenario={"model": "claims:Claims", "parameters": {"network": "reacting"}}, name="mine", title="",
+                       search={"runs": 1, "algorithms": ["rs"], "evaluations": 60}, published={})
+    with pytest.raises(InputError, match=r"in the recorded scene and .* in SUMO with mass = "):
+        sv.run(study, out="results/it", jobs=1)
