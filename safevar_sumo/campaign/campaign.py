@@ -45,7 +45,7 @@ class Campaign(NamedTuple):
 
 
 def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, pool: Pool, observer: Observer,
-                 batch: int = LARGEST_WORLD, *, engine: Engine = Engine.LIBSUMO, retry_failed: bool = False) -> Campaign:
+                 batch: int | None = None, *, engine: Engine = Engine.LIBSUMO, retry_failed: bool = False) -> Campaign:
     """Carry out runs of a study, or finish what of them is unfinished.
 
     Parameters
@@ -85,7 +85,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     def begun(key: RunKey) -> Search:
         return search_of(key, study, problem, results.note)
 
-    batcher, verification = Batcher(persistent, work, batch), Verification(study, results, persistent, begun, engine)
+    batcher, verification = Batcher(persistent, work, batch or LARGEST_WORLD), Verification(study, results, persistent, begun, engine)
 
     def go_on(run: Run) -> None:
         """Let a run go as far as it can, then ask for what it misses."""

@@ -42,6 +42,7 @@ class Verification:
         self._alone = packed(study, results.inputs, engine=engine, afresh=True) if foreign_names(study) else None
         self._in_sumo = packed(study, results.inputs, engine=Engine.LIBSUMO) if engine is Engine.RECORDED else None
         self._begun_twice: set[str] = set()
+        self._asked: set[Run] = set()
         self.under_way: dict[Future[Evaluations], tuple[Run, Evaluations, Refusal]] = {}
 
     def search(self, key: RunKey) -> Search:
@@ -69,15 +70,29 @@ class Verification:
         """
         self._refuse_unrepeatable(run)
         rng = run_generator(self._study, run.key._replace(algorithm=f"recheck {run.key.algorithm}"))
-        batches = [] if self._alone is None else [(self._alone, known, self._refuse_leak) for known in run.samples(rng)]
-        if self._in_sumo is not None and len(known := run.solutions_and_others(rng)):
-            batches.append((self._in_sumo, known, partial(refuse_unlike_sumo, self._study)))
-        for work, known, refuse in batches:
-            self.under_way[self._pool.submit(work, known.settings)] = run, known, refuse
-        return bool(batches)
+        for known in [] if self._alone is None else run.samples(rng):
+            self._submit(self._alone, run, known, partial(self._refuse_leak, run.key))
+        return self._is_under_way(run) or self._ask_sumo(run)
 
-    def _refuse_leak(self, known: Evaluations, alone: Evaluations) -> None:
-        refuse_difference(self._study, {"in its run": known, "alone": alone}, reproducing(self._study, known.settings[0]))
+    def _ask_sumo(self, run: Run) -> bool:
+        """Have settings of a run driven in SUMO, once nothing leaks between them; whether there are any."""
+        rng = run_generator(self._study, run.key._replace(algorithm=f"verify {run.key.algorithm}"))
+        known = None if self._in_sumo is None or run in self._asked else run.solutions_and_others(rng)
+        self._asked.add(run)
+        if not known:
+            return False
+        self._submit(self._in_sumo, run, known, partial(refuse_unlike_sumo, self._study))
+        return True
+
+    def _submit(self, work: bytes | None, run: Run, known: Evaluations, refuse: Refusal) -> None:
+        assert work is not None
+        self.under_way[self._pool.submit(work, known.settings)] = run, known, refuse
+
+    def _is_under_way(self, run: Run) -> bool:
+        return any(run is other for other, *_ in self.under_way.values())
+
+    def _refuse_leak(self, key: RunKey, known: Evaluations, alone: Evaluations) -> None:
+        refuse_difference(self._study, {f"in run {key}": known, "alone": alone}, reproducing(self._study, known.settings[0]))
 
     def _refuse_unrepeatable(self, run: Run) -> None:
         name = self._from_outside(run.key)
@@ -105,4 +120,7 @@ class Verification:
         """
         run, known, refuse = self.under_way.pop(done)
         refuse(known, done.result())
-        return None if any(run is other for other, *_ in self.under_way.values()) else run
+        if self._is_under_way(run) or self._ask_sumo(run):
+            return None
+        self._asked.discard(run)
+        return run

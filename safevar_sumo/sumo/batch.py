@@ -21,11 +21,9 @@ from safevar_sumo.sumo.recording import RecordedWorld, reason_for_copies, record
 from safevar_sumo.sumo.staging import staged
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
-from safevar_sumo.sumo.world import SumoWorld
+from safevar_sumo.sumo.world import SURE_BRAKES, SumoWorld
 from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, at_start, slope_of
 
-SURE_BRAKES = 9.0
-"""SUMO puts nobody onto the road who might not stop before what is ahead; there everybody brakes so hard at least [m/s^2]."""
 Watcher = Callable[[SumoWorld], None]
 
 

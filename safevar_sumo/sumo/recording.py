@@ -120,6 +120,7 @@ def recording_of(scenario: Scenario, options: Sequence[str]) -> Recording:
 def _recorded(scenario: Any, fingerprint: str, options: tuple[str, ...]) -> Recording | str:
     """The scene, or why there is none; `fingerprint` stands for the contents of the network's files."""
     with world_on(staged(scenario), 1, Engine.LIBSUMO, options) as world:
+        world.let_depart()
         world.depart()
         try:
             return _played(scenario, world)

@@ -18,6 +18,10 @@ from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.sumo.reusable import ReusableSumo
 from safevar_sumo.vehicles import Sensors, SumoType
 
+SURE_BRAKES = 9.0
+"""SUMO puts nobody onto the road who might not stop before what is ahead; there everybody brakes so hard at least [m/s^2]."""
+FASTEST = 200.0
+"""A vehicle in a scene that is recorded may depart as fast as this [m/s]."""
 # Speed mode: SUMO obeys every speed that is set and yields to nobody on a junction (TraCI "set speed mode", bit 5).
 OBEY = 32
 # Lane change mode: none at all (TraCI "set lane change mode").
@@ -81,6 +85,12 @@ class SumoWorld:
             vehicletype.setMaxSpeed(name, max_speed)
             vehicletype.setTau(name, tau)
         self.set_decelerations(types.decel)
+
+    def let_depart(self) -> None:
+        """Make the vehicles under test such that SUMO puts them onto the road at any speed."""
+        for name in self.ids(VUT):
+            self._api.vehicletype.setMaxSpeed(name, FASTEST)
+        self.set_decelerations(np.full(self.n, SURE_BRAKES))
 
     def set_decelerations(self, decel: FloatArray) -> None:
         """What their brakes can do at the most, in an emergency too [m/s^2]."""

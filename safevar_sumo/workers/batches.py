@@ -29,6 +29,12 @@ _isolated: set[bytes] = set()
 """Packed studies whose models have been seen to keep settings apart."""
 
 
+def batches_of(study: Study) -> tuple[int, bool]:
+    """How many settings a batch pays to have, and whether they are driven in a recorded scene."""
+    system = assemble(study)
+    return settings_per_batch(system, Engine.RECORDED), not reason_for_sumo(system)
+
+
 def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[[int], None] = lambda number: None) -> Evaluations:
     """Evaluate many filtered settings, shape (M, n), row by row; equal rows are simulated once.
 
@@ -41,13 +47,13 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
         check_isolation(study, CharacteristicSet.of(study.vehicle.characteristics), lambda rows: persistent.submit(work, rows))
         _isolated.add(work)
     unique, row_of = np.unique(settings, axis=0, return_inverse=True)
-    system = assemble(study)
-    size = min(settings_per_batch(system, Engine.RECORDED), max(math.ceil(len(unique) / (SHARES * pool.workers)), LEAST_BATCH))
+    most, recorded = batches_of(study)
+    size = min(most, max(math.ceil(len(unique) / (SHARES * pool.workers)), LEAST_BATCH))
     starts = range(0, len(unique), size)
     futures = {persistent.submit(work, unique[start:start + size]): start for start in starts}
     verified = np.linspace(0, len(unique) - 1, min(VERIFIED, len(unique))).astype(int)
     in_sumo = None
-    if work not in _verified and not reason_for_sumo(system):
+    if recorded and work not in _verified:
         in_sumo = persistent.submit(packed(study, inputs, engine=Engine.LIBSUMO), unique[verified])
     parts: dict[int, Evaluations] = {}
     while len(parts) < len(futures):

@@ -17,6 +17,7 @@ def _made_up_studies_travel_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     def packed(study: Study, *inputs: Any, **options: Any) -> bytes:
         return study.name.encode() if study.name == "made-up" else pack(study, *inputs, **options)
 
-    read = many.inputs_of
+    read, batches = many.inputs_of, many.batches_of
+    monkeypatch.setattr(many, "batches_of", lambda study: (100, False) if study.name == "made-up" else batches(study))
     monkeypatch.setattr(many, "packed", packed)
     monkeypatch.setattr(many, "inputs_of", lambda study, pool: {} if study.name == "made-up" else read(study, pool))
