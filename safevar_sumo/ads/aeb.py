@@ -8,8 +8,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.ads.base import NotNegative, Positive
-from safevar_sumo.ads.driver import in_the_way
-from safevar_sumo.ads.pedals import Trim, pedals, trim
+from safevar_sumo.ads.driver import Trim, in_the_way, pedals, trim
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 LEAST_DECELERATION = 0.5

@@ -7,7 +7,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.pedals import looked_up
+from safevar_sumo.ads.driver import looked_up
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]

@@ -11,7 +11,7 @@ from safevar_sumo.records import Command, Nominal, Observation
 
 
 class _Memory(NamedTuple):
-    """What is known of the original vehicle."""
+    """The original vehicle and the time between two calls [s]."""
 
     nominal: Nominal
     step: float

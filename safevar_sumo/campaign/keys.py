@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, unknown
-from safevar_sumo.plugins import Files, Lookup, Member, digests, forget_foreign, guard_process_state, made, noted_reading
+from safevar_sumo.plugins import Files, Lookup, Member, digests, forget_foreign, guard_process_state, instance_of, noted_reading
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm, Problem, Search
 from safevar_sumo.study import SearchTable, Study
 
@@ -30,7 +30,7 @@ def all_runs(study: Study) -> list[RunKey]:
 
 
 def algorithm_of(label: str, study: Study) -> Algorithm:
-    """An algorithm by its label in results, set as the study says.
+    """An algorithm by its label in results, with the study's parameters.
 
     Raises
     ------
@@ -48,12 +48,12 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     member = algorithm_member(name, study)
     with guard_process_state(source, [name] if member.guard else []):
         parameters = Lookup(source, study.origin.places).with_paths(member, search.parameters.get(label, {}), key)
-        algorithm = made(member, parameters, f"search.algorithms: {name!r}", key, source)
+        algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)
     return algorithm if member.guard is None else GuardedAlgorithm(algorithm, member.guard)
 
 
 def read_by_algorithms(study: Study) -> Files:
-    """Digests of what a study's algorithms from outside read while they are loaded and made, in this process."""
+    """Digests of files that a study's algorithms from outside read while they are loaded and instantiated, in this process."""
     own = _packages(study)
     if not own:
         return {}
@@ -65,7 +65,7 @@ def read_by_algorithms(study: Study) -> Files:
 
 
 def search_of(key: RunKey, study: Study, problem: Problem, note: Callable[[Files], None]) -> Search:
-    """The search of a run; `note` is told after every step which files an algorithm from outside has read."""
+    """The search of a run; calls `note` after every step with the files that an algorithm from outside has read."""
     own, rng, ended = _packages(study), run_generator(study, key), False
     search: Search | None = None
     answer: Any = None  # what begins a generator
@@ -84,17 +84,17 @@ def search_of(key: RunKey, study: Study, problem: Problem, note: Callable[[Files
 
 
 def _packages(study: Study) -> list[str]:
-    """The top modules of algorithms from outside."""
+    """Top modules of the algorithms from outside."""
     return [name.partition(":")[0].partition(".")[0] for name in study.search.algorithms if ":" in name]
 
 
 def algorithm_member(name: str, study: Study) -> Member:
-    """How an algorithm is found."""
+    """An algorithm of a study by its name."""
     lookup = Lookup(f"study {study.name!r}", study.origin.places)
     return lookup.class_of(ALGORITHMS, name, "search.algorithms", ALGORITHM_CONTRACT)
 
 
 def run_generator(study: Study, key: RunKey) -> np.random.Generator:
-    """The random numbers of one run: the same whether it runs alone or with others."""
+    """The random numbers of a run, independent of other runs."""
     sequence = np.random.SeedSequence(study.search.seed, spawn_key=(zlib.crc32(key.algorithm.encode()), key.run))
     return np.random.Generator(np.random.PCG64(sequence))

@@ -9,12 +9,12 @@ from safevar_sumo.plugins.lookup import (
     check_parameters,
     forget_foreign,
     inherit_reachable,
-    made,
+    instance_of,
     make_reachable,
     reachable,
 )
 
 __all__ = [
     "DIGITS", "Contract", "Files", "Guard", "Lookup", "Member", "OwnModules", "accepts", "changes", "check_parameters", "digest_of",
-    "digests", "forget_foreign", "guard_process_state", "inherit_reachable", "located", "made", "make_reachable", "named_files",
+    "digests", "forget_foreign", "guard_process_state", "inherit_reachable", "instance_of", "located", "make_reachable", "named_files",
     "noted_reading", "reachable", "read_only_copy"]

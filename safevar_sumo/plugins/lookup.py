@@ -247,7 +247,7 @@ def _digest(file: str) -> bytes:
         return b""
 
 
-def made(member: Member, parameters: Mapping[str, Any], name: str, key: str, source: str) -> Any:
+def instance_of(member: Member, parameters: Mapping[str, Any], name: str, key: str, source: str) -> Any:
     """An instance of a class.
 
     Parameters
@@ -275,7 +275,7 @@ def made(member: Member, parameters: Mapping[str, Any], name: str, key: str, sou
 
 def check_parameters(function: Callable[..., Any], arguments: tuple[Any, ...], parameters: Mapping[str, Any], name: str, key: str,
                      source: str) -> None:
-    """Refuse parameters that a class or function does not take beside its arguments; otherwise as `made`."""
+    """Refuse parameters that a class or function does not take beside its arguments; raises as `instance_of`."""
     try:
         inspect.signature(function).bind(*arguments, **parameters)
     except TypeError as error:

@@ -29,11 +29,11 @@ def make_directory(path: Path) -> None:
 
 
 def make_durable(path: Path) -> None:
-    """Make a directory and those above it, and have the disk know of each."""
-    missing = [one for one in (path, *path.parents) if not one.is_dir()]
+    """Make a directory and those above it, and sync them to the disk."""
+    missing = [folder for folder in (path, *path.parents) if not folder.is_dir()]
     path.mkdir(parents=True, exist_ok=True)
-    for one in missing:
-        sync_directory(one.parent)
+    for folder in missing:
+        sync_directory(folder.parent)
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -62,7 +62,7 @@ def write_whole(path: Path, text: str) -> None:
 
 
 def sync_directory(path: Path) -> None:
-    """Have the disk know what was made or renamed in a directory; where directories cannot be synced, they need not be."""
+    """Sync a directory to the disk, on systems that can."""
     if not hasattr(os, "O_DIRECTORY"):
         return
     handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)

@@ -1,4 +1,4 @@
-"""Handles: how a solution of a results directory is called, `ALGORITHM:RUN:N`, and the solutions that are asked for by what they are."""
+"""Identifiers of solutions, `ALGORITHM:RUN:N`, and the choice of a solution by its severity or size."""
 
 from __future__ import annotations
 
@@ -62,12 +62,10 @@ def position_of(solutions: pd.DataFrame, handle: SolutionId, source: object = "s
     InputError
         If there is no such solution.
     """
-    known = handles(solutions)
-    if handle in known:
-        return known.index(handle)
-    last: dict[tuple[str, int], int] = {}
-    for one in known:
-        last[one.algorithm, one.run] = one.row
+    all_handles = handles(solutions)
+    if handle in all_handles:
+        return all_handles.index(handle)
+    last = {(other.algorithm, other.run): other.row for other in all_handles}
     if (handle.algorithm, handle.run) in last:
         legal = f"N from 0 to {last[handle.algorithm, handle.run]}"
     else:
@@ -87,7 +85,7 @@ CHOICES = {
     "fewest": ["f_num_diff", "f_safe", "f_diff"],
     "smallest": ["f_diff", "f_safe", "f_num_diff"],
 }
-"""What solutions are asked for by: the objectives that decide, one after the other, the least first."""
+"""Objectives that decide a choice, in order; smaller values first."""
 
 
 def chosen_handle(solutions: pd.DataFrame, original: float, choice: str, source: object) -> SolutionId:

@@ -43,7 +43,7 @@ class Along(BehindSomebody, frozen=True, kw_only=True):
 
     @property
     def test_speed(self) -> float:
-        """That the vehicle is to hold until it brakes [m/s]."""
+        """Speed that the vehicle holds until it brakes [m/s]."""
         return self.speed * KMH
 
     @property
@@ -52,7 +52,7 @@ class Along(BehindSomebody, frozen=True, kw_only=True):
         return self.time_to_impact + self.time_after
 
     def remarks(self) -> list[str]:
-        """What is outside the protocol."""
+        """Remarks on parameters outside the protocol."""
         return PROTOCOL.remarks("CPLA", self.speed, self.impact_location, self.grade)
 
     def actors(self, roads: Roads) -> Actors:

@@ -112,7 +112,7 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     @property
     def test_speed(self) -> float:
-        """That the vehicle is to hold until it brakes [m/s]."""
+        """Speed that the vehicle holds until it brakes [m/s]."""
         return self.speed * KMH
 
     @property
@@ -121,7 +121,7 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return self.time_to_impact + self.time_after
 
     def remarks(self) -> list[str]:
-        """What is outside the protocol."""
+        """Remarks on parameters outside the protocol."""
         return TESTS[self.test].range.remarks(self.test, self.speed, self.impact_location, self.grade)
 
     def actors(self, roads: Roads) -> Actors:

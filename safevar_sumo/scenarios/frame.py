@@ -1,4 +1,4 @@
-"""Places seen from the vehicle's lane: how far along it, and how far to its left; whatever way the lane lies."""
+"""Coordinates along the vehicle's lane and to its left, whatever its direction."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios.base import BentLane, Coordinates, Lane
 
 SKEW = 0.05
-"""So far a crossing at right angles may lead along the road [m]."""
+"""Largest extent along the road of a crossing at right angles [m]."""
 
 
 class Frame(NamedTuple):

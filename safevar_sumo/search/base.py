@@ -61,18 +61,18 @@ class GuardedAlgorithm:
         search = self._guard.call("search", self._algorithm.search, read_only_copy(problem), rng)
         if not (hasattr(search, "send") and hasattr(search, "__next__")):
             raise self._guard.wrong("search", "the search", search, "a generator: a method that yields settings and returns its result")
-        known: dict[bytes, Evaluations] = {}
+        sent: dict[bytes, Evaluations] = {}
         answer: Evaluations | None = None
         left = problem.evaluations
         while True:
             asked, over = self._guard.call("search", _next, search, answer)
             if over:
-                return self._result(asked, known, problem)
+                return self._result(asked, sent, problem)
             settings = self._settings(asked, problem, left)
             left -= len(settings)
             evaluated = yield settings
             for i, row in enumerate(settings):
-                known[row.tobytes()] = evaluated.take([i])
+                sent[row.tobytes()] = evaluated.take([i])
             answer = read_only_copy(evaluated)
 
     def _settings(self, asked: Any, problem: Problem, left: int) -> FloatArray:
@@ -90,18 +90,18 @@ class GuardedAlgorithm:
                                     "filtered settings: problem.characteristics.filter(settings)")
         return settings
 
-    def _result(self, result: Any, known: dict[bytes, Evaluations], problem: Problem) -> Evaluations:
+    def _result(self, result: Any, sent: dict[bytes, Evaluations], problem: Problem) -> Evaluations:
         legal = "an Evaluations of settings that it was sent, such as evaluations.take(rows)"
         if not isinstance(result, Evaluations):
             raise self._guard.wrong("search", "its result", result, legal)
-        if not known:
+        if not sent:
             raise ForeignError(self._guard.source, f"{self._guard.name} ended in search without asking for any setting",
                                f"a generator that yields from 1 to {problem.evaluations} settings before it returns")
         rows = self._guard.numbers("search", "its result's settings", result.settings, (len(result), len(problem.characteristics)))
-        if any(row.tobytes() not in known for row in rows):
+        if any(row.tobytes() not in sent for row in rows):
             raise self._guard.wrong("search", "its result", "settings that it never asked for", legal)
-        nothing = next(iter(known.values())).take([])
-        evaluations = Evaluations.concatenate([nothing, *(known[row.tobytes()] for row in rows)])
+        nothing = next(iter(sent.values())).take([])
+        evaluations = Evaluations.concatenate([nothing, *(sent[row.tobytes()] for row in rows)])
         return evaluations.take(problem.scoring.valid(evaluations))
 
 

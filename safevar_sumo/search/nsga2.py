@@ -23,18 +23,18 @@ Index = Annotated[float, Meta(ge=0, le=1000)]
 
 @cache
 def _fitness(objectives: int) -> type[Any]:
-    """The class of fitnesses of so many objectives, all minimised."""
+    """The class of a fitness with a number of objectives, all minimised."""
     return type("Fitness", (base.Fitness,), {"weights": (-1.0,) * objectives})
 
 
 class _Individual(list[float]):
-    """Unfiltered values of a setting; once evaluated, its fitness and the evaluations that it is a row of.
+    """Unfiltered values of a setting; once evaluated, its fitness, and its `evaluation`: a batch and its row in it.
 
-    Of a survivor `standing` is its rank, from 0, and its crowding distance below 0: who has less is better.
+    A survivor's `standing` is its rank, from 0, and minus its crowding distance: less is better.
     """
 
     fitness: base.Fitness
-    found: tuple[Evaluations, int]
+    evaluation: tuple[Evaluations, int]
     standing: tuple[int, float]
 
 
@@ -62,12 +62,12 @@ class Nsga2(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         while brood:
             evaluated = yield characteristics.filter(np.array(brood))
             for i, (individual, objectives) in enumerate(zip(brood, problem.scoring.values(evaluated).tolist(), strict=True)):
-                individual.found, individual.fitness = (evaluated, i), fitness(tuple(objectives))
+                individual.evaluation, individual.fitness = (evaluated, i), fitness(tuple(objectives))
             asked += len(brood)
-            good = [one for one, valid in zip(brood, problem.scoring.valid(evaluated), strict=True) if valid]
+            good = [individual for individual, valid in zip(brood, problem.scoring.valid(evaluated), strict=True) if valid]
             population = _survivors(population + good, problem.population)
             brood = variation.offspring(population, min(problem.population, problem.evaluations - asked))
-        front = [evaluations.take([row]) for evaluations, row in (one.found for one in population if one.standing[0] == 0)]
+        front = [evaluations.take([row]) for evaluations, row in (best.evaluation for best in population if best.standing[0] == 0)]
         return Evaluations.concatenate(front) if front else evaluated.take([])
 
 
@@ -82,7 +82,7 @@ class _Variation:
 
     @contextmanager
     def randomness(self) -> Iterator[None]:
-        """DEAP draws from the global `random`: lend it this run's state, give the caller's back."""
+        """Run with this run's state of the global `random`, which DEAP draws from; restore the caller's."""
         callers = random.getstate()
         random.setstate(self._state)
         try:
@@ -107,31 +107,31 @@ class _Variation:
 
 def _survivors(individuals: list[_Individual], number: int) -> list[_Individual]:
     """The best `number` by rank, then by crowding distance; DEAP's `selNSGA2`, sorted by compiled code."""
-    ordered = sorted(individuals, key=lambda one: one.fitness.wvalues, reverse=True)
+    ordered = sorted(individuals, key=lambda individual: individual.fitness.wvalues, reverse=True)
     survivors: list[_Individual] = []
     for rank, front in enumerate(_fronts(ordered)):
         tools.emo.assignCrowdingDist(front)
-        for one in front:
-            one.standing = rank, -one.fitness.crowding_dist
-        survivors += sorted(front, key=lambda one: one.standing)
+        for individual in front:
+            individual.standing = rank, -individual.fitness.crowding_dist
+        survivors += sorted(front, key=lambda individual: individual.standing)
         if len(survivors) >= number:
             break
     return survivors[:number]
 
 
 def _fronts(individuals: list[_Individual]) -> list[list[_Individual]]:
-    """The non-dominated ones, then those that only they dominate, and so on; each in the order in which they are given."""
+    """Individuals by non-domination rank, in their given order."""
     if not individuals:
         return []
-    ranks = moocore.pareto_rank([one.fitness.wvalues for one in individuals], maximise=True).tolist()
+    ranks = moocore.pareto_rank([individual.fitness.wvalues for individual in individuals], maximise=True).tolist()
     fronts: list[list[_Individual]] = [[] for _ in range(max(ranks) + 1)]
-    for one, rank in zip(individuals, ranks, strict=True):
-        fronts[rank].append(one)
+    for individual, rank in zip(individuals, ranks, strict=True):
+        fronts[rank].append(individual)
     return fronts
 
 
 def _tournament(population: list[_Individual], size: int = 2) -> _Individual:
-    """The best of some that are drawn without replacement: by rank, then by crowding distance, then by chance."""
+    """The best of `size` individuals drawn without replacement: by rank, crowding distance, then chance."""
     if len(population) == 1:
         return population[0]
     best, *others = random.sample(population, min(size, len(population)))

@@ -1,4 +1,4 @@
-"""What is wrong with a table: every mistake by its key, with what would be right."""
+"""Validation of tables: every mistake with its key and what is expected."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MOST_SHOWN = 8
 
 
 def converted(source: object, raw: object, table: type[T], prefix: str = "") -> T:
-    """A table as what it should be.
+    """A table converted to a record.
 
     Raises
     ------
@@ -35,20 +35,20 @@ def converted(source: object, raw: object, table: type[T], prefix: str = "") -> 
         raise invalid(source, raw, error, prefix) from None
 
 
-def refuse(found: Iterable[InputError]) -> None:
+def refuse(errors: Iterable[InputError]) -> None:
     """Raise mistakes as one error, if there are any."""
-    several = list(found)
-    if len(several) == 1:
-        raise several[0]
-    if several:
-        told = [f"{one.problem}{f' (legal: {one.legal})' if one.legal else ''}" for one in several[:MOST_SHOWN]]
-        if len(several) > MOST_SHOWN:
-            told.append(f"and {len(several) - MOST_SHOWN} more")
-        raise InputError(several[0].source, f"{len(several)} mistakes: {'; '.join(told)}")
+    mistakes = list(errors)
+    if len(mistakes) == 1:
+        raise mistakes[0]
+    if mistakes:
+        texts = [f"{error.problem}{f' (legal: {error.legal})' if error.legal else ''}" for error in mistakes[:MOST_SHOWN]]
+        if len(mistakes) > MOST_SHOWN:
+            texts.append(f"and {len(mistakes) - MOST_SHOWN} more")
+        raise InputError(mistakes[0].source, f"{len(mistakes)} mistakes: {'; '.join(texts)}")
 
 
 def mistakes(source: object, raw: Any, kind: Any, where: str = "") -> Iterator[InputError]:
-    """Everything in `raw` that is not as `kind` says."""
+    """All mistakes in `raw`, which should be of type `kind`."""
     if isinstance(kind, type) and issubclass(kind, Struct) and isinstance(raw, Mapping):
         fields = {field.name: field for field in msgspec.structs.fields(kind)}
         for key in raw:
@@ -72,7 +72,7 @@ def mistakes(source: object, raw: Any, kind: Any, where: str = "") -> Iterator[I
 
 
 def _tables(kind: Any) -> list[Any]:
-    return [one for one in get_args(kind) if isinstance(one, type) and issubclass(one, Struct)]
+    return [option for option in get_args(kind) if isinstance(option, type) and issubclass(option, Struct)]
 
 
 def _inside(where: str, key: str) -> str:
@@ -84,12 +84,12 @@ def invalid(source: object, raw: object, error: msgspec.ValidationError, prefix:
     """Turn msgspec's error on `raw` into one that names the key and its value."""
     problem, _, location = str(error).partition(" - at `$")
     keys = [key for key in location.rstrip("`").replace("[...]", "").split(".") if key]
-    value, known = raw, True
+    value, exists = raw, True
     for key in keys:
-        known = known and isinstance(value, dict) and key in value
-        value = value[key] if known and isinstance(value, dict) else None
+        exists = exists and isinstance(value, dict) and key in value
+        value = value[key] if exists and isinstance(value, dict) else None
     where = ".".join([*([prefix] if prefix else []), *keys])
-    if known and where and not isinstance(value, dict):
+    if exists and where and not isinstance(value, dict):
         return InputError(source, f"{where} = {_short(value)}", problem)
     return InputError(source, f"{where}: {problem}" if where else problem)
 

@@ -18,7 +18,7 @@ import numpy as np
 from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown
 from safevar_sumo.metrics import F_SAFE, METRICS, Metric, Objective, Scoring, foreign_metric
-from safevar_sumo.plugins import Guard, Lookup, Member, OwnModules, check_parameters, guard_process_state, made
+from safevar_sumo.plugins import Guard, Lookup, Member, OwnModules, check_parameters, guard_process_state, instance_of
 from safevar_sumo.records import Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, weather_of
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, foreign_names
@@ -222,7 +222,7 @@ def _traci(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
             """A controller for one vehicle, from what the module that it has for itself says."""
             if not inspect.isclass(what):
                 return partial(what, **parameters)
-            return made(member._replace(what=what), parameters, name, "ads.parameters", lookup.source)
+            return instance_of(member._replace(what=what), parameters, name, "ads.parameters", lookup.source)
 
         controller_of(what)
     places, attribute = [*lookup.places, os.getcwd()], choice.model.partition(":")[2]
@@ -291,14 +291,14 @@ def _check_units(study: Study, vehicle: Vehicle, ours: bool, source: str) -> Non
 def _vehicle(choice: VehicleTable, lookup: Lookup) -> tuple[Vehicle, Member]:
     member = lookup.class_of(VEHICLES, choice.model, "vehicle.model", VEHICLE_CONTRACT)
     parameters = lookup.with_paths(member, choice.parameters, "vehicle.parameters")
-    vehicle = made(member, parameters, f"vehicle.model = {choice.model!r}", "vehicle.parameters", lookup.source)
+    vehicle = instance_of(member, parameters, f"vehicle.model = {choice.model!r}", "vehicle.parameters", lookup.source)
     return (vehicle if member.guard is None else GuardedVehicle(vehicle, member.guard)), member
 
 
 def _scenario(choice: ModelTable, lookup: Lookup) -> tuple[Scenario, Member]:
     member = lookup.class_of(SCENARIOS, choice.model, "scenario.model", SCENARIO_CONTRACT)
     parameters = lookup.with_paths(member, choice.parameters, "scenario.parameters")
-    scenario = made(member, parameters, f"scenario.model = {choice.model!r}", "scenario.parameters", lookup.source)
+    scenario = instance_of(member, parameters, f"scenario.model = {choice.model!r}", "scenario.parameters", lookup.source)
     return _with_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.places), member
 
 
@@ -308,7 +308,8 @@ def _ads(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
     member = lookup.class_of(ADS, choice.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT,
                              otherwise=f'with ads.kind = "traci" {STEP}')
     name = f"ads.model = {choice.model!r}"
-    make = partial(made, member, lookup.with_paths(member, choice.parameters, "ads.parameters"), name, "ads.parameters", lookup.source)
+    parameters = lookup.with_paths(member, choice.parameters, "ads.parameters")
+    make = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
     driver = make()
     if issubclass(member.what, ScalarAds):
         guard = member.guard or Guard(lookup.source, name)

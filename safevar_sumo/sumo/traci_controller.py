@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.ads.pedals import Trim, pedals, trim
+from safevar_sumo.ads.driver import Trim, pedals, trim
 from safevar_sumo.plugins import Guard, OwnModules
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT

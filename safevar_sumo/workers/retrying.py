@@ -1,8 +1,7 @@
-"""A pool that does not give up because a worker did: again, then in ever smaller parts, then without the setting that is left.
+"""A pool that retries a failed batch: as a whole, then in ever smaller parts, then without the setting that fails alone.
 
-Only what SUMO itself refuses, dies of or hangs on becomes an outcome, `simulator-error`: a setting that fails alone, again
-and again, while the original vehicle is simulated in between. What the surroundings are at fault for (disk, network
-files, memory) and what a user's own code does is an error that ends the study; the same command later goes on from there.
+A setting that repeatedly fails alone in SUMO, while the original vehicle can be simulated, gets the outcome `simulator-error`. Faults of
+the environment (disk, network files, memory) and of a user's own code end the study; the same command later goes on from there.
 """
 
 from __future__ import annotations
@@ -23,17 +22,17 @@ from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, PoolLostError, WorkerLostError
 
 Then = Callable[[Evaluations | None, BaseException | None], None]
-"""Is told what became of a batch: its evaluations, or its error."""
+"""Callback for a finished batch, with its evaluations or its error."""
 ATTEMPTS = 2
-"""How often a batch is tried as a whole, and a setting alone: somebody else may have killed the worker."""
+"""Attempts for a whole batch, and for a single setting: another process may have killed the worker."""
 PARTS = 8
-"""Into how many parts a failing batch is split: of 200 settings, one that takes a worker with it costs five workers' time limits."""
+"""Parts into which a failing batch is split: one fatal setting among 200 costs five time limits."""
 FAILURES_IN_A_ROW = 20
-"""So many settings that fail one after the other are a fault of the study, not of the settings."""
+"""Number of failing settings in a row that count as a fault of the study."""
 
 
 class RetryingPool:
-    """Settings that fail alone are evaluated as `simulator-error`; too many of them in a row are an error.
+    """Evaluates settings that fail alone as `simulator-error`; too many in a row are an error.
 
     Parameters
     ----------
@@ -42,7 +41,7 @@ class RetryingPool:
     study
         What is computed.
     note
-        Is told of files that other people's code reads and that the study did not begin with; may refuse them.
+        Called with files that code from outside reads and that the study did not begin with; may refuse them.
     """
 
     def __init__(self, pool: Pool, study: Study, note: Callable[[Mapping[str, str]], None] = lambda files: None) -> None:
@@ -77,7 +76,7 @@ class RetryingPool:
             elif len(settings) > 1:
                 self._in_parts(study, settings, into)
             elif self._foreign and isinstance(error, WorkerLostError):
-                into.set_exception(self._told(self._blamed(error), settings))
+                into.set_exception(self._with_command(self._blamed(error), settings))
             elif must_succeed:
                 into.set_exception(error)
             else:
@@ -86,7 +85,7 @@ class RetryingPool:
         self._computed(study, settings, done)
 
     def _computed(self, study: bytes, settings: FloatArray, then: Then) -> None:
-        """Have a batch computed; `then` is told its evaluations or its error."""
+        """Compute a batch once; call `then` with its evaluations or its error."""
         def done(attempt: Future[Evaluations]) -> None:
             error = PoolLostError("the batch was cancelled") if attempt.cancelled() else attempt.exception()
             if error is None and attempt.result().files:
@@ -104,9 +103,9 @@ class RetryingPool:
             attempt.add_done_callback(done)
 
     def _in_parts(self, study: bytes, settings: FloatArray, into: Future[Evaluations]) -> None:
-        """Part a batch that fails, and the parts that fail again: the others cost what they would have."""
+        """Split a failing batch; parts that fail again are split further."""
         parts = np.array_split(settings, min(PARTS, len(settings)))
-        found: dict[int, Evaluations] = {}
+        results: dict[int, Evaluations] = {}
         lock = threading.Lock()
 
         def done(number: int, part: Future[Evaluations]) -> None:
@@ -116,9 +115,9 @@ class RetryingPool:
                 if part.exception() is not None:
                     into.set_exception(part.exception())
                     return
-                found[number] = part.result()
-                if len(found) == len(parts):
-                    into.set_result(Evaluations.concatenate([found[number] for number in range(len(parts))]))
+                results[number] = part.result()
+                if len(results) == len(parts):
+                    into.set_result(Evaluations.concatenate([results[number] for number in range(len(parts))]))
 
         for number, rows in enumerate(parts):
             if not into.done():
@@ -127,7 +126,7 @@ class RetryingPool:
                 self._attempt(study, rows, ATTEMPTS if len(rows) == 1 else 1, part, must_succeed=False)
 
     def _give_up(self, study: bytes, setting: FloatArray, error: SafevarError, into: Future[Evaluations]) -> None:
-        """Blame the setting if the original vehicle can be simulated and the setting then still cannot."""
+        """Give a setting the outcome `simulator-error` if it still fails after the original vehicle has been simulated."""
         def then_again(evaluations: Evaluations | None, again: BaseException | None) -> None:
             if evaluations is not None:
                 into.set_result(evaluations)
@@ -157,9 +156,9 @@ class RetryingPool:
             f_num_diff=self._characteristics.number_changed(setting), reasons={setting[0].tobytes(): " ".join(str(error).split())})
 
     def _locate(self, study: bytes, settings: FloatArray, error: ForeignError, into: Future[Evaluations]) -> None:
-        """Find the setting that the failure of a user's code belongs to, half by half, and tell how to have it again."""
+        """Find the setting on which a user's code fails, by bisection, and name the command that reproduces it."""
         if len(settings) == 1:
-            into.set_exception(self._told(error, settings))
+            into.set_exception(self._with_command(error, settings))
             return
         halves = settings[:len(settings) // 2], settings[len(settings) // 2:]
 
@@ -178,11 +177,11 @@ class RetryingPool:
         self._computed(study, halves[0], first_done)
 
     def _blamed(self, error: WorkerLostError) -> ForeignError:
-        """A process that ends or hangs with a user's code in it is that code's fault, as far as anybody can tell."""
+        """The error for a worker that repeatedly ends or hangs while it runs a user's code."""
         problem = f"{error}, again and again, with {' and '.join(self._foreign)} in it; a process that is gone cannot tell file and line"
         return ForeignError(f"study {self._study.name!r}", problem)
 
-    def _told(self, error: ForeignError, setting: FloatArray) -> ForeignError:
+    def _with_command(self, error: ForeignError, setting: FloatArray) -> ForeignError:
         """The error with a command that reproduces it."""
         return ForeignError(error.source, f"{error.problem}; again by: {reproducing(self._study, setting[0])}", error.legal)
 
