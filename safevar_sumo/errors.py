@@ -49,13 +49,13 @@ class EnvironmentFault(SafevarError):
     """What a simulation needs beside its setting failed: a disk, memory, netconvert, SUMO's start."""
 
 
-def told(error: BaseException) -> str:
+def first_line(error: BaseException) -> str:
     """What kind of error it is and the first line of what it says, whatever its author did to its text."""
     try:
-        said = str(error).strip().splitlines()
+        lines = str(error).strip().splitlines()
     except Exception:
-        said = []
-    return f"{type(error).__name__}: {said[0]}" if said else type(error).__name__
+        lines = []
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
 def unknown(source: object, problem: str, given: object, names: Iterable[str], otherwise: str = "") -> InputError:
@@ -72,8 +72,8 @@ def unknown(source: object, problem: str, given: object, names: Iterable[str], o
     otherwise
         What would be right beside the names.
     """
-    known = list(names)
-    return InputError(source, f"{problem}{did_you_mean(given, known)}", f"{one_of(known)}{otherwise}")
+    options = list(names)
+    return InputError(source, f"{problem}{did_you_mean(given, options)}", f"{one_of(options)}{otherwise}")
 
 
 def did_you_mean(given: object, names: Iterable[str]) -> str:
@@ -111,5 +111,5 @@ def refuse_other_than_file(path: Path, source: object = None, *, streams: bool =
     """
     handed_on = streams and (str(path) in HANDED_ON or str(path.parent) in HANDLES)
     if path.exists() and not path.is_file() and not handed_on:
-        told = "is no regular file"
-        raise InputError(path if source is None else source, told if source is None else f"{path} {told}", "a file")
+        problem = "is no regular file"
+        raise InputError(path if source is None else source, problem if source is None else f"{path} {problem}", "a file")

@@ -48,10 +48,10 @@ class CampaignProgress:
         self._room = console.width - len(study.name) - 1
         bar = [BarColumn(bar_width=BAR)] if self._room - BAR - 1 >= LEAST_ROOM else []
         self._room -= len(bar) * (BAR + 1)
-        self._bar = Progress(TextColumn("{task.description}", markup=False), *bar, TextColumn("{task.fields[told]}", markup=False),
+        self._bar = Progress(TextColumn("{task.description}", markup=False), *bar, TextColumn("{task.fields[summary]}", markup=False),
                              console=console, disable=not shown)
         self._tally = _Tally(len(keys), study.search.evaluations)
-        self._task = self._bar.add_task(study.name, total=self._tally.total, told="waiting")
+        self._task = self._bar.add_task(study.name, total=self._tally.total, summary="waiting")
         self._spoke = time.monotonic()
 
     def __enter__(self) -> CampaignProgress:
@@ -74,7 +74,7 @@ class CampaignProgress:
 
     def _show(self) -> None:
         tally = self._tally
-        self._bar.update(self._task, completed=tally.done, total=tally.total, told=tally.text(self._room))
+        self._bar.update(self._task, completed=tally.done, total=tally.total, summary=tally.text(self._room))
         now = time.monotonic()
         if not self._console.is_terminal and not self._quiet and now - self._spoke >= SECONDS_BETWEEN_LINES:
             self._spoke = now
@@ -119,11 +119,11 @@ class _Tally:
 
     def text(self, room: int | None = None) -> str:
         """All of it, or what has place in so many letters: what comes first matters most."""
-        found = [] if np.isinf(self._best) else [f"{self._collisions} collisions"]
+        collisions = [] if np.isinf(self._best) else [f"{self._collisions} collisions"]
         best = [] if np.isinf(self._best) else [f"best SD {self._best:.2f}"]
         rate = [f"{self._simulated / self._seconds:.0f}/s"] if self._simulated and self._seconds >= SETTLED else []
         text = ""
-        for part in (*rate, self._left(), *found, f"runs {self._finished}/{self._runs}", *best):
+        for part in (*rate, self._left(), *collisions, f"runs {self._finished}/{self._runs}", *best):
             longer = f"{text}, {part}" if text else part
             if room is not None and len(longer) > room:
                 break
@@ -156,14 +156,14 @@ def counted(console: Console, what: str, total: int) -> Iterator[Callable[[int],
 @contextmanager
 def counted_trials(console: Console, total: int) -> Iterator[Callable[[float], None]]:
     """A bar that counts trials; yields what to call after each with the lowest cost so far."""
-    columns = (TextColumn("trials"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.fields[told]}"))
+    columns = (TextColumn("trials"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.fields[lowest]}"))
     spoke = time.monotonic()
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("trials", total=total, told="")
+        task = bar.add_task("trials", total=total, lowest="")
 
         def done(best: float) -> None:
             nonlocal spoke
-            bar.update(task, advance=1, told=f"lowest cost {best:.4f}")
+            bar.update(task, advance=1, lowest=f"lowest cost {best:.4f}")
             if not console.is_terminal and time.monotonic() - spoke >= SECONDS_BETWEEN_LINES:
                 spoke = time.monotonic()
                 console.print(f"trial {bar.tasks[0].completed:.0f} of {total}, lowest cost {best:.4f}", highlight=False)

@@ -54,10 +54,10 @@ class Within(click.FloatRange):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The number, if it is one and within the range."""
-        found = super().convert(value, param, ctx)
-        if math.isnan(found):
+        number = super().convert(value, param, ctx)
+        if math.isnan(number):
             self.fail(f"{value} is not in the range {self._describe_range()}.", param, ctx)
-        return found
+        return number
 
 
 NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -79,23 +79,23 @@ def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, b
     InputError
         If a change has another form, a name is unknown or given twice, or a value is outside its domain.
     """
-    found: dict[str, list[float]] = {}
+    values_by_name: dict[str, list[float]] = {}
     for change in changes:
         name, sign, text = (part.strip() for part in change.partition("="))
         if not sign:
             raise InputError("--set", repr(change), LEGAL)
-        if name in found:
+        if name in values_by_name:
             raise InputError("--set", f"{name} is set twice", "each characteristic once")
         if name not in characteristics.names:
             raise unknown("--set", f"there is no characteristic {name!r}", name, characteristics.names)
         member = characteristics.members[characteristics.names.index(name)]
-        found[name] = _values(change, text, member.original)
-        for value in found[name]:
+        values_by_name[name] = _values(change, text, member.original)
+        for value in values_by_name[name]:
             share = f", or {name}={text}% of the original" if SIGNED.fullmatch(text) else ""
             member.check(value, "--set", beyond=beyond, otherwise=share, switch="--beyond")
-    if np.prod([len(values) for values in found.values()], dtype=float) > MOST:
+    if np.prod([len(values) for values in values_by_name.values()], dtype=float) > MOST:
         raise InputError("--set", f"{' '.join(changes)}: more than {MOST} settings", "shorter sweeps, FROM..TO:NUMBER")
-    return found
+    return values_by_name
 
 
 def settings_of(changes: dict[str, list[float]], base: FloatArray, characteristics: CharacteristicSet) -> FloatArray:

@@ -98,8 +98,8 @@ def calibrate_command(study: str, references: tuple[Path, ...], trials: int | No
     chosen = msgspec.structs.replace(given, fit=msgspec.structs.replace(given.fit, **asked))
     system = assemble(chosen, study)
     target = out or Path(f"{chosen.name}-calibrated.toml")
-    for taken in (Path(study), *references):
-        if target.exists() and taken.exists() and target.samefile(taken):
+    for source in (Path(study), *references):
+        if target.exists() and source.exists() and target.samefile(source):
             raise InputError("--out", f"{target} is what the calibration starts from", "another file")
     check_writable(target)
     if len({path.name for path in references}) < len(references):
@@ -114,15 +114,15 @@ def calibrate_command(study: str, references: tuple[Path, ...], trials: int | No
                 tried, lowest, best = tried + 1, cost, so_far
                 done(cost)
 
-            found = calibrate(chosen, data, pool, one_done, from_scratch=from_scratch)
+            calibration = calibrate(chosen, data, pool, one_done, from_scratch=from_scratch)
     except KeyboardInterrupt:
         if tried:
             account = f"Best of {tried} of {chosen.fit.trials} trials, then interrupted (seed {chosen.fit.seed}). Cost {lowest:.4f}."
             write_study(target, fitted_as(chosen, best), account)
             click.echo(f"interrupted: the best of {tried} trials is in {target}", err=True)
         raise
-    print_calibration(Console(), chosen, found)
-    write_study(target, fitted_as(chosen, found.study), calibration_comment(found, chosen, data, from_scratch=from_scratch))
+    print_calibration(Console(), chosen, calibration)
+    write_study(target, fitted_as(chosen, calibration.study), calibration_comment(calibration, chosen, data, from_scratch=from_scratch))
     Console().print(f"Study file: {target}", soft_wrap=True)
 
 
@@ -227,35 +227,35 @@ def _near(cases: Sequence[Case], references: Sequence[str]) -> list[Nearness]:
 
 def _rows_by_case(path: Path, cases: Sequence[Case]) -> dict[str, ReferenceData]:
     """The file's rows for every case whose vehicle it is of."""
-    found: dict[str, ReferenceData] = {}
+    rows: dict[str, ReferenceData] = {}
     for case in cases:
         try:
-            found[case.name] = read_reference(path, case.characteristics)
+            rows[case.name] = read_reference(path, case.characteristics)
         except InputError as error:
             if len(cases) == 1 or not ("lacks the columns" in error.problem or "in the domains" in error.problem):
                 raise
-    return found
+    return rows
 
 
-def print_agreement(console: Console, study: Study, told: Agreement) -> None:
+def print_agreement(console: Console, study: Study, result: Agreement) -> None:
     """Comparison with reference data, metric by metric."""
-    table = WholeTable("", title=escape(f"{study.title}: {told.rows} rows"), title_justify="left")
+    table = WholeTable("", title=escape(f"{study.title}: {result.rows} rows"), title_justify="left")
     for head in ("Spearman's rho", "mean abs. error", "in repeats", "bias", "original there", "original here"):
         table.add_column(head, justify="right")
-    for name in told.spearman:
+    for name in result.spearman:
         head = METRICS[name].heading
-        numbers = (told.spearman[name], told.mean_absolute_error[name], told.in_repeats[name], told.bias[name],
-                   *told.original[name].values())
+        numbers = (result.spearman[name], result.mean_absolute_error[name], result.in_repeats[name], result.bias[name],
+                   *result.original[name].values())
         table.add_row(head, *("-" if number is None else f"{number:.3f}" for number in numbers))
     console.print(table)
-    collisions = told.collisions
+    collisions = result.collisions
     console.print(f"Collisions: {collisions['reference']} in the reference, {collisions['here']} here, {collisions['both']} in both: "
-                  f"precision {_number(told.precision)}, recall {_number(told.recall)}; their mean speed is "
-                  f"{_number(told.collision_speed['reference'])} m/s there and {_number(told.collision_speed['here'])} m/s here.")
-    if told.undecided["within_repeats"] is not None:
-        console.print(f"Of {told.undecided['differ']} settings that collide on one side alone, {told.undecided['within_repeats']} "
+                  f"precision {_number(result.precision)}, recall {_number(result.recall)}; their mean speed is "
+                  f"{_number(result.collision_speed['reference'])} m/s there and {_number(result.collision_speed['here'])} m/s here.")
+    if result.undecided["within_repeats"] is not None:
+        console.print(f"Of {result.undecided['differ']} settings that collide on one side alone, {result.undecided['within_repeats']} "
                       "may do either: repeats of them differ by as much.")
-    bins = ", ".join(f"{part['lowest']:.2f} to {part['highest']:.2f}: {part['bias']:+.2f}" for part in told.by_predicted)
+    bins = ", ".join(f"{part['lowest']:.2f} to {part['highest']:.2f}: {part['bias']:+.2f}" for part in result.by_predicted)
     console.print(f"Mean error by the safety degree here: {bins}.", markup=False)
 
 
@@ -263,27 +263,27 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def print_calibration(console: Console, study: Study, found: Calibration) -> None:
+def print_calibration(console: Console, study: Study, result: Calibration) -> None:
     """Found values, and how well they do on both halves of the data."""
     table = WholeTable("parameter", "unit", title=escape(study.title), title_justify="left")
     for head in ("found", "lower", "upper"):
         table.add_column(head, justify="right")
-    for name, value in found.values.items():
+    for name, value in result.values.items():
         row = study.calibration[name]
         table.add_row(name, row.unit, *(f"{number:.5g}" for number in (value, row.lower, row.upper)))
     console.print(table)
-    for name in found.used:
+    for name in result.used:
         both = WholeTable(title=escape(f"{name}: rows used / held back"), title_justify="left")
         both.add_column("")
         for head in ("Spearman's rho", "mean abs. error", "bias"):
             both.add_column(head, justify="right")
-        halves = (found.used[name], found.held_back[name])
+        halves = (result.used[name], result.held_back[name])
         for metric in halves[0].spearman:
             head = METRICS[metric].heading
             both.add_row(head, *(
                 " / ".join("-" if number is None else f"{number:.3f}" for number in (getattr(half, what)[metric] for half in halves))
                 for what in ("spearman", "mean_absolute_error", "bias")))
         console.print(both)
-    for name in on_a_bound(found.values, study.calibration):
+    for name in on_a_bound(result.values, study.calibration):
         console.print(f"{name} stands on its bound: a wider one may fit better.", markup=False)
-    console.print(cost_line(found))
+    console.print(cost_line(result))

@@ -71,14 +71,14 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
             raise InputError("--set", f"{' '.join(changes)} is a sweep", "one value for each with --trace, --plot, --animate or --gui")
         _sweep(target, system, asked, tuple(swept), not no_filter, as_json)
         return
-    found = beside_the_original(target.study, system, asked[0], filtered=not no_filter)
+    simulation = beside_the_original(target.study, system, asked[0], filtered=not no_filter)
     if target.recorded is not None and not changes:
-        _warn_of_differences(target, found)
+        _warn_of_differences(target, simulation)
     if trace is not None:
-        _write_trace(trace, found)
+        _write_trace(trace, simulation)
     if showing.asked:
-        showing.show(target.study, system, found.evaluation.settings[0])
-    _tell(target, system, found, as_json)
+        showing.show(target.study, system, simulation.evaluation.settings[0])
+    _tell(target, system, simulation, as_json)
 
 
 def _check_outputs(study: str, trace: Path | None, showing: Shown) -> None:
@@ -93,12 +93,12 @@ def _check_outputs(study: str, trace: Path | None, showing: Shown) -> None:
 
 def _sweep(target: Target, system: System, asked: FloatArray, names: tuple[str, ...], filtered: bool, as_json: bool) -> None:
     settings = system.characteristics.filter(asked) if filtered else asked
-    found = evaluated(target.study, np.concatenate([system.characteristics.original[np.newaxis], settings]))
-    original, rows = found.take([0]), found.take(np.arange(1, len(found)))
+    evaluations = evaluated(target.study, np.concatenate([system.characteristics.original[np.newaxis], settings]))
+    original, rows = evaluations.take([0]), evaluations.take(np.arange(1, len(evaluations)))
     if as_json:
-        told = [{"study": target.study.name, "vcs": dict(zip(system.characteristics.names, rows.settings[row].tolist(), strict=True)),
+        records = [{"study": target.study.name, "vcs": dict(zip(system.characteristics.names, rows.settings[row].tolist(), strict=True)),
                  **record(rows, row)} for row in range(len(rows))]
-        click.echo(json.dumps(told, indent=2, allow_nan=False))
+        click.echo(json.dumps(records, indent=2, allow_nan=False))
     else:
         print_sweep(Console(), target.study, names, original, rows)
     back = int(np.count_nonzero((settings != asked).any(axis=1)))
@@ -107,39 +107,39 @@ def _sweep(target: Target, system: System, asked: FloatArray, names: tuple[str, 
                    err=True)
 
 
-def _tell(target: Target, system: System, found: Simulation, as_json: bool) -> None:
-    points = at_every_point(system, found.evaluation.settings) if system.matrix else []
+def _tell(target: Target, system: System, simulation: Simulation, as_json: bool) -> None:
+    points = at_every_point(system, simulation.evaluation.settings) if system.matrix else []
     if as_json:
         replayed = {} if target.handle is None else {"solution": str(target.handle)}
         matrix = {"points": [point_record(one) for one in points]} if points else {}
-        click.echo(json.dumps({**found.to_dict(), **replayed, **matrix}, indent=2, allow_nan=False))
+        click.echo(json.dumps({**simulation.to_dict(), **replayed, **matrix}, indent=2, allow_nan=False))
     else:
-        print_simulation(Console(), found)
+        print_simulation(Console(), simulation)
         print_matrix(Console(), points)
         if types := tags(system.points):
             _say(Console(), types)
     remarks = [remark for one in system.points for remark in remarks_of(one.scenario)]
     for remark in dict.fromkeys([*remarks, *system.remarks, *vehicle_remarks(system)]):
         click.echo(f"note: {remark}", err=True)
-    for name, value in found.put_back.items():
-        click.echo(f"note: {name} = {value:g} is so near the original that the filter put {found.setting[name]:g} back; "
+    for name, value in simulation.put_back.items():
+        click.echo(f"note: {name} = {value:g} is so near the original that the filter put {simulation.setting[name]:g} back; "
                    "--no-filter keeps it", err=True)
 
 
-def _warn_of_differences(target: Target, found: Simulation) -> None:
+def _warn_of_differences(target: Target, simulation: Simulation) -> None:
     """A replay gives what was recorded, or there is a reason to be told."""
     from safevar_sumo.replay.comparison import differences
 
     assert target.recorded is not None
-    for one in differences(found.evaluation, target.recorded):
+    for one in differences(simulation.evaluation, target.recorded):
         click.echo(f"warning: {target.handle} of {target.source}: {one}; other versions or code than those of the study?", err=True)
 
 
-def _write_trace(path: Path, found: Simulation) -> None:
+def _write_trace(path: Path, simulation: Simulation) -> None:
     """One row per simulation step, units in the header."""
     try:
         with path.open("w", encoding="utf-8", newline="") as file:
-            found.trace.to_csv(file, index=False, lineterminator="\n")
+            simulation.trace.to_csv(file, index=False, lineterminator="\n")
     except OSError as error:
         raise InputError("--trace", f"cannot write {path}: {error.strerror or error}", "a file in a directory that exists") from None
 
@@ -191,42 +191,42 @@ class Shown(NamedTuple):
             show_in_gui(comparison, slower=self.slower)
 
 
-def print_simulation(console: Console, found: Simulation) -> None:
+def print_simulation(console: Console, simulation: Simulation) -> None:
     """A setting beside the original vehicle: what was simulated, how it ended, metrics and objectives, a verdict."""
-    _print_setting(console, found)
-    members = CharacteristicSet.of(found.study.vehicle.characteristics)
-    print_meanings(console, [member for member in members if found.setting[member.name] != member.original])
-    records = (found.original.to_dict(), found.to_dict())
+    _print_setting(console, simulation)
+    members = CharacteristicSet.of(simulation.study.vehicle.characteristics)
+    print_meanings(console, [member for member in members if simulation.setting[member.name] != member.original])
+    records = (simulation.original.to_dict(), simulation.to_dict())
     table = WholeTable()
     table.add_column("result")
     table.add_column("unit")
     for head in ("original", "simulated"):
         table.add_column(head, justify="right")
     table.add_row("outcome", "", *(record["outcome"] for record in records))
-    for name, unit in found.units.items():
+    for name, unit in simulation.units.items():
         table.add_row(name, unit, *("undefined" if record[name] is None else f"{record[name]:.4g}" for record in records))
     console.print(table)
-    _say(console, f"The original vehicle {found.original.verdict}.")
-    if found is not found.original and found.setting != found.original.setting:
-        _say(console, f"The changed vehicle {found.verdict}: {_against(found)}.")
+    _say(console, f"The original vehicle {simulation.original.verdict}.")
+    if simulation is not simulation.original and simulation.setting != simulation.original.setting:
+        _say(console, f"The changed vehicle {simulation.verdict}: {_against(simulation)}.")
 
 
-def _print_setting(console: Console, found: Simulation) -> None:
-    table = WholeTable(title=plain(found.study.title))
+def _print_setting(console: Console, simulation: Simulation) -> None:
+    table = WholeTable(title=plain(simulation.study.title))
     table.add_column("characteristic")
     table.add_column("unit")
     for head in ("original", "simulated"):
         table.add_column(head, justify="right")
-    for member in CharacteristicSet.of(found.study.vehicle.characteristics):
-        value = found.setting[member.name]
+    for member in CharacteristicSet.of(simulation.study.vehicle.characteristics):
+        value = simulation.setting[member.name]
         changed = value != member.original
         note = f"{value:g}" + ("" if member.lower <= value <= member.upper else " (beyond)")
         table.add_row(plain(member.name), plain(member.unit), f"{member.original:g}", note, style="bold" if changed else None)
     console.print(table)
 
 
-def _against(found: Simulation) -> str:
-    here, there = found.metrics[SAFETY_DEGREE], found.original.metrics[SAFETY_DEGREE]
+def _against(simulation: Simulation) -> str:
+    here, there = simulation.metrics[SAFETY_DEGREE], simulation.original.metrics[SAFETY_DEGREE]
     if np.isnan(here) or np.isnan(there):
         return "nothing tells whether that is less safe"
     if here == there:
@@ -234,7 +234,7 @@ def _against(found: Simulation) -> str:
     return f"{'less safe' if here < there else 'safer'} than the original, SD {here:.2f} against {there:.2f}"
 
 
-def print_sweep(console: Console, study: Study, names: Sequence[str], original: Evaluations, found: Evaluations) -> None:
+def print_sweep(console: Console, study: Study, names: Sequence[str], original: Evaluations, variants: Evaluations) -> None:
     """Many settings, a row each under the original vehicle's, by the values of the named characteristics."""
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     columns = [characteristics.names.index(name) for name in names]
@@ -242,11 +242,11 @@ def print_sweep(console: Console, study: Study, names: Sequence[str], original: 
     for column in columns:
         unit = characteristics.members[column].unit
         table.add_column(plain(f"{names[columns.index(column)]}{'' if unit == '-' else f', {unit}'}"), justify="right")
-    for head in ("outcome", *(METRICS[name].heading if name in METRICS else name for name in found.metrics)):
+    for head in ("outcome", *(METRICS[name].heading if name in METRICS else name for name in variants.metrics)):
         table.add_column(head, justify="left" if head == "outcome" else "right")
-    for which in (original, found):
+    for which in (original, variants):
         for row in range(len(which)):
-            metrics = [which.metrics[name][row] for name in found.metrics]
+            metrics = [which.metrics[name][row] for name in variants.metrics]
             table.add_row(*(f"{which.settings[row, column]:g}" for column in columns), str(which.outcome[row]),
                           *("-" if np.isnan(value) else f"{value:.3f}" for value in metrics), end_section=which is original)
     console.print(table)
@@ -265,20 +265,20 @@ NAMED = 6
 ROW, COLUMN = "speed", "impact_location"
 
 
-def print_matrix(console: Console, found: Sequence[AtPoint], row: int = 0) -> None:
+def print_matrix(console: Console, results: Sequence[AtPoint], row: int = 0) -> None:
     """A table for each test and weather, speed by impact location; what else varies has rows of its own."""
-    records = [point_record(one, row) for one in found]
+    records = [point_record(one, row) for one in results]
     tables: dict[tuple[str, str], list[tuple[dict[str, Any], dict[str, Any]]]] = {}
-    for one, told in zip(found, records, strict=True):
+    for one, result in zip(results, records, strict=True):
         place = dict(one.point.place)
-        tables.setdefault((place.pop("test"), place.pop("weather")), []).append((place, told))
+        tables.setdefault((place.pop("test"), place.pop("weather")), []).append((place, result))
     for (test, weather), points in tables.items():
         _print_table(console, f"{test}, {weather}", points)
     if records:
-        hit = [told["point"] for told in records if told["impact_speed"] is not None]
+        hit = [result["point"] for result in records if result["impact_speed"] is not None]
         first = "; ".join(hit[:NAMED]) + (f" and {len(hit) - NAMED} more" if len(hit) > NAMED else "")
         summary = f"{len(hit)} of {len(records)} points fail{': ' + first if hit else ''}."
-        invalid = sum(told["outcome"] == Outcome.INVALID_TEST for told in records)
+        invalid = sum(result["outcome"] == Outcome.INVALID_TEST for result in records)
         if invalid:
             summary += f" {invalid} are no valid tests: the vehicle leaves the tolerance of their speed before the ADS acts."
         console.print(summary, soft_wrap=True, markup=False, highlight=False)
@@ -291,8 +291,8 @@ def _print_table(console: Console, title: str, points: Sequence[tuple[dict[str, 
     for column in columns:
         table.add_column("" if column is None else f"{column:g} %", justify="right")
     cells: dict[str, dict[Any, Text]] = {}
-    for place, told in points:
-        cells.setdefault(_row(place), {})[place.get(COLUMN)] = _cell(told)
+    for place, result in points:
+        cells.setdefault(_row(place), {})[place.get(COLUMN)] = _cell(result)
     for name, by_column in cells.items():
         table.add_row(plain(name), *(by_column.get(column, Text("")) for column in columns))
     console.print(table)
@@ -303,12 +303,12 @@ def _row(place: dict[str, Any]) -> str:
     return ", ".join([*speed, *(f"{name} {value}" for name, value in place.items() if name not in (ROW, COLUMN))])
 
 
-def _cell(told: dict[str, Any]) -> Text:
-    if told["outcome"] == Outcome.INVALID_TEST:
-        return Text(f"{told['outcome']} ({told['test_speed_error']:+.1f} km/h)", "magenta")
-    if told["impact_speed"] is None:
-        touched = f", {told['contact']['side']} side touched" if "contact" in told else ""
-        return Text("avoided" + touched if told["outcome"] in (Outcome.STOPPED, Outcome.PASSED) else told["outcome"], "green")
-    relative = (told["relative_impact_speed"] or 0.0) * KMH
+def _cell(result: dict[str, Any]) -> Text:
+    if result["outcome"] == Outcome.INVALID_TEST:
+        return Text(f"{result['outcome']} ({result['test_speed_error']:+.1f} km/h)", "magenta")
+    if result["impact_speed"] is None:
+        touched = f", {result['contact']['side']} side touched" if "contact" in result else ""
+        return Text("avoided" + touched if result["outcome"] in (Outcome.STOPPED, Outcome.PASSED) else result["outcome"], "green")
+    relative = (result["relative_impact_speed"] or 0.0) * KMH
     colour = next((colour for below, colour in BANDS if relative < below), "red")
-    return Text(f"{told['impact_speed'] * KMH:.1f} km/h", colour)
+    return Text(f"{result['impact_speed'] * KMH:.1f} km/h", colour)

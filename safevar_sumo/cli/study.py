@@ -111,41 +111,41 @@ def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
     """Tell how far the study in DIR is, without disturbing it: runs, front so far, collisions, time left."""
     from safevar_sumo.results import status as look
 
-    told, begun = look(directory), time.monotonic()
-    first = told
-    for remark in told.remarks:
+    progress, begun = look(directory), time.monotonic()
+    first = progress
+    for remark in progress.remarks:
         click.echo(remark, err=True)
     if as_json:
-        click.echo(json.dumps(told.record(), indent=None if watch else 2))
-        while watch and not told.finished:
+        click.echo(json.dumps(progress.record(), indent=None if watch else 2))
+        while watch and not progress.finished:
             time.sleep(every)
-            told = look(directory)
-            click.echo(json.dumps(told.record()))
+            progress = look(directory)
+            click.echo(json.dumps(progress.record()))
         return
     if not watch:
-        Console().print(status_view(told, None))
+        Console().print(status_view(progress, None))
         return
-    with Live(status_view(told, None), console=Console(), auto_refresh=False) as live:
-        while not told.finished:
+    with Live(status_view(progress, None), console=Console(), auto_refresh=False) as live:
+        while not progress.finished:
             time.sleep(every)
-            told = look(directory)
-            live.update(status_view(told, (told.share - first.share) / (time.monotonic() - begun)), refresh=True)
+            progress = look(directory)
+            live.update(status_view(progress, (progress.share - first.share) / (time.monotonic() - begun)), refresh=True)
 
 
 SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\nTET, TIT: over solutions without collision."
 
 
-def print_forecast(console: Console, study: Study, runs: int, told: Forecast, engine: str) -> None:
+def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, engine: str) -> None:
     """What a campaign would take."""
     console.print(study.title, soft_wrap=True, highlight=False, markup=False)
     table = WholeTable(show_header=False)
     table.add_row("algorithms", ", ".join(study.search.labels))
     table.add_row("runs", str(runs))
     table.add_row("engine", engine)
-    table.add_row("evaluations, at the most", str(told.evaluations))
-    table.add_row("evaluations/s, measured by a short probe", f"{told.rate:.0f}")
-    table.add_row("time, at the most", f"{told.seconds / 60:.1f} min")
-    table.add_row("disk, at the most", f"{told.size / 1e6:.0f} MB")
+    table.add_row("evaluations, at the most", str(cost.evaluations))
+    table.add_row("evaluations/s, measured by a short probe", f"{cost.rate:.0f}")
+    table.add_row("time, at the most", f"{cost.seconds / 60:.1f} min")
+    table.add_row("disk, at the most", f"{cost.size / 1e6:.0f} MB")
     console.print(table)
 
 
@@ -160,20 +160,20 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     if len(solutions):
         for line in lead(study, solutions, campaign.original, pool, str(directory)):
             console.print(line, soft_wrap=True, markup=False, highlight=False)
-    found = {"original vehicle": campaign.original}
+    by_vehicle = {"original vehicle": campaign.original}
     for algorithm in study.search.labels:
         group = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]
         if group:
-            found[algorithm] = Evaluations.concatenate(group)
+            by_vehicle[algorithm] = Evaluations.concatenate(group)
     table = WholeTable("", title=escape(study.title), title_justify="left")
-    for head in found:
+    for head in by_vehicle:
         table.add_column(head, justify="right")
-    table.add_row("solutions", "-", *(str(len(one)) for one in list(found.values())[1:]))
-    table.add_row("solutions that collide", *(str(int(np.count_nonzero(one.collided))) for one in found.values()))
-    collisions = [sum(number for key, number in campaign.collisions.items() if key.algorithm == name) for name in list(found)[1:]]
+    table.add_row("solutions", "-", *(str(len(one)) for one in list(by_vehicle.values())[1:]))
+    table.add_row("solutions that collide", *(str(int(np.count_nonzero(one.collided))) for one in by_vehicle.values()))
+    collisions = [sum(number for key, number in campaign.collisions.items() if key.algorithm == name) for name in list(by_vehicle)[1:]]
     table.add_row("collisions simulated", *map(str, [int(campaign.original.collided[0]), *collisions]))
     for metric in campaign.scoring.metrics:
-        table.add_row(escape(f"mean {metric.heading}"), *(_mean(one.metrics[metric.name]) for one in found.values()))
+        table.add_row(escape(f"mean {metric.heading}"), *(_mean(one.metrics[metric.name]) for one in by_vehicle.values()))
     console.print(table)
     console.print(SAFETY_NOTE)
     if campaign.failures:
@@ -219,15 +219,15 @@ RUNS_SHOWN = 12
 """Runs under way that are named."""
 
 
-def status_view(told: Status, rate: float | None) -> RenderableType:
+def status_view(progress: Status, rate: float | None) -> RenderableType:
     """A study's runs by algorithm and the front so far; `rate` is the share of the work done per second, if it is known."""
-    table = WholeTable("algorithm", title=Text(told.title), title_justify="left")
+    table = WholeTable("algorithm", title=Text(progress.title), title_justify="left")
     for head in ("runs", "under\nway", "simulated", "collisions", "simulator\nerrors", "best\nSD"):
         table.add_column(head, justify="right")
-    for algorithm in dict.fromkeys(run.algorithm for run in told.runs):
-        group = [run for run in told.runs if run.algorithm == algorithm]
+    for algorithm in dict.fromkeys(run.algorithm for run in progress.runs):
+        group = [run for run in progress.runs if run.algorithm == algorithm]
         table.add_row(Text(algorithm), *_cells(group))
-    return Group(table, Text(_under_way(told)), Text(_left(told, rate)), _front(told))
+    return Group(table, Text(_under_way(progress)), Text(_left(progress, rate)), _front(progress))
 
 
 def _cells(runs: list[RunStatus]) -> list[str]:
@@ -237,25 +237,25 @@ def _cells(runs: list[RunStatus]) -> list[str]:
             str(sum(run.simulator_errors for run in runs)), f"{min(best):.2f}" if best else "-"]
 
 
-def _under_way(told: Status) -> str:
-    begun = [f"{run.algorithm}:{run.run} {run.simulated}/{told.budget}" for run in told.runs if run.state == "begun"]
+def _under_way(progress: Status) -> str:
+    begun = [f"{run.algorithm}:{run.run} {run.simulated}/{progress.budget}" for run in progress.runs if run.state == "begun"]
     more = f" and {len(begun) - RUNS_SHOWN} more" if len(begun) > RUNS_SHOWN else ""
     return f"Under way: {', '.join(begun[:RUNS_SHOWN])}{more}" if begun else ""
 
 
-def _left(told: Status, rate: float | None) -> str:
-    if told.finished:
+def _left(progress: Status, rate: float | None) -> str:
+    if progress.finished:
         return "Finished."
     if not rate:
-        return f"{told.share:.0%} done."
-    return f"{told.share:.0%} done, {timedelta(seconds=round((1 - told.share) / rate))} left at this pace."
+        return f"{progress.share:.0%} done."
+    return f"{progress.share:.0%} done, {timedelta(seconds=round((1 - progress.share) / rate))} left at this pace."
 
 
-def _front(told: Status) -> RenderableType:
+def _front(progress: Status) -> RenderableType:
     """The most severe points that no other one beats in all three objectives."""
-    if not len(told.points):
+    if not len(progress.points):
         return Text("Nothing simulated yet.")
-    front = nondominated(told.points)
+    front = nondominated(progress.points)
     front = front[front[:, 0].argsort(kind="stable")]
     table = WholeTable(title=f"Front so far: {len(front)} points, the most severe ones", title_justify="left")
     for head in ("safety degree [m, -m/s]", "f_diff [fraction]", "changed"):

@@ -137,14 +137,14 @@ def results_or_study(place: str, point: str | None = None) -> Study | Case:
 
     with warnings.catch_warnings(record=True) as changed:
         warnings.simplefilter("always", UserWarning)
-        found = study_or_case(place, as_it_is_now=as_it_is_now())
+        source = study_or_case(place, as_it_is_now=as_it_is_now())
     for one in changed:
         click.echo(f"warning: {one.message}", err=True)
     if point is None:
-        return found
-    if isinstance(found, Study):
-        return _at(found, point)
-    return replace(found, study=_at(found.study, point), solutions=found.solutions.assign(outcome=UNKNOWN))
+        return source
+    if isinstance(source, Study):
+        return _at(source, point)
+    return replace(source, study=_at(source.study, point), solutions=source.solutions.assign(outcome=UNKNOWN))
 
 
 def _at(study: Study, point: str) -> Study:

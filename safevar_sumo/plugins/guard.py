@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from safevar_sumo.errors import ForeignError, InputError, told
+from safevar_sumo.errors import ForeignError, InputError, first_line
 from safevar_sumo.plugins.files import watch
 from safevar_sumo.records import BoolArray, FloatArray
 
@@ -174,7 +174,7 @@ class Guard(NamedTuple):
     def failed(self, method: str, error: BaseException) -> ForeignError:
         """The error for an exception that the plug-in raised."""
         place = self._place(error)
-        problem = f"{self.name} raised in {method}: {told(error)}{f' ({place})' if place else ''}"
+        problem = f"{self.name} raised in {method}: {first_line(error)}{f' ({place})' if place else ''}"
         return ForeignError(self.source, problem, error.legal if isinstance(error, InputError) else "")
 
     def wrong(self, method: str, what: str, got: object, expected: str) -> ForeignError:

@@ -29,25 +29,25 @@ EDGE = 0.01
 """Nearer than this share of its width to an end, a value stands on its bound."""
 
 
-def calibration_comment(found: Calibration, study: Study, references: Mapping[str, ReferenceData], *, from_scratch: bool) -> str:
+def calibration_comment(result: Calibration, study: Study, references: Mapping[str, ReferenceData], *, from_scratch: bool) -> str:
     """Data with fingerprints, search, cost, agreement on both parts, and what stands on its bound."""
     fit = study.fit
     start = "random places alone" if from_scratch else f"its own values and {fit.starts} random places" if fit.starts else "its own values"
     parts = [
-        f"  {name}: rho of the safety degree {_rho(found.used[name])} on the rows used, {_rho(found.held_back[name])} on those held back"
-        for name in found.used]
+        f"  {name}: rho of the safety degree {_rho(result.used[name])} on the rows used, {_rho(result.held_back[name])} on those held back"
+        for name in result.used]
     others = f" and to all but each {_ordinal(fit.hold_out)} row of" if references else "."
     return "\n".join([
         f"Study {study.name!r}, calibrated by CMA-ES ({fit.trials} trials, seed {fit.seed}, from {start})",
         f"to the original vehicle's published values{others}", *(_data_line(name, data) for name, data in references.items()),
-        f"{cost_line(found)}.", *parts,
-        *(f"{name} stands on its bound." for name in on_a_bound(found.values, study.calibration))])
+        f"{cost_line(result)}.", *parts,
+        *(f"{name} stands on its bound." for name in on_a_bound(result.values, study.calibration))])
 
 
-def cost_line(found: Calibration) -> str:
+def cost_line(calibration: Calibration) -> str:
     """The cost of what was found, and what each search came to if there was any."""
-    reached = ", ".join(f"{cost:.4f}" for cost in found.reached)
-    return f"Cost {found.cost:.4f}" + (f"; each search came to {reached}" if reached else "")
+    reached = ", ".join(f"{cost:.4f}" for cost in calibration.reached)
+    return f"Cost {calibration.cost:.4f}" + (f"; each search came to {reached}" if reached else "")
 
 
 def on_a_bound(values: Mapping[str, float], free: Mapping[str, FreeParameter]) -> list[str]:
@@ -65,8 +65,8 @@ def _data_line(name: str, data: ReferenceData) -> str:
     return f"  {name}, SHA-256 {data.fingerprint}{without}"
 
 
-def _rho(told: Agreement) -> str:
-    rho = told.spearman[SAFETY_DEGREE]
+def _rho(result: Agreement) -> str:
+    rho = result.spearman[SAFETY_DEGREE]
     return "undefined" if rho is None else f"{rho:.3f}"
 
 
@@ -197,14 +197,14 @@ class _Trial:
 
 def _told(study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> dict[str, Agreement]:
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    told = {}
+    parts = {}
     for name, data in references.items():
         evaluations = evaluate_all(study, np.concatenate([characteristics.original[np.newaxis], data.settings]), pool)
         here = evaluations.take(np.arange(1, len(evaluations)))
-        told[name] = agreement(data, here, study, evaluations.take([0]))
-    return told
+        parts[name] = agreement(data, here, study, evaluations.take([0]))
+    return parts
 
 
-def fitted_as(study: Study, found: Study) -> Study:
+def fitted_as(study: Study, fitted: Study) -> Study:
     """The found study under a name of its own: nobody is to take it for the one whose published values it stands beside."""
-    return msgspec.structs.replace(found, name=f"{study.name}-calibrated")
+    return msgspec.structs.replace(fitted, name=f"{study.name}-calibrated")

@@ -66,18 +66,18 @@ def paired(here: Sequence[Case], there: Sequence[Case]) -> Pairs:
 
 
 def _by_study(cases: Sequence[Case], flag: str) -> dict[str, Case]:
-    found: dict[str, Case] = {}
+    by_study: dict[str, Case] = {}
     for case in cases:
-        if case.study.name in found:
+        if case.study.name in by_study:
             raise InputError(flag, f"has two results of the study {case.study.name!r}", "one of each study")
-        found[case.study.name] = case
-    return found
+        by_study[case.study.name] = case
+    return by_study
 
 
 def tables_beside(pairs: Pairs) -> list[Beside]:
     """Every table of the research questions with both sides."""
     sides = [{one.name: one for one in answer(cases)} for cases in (pairs.here, pairs.there)]
-    found = []
+    tables = []
     for name, keys in KEYS.items():
         answers = [side.get(name, Answer(name, pd.DataFrame(), ())) for side in sides]  # a footer is missing with its table
         frames = [_shares(cases) for cases in pairs[:2]] if name == "rq3.1" else [one.frame for one in answers]
@@ -85,13 +85,13 @@ def tables_beside(pairs: Pairs) -> list[Beside]:
         frames = [_with_places(frame) for frame in frames]
         if any(frame.empty for frame in frames):
             lacking = [side for side, frame in zip((HERE, THERE), frames, strict=True) if frame.empty]
-            found.append(Beside(name, pd.DataFrame(), [], [*notes, f"No table: nothing to show {' and '.join(lacking)}."]))
+            tables.append(Beside(name, pd.DataFrame(), [], [*notes, f"No table: nothing to show {' and '.join(lacking)}."]))
             continue
         quantities = [str(column) for column in frames[0] if column not in (*keys, *NO_CELLS) and column in frames[1]]
         both = frames[0][[*keys, *quantities]].merge(frames[1][[*keys, *quantities]], on=list(keys), how="outer", sort=False,
                                                      suffixes=(f" {HERE}", f" {THERE}"))
-        found.append(Beside(name, both, quantities, notes))
-    return found
+        tables.append(Beside(name, both, quantities, notes))
+    return tables
 
 
 def _shares(cases: Sequence[Case]) -> pd.DataFrame:
@@ -196,23 +196,23 @@ def _numbers(frame: pd.DataFrame) -> Iterator[Conclusion]:
 
 def _orders(frame: pd.DataFrame) -> Iterator[Conclusion]:
     for setting, rows in frame[frame["j"] == "any"].groupby("setting", sort=False):
-        told = rows.dropna(subset=[f"percent {HERE}", f"percent {THERE}"])
-        if told.empty:
+        both = rows.dropna(subset=[f"percent {HERE}", f"percent {THERE}"])
+        if both.empty:
             continue
-        first = told.sort_values(f"percent {THERE}", ascending=False, kind="stable")["characteristic"].head(3)
-        mine = told.sort_values(f"percent {HERE}", ascending=False, kind="stable")["characteristic"].head(3)
-        yield _by_rank("RQ3.2", str(setting), f"changed most often: {', '.join(first)}", told, "percent", f"; here {', '.join(mine)}")
+        first = both.sort_values(f"percent {THERE}", ascending=False, kind="stable")["characteristic"].head(3)
+        mine = both.sort_values(f"percent {HERE}", ascending=False, kind="stable")["characteristic"].head(3)
+        yield _by_rank("RQ3.2", str(setting), f"changed most often: {', '.join(first)}", both, "percent", f"; here {', '.join(mine)}")
 
 
 def _weather(frame: pd.DataFrame) -> Iterator[Conclusion]:
     for (setting, other), rows in frame.groupby(["setting", "other"], sort=False):
-        told = rows.dropna(subset=[f"difference {HERE}", f"difference {THERE}"])
+        both = rows.dropna(subset=[f"difference {HERE}", f"difference {THERE}"])
         yield _by_rank("weather", f"{setting}, {other}", "how much more often each characteristic is changed in the worse weather",
-                       told, "difference", "")
+                       both, "difference", "")
 
 
-def _by_rank(question: str, setting: str, words: str, told: pd.DataFrame, column: str, more: str) -> Conclusion:
-    rho = rank_correlation(*(told[f"{column} {side}"].to_numpy(dtype=float) for side in (HERE, THERE)))
+def _by_rank(question: str, setting: str, words: str, both: pd.DataFrame, column: str, more: str) -> Conclusion:
+    rho = rank_correlation(*(both[f"{column} {side}"].to_numpy(dtype=float) for side in (HERE, THERE)))
     verdict = OPEN if rho is None else HOLDS if rho >= CLOSE else DIRECTION if rho >= ALIKE else DIFFERS
     return Conclusion(question, setting, words, verdict, ("no rank correlation" if rho is None else f"rank correlation {rho:.2f}") + more)
 

@@ -40,18 +40,18 @@ def _huber(miss: float, tolerance: float) -> float:
     return distance * distance if distance <= 1 else 2 * distance - 1
 
 
-def reference_cost(told: Agreement, data: ReferenceData, fit: FitTable) -> float:
+def reference_cost(result: Agreement, data: ReferenceData, fit: FitTable) -> float:
     """Lost rank correlation and absolute error (in standard deviations of the reference), weighted, and collisions."""
     cost = 0.0
     for name, weight in fit.weights.items():
         values = data.metrics[name][~np.isnan(data.metrics[name])]
         if not values.size or np.ptp(values) == 0:
             continue
-        rho, error = told.spearman[name], told.mean_absolute_error[name]
+        rho, error = result.spearman[name], result.mean_absolute_error[name]
         cost += weight * (fit.rank * (1 - (rho or 0.0)) + (np.inf if error is None else error) / float(np.std(values)))
-    collisions = told.collisions
+    collisions = result.collisions
     missed = collisions["reference"] + collisions["here"] - 2 * collisions["both"]
-    return min(cost, LARGEST) + fit.collisions * missed / max(told.rows, 1)
+    return min(cost, LARGEST) + fit.collisions * missed / max(result.rows, 1)
 
 
 class Trial(Protocol):

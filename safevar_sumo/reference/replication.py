@@ -60,7 +60,7 @@ def nearness(case: Case, references: Sequence[ReferenceData]) -> list[Nearness]:
     safety = np.concatenate([data.metrics[SAFETY_DEGREE] for data in references])
     tree, number = scipy.spatial.cKDTree(rows), min(NEIGHBOURS, len(rows))
     among = tree.query(rows, number + 1)[0][:, 1:] if len(rows) > number else np.full((1, 1), np.nan)
-    found = []
+    near = []
     for algorithm in case.algorithms:
         solutions = case.solutions_of(algorithm)
         if solutions.empty:
@@ -68,11 +68,11 @@ def nearness(case: Case, references: Sequence[ReferenceData]) -> list[Nearness]:
         places: FloatArray = solutions[list(domains.names)].to_numpy(dtype=float) / width
         distance, nearest = (np.reshape(part, (len(places), number)) for part in tree.query(places, number))
         hit = collided(solutions).to_numpy()
-        found.append(Nearness(
+        near.append(Nearness(
             case.name, algorithm, len(solutions), float(np.median(distance)), float(np.median(among)),
             float(np.nanmean(solutions[SAFETY_DEGREE])), float(safety[nearest].mean()), int(hit.sum()),
             float((safety[nearest[hit]] <= 0).mean()) if hit.any() else None))
-    return found
+    return near
 
 
 COUNTED = {HOLDS: "hold", DIRECTION: "hold in direction", DIFFERS: "differ", OPEN: "cannot be told"}
@@ -89,17 +89,17 @@ NOT_COMPARED = ": RQ2, RQ3 and the weathers are about them and are not compared"
 def replication(pairs: Pairs, near: Sequence[Nearness]) -> str:
     """The whole page."""
     tables = tables_beside(pairs)
-    found = conclusions(tables)
-    parts = [_head(pairs, found), _conclusions(found)]
+    verdicts = conclusions(tables)
+    parts = [_head(pairs, verdicts), _conclusions(verdicts)]
     if near:
         parts.append(_near(near))
     return "\n".join([*parts, "## Cell beside cell\n", *(_beside(table) for table in tables)])
 
 
-def _head(pairs: Pairs, found: Sequence[Conclusion]) -> str:
-    counts = Counter(one.verdict for one in found)
-    told = ", ".join(f"{counts[verdict]} {words}" for verdict, words in COUNTED.items())
-    lines = ["# Does the published study replicate?", "", f"Of {len(found)} conclusions: {told}.", ""]
+def _head(pairs: Pairs, verdicts: Sequence[Conclusion]) -> str:
+    counts = Counter(one.verdict for one in verdicts)
+    summary = ", ".join(f"{counts[verdict]} {words}" for verdict, words in COUNTED.items())
+    lines = ["# Does the published study replicate?", "", f"Of {len(verdicts)} conclusions: {summary}.", ""]
     for here, there in zip(pairs.here, pairs.there, strict=True):
         sizes = f"{_solutions(here.solutions)} here, {_solutions(there.solutions)} published"
         lines.append(f"- {here.study.title} ({here.study.name}): {sizes}.")
@@ -117,8 +117,8 @@ def _solutions(frame: pd.DataFrame) -> str:
     return " + ".join(f"{number} of {name}" for name, number in frame["algorithm"].value_counts(sort=False).items()) or "no solution"
 
 
-def _conclusions(found: Sequence[Conclusion]) -> str:
-    rows = [(one.question, one.setting, one.words, f"*{one.verdict}*", one.why) for one in found]
+def _conclusions(verdicts: Sequence[Conclusion]) -> str:
+    rows = [(one.question, one.setting, one.words, f"*{one.verdict}*", one.why) for one in verdicts]
     return "\n".join(["## Conclusions", "", "What the published results say, and whether it holds here. The rules:", "",
                       *(f"- {rule}" for rule in RULES), "",
                       _markdown(("question", "setting", "published conclusion", "here", "why"), rows), ""])

@@ -151,15 +151,15 @@ def _plain(name: str) -> str:
 
 def _characteristic_columns(path: Path, table: pd.DataFrame, characteristics: CharacteristicSet) -> list[str]:
     """The file's columns of the characteristics, in the study's order."""
-    found: dict[str, str] = {}
+    by_plain_name: dict[str, str] = {}
     for column in map(str, table.columns):
-        if _plain(column) in found:
-            raise InputError(path, f"has two columns of one name, {found[_plain(column)]!r} and {column!r}", "each column once")
-        found[_plain(column)] = column
-    missing = [name for name in characteristics.names if _plain(name) not in found]
+        if _plain(column) in by_plain_name:
+            raise InputError(path, f"has two columns of one name, {by_plain_name[_plain(column)]!r} and {column!r}", "each column once")
+        by_plain_name[_plain(column)] = column
+    missing = [name for name in characteristics.names if _plain(name) not in by_plain_name]
     if missing:
         raise InputError(path, f"lacks the columns {', '.join(missing)}", f"all of {', '.join(characteristics.names)}")
-    return [found[_plain(name)] for name in characteristics.names]
+    return [by_plain_name[_plain(name)] for name in characteristics.names]
 
 
 def _numbers(path: Path, table: pd.DataFrame, column: str) -> FloatArray:

@@ -296,7 +296,7 @@ def quoted(study: Study) -> list[Totals]:
     return [_totals(name, file, entry) for name, files in _read(TOTALS).items() if name in names for file, entry in files.items()]
 
 
-def keep_totals(path: Path, study: Study, file: str, found: Agreement) -> None:
+def keep_totals(path: Path, study: Study, file: str, result: Agreement) -> None:
     """Write, or replace, the entry of one study and one file.
 
     Raises
@@ -305,8 +305,8 @@ def keep_totals(path: Path, study: Study, file: str, found: Agreement) -> None:
         If the file holds something else or cannot be written.
     """
     kept = _read(path) if path.exists() else {}
-    entry = {"rows": found.rows, "spearman": _rounded(found.spearman), "mean_absolute_error": _rounded(found.mean_absolute_error),
-             "collisions": found.collisions}
+    entry = {"rows": result.rows, "spearman": _rounded(result.spearman), "mean_absolute_error": _rounded(result.mean_absolute_error),
+             "collisions": result.collisions}
     kept = {**kept, study.name: {**kept.get(study.name, {}), file: entry}}
     write_whole(path, f"# {WHAT}\n\n{tomli_w.dumps(kept)}")
 

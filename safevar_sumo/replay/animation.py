@@ -132,10 +132,10 @@ class _Canvas:
         trace = self._scene.comparison.film.drives.trace
         self._word(draw, (12, 14), f"{sample * self._scene.step:.2f} s", INK, 26)
         for row in self._scene.comparison.rows:
-            told = self._scene.moments[row]
-            at = min(sample, told.end)
+            ended = self._scene.moments[row]
+            at = min(sample, ended.end)
             gap = trace.gap[at, row]
-            over = sample >= (told.end if told.nearest is None else told.nearest)
+            over = sample >= (ended.end if ended.nearest is None else ended.nearest)
             state = self._scene.comparison.verdict(row) if over else "brakes" if self._brakes(row, at) else ""
             y = 8 + 26 * row
             draw.rectangle((FINER * 132, FINER * (y + 3), FINER * 154, FINER * (y + 17)), fill=VEHICLES[row])
@@ -230,9 +230,9 @@ def _film(scene: Scene, path: Path) -> None:
 
 def _ffmpeg() -> str:
     """The program that encodes films: on the path, or the one that the package imageio-ffmpeg brings."""
-    found = shutil.which("ffmpeg")
-    if found is not None:
-        return found
+    program = shutil.which("ffmpeg")
+    if program is not None:
+        return program
     try:
         import imageio_ffmpeg
 

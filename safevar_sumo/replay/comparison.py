@@ -162,11 +162,11 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     settings = np.stack([original]) if np.array_equal(original, setting) else np.stack([original, setting])
     there = at_worst(system, settings)
     where = [f" ({point.name})" for point in system.matrix if (point.scenario, point.weather) == (there.scenario, there.weather)]
-    taken = film(there, settings)
+    recording = film(there, settings)
     return Comparison(title=study.title + "".join(where[:1]), characteristics=system.characteristics,
                       ttc_threshold=system.metrics.ttc_threshold, network=there.scenario.network,
-                      evaluations=score(there, settings, taken.drives),
-                      film=replace(taken, drives=_up_to_impacts(taken.drives)))
+                      evaluations=score(there, settings, recording.drives),
+                      film=replace(recording, drives=_up_to_impacts(recording.drives)))
 
 
 def _up_to_impacts(drives: SimulationRuns) -> SimulationRuns:
@@ -182,8 +182,8 @@ def _up_to_impacts(drives: SimulationRuns) -> SimulationRuns:
 
 def differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:
     """Where the only row of a replay differs from its row of solutions.csv: each with both values."""
-    told = [f"{name} is {recorded[name]:.6g} there and {replayed.metrics[name][0]:.6g} here" for name in replayed.metrics
+    problems = [f"{name} is {recorded[name]:.6g} there and {replayed.metrics[name][0]:.6g} here" for name in replayed.metrics
             if name in recorded and not np.array_equal(float(recorded[name]), float(replayed.metrics[name][0]), equal_nan=True)]
     if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):
-        told.insert(0, f"the outcome is {recorded['outcome']} there and {replayed.outcome[0]} here")
-    return told
+        problems.insert(0, f"the outcome is {recorded['outcome']} there and {replayed.outcome[0]} here")
+    return problems

@@ -50,7 +50,7 @@ def show_in_gui(comparison: Comparison, network: str | None = None, *, slower: f
     with open_window(network or comparison.network, scene.step) as window:
         for row in comparison.rows:
             _furnish(window, scene, row, turn)
-        rests = {told.nearest for told in scene.moments if told.nearest is not None} | {scene.length - 1}
+        rests = {one.nearest for one in scene.moments if one.nearest is not None} | {scene.length - 1}
         begun = time.monotonic()
         for sample in range(scene.length):
             _show(window, scene, sample, turn)

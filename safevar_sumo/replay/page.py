@@ -73,22 +73,22 @@ def _told(scene: Scene) -> str:
 
 def _moments(scene: Scene) -> list[dict[str, Any]]:
     """Where one may jump to."""
-    told = []
+    jumps = []
     for row, one in enumerate(scene.moments):
         name = scene.comparison.name(row)
         if one.brake is not None:
-            told.append({"name": f"{name} brakes", "sample": one.brake})
+            jumps.append({"name": f"{name} brakes", "sample": one.brake})
         if one.nearest is not None:
             hit = not np.isnan(scene.comparison.film.drives.collision_speed[row])
-            told.append({"name": f"{name} {'hits' if hit else 'is nearest'}", "sample": one.nearest})
-    return sorted(told, key=lambda moment: moment["sample"])
+            jumps.append({"name": f"{name} {'hits' if hit else 'is nearest'}", "sample": one.nearest})
+    return sorted(jumps, key=lambda moment: moment["sample"])
 
 
 def _drive(scene: Scene, row: int) -> dict[str, Any]:
-    trace, told = scene.comparison.film.drives.trace, scene.moments[row]
-    shown = slice(0, told.end + 1)
-    return {"name": scene.comparison.name(row), "verdict": scene.comparison.verdict(row), "end": told.end,
-            "nearest": told.end if told.nearest is None else told.nearest, "speed": _list(trace.speed[shown, row]),
+    trace, marks = scene.comparison.film.drives.trace, scene.moments[row]
+    shown = slice(0, marks.end + 1)
+    return {"name": scene.comparison.name(row), "verdict": scene.comparison.verdict(row), "end": marks.end,
+            "nearest": marks.end if marks.nearest is None else marks.nearest, "speed": _list(trace.speed[shown, row]),
             "gap": _list(trace.gap[shown, row]), "brakes": (trace.brake[shown, row] > 0).astype(int).tolist()}
 
 
@@ -121,5 +121,5 @@ def _list(values: FloatArray, decimals: int = CENTIMETRES) -> list[float | None]
 
 def _numbers(values: FloatArray, decimals: int = CENTIMETRES) -> list[float | None] | float | None:
     """One number where all are the same."""
-    found = _list(values, decimals)
-    return found[0] if len(set(found)) == 1 else found
+    numbers = _list(values, decimals)
+    return numbers[0] if len(set(numbers)) == 1 else numbers

@@ -75,8 +75,8 @@ class Scene:
     @property
     def key_sample(self) -> int:
         """The sample that a still picture shows: where the changed vehicle, or else the original, is nearest."""
-        told = self.moments[-1]
-        return told.nearest if told.nearest is not None else told.end
+        last = self.moments[-1]
+        return last.nearest if last.nearest is not None else last.end
 
     def tens(self, sample: int) -> list[int]:
         """The tens of metres from the start that are in view."""
@@ -91,13 +91,13 @@ def scene_of(comparison: Comparison) -> Scene:
     turn = np.deg2rad(90 - vut.angle[0, 0])
     to_scene = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     start = np.array([vut.x[0, 0], vut.y[0, 0]])
-    told = tuple(moments(film.drives, row) for row in comparison.rows)
-    length = max(one.end for one in told) + 1
-    bodies = tuple(_body(name, track, row, told[row].end, length, to_scene, start, turn)
+    all_moments = tuple(moments(film.drives, row) for row in comparison.rows)
+    length = max(one.end for one in all_moments) + 1
+    bodies = tuple(_body(name, track, row, all_moments[row].end, length, to_scene, start, turn)
                    for name, track in film.tracks.items() for row in comparison.rows
                    if name == VUT or (_shown(film, name, row) and not _seen_already(comparison, name, row)))
     road = tuple(lane._replace(line=(lane.line - start) @ to_scene.T) for lane in film.road)
-    return Scene(comparison=comparison, step=film.drives.trace.step, length=length, road=road, bodies=bodies, moments=told,
+    return Scene(comparison=comparison, step=film.drives.trace.step, length=length, road=road, bodies=bodies, moments=all_moments,
                  view=_view(bodies, length))
 
 

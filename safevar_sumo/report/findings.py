@@ -37,9 +37,9 @@ def explanations(material: ReportInput, jobs: int | None, progress: Progress) ->
     return list(stored(material, "explain", compute))
 
 
-def necessity(found: Found, material: ReportInput) -> Markup | None:
+def necessity(explained: Found, material: ReportInput) -> Markup | None:
     """How often each characteristic is changed in a failure, and how often it is needed."""
-    shares: dict[str, dict[str, Any]] = next((one["summary"] for one in found if "summary" in one), {})
+    shares: dict[str, dict[str, Any]] = next((one["summary"] for one in explained if "summary" in one), {})
     names = [name for name in shares.get("necessary", {}) if shares["changed"].get(name)]
     if not names:
         return None
@@ -49,8 +49,8 @@ def necessity(found: Found, material: ReportInput) -> Markup | None:
               for name in ordered]
     ends = [("", f"needed {shares['necessary'][name]:.0%}{_interval(*shares['necessary_interval'][name])}, "
                  f"changed {shares['changed'][name]:.0%}") for name in ordered]
-    told = f"{material.case.name}: how often a characteristic is needed for a failure, beside how often it is changed"
-    return rows(told, ordered, pieces, [None] * len(ordered), ends)
+    description = f"{material.case.name}: how often a characteristic is needed for a failure, beside how often it is changed"
+    return rows(description, ordered, pieces, [None] * len(ordered), ends)
 
 
 def _interval(low: float, high: float) -> str:
@@ -58,10 +58,10 @@ def _interval(low: float, high: float) -> str:
     return f" ({low:.0%} to {high:.0%})" if low < high else ""
 
 
-def causes(found: Found, material: ReportInput) -> list[dict[str, Any]]:
+def causes(explained: Found, material: ReportInput) -> list[dict[str, Any]]:
     """The distinct minimal causes, the one of the fewest and smallest changes first, each with its replay at the boundary."""
     distinct: dict[tuple[str, ...], dict[str, Any]] = {}
-    for failure in found:
+    for failure in explained:
         for cause in _with_changes(failure):
             key = tuple(cause["changes"])
             if key not in distinct or _size(material, cause) < _size(material, distinct[key]["cause"]):
@@ -107,7 +107,7 @@ def _told(material: ReportInput, place: int, one: dict[str, Any]) -> dict[str, A
 
 def replays(material: ReportInput, explained: Found | None) -> list[dict[str, Any]]:
     """The solutions worth a look: the chosen ones, the explained ones, and unsafe ones that no other beats in every objective."""
-    told, chosen = [], _chosen(material, explained)
+    shown, chosen = [], _chosen(material, explained)
     if material.system is not None and chosen:
         material.again([material.setting_of(SolutionId.parse(handle)) for handle in chosen])
     for place, handle in enumerate(chosen):
@@ -115,10 +115,10 @@ def replays(material: ReportInput, explained: Found | None) -> list[dict[str, An
         one = {"handle": handle, "anchor": material.anchor("replay", handle), "f_safe": row["f_safe"], "f_diff": row["f_diff"],
                "f_num_diff": row["f_num_diff"], "outcome": row["outcome"], "open": place == 0 and not explained,
                "differences": [], "where": None, "changes": material.changes(setting)}
-        told.append(one if material.system is None else {
+        shown.append(one if material.system is None else {
             **one, "replay": material.replay(setting), "where": material.where(setting),
             "differences": differences(material.again([setting])[0].evaluation, row)})
-    return sorted(told, key=lambda one: (one["f_safe"], one["handle"]))
+    return sorted(shown, key=lambda one: (one["f_safe"], one["handle"]))
 
 
 def _chosen(material: ReportInput, explained: Found | None) -> list[str]:

@@ -143,8 +143,8 @@ class ReportInput:
         assert self.system is not None
         new = {setting.tobytes(): setting for setting in settings if setting.tobytes() not in self._again}
         if new:
-            found = at_every_point(self.system, np.stack(list(new.values())))
-            evaluations, points = aggregated(self.system, found), points_of(self.system, found, self.unsafe)
+            at_points = at_every_point(self.system, np.stack(list(new.values())))
+            evaluations, points = aggregated(self.system, at_points), points_of(self.system, at_points, self.unsafe)
             for row, key in enumerate(new):
                 self._again[key] = Again(evaluations.take([row]), points[row])
         return [self._again[setting.tobytes()] for setting in settings]
@@ -195,7 +195,7 @@ def gather(directories: Iterable[str | Path], point: str = "", *, as_it_is_now: 
         computed with has changed since and `as_it_is_now` does not allow that.
     """
     places = [Path(directory) for directory in directories]
-    found = []
+    inputs = []
     for number, (place, case) in enumerate(zip(places, load_cases(places), strict=True), 1):
         system, lacking, changed = None, "", list[str]()
         try:
@@ -207,9 +207,9 @@ def gather(directories: Iterable[str | Path], point: str = "", *, as_it_is_now: 
         if point:
             case = _at_point(case, point)
             system = assemble(case.study, str(place))
-        found.append(ReportInput(number=number, place=place, case=case, manifest=read_manifest(place), system=system, lacking=lacking,
+        inputs.append(ReportInput(number=number, place=place, case=case, manifest=read_manifest(place), system=system, lacking=lacking,
                               point=point, changed=changed))
-    return found
+    return inputs
 
 
 def _at_point(case: Case, point: str) -> Case:
@@ -217,9 +217,9 @@ def _at_point(case: Case, point: str) -> Case:
     study = study_at(case.study, point, "--point")
     system = assemble(study)
     settings = np.concatenate([case.characteristics.original[np.newaxis], case.solutions[list(case.characteristics.names)].to_numpy(float)])
-    found = evaluate(system, settings)
-    measured = {"f_safe": found.f_safe, **found.metrics, "outcome": found.outcome}
-    return replace(case, study=study, original={name: float(found.metrics[name][0]) for name in case.original if name in found.metrics},
+    now = evaluate(system, settings)
+    measured = {"f_safe": now.f_safe, **now.metrics, "outcome": now.outcome}
+    return replace(case, study=study, original={name: float(now.metrics[name][0]) for name in case.original if name in now.metrics},
                    solutions=case.solutions.assign(**{name: values[1:] for name, values in measured.items() if name in case.solutions}))
 
 
@@ -259,8 +259,8 @@ def _identity(material: ReportInput, name: str) -> str:
         file = material.place / kept
         content = file.read_bytes() if file.is_file() else b""
         digest.update(len(content).to_bytes(8, "big") + content)
-    told = [material.case.finished, material.point, material.options[name]]
-    digest.update(repr(told).encode())
+    parts = [material.case.finished, material.point, material.options[name]]
+    digest.update(repr(parts).encode())
     return digest.hexdigest()
 
 

@@ -24,11 +24,11 @@ Found = dict[str, Any]
 def tolerance(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
     """Every characteristic's safe interval alone, as bars over its domain, and the factor for all together."""
     def compute() -> Found:
-        told = find_tolerances(material.case.study, material.options["tolerance"], jobs=jobs, progress=progress)
-        return {**told.to_dict(), "verdict": told.verdict}
+        tolerances = find_tolerances(material.case.study, material.options["tolerance"], jobs=jobs, progress=progress)
+        return {**tolerances.to_dict(), "verdict": tolerances.verdict}
 
-    found = stored(material, "tolerance", compute)
-    return {"verdict": found["verdict"], "unsafe": found["unsafe"], "joint": found["joint"], "chart": _bars(material, found["alone"])}
+    result = stored(material, "tolerance", compute)
+    return {"verdict": result["verdict"], "unsafe": result["unsafe"], "joint": result["joint"], "chart": _bars(material, result["alone"])}
 
 
 def risk(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
@@ -36,25 +36,25 @@ def risk(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
     def compute() -> Found:
         return estimate_risk(material.case.study, material.options["risk"], jobs=jobs, progress=progress).to_dict()
 
-    found = stored(material, "risk", compute)
+    result = stored(material, "risk", compute)
     study = material.case.study
-    return {**found, "of_domain": not study.variation, "correlated": bool(study.correlations),
-            "chart": _sensitivity(material, found["sensitivity"])}
+    return {**result, "of_domain": not study.variation, "correlated": bool(study.correlations),
+            "chart": _sensitivity(material, result["sensitivity"])}
 
 
 def rules(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
     """Rules in words, with what they are worth on vehicles that they were not made from."""
     def compute() -> Found:
-        told = find_rules(material.case.study, material.options["rules"], jobs=jobs, progress=progress)
-        sure = [rule for rule in told.rules if rule.tells_more_than(told.unsafe_share)]
-        words = [raised(rule_in_words(rule, material.case.characteristics, told.unsafe)) for rule in sure]
-        dropped = number_of(len(told.rules) - len(sure), "rule")
-        remark = told.remark if len(sure) == len(told.rules) else (
+        regions = find_rules(material.case.study, material.options["rules"], jobs=jobs, progress=progress)
+        sure = [rule for rule in regions.rules if rule.tells_more_than(regions.unsafe_share)]
+        words = [raised(rule_in_words(rule, material.case.characteristics, regions.unsafe)) for rule in sure]
+        dropped = number_of(len(regions.rules) - len(sure), "rule")
+        remark = regions.remark if len(sure) == len(regions.rules) else (
             f"Left out: {dropped} that so few vehicles do not tell from chance; the command rules looks at more.")
-        return {"words": words, "samples": told.samples, "share": told.unsafe_share, "remark": remark, "unsafe": str(told.unsafe)}
+        return {"words": words, "samples": regions.samples, "share": regions.unsafe_share, "remark": remark, "unsafe": str(regions.unsafe)}
 
-    found: Found = stored(material, "rules", compute)
-    return found
+    result: Found = stored(material, "rules", compute)
+    return result
 
 
 LIMITS: Mapping[str, Callable[[ReportInput, int | None, Progress], Found]] = {"tolerance": tolerance, "risk": risk, "rules": rules}
@@ -73,8 +73,8 @@ def _bars(material: ReportInput, alone: list[Found]) -> Markup:
                        *(_bar(member, interval, "weak", "could not be simulated") for interval in one["not_simulated"])])
         marks.append(_share(member, member.original))
         ends.append((f"{number(member.lower)}{spaced(member.unit)}", f"{number(member.upper)}{spaced(member.unit)}"))
-    told = f"{material.case.name}: where each characteristic alone is safe and where it is unsafe; a mark at the original"
-    return rows(told, names, pieces, marks, ends)
+    description = f"{material.case.name}: where each characteristic alone is safe and where it is unsafe; a mark at the original"
+    return rows(description, names, pieces, marks, ends)
 
 
 def _bar(member: Characteristic, interval: Sequence[float], look: str, state: str = "") -> Bar:
@@ -97,8 +97,8 @@ def _share(member: Characteristic, value: float) -> float:
 
 
 def _sensitivity(material: ReportInput, sensitivity: list[Found]) -> Markup | None:
-    known = [one for one in sensitivity if one["total"] is not None]
-    ordered = sorted(known, key=lambda one: (-one["total"], one["characteristic"]))
+    defined = [one for one in sensitivity if one["total"] is not None]
+    ordered = sorted(defined, key=lambda one: (-one["total"], one["characteristic"]))
     if not ordered:
         return None
     pieces = [[_part(one["characteristic"], one["total"], "weak", "together with others"),

@@ -129,8 +129,8 @@ def _again(study: Study, out: str, place: Path) -> str:
         options = {name: getattr(search, name) for name in ("seed", "runs", "evaluations", "algorithms")}
         shipped = load_study(study.name)
         if msgspec.structs.replace(shipped, search=msgspec.structs.replace(shipped.search, **options), origin=study.origin) == study:
-            told = {**options, "algorithms": shlex.quote(",".join(search.algorithms)), "out": shlex.quote(out)}
-            return " ".join([f"{RUN} study {study.name}", *(f"--{name} {value}" for name, value in told.items())])
+            flags = {**options, "algorithms": shlex.quote(",".join(search.algorithms)), "out": shlex.quote(out)}
+            return " ".join([f"{RUN} study {study.name}", *(f"--{name} {value}" for name, value in flags.items())])
     script = f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(str(place))}).study, out={json.dumps(out)}, progress=True)"
     return f"python -c {shlex.quote(script)}"
 
@@ -193,8 +193,8 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
         wanted = [name for name in wanted if name != "questions"]
     materials = gather(directories, point, as_it_is_now=as_it_is_now)
     for material in materials:
-        for told in material.changed:
-            warnings.warn(f"{material.place}: {told}", stacklevel=2)
+        for change in material.changed:
+            warnings.warn(f"{material.place}: {change}", stacklevel=2)
     studies = [_study(material, wanted, jobs, progress) for material in materials]
     progress("tables and figures", 0, 1)
     cases = [material.case for material in materials]
@@ -216,7 +216,7 @@ def _study(material: ReportInput, wanted: Sequence[str], jobs: int | None, progr
               if name in wanted and material.system is not None}
     progress(f"{material.case.name}: replays", 0, 1)
     shown = replays(material, explained) if "causes" in wanted else []
-    made: dict[str, Callable[[], Any]] = {
+    sections: dict[str, Callable[[], Any]] = {
         "tested": lambda: tested(material),
         "verdict": lambda: verdict(material, explained, limits.get("tolerance")),
         "causes": lambda: causes(explained or [], material),
@@ -230,7 +230,7 @@ def _study(material: ReportInput, wanted: Sequence[str], jobs: int | None, progr
             "otherwise": otherwise,
             "lacking": material.lacking, "changed": material.changed, "original_fails": material.original_fails,
             "front": front(material, [one["handle"] for one in shown]) if shown else None,
-            **limits, **{name: make() for name, make in made.items() if name in wanted or (name == "necessity" and "causes" in wanted)}}
+            **limits, **{name: make() for name, make in sections.items() if name in wanted or (name == "necessity" and "causes" in wanted)}}
 
 
 def _named(progress: Progress, material: ReportInput) -> Progress:

@@ -34,9 +34,9 @@ class Bar(NamedTuple):
     title: str
 
 
-def rows(told: str, names: Sequence[str], pieces: Sequence[Sequence[Bar]], marks: Sequence[float | None],
+def rows(description: str, names: Sequence[str], pieces: Sequence[Sequence[Bar]], marks: Sequence[float | None],
          ends: Sequence[tuple[str, str]]) -> Markup:
-    """Rows of bars with a mark each; `told` is the chart in words, `ends` what stands at a row's left and right end."""
+    """Rows of bars with a mark each; `description` is the chart in words, `ends` what stands at a row's left and right end."""
     parts, inside = [], WIDTH - LABEL - RIGHT
     for i, (name, bars, mark, (left, right)) in enumerate(zip(names, pieces, marks, ends, strict=True)):
         y = i * ROW * 1.6
@@ -50,10 +50,10 @@ def rows(told: str, names: Sequence[str], pieces: Sequence[Sequence[Bar]], marks
             parts.append(f'<path class="mark" d="M{LABEL + inside * mark:.1f} {y:.1f}v{ROW}"/>')
         parts.append(_text(LABEL, y + ROW + 8, left, "end start"))
         parts.append(_text(WIDTH - RIGHT, y + ROW + 8, right, "end"))
-    return _svg(told, ROW * 1.6 * len(names) + 4, parts)
+    return _svg(description, ROW * 1.6 * len(names) + 4, parts)
 
 
-def scatter(told: str, dots: Sequence[Dot], x_title: str, y_title: str, line: float | None, line_title: str) -> Markup:
+def scatter(description: str, dots: Sequence[Dot], x_title: str, y_title: str, line: float | None, line_title: str) -> Markup:
     """Points in a plane, with a level line; y points up."""
     height, left, bottom = 330, 62, 44
     xs, ys = [dot.x for dot in dots], [dot.y for dot in dots] + ([] if line is None else [line])
@@ -77,12 +77,12 @@ def scatter(told: str, dots: Sequence[Dot], x_title: str, y_title: str, line: fl
         place = f'cx="{across(dot.x):.1f}" cy="{up(dot.y):.1f}"'
         drawn = f'<circle class="{dot.look}" {place} r="4.5"><title>{escape(dot.title)}</title></circle>'
         parts.append(f'<a href="#{escape(dot.link)}" aria-label="{escape(dot.title)}">{drawn}</a>' if dot.link else drawn)
-    return _svg(told, height, parts, role="group" if any(dot.link for dot in dots) else "img")
+    return _svg(description, height, parts, role="group" if any(dot.link for dot in dots) else "img")
 
 
-def _svg(told: str, height: float, parts: Sequence[str], role: str = "img") -> Markup:
+def _svg(description: str, height: float, parts: Sequence[str], role: str = "img") -> Markup:
     """A chart of these parts, all of them escaped already."""
-    return Markup(f'<svg class="chart" role="{role}" viewBox="0 0 {WIDTH} {height:.0f}" aria-label="{escape(told)}">\n'
+    return Markup(f'<svg class="chart" role="{role}" viewBox="0 0 {WIDTH} {height:.0f}" aria-label="{escape(description)}">\n'
                   + "\n".join(parts) + "\n</svg>")
 
 
@@ -94,5 +94,5 @@ def _ticks(low: float, high: float) -> list[float]:
     """Round numbers that span from low to high."""
     from matplotlib.ticker import MaxNLocator
 
-    found = MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high if high > low else low + 1)
-    return [round(float(one), 10) for one in found]
+    ticks = MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high if high > low else low + 1)
+    return [round(float(one), 10) for one in ticks]

@@ -74,7 +74,7 @@ def _how(material: ReportInput) -> str:
 
 
 def _named(models: Mapping[str, Any], name: str) -> str:
-    return f"{name} ({told})" if (told := _described(models, name)) else name
+    return f"{name} ({description})" if (description := _described(models, name)) else name
 
 
 def _described(models: Mapping[str, Any], name: str) -> str:
@@ -230,11 +230,11 @@ def _together(tolerance: Mapping[str, Any] | None) -> dict[str, str]:
 
 def agreement(material: ReportInput) -> dict[str, Any]:
     """How well the study agrees with published data: a sentence, and the rows of a table; none where nothing is known."""
-    known = quoted(material.case.study)
-    if not known:
+    totals = quoted(material.case.study)
+    if not totals:
         return {"sentence": "This study was not compared with published data: how far another simulator or a real vehicle does the same "
                             "is unknown.", "rows": []}
-    first = max(known, key=lambda one: (one.reference, one.rows))
+    first = max(totals, key=lambda one: (one.reference, one.rows))
     shares = "no published collision is among them" if first.recall is None else (
         f"{first.both} of the {first.reference} published collisions collide here too (recall {first.recall:.2f})")
     if first.precision is not None:
@@ -242,7 +242,7 @@ def agreement(material: ReportInput) -> dict[str, Any]:
     rho = first.spearman.get(SAFETY_DEGREE)
     order = "" if rho is None else f" safety degrees are in the same order with a rank correlation of {rho:.2f} (1 is perfect);"
     return {"sentence": f"Agreement with published data, {first.rows} vehicles simulated again:{order} {shares}.",
-            "rows": [_row(one) for one in known]}
+            "rows": [_row(one) for one in totals]}
 
 
 def _row(one: Totals) -> dict[str, str]:
@@ -267,20 +267,20 @@ def trust(material: ReportInput, explained: Found | None) -> dict[str, Any]:
     case = material.case
     rows = [{"name": name, "published": case.study.published[name], "here": case.original[name]}
             for name in METRICS if name in case.study.published and not math.isnan(case.original[name])]
-    told = []
+    remarks = []
     failed = int((case.evaluations["outcome"] == str(Outcome.SIMULATOR_ERROR)).sum())
     if failed:
-        told.append(f"{failed} of {len(case.evaluations)} settings could not be simulated; they are in no result.")
+        remarks.append(f"{failed} of {len(case.evaluations)} settings could not be simulated; they are in no result.")
     invalid = int((case.evaluations["outcome"] == str(Outcome.INVALID_TEST)).sum())
     if invalid:
-        told.append(f"{invalid} of {len(case.evaluations)} settings left the tolerance of a test's speed before the driving system acted: "
-                    "they are neither failures nor successes.")
+        remarks.append(f"{invalid} of {len(case.evaluations)} settings left the tolerance of a test's speed before the driving system "
+                       "acted: they are neither failures nor successes.")
     if explained:
         shares = [failure["robustness"] for failure in explained if failure.get("robustness") is not None]
         if shares:
             fragile = sum(map(is_borderline, shares))
-            told.append(f"{fragile} of {len(shares)} failures analysed are borderline: "
+            remarks.append(f"{fragile} of {len(shares)} failures analysed are borderline: "
                         f"fewer than {BORDERLINE:.0%} of their neighbours are unsafe too.")
     if not rows:
-        told.append("No published values of the original vehicle are known to hold the study against.")
-    return {"published": rows, "told": told, "general": NOT_MODELLED, "agreement": agreement(material)["rows"]}
+        remarks.append("No published values of the original vehicle are known to hold the study against.")
+    return {"published": rows, "told": remarks, "general": NOT_MODELLED, "agreement": agreement(material)["rows"]}

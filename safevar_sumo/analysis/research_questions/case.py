@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.errors import InputError, told
+from safevar_sumo.errors import InputError, first_line
 from safevar_sumo.metrics import SAFEVAR, MetricFacts, Scoring
 from safevar_sumo.records import FloatArray, Outcome
 from safevar_sumo.results import Failure, failure_lines, load, places_of
@@ -105,19 +105,19 @@ class Case:
     @property
     def remarks(self) -> list[str]:
         """What a reader of any table of this case should know."""
-        told = []
+        lines = []
         if not self.has_runs:
-            told.append(f"{self.name}: imported solutions, without runs; the original vehicle as published or given.")
+            lines.append(f"{self.name}: imported solutions, without runs; the original vehicle as published or given.")
         else:
             done = Counter(algorithm for algorithm, _ in self.finished)
             planned = self.study.search.runs
             short = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.labels if done[name] < planned]
             if short:
-                told.append(f"{self.name}: unfinished, {', '.join(short)}; made of what is finished.")
+                lines.append(f"{self.name}: unfinished, {', '.join(short)}; made of what is finished.")
         if self.failures:
-            told.append(f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) and are in no result: "
+            lines.append(f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) and are in no result: "
                         f"{'; '.join(failure_lines(self.failures))}. study --retry-failed simulates them again.")
-        return told
+        return lines
 
 
 def counted(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
@@ -127,8 +127,8 @@ def counted(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
 
 def values(solutions: pd.DataFrame, metric: MetricFacts) -> FloatArray:
     """Where a metric counts, its values; undefined ones left out."""
-    found = counted(solutions, metric)[metric.name].to_numpy(dtype=float)
-    return np.asarray(found[~np.isnan(found)])
+    column = counted(solutions, metric)[metric.name].to_numpy(dtype=float)
+    return np.asarray(column[~np.isnan(column)])
 
 
 def collided(solutions: pd.DataFrame) -> pd.Series[bool]:
@@ -148,16 +148,16 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
     twice = [place for place, number in Counter(place.resolve() for place in places).items() if number > 1]
     if twice:
         raise InputError("directories", f"{twice[0]} is given twice", "each results directory once")
-    found = [_loaded(place) for place in places]
-    names = Counter(one.name for one in found)
-    return [replace(one, name=f"{one.name} ({place})") if names[one.name] > 1 else one for one, place in zip(found, places, strict=True)]
+    cases = [_loaded(place) for place in places]
+    names = Counter(one.name for one in cases)
+    return [replace(one, name=f"{one.name} ({place})") if names[one.name] > 1 else one for one, place in zip(cases, places, strict=True)]
 
 
 def _loaded(place: Path) -> Case:
     try:
         return load_case(place)
     except (TypeError, ValueError, KeyError, ArithmeticError) as error:
-        raise InputError(place, f"is damaged: {told(error)}", "a directory as the command study has left it") from error
+        raise InputError(place, f"is damaged: {first_line(error)}", "a directory as the command study has left it") from error
 
 
 def load_case(directory: Path) -> Case:

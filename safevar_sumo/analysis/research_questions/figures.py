@@ -92,13 +92,13 @@ def sizes_of_changes(case: Case) -> Figure:
     import seaborn as sns
 
     total = _some_critical(case)
-    found = effects(case)
+    changes = effects(case)
     members = case.characteristics.members
     columns = min(4, len(members))
     rows = -(-len(members) // columns)
     figure, axes = _figure(f"{case.name}: changes in critical solutions", rows, columns, (9.0, 1.0 + 1.85 * rows))
     for axis, member in zip(axes.flat, members, strict=False):
-        change = found.loc[found["characteristic"] == member.name, "change"]
+        change = changes.loc[changes["characteristic"] == member.name, "change"]
         low, high = (float(f"{end - member.original:.9g}") for end in (member.lower, member.upper))
         sides = {INCREASE: change[change > 0], DECREASE: change[change < 0]}
         for colour, side in sides.items():
@@ -207,22 +207,22 @@ def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
     Unanswerable
         If no figure can be drawn.
     """
-    found, refused = {}, []
+    figures, refused = {}, []
     alone = len(cases) == 1
     for name, of_all in OF_ALL.items():
         able, unable = _able(cases)
         refused += unable
         if able:
-            found[name] = of_all(able)
+            figures[name] = of_all(able)
     for case in cases:
         for name, group in OF_A_CASE.items():
             try:
-                found[name if alone else f"{case.name}-{name}"] = group(case)
+                figures[name if alone else f"{case.name}-{name}"] = group(case)
             except Unanswerable as error:
                 refused.append(error)
-    if not found:
+    if not figures:
         raise refused[0]
-    return found, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in refused))
+    return figures, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in refused))
 
 
 def _able(cases: Sequence[Case]) -> tuple[list[Case], list[Unanswerable]]:

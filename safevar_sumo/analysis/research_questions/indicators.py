@@ -105,8 +105,8 @@ def indicators(case: Case) -> pd.DataFrame:
     for algorithm, run in runs:
         front = objectives(case, by_run[algorithm, run]) if (algorithm, run) in by_run else np.zeros((0, 0))
         if len(front):
-            found = scale.normalised(front)
-            rows.append((algorithm, run, igd(front, reference), igd_plus(found, normal), hypervolume(found)))
+            scaled = scale.normalised(front)
+            rows.append((algorithm, run, igd(front, reference), igd_plus(scaled, normal), hypervolume(scaled)))
     return pd.DataFrame(rows, columns=["algorithm", "run", *MORE_IS_BETTER])
 
 
@@ -134,13 +134,13 @@ def convergence(case: Case, points: int = 50) -> pd.DataFrame:
 
 def _growth(case: Case, evaluations: pd.DataFrame, scale: Scale, grid: np.ndarray) -> list[float]:
     """Hypervolume of the first k evaluations for every k of the grid."""
-    found = scale.normalised(_values(case, evaluations))
-    defined = np.isfinite(found).all(axis=1)
-    found, places = found[defined], evaluations["evaluation"].to_numpy()[defined]
+    scaled = scale.normalised(_values(case, evaluations))
+    defined = np.isfinite(scaled).all(axis=1)
+    scaled, places = scaled[defined], evaluations["evaluation"].to_numpy()[defined]
     ends = np.searchsorted(places, grid, side="left")
-    front, grown = np.zeros((0, found.shape[1])), []
+    front, grown = np.zeros((0, scaled.shape[1])), []
     for start, end in zip([0, *ends[:-1]], ends, strict=True):
-        front = np.concatenate([front, found[start:end]])
+        front = np.concatenate([front, scaled[start:end]])
         front = nondominated(front) if len(front) else front
         grown.append(hypervolume(front) if len(front) else 0.0)
     return grown
@@ -148,9 +148,9 @@ def _growth(case: Case, evaluations: pd.DataFrame, scale: Scale, grid: np.ndarra
 
 def _checked(points: FloatArray, what: str) -> FloatArray:
     """Refuse what indicators would answer with their best value: no point, or undefined ones."""
-    found = np.asarray(points, dtype=float)
-    if found.ndim != 2 or not found.size:
+    array = np.asarray(points, dtype=float)
+    if array.ndim != 2 or not array.size:
         raise InputError(what, "is empty", "at least one point, shape (M, m)")
-    if not np.isfinite(found).all():
+    if not np.isfinite(array).all():
         raise InputError(what, "holds an undefined value", "points with finite objectives")
-    return found
+    return array

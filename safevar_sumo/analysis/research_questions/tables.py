@@ -60,8 +60,8 @@ def csv(answers: Sequence[Answer]) -> str:
 def as_json(answers: Sequence[Answer]) -> str:
     """One list of records; of several tables, each record tells its own under "table"."""
     several = len(answers) > 1
-    found = [{"table": answer.name, **row} if several else row for answer in answers for row in records(answer.frame)]
-    return json.dumps(found, indent=2, allow_nan=False) + "\n"
+    rows = [{"table": answer.name, **row} if several else row for answer in answers for row in records(answer.frame)]
+    return json.dumps(rows, indent=2, allow_nan=False) + "\n"
 
 
 def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
@@ -144,9 +144,9 @@ def _tabular(table: Table) -> list[str]:
 def escaped(plain: str) -> str:
     """Plain text as LaTeX; a character that its fonts may lack becomes its code point."""
     powers = re.split(r"\^(-?\d+)", re.sub(r"(?<![\w)^-])-(?=\.?\d)", MINUS, " ".join(plain.split())))
-    found = "".join(rf"\textsuperscript{{{''.join(map(_letter, part.replace('-', MINUS)))}}}" if i % 2 else "".join(map(_letter, part))
+    text = "".join(rf"\textsuperscript{{{''.join(map(_letter, part.replace('-', MINUS)))}}}" if i % 2 else "".join(map(_letter, part))
                     for i, part in enumerate(powers))
-    return found.replace("--", "-{}-")
+    return text.replace("--", "-{}-")
 
 
 def _letter(sign: str) -> str:
