@@ -31,7 +31,7 @@ Actors = Mapping[str, Mapping[str, str] | None]
 
 
 class Lane(NamedTuple):
-    """First and last point of a lane's middle line [m]."""
+    """First and last point of a lane's centre line [m]."""
 
     start: Coordinates
     end: Coordinates
@@ -65,7 +65,7 @@ class Roads(Protocol):
 
 
 class World(Protocol):
-    """N copies of a network while SUMO simulates them, as a scenario sees them."""
+    """N copies of a simulated network, for scenarios."""
 
     def vehicle_positions(self, actor: str) -> FloatArray:
         """Front bumpers of a vehicle in its N copies; shape (N, 2) [m]."""
@@ -98,13 +98,13 @@ class World(Protocol):
         """Let a vehicle reach a speed [m/s] within the coming step, in all copies."""
 
     def turn_back(self, person: str) -> None:
-        """Let a person turn round where it is and walk back to the edge that it came from, as fast as before."""
+        """Let a person turn round and walk back to its first edge at the same speed."""
 
 
 class Scene(NamedTuple):
     """The obstacle relative to N vehicles, each of shape (N,); see `Observation` for the quantities.
 
-    `over` tells where the encounter has ended and cannot come back, `visible` where nothing stands in the sensors' way.
+    `over` is true where the encounter has ended for good, `visible` where the obstacle is not occluded.
     """
 
     gap: FloatArray
@@ -116,34 +116,32 @@ class Scene(NamedTuple):
 
 
 class Scenario(Protocol):
-    """A scenario. Its fields are the parameters that a study gives under `scenario.parameters`.
+    """A scenario. Its fields are the parameters of `scenario.parameters`.
 
-    `reactive_actors` says whether anybody may react to the vehicle under test, as they do unless it is False: only where nobody does
-    can SUMO play the scene once, for all vehicles. `network` is a folder of `sumo_nets/`, or the path of a folder with the same files;
-    `duration` is the length of a run [s].
+    `network` is a folder of `sumo_nets/`, or the path of a folder with the same files; `duration` is the length of a run [s].
 
-    It may have a `grade`, by how much its road rises over the way [%]: SUMO's plane is then that road, and gravity acts in the
-    vehicles. It may have a `pre_crash`, what type of NHTSA's it is of. It may have `actors(roads) -> Actors`, what its
-    parameters make of the network's traffic, and `remarks() -> list[str]`,
-    what a user should know of them. It may have a `test_speed` [m/s]: a robot then holds the vehicle at that speed until the system
-    brakes, a run that leaves the tolerance before that is no valid test, and only what the front hits is a collision.
+    Optional: `reactive_actors = False` says that no actor reacts to the vehicle under test, so that SUMO can play the scene once for all
+    vehicles; `grade`, the rise of the road [%] (SUMO's plane is then that road, and gravity acts in the vehicles); `pre_crash`, its type
+    in NHTSA's typology; `actors(roads) -> Actors`, changes to the network's traffic; `remarks() -> list[str]` on its parameters for the
+    user; `test_speed` [m/s]: a robot holds the vehicle at that speed until the ADS brakes, a run that leaves the tolerance before that
+    is an invalid test, and only contacts at the vehicle's front are collisions.
     """
 
     network: str
     duration: float
 
     def begin(self, world: World) -> Any:
-        """Look at the world once, before the first step; returns what `observe` remembers."""
+        """Prepare a run, before the first step; returns the memory for `observe`."""
 
     def observe(self, world: World, step: float, memory: Any) -> tuple[Scene, Any]:
-        """Where the obstacle is now, `step` seconds after the last look; moves it on where SUMO does not."""
+        """The obstacle now, `step` seconds after the last call, and the memory; also controls actors that SUMO does not move."""
 
     def encounter(self, trace: Trace) -> Encounter:
         """The geometry that the metrics are computed from."""
 
 
 class Point(NamedTuple):
-    """A scenario in a weather; `name` is what a study calls it, `place` what tells it from the study's other points."""
+    """A scenario in a weather; `name` is its name in the study, `place` holds the parameters that distinguish it from other points."""
 
     scenario: Scenario
     weather: Weather

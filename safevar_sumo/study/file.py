@@ -1,4 +1,4 @@
-"""Study files read strictly, with what they extend."""
+"""Reading study files strictly, with the studies that they extend, and writing them."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from safevar_sumo.study.schema import NAME, Origin, SearchTable, Study, StudyLik
 from safevar_sumo.study.validation import converted, implausible, refuse, unusable
 
 REPLACED = ("calibration", "published", "repeatability")
-"""Tables that a study does not inherit in part from the one that it extends."""
+"""Tables that a study inherits as a whole or not at all."""
 OF_ONE_SYSTEM = ("title", "published", "repeatability")
-"""What holds for one vehicle, ADS, scenario (its network too), weather and matrix alone: with another one it is not inherited."""
+"""Keys that hold for one vehicle, ADS, scenario, network, weather and matrix; a study with another one does not inherit them."""
 
 
 class _Raw(NamedTuple):
-    """A study's tables before they are checked, and where they come from."""
+    """Unchecked tables of a study, and their origin."""
 
     source: object
     tables: dict[str, Any]
@@ -36,7 +36,7 @@ def load_study(study: StudyLike, **changes: Any) -> Study:
     Parameters
     ----------
     study
-        Its name, the path of its file, its tables as they would stand in a file, or a study that is to be changed.
+        Its name, the path of its file, its tables as in a file, or a study to change.
     changes
         Keys that override the study's, table by table as in a file that extends it:
         `weather="fog"`, `search={"runs": 2}`.
@@ -44,7 +44,7 @@ def load_study(study: StudyLike, **changes: Any) -> Study:
     Raises
     ------
     InputError
-        Naming file, key, value and what is legal.
+        Naming file, key, value and what is expected.
     """
     given = _given(study)
     return _checked(_overridden(given, changes, given.source) if changes else given)
@@ -68,7 +68,7 @@ def _checked(raw: _Raw) -> Study:
 
 
 def _with_algorithms(raw: dict[str, Any]) -> dict[str, Any]:
-    """The tables of algorithms, such as [search.nsga2], put where the schema has them."""
+    """Move the tables of algorithms, such as [search.nsga2], to `search.parameters`."""
     search = raw.get("search")
     if not isinstance(search, dict) or not isinstance(search.get("parameters", {}), dict):
         return raw
@@ -78,7 +78,7 @@ def _with_algorithms(raw: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read(path: Path, seen: tuple[Path, ...]) -> _Raw:
-    """Read a TOML file; what it `extends` comes first, its own keys override table by table."""
+    """Read a TOML file and what it `extends`; its own keys override table by table."""
     if path in seen:
         raise InputError(path, f"extends = {path.stem!r} leads back to this file", "a study that does not extend this one")
     try:
@@ -98,7 +98,7 @@ def _read(path: Path, seen: tuple[Path, ...]) -> _Raw:
 
 
 def _extended(raw: _Raw, path: Path, seen: tuple[Path, ...]) -> _Raw:
-    """The tables of the study that `raw` extends, overridden by its own; and the folders of both."""
+    """The tables of the study that `raw` extends, overridden by those of `raw`, with the folders of both."""
     tables = dict(raw.tables)
     base = tables.pop("extends", None)
     if base is None:
@@ -111,12 +111,12 @@ def _extended(raw: _Raw, path: Path, seen: tuple[Path, ...]) -> _Raw:
     extended = _read(beside if is_file(beside) else study_path(base), (*seen, path))
     over = _overridden(extended, tables, raw.source)
     places = tuple(dict.fromkeys((*raw.origin.places, *extended.origin.places)))
-    remarks = () if path.parent == STUDIES else over.origin.remarks  # who made a study of ours knew what it leaves out
+    remarks = () if path.parent == STUDIES else over.origin.remarks  # shipped studies leave keys out on purpose
     return over._replace(origin=msgspec.structs.replace(over.origin, called=raw.origin.called, places=places, remarks=remarks))
 
 
 def _overridden(base: _Raw, over: Mapping[str, Any], source: object) -> _Raw:
-    """Override a study's tables by others; with another system what holds for the old one alone is left out."""
+    """Override a study's tables; another system does not inherit the keys `OF_ONE_SYSTEM`."""
     tables = _merged(base.tables, over)
     other = [key for key in ("weather", "vehicle", "ads", "scenario", "matrix") if _kind(tables.get(key)) != _kind(base.tables.get(key))]
     remarks = base.origin.remarks
@@ -131,7 +131,7 @@ def _overridden(base: _Raw, over: Mapping[str, Any], source: object) -> _Raw:
 
 
 def _kind(table: object) -> object:
-    """Which model on which network, or which weather or matrix, a table stands for."""
+    """The model and network of a table, or the weather or matrix itself."""
     if not isinstance(table, dict):
         return table
     parameters = table.get("parameters")
@@ -139,7 +139,7 @@ def _kind(table: object) -> object:
 
 
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Override `base` by `over`; another `model` or `distribution`, and what may be calibrated, replace the whole table."""
+    """Override `base` by `over`; another `model` or `distribution`, and the tables `REPLACED`, replace a whole table."""
     result = dict(base)
     for key, value in over.items():
         result[key] = _merged(base[key], value) if _refines(key, base.get(key), value) else value
@@ -154,12 +154,12 @@ def _refines(key: str, old: object, new: object) -> bool:
 
 
 def without_nothing(raw: Any) -> Any:
-    """TOML has no null: what is not given is left out."""
+    """Tables without null values, which TOML does not have."""
     return {key: without_nothing(value) for key, value in raw.items() if value is not None} if isinstance(raw, dict) else raw
 
 
 def write_study(path: Path, study: Study, comment: str) -> None:
-    """Write a complete study file that begins with a comment; the study is called as the file, as far as that is a name.
+    """Write a complete study file that begins with a comment; the study takes the file's name if that is a legal one.
 
     Raises
     ------
@@ -178,7 +178,7 @@ def write_study(path: Path, study: Study, comment: str) -> None:
 
 
 def check_writable(path: Path, source: str = "out") -> None:
-    """Refuse a file that cannot be written before the work whose result it is to take.
+    """Refuse an output file that cannot be written, before the work begins.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a study is: which vehicle, driven by which ADS, in which scenario and weather, searched how; and where its file lies."""
+"""The tables of a study: vehicle, ADS, scenario, weather, metrics and search; and the places of its files."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
 SAFETY_DEGREE: Final = "safety_degree"
 """Column and key of that metric."""
 OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
-"""What the published study minimises."""
+"""Objectives of the published study."""
 LONGEST_WORDS = 200
-"""Characters of what a characteristic is, in words."""
+"""Largest number of characters of a characteristic's description."""
 WORDS = ("meaning", "counterpart")
-"""Keys of a characteristic that people read and no result depends on."""
+"""Keys of a characteristic for people to read; no result depends on them."""
 
 
 class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One row of the characteristics table; the quantities are in `unit`, a change counts `weight` times in f_diff.
 
-    `meaning` is what the characteristic is, in words, which begin with a short name (up to the first comma or bracket);
-    `counterpart` is the part of a real vehicle that sets it. No result depends on either.
+    `meaning` describes the characteristic and begins with a short name (up to the first comma or bracket); `counterpart` is the part
+    of a real vehicle that sets it.
     """
 
     unit: str
@@ -58,7 +58,7 @@ class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The vehicle under test: its model, the model's parameters, and what may vary."""
+    """The vehicle under test: its model, the model's parameters, and the characteristics that vary."""
 
     model: str
     characteristics: dict[str, CharacteristicTable]
@@ -68,11 +68,10 @@ class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Weather as data: what it does to the road and to the sensors.
 
-    `road_friction` and `visibility` are factors on the dry, clear case [-]; `wet` says whether there is water on the road, which worn
-    treads lose friction to, beyond that factor; `recognition_delay` is by how much later
-    than in clear weather an ADS makes somebody out [s], `hesitation` by how much later than it lets go of the accelerator
-    it then brakes [s]: both are World On Rails' and do not act on an ADS with reactions of its own.
-    `light` says when it is, and acts through these alone.
+    `road_friction` and `visibility` are factors on the dry, clear case [-]; on a `wet` road worn treads lose further friction.
+    `recognition_delay` is the additional time in which an ADS recognises an obstacle [s], `hesitation` the additional time between
+    releasing the accelerator and braking [s]; both were measured on World On Rails and do not act on an ADS with its own reactions.
+    `light` is a label without an effect of its own.
     """
 
     name: str
@@ -85,7 +84,7 @@ class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     @property
     def without_reactions(self) -> Weather:
-        """The same for a driver with reactions of its own."""
+        """The weather for a driver with its own reactions."""
         return msgspec.structs.replace(self, recognition_delay=0.0, hesitation=0.0)
 
 
@@ -103,11 +102,10 @@ class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is searched with: `runs` runs of every algorithm, each with `evaluations` simulations.
+    """The search: `runs` runs of every algorithm, each with `evaluations` simulations.
 
-    A batch of simulations that takes longer than `time_limit` [s] is taken for hung. `objectives` are minimised, a
-    metric in its unsafe direction. `parameters` are those of algorithms, by their labels; in a file they stand in tables
-    such as [search.nsga2].
+    A batch of simulations longer than `time_limit` [s] counts as hung. `objectives` are minimised, a metric in its unsafe direction.
+    `parameters` of algorithms are given by label; a file has them in tables such as [search.nsga2].
     """
 
     algorithms: Annotated[list[str], Meta(min_length=1)]
@@ -121,12 +119,12 @@ class SearchTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     @property
     def labels(self) -> dict[str, str]:
-        """What the algorithms are called in results, and how the study names them: of `package.module:Name` the Name."""
+        """Names of the algorithms in the study, by their labels in results (see `label_of`)."""
         return {label_of(name): name for name in self.algorithms}
 
 
 def label_of(algorithm: str) -> str:
-    """What an algorithm is called in results: of `package.module:Name` the Name."""
+    """Label of an algorithm in results: the Name of `package.module:Name`."""
     return algorithm.rpartition(":")[2]
 
 
@@ -146,8 +144,7 @@ class MatrixTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Several scenario points in which every setting is simulated.
 
-    `aggregate` is what becomes of their safety degrees: that of the point in which the setting comes off worst. (A mean
-    is refused: it would average distances with minus the speeds of collisions.)
+    `aggregate` combines their safety degrees: the worst counts. (A mean would average distances with minus the speeds of collisions.)
     """
 
     tests: Annotated[list[MatrixTest], Meta(min_length=1)]
@@ -155,7 +152,7 @@ class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A parameter that may be calibrated: its bounds in `unit`, and what it means."""
+    """A parameter to calibrate: its bounds in `unit`, and its meaning."""
 
     lower: float
     upper: float
@@ -164,10 +161,10 @@ class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where a study comes from; no part of what it is.
+    """The files of a study; results do not depend on them.
 
-    `called` is the path that names it on the command line, if its name does not; `places` are the folders of its file and
-    of those that it extends, in which its plug-ins are looked up first; `remarks` are what whoever uses it should know.
+    `called` is its path on the command line, if its name is not enough; `places` are the folders of its file and of the files that it
+    extends, where its plug-ins are looked up first; `remarks` are for the user.
     """
 
     called: str = ""
@@ -229,23 +226,23 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def tables_of(study: Study) -> dict[str, Any]:
-    """A study as plain tables, without where it comes from: what two equal studies have in common."""
+    """A study as plain tables, without its origin."""
     tables: dict[str, Any] = msgspec.to_builtins(study)
     del tables["origin"]
     return tables
 
 
 StudyLike = str | Path | Mapping[str, Any] | Study
-"""A study by its name, the path of its file, its tables, or itself."""
+"""A study as its name, the path of its file, its tables, or a `Study`."""
 
 
 def study_names() -> list[str]:
-    """Names of the studies that come with the package."""
+    """Names of the shipped studies."""
     return sorted(path.stem for path in STUDIES.glob("*.toml"))
 
 
 def study_path(study: str) -> Path:
-    """The file of a study that is given by its name or by a path.
+    """The file of a study given by name or path.
 
     Raises
     ------
@@ -264,7 +261,7 @@ def study_path(study: str) -> Path:
 
 
 def foreign_names(study: Study) -> list[str]:
-    """What of a study is computed by code from outside, as the study names it."""
+    """The parts of a study that code from outside computes, such as `ads.model = 'my_ads:Careful'`."""
     return [f"{key} = {name!r}" for key, name in _foreign(study)]
 
 
@@ -274,7 +271,7 @@ def foreign_packages(study: Study) -> list[str]:
 
 
 def _foreign(study: Study) -> list[tuple[str, str]]:
-    """Keys of a study and names that stand for code from outside."""
+    """Keys and names of a study's code from outside."""
     tests = [] if study.matrix is None else [test.model for test in study.matrix.tests]
     named = {"vehicle.model": [study.vehicle.model], "ads.model": [study.ads.model], "scenario.model": [study.scenario.model, *tests],
              "metrics.also": study.metrics.also, "search.objectives": study.search.objectives}
@@ -284,5 +281,5 @@ def _foreign(study: Study) -> list[tuple[str, str]]:
 def is_file(path: Path) -> bool:
     try:
         return path.is_file()
-    except OSError:  # a name that is too long, say
+    except OSError:  # for example a name that is too long
         return False

@@ -17,7 +17,7 @@ GRAVITY = 9.81
 
 
 class Slope(NamedTuple):
-    """Gravity on a road, for all vehicles or shape (N,) [m/s^2]: `back` against the way, negative downhill; `down` onto the road."""
+    """Gravity on a road, scalar or shape (N,) [m/s^2]: `back` against the direction of travel, negative downhill; `down` onto the road."""
 
     back: float | FloatArray
     down: float | FloatArray
@@ -27,7 +27,7 @@ LEVEL = Slope(0.0, GRAVITY)
 
 
 def slope_of(grade: FloatArray) -> Slope:
-    """The slope of a grade, rise over run [%]: g sin and g cos of the angle whose tangent that is."""
+    """The slope of a grade, rise over run [%]: g sin and g cos of its angle."""
     rise = grade / 100
     length = np.sqrt(1 + rise * rise)
     return Slope(GRAVITY * (rise / length), GRAVITY / length)
@@ -51,7 +51,7 @@ class SumoType(NamedTuple):
 
 
 class VehicleState(Protocol):
-    """What every model's state tells of N vehicles, each of shape (N,): m/s, -, -, -."""
+    """The columns of every model's state, each of shape (N,): m/s, -, -, -."""
 
     @property
     def speed(self) -> FloatArray: ...
@@ -64,45 +64,45 @@ class VehicleState(Protocol):
 
 
 class Vehicle(Protocol):
-    """A vehicle model. Its fields are the parameters that a study gives under `vehicle.parameters`.
+    """A vehicle model. Its fields are the parameters of `vehicle.parameters`.
 
     Every method is a pure function over arrays of N vehicles: element i of a result depends on
     element i of the arguments alone, to the bit. So methods use only + - * / and square roots,
     comparisons, minima and maxima: those are exact on every machine and for every N.
 
-    It may have `hold_gear(prepared, state, holds)`, the state in which the vehicles that `holds`, of shape (N,), do not change gear
-    and the others do by themselves: a driver needs it who holds the speed of a test. It may have `FITTED_UP_TO`, the fastest speed
-    that its parameters were identified at [m/s].
+    Optional: `hold_gear(prepared, state, holds)` returns the state in which the vehicles where `holds`, shape (N,), is true do not change
+    gear (the driving robot of tests at a speed needs it); `FITTED_UP_TO` is the highest speed at which its parameters were identified
+    [m/s].
     """
 
     UNITS: Mapping[str, str]
 
     def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
                 wet: bool | BoolArray = False) -> Any:
-        """Everything that stays the same in a run, `step` seconds a step, once computed.
+        """Constants of a run with a time step of `step` seconds.
 
-        `road_friction` is the weather's factor on the tyres' friction, `wet` whether the road is wet, for vehicles on which water acts
-        beyond that factor. A vehicle whose method takes no `slope` drives on level roads only; one that takes no `wet` is not told.
+        `road_friction` is the weather's factor on the tyres' friction; `wet` is for vehicles on which water acts beyond that factor.
+        A method without `slope` is for level roads only; a method without `wet` ignores it.
         """
 
     def sumo_type(self, prepared: Any) -> SumoType:
-        """The SUMO vehicle types that these vehicles are."""
+        """The SUMO types of the vehicles."""
 
     def at_rest(self, prepared: Any) -> Any:
         """The state at the start: standing, pedals released."""
 
     def at_speed(self, prepared: Any, speed: FloatArray) -> Any:
-        """The steady state at a speed above 0 [m/s], shape (N,): with the pedals kept where they are nothing changes."""
+        """The steady state at a speed above 0 [m/s], shape (N,), with the pedals that hold it."""
 
     def sense(self, prepared: Any, state: Any, seen: Observation) -> tuple[Observation, Any]:
-        """What the vehicles' own sensors leave of an observation, and the state after it."""
+        """An observation through the vehicles' own sensors, and the state after it."""
 
     def advance(self, prepared: Any, state: Any, command: Command) -> Any:
         """The state one simulation step later."""
 
 
 def at_start(vehicle: Vehicle, prepared: Any, speed: FloatArray) -> Any:
-    """The state of vehicles that the traffic puts onto the road with `speed` [m/s], shape (N,): at rest, or steady."""
+    """The initial state at a speed [m/s], shape (N,): at rest, or steady."""
     rest = vehicle.at_rest(prepared)
     rolls = speed > 0
     if not rolls.any():
@@ -110,7 +110,8 @@ def at_start(vehicle: Vehicle, prepared: Any, speed: FloatArray) -> Any:
     steady = vehicle.at_speed(prepared, np.where(rolls, speed, 1.0))
     if rolls.all():
         return steady
-    return type(rest)(*(one if one is None else np.where(rolls, one, other) for one, other in zip(steady, rest, strict=True)))
+    return type(rest)(*(moving if moving is None else np.where(rolls, moving, standing)
+                        for moving, standing in zip(steady, rest, strict=True)))
 
 
 VEHICLE_CONTRACT = Contract.of(Vehicle, "a vehicle", optional=("at_speed",))

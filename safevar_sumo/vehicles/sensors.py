@@ -1,4 +1,4 @@
-"""Signals that arrive late: a history of samples, read back by every vehicle at its own age."""
+"""Sensors and delayed signals: a history of samples that every vehicle reads with its own delay."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray, Observation
 
 LONGEST = 3600.0
-"""[s]"""
+"""Longest delay [s]."""
 
 
 def history(longest: float, step: float, sample: FloatArray) -> FloatArray:
-    """Room for delays up to `longest` seconds, filled with a first sample of shape (..., N); newest first.
+    """A history for delays up to `longest` seconds, filled with a first sample of shape (..., N); newest first.
 
     Raises
     ------
     InputError
-        If nobody simulates that long.
+        If the delay is longer than any run.
     """
     if not longest <= LONGEST:
         raise InputError("vehicle", f"one of its delays is {longest:g} s", f"up to {LONGEST:g} s")
@@ -28,27 +28,26 @@ def history(longest: float, step: float, sample: FloatArray) -> FloatArray:
 
 
 def remembered(past: FloatArray, sample: FloatArray) -> FloatArray:
-    """The history with a new sample in front and the oldest forgotten."""
+    """The history with a new sample first, without the oldest."""
     return np.concatenate([sample[np.newaxis], past[:-1]])
 
 
 def delayed(past: FloatArray, delay: FloatArray, step: float) -> FloatArray:
-    """What vehicle i's signal was `delay[i]` seconds ago, linear between two samples; shape (..., N)."""
+    """The signal of vehicle i `delay[i]` seconds ago, interpolated linearly; shape (..., N)."""
     age = delay / step
     newer = np.floor(age)
     share = age - newer
     row, column = newer.astype(np.intp), np.arange(len(delay))
     after, before = np.moveaxis(past[row, ..., column], 0, -1), np.moveaxis(past[row + 1, ..., column], 0, -1)
-    with np.errstate(invalid="ignore"):  # infinitely far a whole number of steps ago, and now in sight
+    with np.errstate(invalid="ignore"):  # infinite when out of sight, finite a step later
         between = after * (1 - share) + before * share
     return np.where(np.isnan(between), after, between)
 
 
 class Sensors(NamedTuple):
-    """What lies between the world and the ADSs of N vehicles, each of shape (N,): s, m, -.
+    """Sensors of N vehicles, each of shape (N,): latency [s], range in clear weather [m], factor on distances [-].
 
-    They tell of others `latency` late, of nobody beyond `reach` in clear weather, and `scale` times as far away as they are.
-    A vehicle's method `sensors(prepared)` returns them; `Vehicle.sense` does the same to an observation.
+    A vehicle's method `sensors(prepared)` returns them; `Vehicle.sense` applies the same to an observation.
     """
 
     latency: FloatArray
@@ -57,13 +56,13 @@ class Sensors(NamedTuple):
 
     @classmethod
     def perfect(cls, n: int) -> Sensors:
-        """At once, however far."""
+        """Sensors without latency, with unlimited range."""
         return cls(np.zeros(n), np.full(n, np.inf), np.ones(n))
 
 
 def late_and_near(seen: Observation, past: FloatArray | None, latency: FloatArray, reach: FloatArray,
                   step: float) -> tuple[Observation, FloatArray]:
-    """What was there `latency` [s] ago, and nothing beyond `reach` [m] times the visibility; and what is to be remembered for that."""
+    """The observation `latency` [s] ago without obstacles beyond `reach` [m] times the visibility, and the history for the next call."""
     obstacle_speed = np.broadcast_to(seen.obstacle_speed, seen.gap.shape)
     now = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed, obstacle_speed])
     past = history(float(np.max(latency)), step, now) if past is None else remembered(past, now)
