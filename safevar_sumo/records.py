@@ -17,6 +17,8 @@ BoolArray = npt.NDArray[np.bool_]
 
 STANDSTILL = 1e-3
 """Below this speed a vehicle counts as standing [m/s] (method section 4)."""
+KMH = 3.6
+"""km/h per m/s."""
 TIME_DECIMALS = 9
 """Sums of steps are told as 0.15 s, not as 0.15000000000000002 s."""
 

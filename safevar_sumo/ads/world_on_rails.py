@@ -7,11 +7,11 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.records import KMH, BoolArray, Command, FloatArray, Nominal, Observation
 
 NotNegative = Annotated[float, Meta(ge=0, le=60)]
 Throttle = Annotated[float, Meta(ge=0, le=1)]
-SPEED_LIMIT = 20 / 3.6
+SPEED_LIMIT = 20 / KMH
 """Above this speed the agent releases the throttle [m/s] (its source, 20 km/h)."""
 SPEED_LEVELS = (0.0, 8 / 3, 16 / 3)
 """Speeds that the policy is interpolated over, as far as the limit lets it [m/s] (its source: four in 0..8 m/s)."""

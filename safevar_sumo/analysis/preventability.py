@@ -108,7 +108,7 @@ def preventable_by(bench: Bench, settings: FloatArray) -> list[PreventableBy | N
 
     None where a setting cannot be simulated.
     """
-    found: list[PreventableBy | None] = [None] * len(settings)
+    classes: list[PreventableBy | None] = [None] * len(settings)
     system = assemble(bench.study)
     worst = _worst_points(bench, system, settings)
     for k in np.unique(worst).tolist():
@@ -116,8 +116,8 @@ def preventable_by(bench: Bench, settings: FloatArray) -> list[PreventableBy | N
         point = system.points[k]
         here = bench.of(study_at(bench.study, point.name, point.name) if system.matrix else bench.study)
         for row, by in zip(rows.tolist(), _at_one_point(here, system.at(point), settings[rows]), strict=True):
-            found[row] = by
-    return found
+            classes[row] = by
+    return classes
 
 
 def _worst_points(bench: Bench, system: System, settings: FloatArray) -> npt.NDArray[np.intp]:
@@ -137,10 +137,10 @@ def _at_one_point(bench: Bench, system: System, settings: FloatArray) -> list[Pr
     competent = drivers["competent_driver"].evaluate(settings, "a competent driver in the same vehicle")
     left = np.flatnonzero(competent.collided)
     braking = drivers["full_braking"].evaluate(settings[left], "full braking in the same vehicle")
-    found: list[PreventableBy | None] = [PreventableBy.COMPETENT_DRIVER if valid else None for valid in competent.valid]
+    classes: list[PreventableBy | None] = [PreventableBy.COMPETENT_DRIVER if valid else None for valid in competent.valid]
     for row, collided, valid in zip(left.tolist(), braking.collided, braking.valid, strict=True):
-        found[row] = None if not valid else PreventableBy.NOBODY if collided else PreventableBy.FULL_BRAKING
-    return found
+        classes[row] = None if not valid else PreventableBy.NOBODY if collided else PreventableBy.FULL_BRAKING
+    return classes
 
 
 def approach(system: System) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,74 +11,92 @@ import click
 from rich.console import Console
 
 from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.options import PICTURES, check_output
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import jobs_option, json_option, now_option, options_of, point_option, results_or_study, study_at_point
+from safevar_sumo.cli.target import (
+    Command,
+    jobs_option,
+    json_option,
+    now_option,
+    options_of,
+    point_option,
+    results_or_study,
+    study_at_point,
+)
 from safevar_sumo.errors import InputError
 from safevar_sumo.results import make_directory, write_whole
+from safevar_sumo.terminal import stages
 
 
-@commands.command()
-@click.argument("place", metavar="DIR|STUDY")
-@options_of(ExplainOptions)
-@click.option("--full", is_flag=True, help="Print every explanation in full, not the answer alone.")
-@point_option
-@now_option
-@jobs_option
-@json_option
-@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write causes.json, causes.csv and a picture there.")
+def question(options: type[Options], metavar: str, *extra: Callable[[Command], Command]) -> Callable[[Command], click.Command]:
+    """A command with the flags of a question's options, those that all questions share, and some of its own."""
+    def add(command: Command) -> click.Command:
+        decorators: list[Callable[[Command], Command]] = [
+            click.argument("place", metavar=metavar), options_of(options), point_option, now_option, jobs_option, json_option, *extra]
+        for decorator in reversed(decorators):
+            command = decorator(command)
+        return commands.command(name=options.question)(command)
+
+    return add
+
+
+def _answer(compute: Callable[..., Any], subject: Any, options: Options, jobs: int | None) -> Any:
+    """The result, computed with a bar on the terminal."""
+    with stages(Console(stderr=True)) as progress:
+        return compute(subject, options, jobs=jobs, progress=progress)
+
+
+def _json(result: Any) -> str:
+    return json.dumps(result.to_dict(), indent=2, allow_nan=False)
+
+
+def _plot_option(help_text: str) -> Callable[[Command], Command]:
+    return click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help=help_text)
+
+
+@question(ExplainOptions, "DIR|STUDY", click.option("--full", is_flag=True, help="Print every explanation in full, not the answer alone."),
+          click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write causes.json, causes.csv and a picture there."))
 def explain(place: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **given: Any) -> None:
     """Explain failures of results in DIR, or all over the domain of STUDY: which changes did it, how little is enough, why."""
     from safevar_sumo.analysis.explain.compute import explain_failures
     from safevar_sumo.analysis.explain.render import necessity_figure, print_explained
     from safevar_sumo.analysis.figures import save
-    from safevar_sumo.terminal import stages
 
     source = results_or_study(place, point)
     if out is not None:
         make_directory(out)
-    with stages(Console(stderr=True)) as progress:
-        result = explain_failures(source, ExplainOptions(**given), jobs=jobs, progress=progress)
-    records = json.dumps(result.to_dict(), indent=2, allow_nan=False)
+    result = _answer(explain_failures, source, ExplainOptions(**given), jobs)
     if as_json:
-        click.echo(records)
+        click.echo(_json(result))
     else:
         print_explained(Console(), place, result, point or "", full=full)
     if out is not None:
-        write_whole(out / "causes.json", records + "\n")
+        write_whole(out / "causes.json", _json(result) + "\n")
         write_whole(out / "causes.csv", result.to_frame().to_csv(index=False, lineterminator="\n"))
         save(necessity_figure(result), out / "necessity.png")
         click.echo(f"Causes: {out}", err=as_json)
 
 
-@commands.command()
-@click.argument("place", metavar="STUDY|DIR")
-@options_of(ToleranceOptions)
-@point_option
-@now_option
-@jobs_option
-@json_option
-@click.option("--plot", type=click.Path(path_type=Path), metavar="FILE",
-              help="Draw the profiles here: png, pdf or svg; with --pairs, the worst pairs in a second file beside it.")
+@question(ToleranceOptions, "STUDY|DIR",
+          _plot_option("Draw the profiles here: png, pdf or svg; with --pairs, the worst pairs in a second file beside it."))
 def tolerance(place: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **given: Any) -> None:
     """Find how far each characteristic of STUDY may go: alone, in pairs, and all together."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
     from safevar_sumo.analysis.tolerance.render import pairs_figure, print_tolerance, profiles_figure
-    from safevar_sumo.terminal import stages
 
-    options, chosen = ToleranceOptions(**given), study_at_point(place, point)
+    options, study = ToleranceOptions(**given), study_at_point(place, point)
     second = None if plot is None else plot.with_stem(f"{plot.stem}-pairs")
     for path in (plot, second if options.pairs else None):
         if path is not None:
             check_output(path, "--plot", PICTURES)
-    with stages(Console(stderr=True)) as progress:
-        result = find_tolerances(chosen, options, jobs=jobs, progress=progress)
+    result = _answer(find_tolerances, study, options, jobs)
     if as_json:
-        click.echo(json.dumps(result.to_dict(), indent=2, allow_nan=False))
+        click.echo(_json(result))
     else:
         print_tolerance(Console(), result)
     if plot is not None and second is not None:
@@ -86,58 +105,40 @@ def tolerance(place: str, point: str | None, jobs: int | None, as_json: bool, pl
             save(pairs_figure(result), second, "--plot")
 
 
-@commands.command()
-@click.argument("place", metavar="STUDY|DIR")
-@options_of(RiskOptions)
-@point_option
-@now_option
-@jobs_option
-@json_option
-@click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help="Draw what decides here: png, pdf or svg.")
+@question(RiskOptions, "STUDY|DIR", _plot_option("Draw what decides here: png, pdf or svg."))
 def risk(place: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **given: Any) -> None:
     """Estimate how likely an unsafe outcome is when vehicles vary as STUDY says under [variation], and what decides."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.risk.compute import estimate_risk
     from safevar_sumo.analysis.risk.render import print_risk, sensitivity_figure
-    from safevar_sumo.terminal import stages
 
-    chosen = study_at_point(place, point)
+    study = study_at_point(place, point)
     if plot is not None:
         check_output(plot, "--plot", PICTURES)
-        if chosen.correlations:
+        if study.correlations:
             raise InputError("--plot", "sensitivity indices of correlated characteristics are not defined", "a study without correlations")
-    with stages(Console(stderr=True)) as progress:
-        result = estimate_risk(chosen, RiskOptions(**given), jobs=jobs, progress=progress)
+    result = _answer(estimate_risk, study, RiskOptions(**given), jobs)
     if result.sensitivity is None:
         click.echo("note: characteristics are correlated, for which sensitivity indices are not defined: there are none", err=True)
     if result.errors:
         click.echo(f"warning: {result.errors} vehicles could not be simulated and are left out", err=True)
     if as_json:
-        click.echo(json.dumps(result.to_dict(), indent=2, allow_nan=False))
+        click.echo(_json(result))
     else:
         print_risk(Console(), result)
     if plot is not None:
         save(sensitivity_figure(result), plot, "--plot")
 
 
-@commands.command()
-@click.argument("place", metavar="STUDY|DIR")
-@options_of(RulesOptions)
-@point_option
-@now_option
-@jobs_option
-@json_option
+@question(RulesOptions, "STUDY|DIR")
 def rules(place: str, point: str | None, jobs: int | None, as_json: bool, **given: Any) -> None:
     """Find rules in physical units that say where STUDY is unsafe, from evenly spread settings, not from a search."""
-    from safevar_sumo.analysis.rules.compute import find_rules
-    from safevar_sumo.analysis.rules.render import print_rules
-    from safevar_sumo.terminal import stages
+    from safevar_sumo.analysis.rules.compute import find_rules, print_rules
 
-    with stages(Console(stderr=True)) as progress:
-        result = find_rules(study_at_point(place, point), RulesOptions(**given), jobs=jobs, progress=progress)
-    if as_json:
-        if result.remark:
-            click.echo(f"note: {result.remark}", err=True)
-        click.echo(json.dumps(result.to_dict(), indent=2, allow_nan=False))
-    else:
+    result = _answer(find_rules, study_at_point(place, point), RulesOptions(**given), jobs)
+    if not as_json:
         print_rules(Console(), result)
+        return
+    if result.remark:
+        click.echo(f"note: {result.remark}", err=True)
+    click.echo(_json(result))

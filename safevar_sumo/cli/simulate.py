@@ -27,7 +27,7 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import Target, now_option, replay_options, target_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.records import KMH, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import tags
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable
@@ -257,7 +257,6 @@ def _say(console: Console, sentence: str) -> None:
     console.print(sentence, soft_wrap=True, markup=False, highlight=False)
 
 
-KMH = 3.6
 BANDS = ((5.0, "green"), (15.0, "yellow"), (25.0, "dark_orange"), (35.0, "orange4"))
 """Relative impact speed [km/h] below which a colour holds, red above: the bands of Euro NCAP's tests of AEB between cars."""
 NAMED = 6

@@ -9,8 +9,7 @@ from markupsafe import Markup
 
 from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.risk.compute import estimate_risk
-from safevar_sumo.analysis.rules.compute import find_rules
-from safevar_sumo.analysis.rules.render import rule_in_words
+from safevar_sumo.analysis.rules.compute import find_rules, rule_in_words
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.replay.comparison import number, raised, spaced

@@ -15,7 +15,7 @@ from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, collided
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import FloatArray, Outcome
+from safevar_sumo.records import KMH, FloatArray, Outcome
 from safevar_sumo.reference import Totals, quoted
 from safevar_sumo.replay.comparison import number, raised
 from safevar_sumo.report.findings import Found, handle_of
@@ -87,8 +87,6 @@ def _described(models: Mapping[str, Any], name: str) -> str:
 
 TITLES = {ROBUST: "Smallest robust failure", REASONS["fewest"]: "Fewest changes", REASONS["smallest"]: "Smallest changes",
           REASONS["most_severe"]: "Most severe"}
-KMH = 3.6
-"""km/h in 1 m/s."""
 UNKNOWN = "–"  # noqa: RUF001
 
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo import rules
-from safevar_sumo.analysis.rules.compute import Rules
-from safevar_sumo.analysis.rules.render import rule_in_words
+from safevar_sumo.analysis.rules.compute import Rules, rule_in_words
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.analysis.known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
 

@@ -16,7 +16,7 @@ from safevar_sumo.analysis.explain.necessity import Robustness, robustness, smal
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, preventability
 from safevar_sumo.analysis.words import ENDS, ask, changes, joined, number_of
-from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.records import KMH, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, unsafe_rows
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.base import pre_crash_of
@@ -120,8 +120,6 @@ def _in_words(bench: Bench, causes: list[MinimalCause]) -> str:
     return f"These changes alone cause it: {changes(bench.characteristics, values)}{others}."
 
 
-KMH = 3.6
-"""km/h per m/s."""
 NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 NAMED = 4
 """Changes that are listed; of more the largest ones."""
