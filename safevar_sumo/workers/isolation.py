@@ -1,4 +1,4 @@
-"""Whether other people's models keep settings apart: the same settings alone, together, again and in another order."""
+"""Checks that models from outside keep settings apart, and that a recorded scene gives the results of SUMO."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ LEGAL = ("what happens to vehicle i depends on vehicle i alone: nothing kept in 
          "setting to another, no mean or sum over the batch, nothing random")
 
 ROUNDING = 1e-9
-"""Most by which a metric in a recorded scene may differ from SUMO's."""
+"""Largest difference between a metric in a recorded scene and in SUMO."""
 
 
 class Submit(Protocol):
-    """Has a batch of settings computed."""
+    """Computes a batch of settings."""
 
     def __call__(self, settings: FloatArray) -> Future[Evaluations]: ...
 
 
 def check_isolation(study: Study, characteristics: CharacteristicSet, submit: Submit) -> None:
-    """Refuse models that let one setting change another's result.
+    """Simulate the same settings together, again, in another order and alone; refuse models whose results differ.
 
     Raises
     ------
@@ -43,32 +43,32 @@ def check_isolation(study: Study, characteristics: CharacteristicSet, submit: Su
     ways: dict[str, Sequence[npt.NDArray[np.intp]]] = {
         "together": [order], "together again": [order], "in another order": [order[::-1]], "alone": list(order[:, np.newaxis])}
     running = {way: [(rows, submit(settings[rows])) for rows in batches] for way, batches in ways.items()}
-    found = {way: {int(row): result_of(future).take([i]) for rows, future in batches for i, row in enumerate(rows)}
-             for way, batches in running.items()}
-    for way, results in found.items():
-        for row, result in results.items():
-            refuse_difference(study, {"together": found["together"][row], way: result})
+    results = {way: {int(row): result_of(future).take([i]) for rows, future in batches for i, row in enumerate(rows)}
+               for way, batches in running.items()}
+    for way, by_row in results.items():
+        for row, result in by_row.items():
+            refuse_difference(study, {"together": results["together"][row], way: result})
 
 
 def refuse_difference(study: Study, ways: dict[str, Evaluations], again: str = "") -> None:
-    """Refuse two evaluations of one setting that differ, by how they came about; `again` is a command that has one of them again.
+    """Refuse two different evaluations of a setting, by how it was simulated; `again` is a command that repeats one of them.
 
     Raises
     ------
     ForeignError
         As `check_isolation`.
     """
-    (here, one), (there, other) = next(iter(ways.items())), list(ways.items())[-1]
-    told = _difference(one, other)
-    if told:
-        name, value, others = told
+    (here, first), (there, second) = next(iter(ways.items())), list(ways.items())[-1]
+    difference = _difference(first, second)
+    if difference:
+        name, value, other_value = difference
         problem = (f"with {' and '.join(foreign_names(study))} a result depends on what else is simulated: "
-                   f"{name} is {value} {here} and {others} {there}")
+                   f"{name} is {value} {here} and {other_value} {there}")
         raise ForeignError(f"study {study.name!r}", f"{problem}{again and f'; again by: {again}'}", LEGAL)
 
 
 def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations) -> None:
-    """Refuse settings that came out otherwise in a recorded scene than in SUMO itself.
+    """Refuse settings with different results in a recorded scene and in SUMO itself.
 
     Raises
     ------
@@ -95,14 +95,14 @@ def _far_apart(characteristics: CharacteristicSet) -> FloatArray:
     return characteristics.filter(np.array(corners))
 
 
-def _difference(one: Evaluations, other: Evaluations, most: float = 0.0) -> tuple[str, object, object] | None:
-    """The first number in which two evaluations of a setting differ, and both values, by more than `most`; failures tell nothing."""
+def _difference(one: Evaluations, other: Evaluations, tolerance: float = 0.0) -> tuple[str, object, object] | None:
+    """The first quantity that differs by more than `tolerance` in two evaluations of a setting, and both values; None if one failed."""
     if one.failed[0] or other.failed[0]:
         return None
     if one.outcome[0] != other.outcome[0]:
         return "outcome", str(one.outcome[0]), str(other.outcome[0])
     for name in ("collision_speed", *one.metrics):
-        here, there = (of.metrics.get(name, of.collision_speed) for of in (one, other))
-        if not np.allclose(here, there, rtol=0, atol=most, equal_nan=True):
+        here, there = (evaluation.metrics.get(name, evaluation.collision_speed) for evaluation in (one, other))
+        if not np.allclose(here, there, rtol=0, atol=tolerance, equal_nan=True):
             return name, float(here[0]), float(there[0])
     return None
