@@ -10,17 +10,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn
 
 from safevar_sumo.campaign import RunKey
 from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study
-from safevar_sumo.terminal import stages
+from safevar_sumo.terminal import SECONDS_BETWEEN_LINES, stages
 
 if TYPE_CHECKING:
     from safevar_sumo.analysis.evaluator import Progress as StageProgress
 
-SECONDS_BETWEEN_LINES = 30.0
 SETTLED = 5.0
 """Seconds of work after which a throughput is told: batches that end together make the first ones meaningless."""
 BAR = 10
@@ -146,26 +145,13 @@ class _Tally:
 @contextmanager
 def counted(console: Console, what: str, total: int) -> Iterator[Callable[[int], None]]:
     """A bar that counts up to `total`; yields what to call with every number that is done."""
-    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    bar = Progress(*columns, console=console, disable=not console.is_terminal)
-    with bar:
-        task = bar.add_task(what, total=total)
-        yield lambda number: bar.update(task, advance=number)
+    done = 0
+    with stages(console) as show:
+        show(what, done, total)
 
+        def add(number: int) -> None:
+            nonlocal done
+            done += number
+            show(what, done, total)
 
-@contextmanager
-def counted_trials(console: Console, total: int) -> Iterator[Callable[[float], None]]:
-    """A bar that counts trials; yields what to call after each with the lowest cost so far."""
-    columns = (TextColumn("trials"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.fields[lowest]}"))
-    spoke = time.monotonic()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("trials", total=total, lowest="")
-
-        def done(best: float) -> None:
-            nonlocal spoke
-            bar.update(task, advance=1, lowest=f"lowest cost {best:.4f}")
-            if not console.is_terminal and time.monotonic() - spoke >= SECONDS_BETWEEN_LINES:
-                spoke = time.monotonic()
-                console.print(f"trial {bar.tasks[0].completed:.0f} of {total}, lowest cost {best:.4f}", highlight=False)
-
-        yield done
+        yield add

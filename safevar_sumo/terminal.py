@@ -74,7 +74,7 @@ def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
             nonlocal spoke
             if number == 0:
                 bar.reset(task, description=stage, total=total)
-            bar.update(task, completed=number)
+            bar.update(task, description=stage, completed=number)
             if not console.is_terminal and time.monotonic() - spoke >= SECONDS_BETWEEN_LINES:
                 spoke = time.monotonic()
                 console.print(f"{stage}: {number} of {total}", markup=False, highlight=False, soft_wrap=True)

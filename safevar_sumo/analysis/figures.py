@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 200
+UNDATED: Mapping[str, dict[str, Any]] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+"""Metadata that leaves no date in a picture."""
 FONT = 8
 DEGREE = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"
 UNSAFE = "#d55e00"
@@ -35,17 +38,21 @@ def new_figure(title: str, rows: int, columns: int, size: tuple[float, float]) -
 
 
 def save(figure: Figure, path: Path, source: str = "out") -> None:
-    """Write a figure to a file: png, pdf or svg.
+    """Write a figure to a file: png, pdf or svg; the same figure gives the same bytes.
 
     Raises
     ------
     InputError
         If it cannot be written.
     """
+    import matplotlib
+
     try:
-        figure.savefig(path, dpi=DPI)
-    except OSError as error:
-        raise InputError(source, f"cannot write {path}: {error.strerror or error}", "a directory that can be written") from None
+        with matplotlib.rc_context({"svg.hashsalt": "safevar_sumo"}):
+            figure.savefig(path, dpi=DPI, metadata=UNDATED.get(path.suffix.lower()))
+    except (OSError, ValueError) as error:
+        raise InputError(source, f"cannot write {path}: {getattr(error, 'strerror', None) or error}",
+                         "a file that ends in .png, .pdf or .svg, in a directory that can be written") from None
 
 
 def plain(name: str) -> str:

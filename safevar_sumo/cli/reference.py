@@ -17,7 +17,7 @@ from safevar_sumo.cli.options import PICTURES, check_output, complete_study, ref
 from safevar_sumo.cli.program import commands, tell_remarks
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.progress import counted, counted_trials
+from safevar_sumo.progress import counted
 from safevar_sumo.records import Evaluations
 from safevar_sumo.reference import (
     Agreement,
@@ -39,7 +39,7 @@ from safevar_sumo.reference.replication import Nearness, nearness, paired, repli
 from safevar_sumo.results import write_imported, write_whole
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, load_study, write_study
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import WholeTable
+from safevar_sumo.terminal import WholeTable, stages
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import evaluate_all
 from safevar_sumo.workers.local import available_cores, local_pool
@@ -108,11 +108,13 @@ def calibrate_command(study: str, references: tuple[Path, ...], trials: int | No
     tried, lowest, best = 0, np.inf, chosen
     try:
         with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
-              counted_trials(Console(stderr=True), chosen.fit.trials) as done):
+              stages(Console(stderr=True)) as show):
+            show("trials", 0, chosen.fit.trials)
+
             def one_done(cost: float, so_far: Study) -> None:
                 nonlocal tried, lowest, best
                 tried, lowest, best = tried + 1, cost, so_far
-                done(cost)
+                show(f"trials, lowest cost {cost:.4f}", tried, chosen.fit.trials)
 
             calibration = calibrate(chosen, data, pool, one_done, from_scratch=from_scratch)
     except KeyboardInterrupt:

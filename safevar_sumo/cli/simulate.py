@@ -177,14 +177,15 @@ class Shown(NamedTuple):
 
     def show(self, study: Study, system: System, setting: FloatArray) -> None:
         """Simulate a filtered setting, shape (n,), beside the original vehicle, and show both."""
+        from safevar_sumo.analysis.figures import save
         from safevar_sumo.replay.animation import animate
         from safevar_sumo.replay.comparison import compare_setting
-        from safevar_sumo.replay.figure import draw_comparison, write_figure
+        from safevar_sumo.replay.figure import draw_comparison
         from safevar_sumo.replay.gui import show_in_gui
 
         comparison = compare_setting(study, system, setting)
         if self.plot is not None:
-            write_figure(draw_comparison(comparison), self.plot)
+            save(draw_comparison(comparison), self.plot, "--plot")
         if self.animate is not None:
             animate(comparison, self.animate)
         if self.gui:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import scipy
 import tomli_w
 
+from safevar_sumo.analysis.figures import save
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -24,8 +25,6 @@ from safevar_sumo.vehicles import CharacteristicSet
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_UNDATED: dict[str, dict[str, Any]] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
-"""Metadata that leaves no date in a picture: the same data, the same bytes."""
 BINS = 8
 """Into so many equally full bins a characteristic's values are put in the picture."""
 
@@ -201,12 +200,8 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
             if i % columns == 0:
                 axis.set_ylabel("error of SD")
         figure.suptitle(title.replace("$", r"\$"))
-        try:
-            figure.savefig(path, dpi=150, metadata=_UNDATED.get(path.suffix.lower()))
-        except (OSError, ValueError) as error_written:
-            raise InputError("plot", f"cannot write {path}: {error_written}", "a file that ends in .png, .pdf or .svg") from None
-        finally:
-            plt.close(figure)
+        save(figure, path, "plot")
+        plt.close(figure)
 
 
 def _label(metric: str) -> str:

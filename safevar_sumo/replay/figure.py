@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import time_to_collision
 from safevar_sumo.records import STANDSTILL, FloatArray, SimulationRuns
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison, divergence, moments
@@ -25,7 +23,6 @@ BRAKING, NEAREST, IMPACT = "v", "o", "X"
 SHOWN_TTC = 6.0
 """Longer times to collision are not of interest [s]."""
 FONT = 9
-DPI = 200
 LINE = 118
 """Letters in a line of the heading."""
 
@@ -76,24 +73,6 @@ def _over(comparison: Comparison) -> float:
 def _comes_to_rest(drives: SimulationRuns, row: int) -> int:
     """The last sample of a drive at which its vehicle moves, its first one if it never does."""
     return int(np.flatnonzero(drives.trace.active[:, row] & (drives.trace.speed[:, row] > STANDSTILL)).max(initial=0))
-
-
-def write_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as its file's ending says; the same figure gives the same bytes.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
-    import matplotlib
-
-    undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
-    try:
-        with matplotlib.rc_context({"svg.hashsalt": "safevar_sumo"}):
-            figure.savefig(path, dpi=DPI, metadata=undated.get(path.suffix.lower().lstrip("."), {}))
-    except OSError as error:
-        raise InputError("plot", f"cannot write {path}: {error.strerror or error}", "a file in a directory that exists") from None
 
 
 def _legend(figure: Figure, comparison: Comparison) -> None:

@@ -86,13 +86,6 @@ def test_a_cell_that_is_no_number_is_told_with_row_and_column(tmp_path: Path, ce
         read_reference(tmp_path / "data.csv", SUN)
 
 
-def test_a_file_without_an_end_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("safevar_sumo.reference.rows.MOST_BYTES", 1000)
-    (tmp_path / "endless.csv").write_bytes(b"\0" * 1001)
-    with pytest.raises(InputError, match="more than 1000 bytes"):
-        read_reference(tmp_path / "endless.csv", SUN)
-
-
 def test_a_cell_is_told_by_its_line_though_lines_are_blank_and_cells_empty(tmp_path: Path) -> None:
     frame = table(SUN, SUN_COLUMNS).astype(object)
     frame.loc[1, "mass"] = ""

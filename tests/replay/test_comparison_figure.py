@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from safevar_sumo.analysis.figures import save
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.replay.comparison import Comparison, compare_setting
-from safevar_sumo.replay.figure import draw_comparison, write_figure
+from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate, study_at
 from safevar_sumo.sumo.system import assemble
@@ -88,5 +89,5 @@ def test_at_an_impact_the_pedals_are_those_that_were_in_force() -> None:
 @pytest.mark.parametrize("kind", ["png", "svg"])
 def test_the_same_bytes_twice(kind: str, comparison: Comparison, tmp_path: Path) -> None:
     for name in ("a", "b"):
-        write_figure(draw_comparison(comparison), tmp_path / f"{name}.{kind}")
+        save(draw_comparison(comparison), tmp_path / f"{name}.{kind}")
     assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()

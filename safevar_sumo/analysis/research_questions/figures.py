@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -10,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from safevar_sumo.analysis.figures import FONT, new_figure, plain, raised, save
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
 from safevar_sumo.analysis.research_questions.changes import ANY, critical, effects, rq31, rq32
 from safevar_sumo.analysis.research_questions.indicators import WORST, convergence, nondominated, objectives
-from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
 from safevar_sumo.study import SAFETY_DEGREE
 
@@ -28,8 +27,6 @@ MARKERS, DASHES = ("o", "X", "^", "s", "D", "v"), ("-", "--", "-.", ":", (0, (5,
 INCREASE, DECREASE = COLOURS[1], COLOURS[0]
 OBJECTIVE_TITLES = {"f_safe": "f_safe: safety degree [m, -m/s]", "f_diff": "f_diff: largest change [fraction of the original]",
                     "f_num_diff": "f_numDiff: characteristics changed"}
-DPI = 200
-FONT = 8
 LONG_NAME = 28
 """Letters that fit above a small axis."""
 PANELS = 3
@@ -58,7 +55,7 @@ def number_of_changes(cases: Sequence[Case]) -> Figure:
         sns.boxplot(group, x="j", y="count", ax=axis, color="#56b4e9", linecolor="black", linewidth=0.8, fliersize=3)
         axis.set_xlabel("characteristics changed")
         axis.set_ylabel(f"critical solutions per run\n({group['run'].nunique()} runs)")
-        axis.set_title(_plain(case.name) if len(cases) > 1 else "", fontsize=FONT)
+        axis.set_title(plain(case.name) if len(cases) > 1 else "", fontsize=FONT)
         _whole_numbers(axis.yaxis)
     for axis in list(axes.flat)[len(cases):]:
         axis.set_axis_off()
@@ -73,7 +70,7 @@ def changed_characteristics(case: Case) -> Figure:
     shares = rq32(case)
     order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
     grid = shares.pivot(index="characteristic", columns="j", values="percent").astype(float)
-    grid = grid.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=_plain)
+    grid = grid.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=plain)
     figure, ((axis,),) = _figure(f"{case.name}: characteristics changed in critical solutions", 1, 1, (7.6, 1.4 + 0.3 * len(grid)))
     sns.heatmap(grid, ax=axis, cmap="cividis", vmin=0, vmax=100, annot=True, fmt=".0f", annot_kws={"fontsize": 7}, linewidths=0.5,
                 cbar_kws={"label": "critical solutions\nin which it is changed [%]"})
@@ -109,8 +106,8 @@ def sizes_of_changes(case: Case) -> Figure:
         axis.axvline(0, color="black", linewidth=0.8)
         axis.set_xlim(low, high)
         size = min(FONT, FONT * LONG_NAME / len(member.name))
-        axis.set_title(f"{_plain(member.name)}\n+{len(sides[INCREASE])}, -{len(sides[DECREASE])}", fontsize=size)
-        axis.set_xlabel(f"change [{_unit(member.unit)}]", fontsize=FONT)
+        axis.set_title(f"{plain(member.name)}\n+{len(sides[INCREASE])}, -{len(sides[DECREASE])}", fontsize=size)
+        axis.set_xlabel(f"change [{raised(member.unit)}]", fontsize=FONT)
         axis.set_ylabel("")
         axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
         _whole_numbers(axis.yaxis, 4)
@@ -162,7 +159,7 @@ def pareto_fronts(case: Case) -> Figure:
 
 
 def _objective_title(objective: Objective) -> str:
-    return OBJECTIVE_TITLES.get(objective.name) or f"{_plain(objective.title)} [{_unit(objective.unit)}]"
+    return OBJECTIVE_TITLES.get(objective.name) or f"{plain(objective.title)} [{raised(objective.unit)}]"
 
 
 def _of_original(case: Case, objective: Objective) -> float:
@@ -249,25 +246,16 @@ def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Pa
     written = []
     for name, figure in figures.items():
         path = directory / f"{_file_name(f'{cases[0].name}-{name}' if len(cases) == 1 else name)}.{kind}"
-        try:
-            directory.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path, dpi=DPI)
-        except OSError as error:
-            raise InputError(path, f"cannot be written: {error.strerror or error}", "a directory that can be written") from None
+        directory.mkdir(parents=True, exist_ok=True)
+        save(figure, path)
         written.append(path)
     return written, lacking
 
 
 def _figure(title: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
-    """A figure with its axes, shape (rows, columns), that no global state knows of."""
-    import matplotlib.style
-    from matplotlib.figure import Figure
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
-
-    with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT, "axes.labelsize": FONT, "axes.titlesize": FONT}]):
-        figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.1))
-        axes = figure.subplots(rows, columns, squeeze=False)
-    figure.suptitle(_plain(title), fontsize=FONT + 2)
+    """A figure with room between its axes, and these, shape (rows, columns)."""
+    figure, axes = new_figure(title, rows, columns, size)
+    figure.set_layout_engine("constrained", w_pad=0.1)
     return figure, axes
 
 
@@ -291,17 +279,7 @@ def _whole_numbers(axis: object, steps: int = 6) -> None:
 
 
 def _title(algorithm: str) -> str:
-    return _plain(ALGORITHM_TITLES.get(algorithm, algorithm))
-
-
-def _plain(name: str) -> str:
-    """A name in which matplotlib sees no formula."""
-    return name.replace("$", r"\$")
-
-
-def _unit(unit: str) -> str:
-    """A unit with its powers raised."""
-    return re.sub(r"\^(-?\d+)", r"$^{\1}$", _plain(unit))
+    return plain(ALGORITHM_TITLES.get(algorithm, algorithm))
 
 
 def _file_name(name: str) -> str:
