@@ -21,7 +21,7 @@ KEEPS_GAP, KEEPS_SPEED = 0.2, 0.1  # m, m/s: errors below which the gap is kept
 
 
 class Acc(Following, frozen=True, kw_only=True):
-    """Holds a speed, or a time headway to the one ahead.
+    """Holds a speed, or a time headway to a leader.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class Acc(Following, frozen=True, kw_only=True):
     headway, standing_gap
         Desired time headway [s], and the gap on top of it [m].
     corridor
-        Half the width of its way [m].
+        Half the width of the corridor that it watches [m].
     """
 
     cruise_speed: Positive = 13.89

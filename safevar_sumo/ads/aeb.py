@@ -12,12 +12,12 @@ from safevar_sumo.ads.driver import Trim, in_the_way, pedals, trim
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 LEAST_DECELERATION = 0.5
-"""Of somebody ahead who counts as braking [m/s^2]."""
+"""Least deceleration of an obstacle that counts as braking [m/s^2]."""
 
 
 class _Memory(NamedTuple):
-    """The original vehicle; time between calls [s]; speed to hold and pedals that hold it, of the first look; stage 0 to 2,
-    whether it has ever braked; the obstacle's speed a call ago [m/s].
+    """The original vehicle; time between calls [s]; initial speed and the pedals that hold it; stage 0 to 2; whether it has ever braked;
+    the obstacle's speed at the last call [m/s].
     """
 
     nominal: Nominal
@@ -29,32 +29,32 @@ class _Memory(NamedTuple):
 
 
 class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Holds its speed; brakes in part, then fully, when the gap to somebody in its way falls below its braking distances.
+    """Holds its speed; brakes in part, then fully, when the gap to an obstacle in its way falls below its braking distances.
 
-    distance = v rt + max(v_rel^2 / (2 b), v^2 / (2 b) - u^2 / (2 b_u)) + margin, with b_u the deceleration of the one ahead.
-    Once it has braked it drives no more.
+    distance = v rt + max(v_rel^2 / (2 b), v^2 / (2 b) - u^2 / (2 b_u)) + margin, with b_u the deceleration of the obstacle.
+    After braking it never accelerates again.
 
     Parameters
     ----------
     cruise_speed, cruise_gain
-        Speed that it holds [m/s], by default the one that it starts with, and acceleration per error of it [1/s].
+        Speed that it holds [m/s], by default its initial speed, and acceleration per error of that speed [1/s].
     response_time
-        Time that it plans to lose before it brakes [s].
+        Response time that it plans with [s].
     braking_share
         Share of the original's greatest deceleration that it plans with [-].
     margin
-        Gap that it means to keep [m].
+        Gap to keep at the stop [m].
     partial_share, partial_time
-        Pedal of the partial stage [-], and by how much earlier than the full one it begins [s].
+        Pedal of the partial stage [-], and its lead over the full stage [s].
     corridor
-        Half the width of its way [m].
+        Half the width of the corridor that it watches [m].
     reach
         Its sensors' range in clear weather [m].
 
     Notes
     -----
-    The defaults are chosen, not measured: so that the original vehicle of `carla` avoids the standard points of Euro NCAP's
-    pedestrian and car-to-car tests with little to spare. docs/scenarios.md tells where it cannot.
+    The defaults are chosen, not measured: the original vehicle of `carla` then just avoids the standard points of Euro NCAP's
+    pedestrian and car-to-car tests. docs/scenarios.md lists the exceptions.
     """
 
     cruise_speed: Positive | None = None
@@ -86,7 +86,7 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return seen.speed if self.cruise_speed is None else np.full_like(seen.speed, self.cruise_speed)
 
     def _stage(self, seen: Observation, memory: _Memory) -> FloatArray:
-        """A stage once begun lasts as long as somebody is in the way or about to leave it."""
+        """The stage; once begun, it lasts until the obstacle has left the way."""
         speed, obstacle_speed = seen.speed, _obstacle_speed(seen)
         deceleration = self.braking_share * memory.nominal.decel
         theirs = (memory.obstacle_speed - obstacle_speed) / memory.step

@@ -37,17 +37,17 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     first_command
         Time from the run's start to the first command, of a vehicle that stands [s].
     perception_range
-        It knows of obstacles up to this gap, times the visibility [m].
+        Largest gap at which it detects obstacles, in clear weather [m].
     cruise_speed, cruise_gain, cruise_acceleration
         Speed that it accelerates to [m/s], acceleration per error of that speed [1/s], and the largest one [m/s^2].
     jerk
-        Limit on the change of the acceleration that it asks for [m/s^3].
+        Limit on the change of the commanded acceleration [m/s^3].
     stop_gap
         Gap at which the planned deceleration ends [m].
     comfortable_deceleration
-        Deceleration needed to stand there at which it begins to brake [m/s^2].
+        It begins to brake when stopping there needs this deceleration [m/s^2].
     largest_deceleration
-        What it asks for at the most while it brakes [m/s^2].
+        Largest deceleration that it commands [m/s^2].
     creep_speed, creep_time
         Speed and duration of the last creep, a soft stop with the brake released [m/s, s].
     pedal_lag
@@ -81,7 +81,7 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return Command(*(np.where(waits, 0.0, pedal) for pedal in command)), _Memory(memory.nominal, memory.step, *kept)
 
     def _plan(self, seen: Observation, memory: _Memory) -> _Memory:
-        """The acceleration to ask for: cruise, or v^2 / (2 d) to stand before the obstacle; then creep and hold."""
+        """The commanded acceleration: cruise, or v^2 / (2 d) to stand before the obstacle; then creep and hold."""
         v = seen.speed
         detected = seen.gap <= self.perception_range * seen.visibility
         distance = np.where(detected, np.minimum(seen.gap, self.perception_range) - self.stop_gap, np.inf)

@@ -14,7 +14,7 @@ from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observ
 
 
 class _Memory(NamedTuple):
-    """Reaction; where the obstacle was first seen, infinite before [m]; whether it was in the way then; for how long it has strayed [s]."""
+    """Reaction; lateral position of the obstacle at first sight, infinite before [m]; whether it was in the way; time since it strayed [s]."""
 
     reaction: Reaction
     first: FloatArray
@@ -23,27 +23,27 @@ class _Memory(NamedTuple):
 
 
 class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Holds its speed or a headway; perceives who strays into its way, reacts to a TTC below 2 s, and brakes with up to 0.774 g.
+    """Holds its speed or a headway; perceives obstacles that move into its way, reacts to a TTC below 2 s, and brakes with up to 0.774 g.
 
-    It stands until the way is clear. Behind somebody who drives it keeps its headway with the accelerator alone:
+    After a stop it waits until the way is clear. Behind a moving leader it keeps its headway with the accelerator alone:
     a = 0.07 (u - v) + 0.23 (gap - headway v), the gap control of Milanes and Shladover (2014), and not below `-lets_go`.
 
     Parameters
     ----------
     cruise_speed
-        Speed that it holds [m/s], by default the one that it starts with.
+        Speed that it holds [m/s], by default its initial speed.
     critical_ttc, reaction_time
-        Time to collision that is a danger, and time from there to the brake [s].
+        Time to collision that counts as a danger, and reaction time before braking [s].
     stray, perception_time
-        Who enters the way is perceived once he has strayed so far from where he was first seen, and so long after [m, s].
+        An obstacle that enters the way is perceived `perception_time` after it has moved `stray` from its first lateral position [m, s].
     lets_go
-        Deceleration with the accelerator released, while it reacts or drops back [m/s^2].
+        Coasting deceleration, while it reacts or drops back [m/s^2].
     headway
         Time headway at which it follows [s].
     corridor
-        Half the width of its way [m].
+        Half the width of the corridor that it watches [m].
     start_throttle
-        Throttle of the run's first steps, one value a step, as long as it sees no danger [-].
+        Throttle in the run's first steps, one value per step, until it sees a danger [-].
     """
 
     cruise_speed: Positive | None = None
@@ -70,7 +70,7 @@ class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         return command, memory._replace(reaction=reaction)
 
     def _following(self, seen: Observation, ahead: BoolArray) -> FloatArray:
-        """Acceleration that keeps the headway to somebody ahead who drives the same way [m/s^2]; infinite behind nobody."""
+        """Acceleration that keeps the headway to a moving leader [m/s^2]; infinite without one."""
         gap = np.where(ahead, seen.gap, 0.0)
         law = KEEPING[0] * (seen.obstacle_speed - seen.speed) + KEEPING[1] * (gap - self.headway * seen.speed)
         return np.where(ahead & (seen.obstacle_speed > 0), np.maximum(law, -self.lets_go), np.inf)

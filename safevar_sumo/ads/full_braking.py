@@ -1,4 +1,4 @@
-"""Full braking at the first possible moment: what nobody can do better in the lane."""
+"""Full braking at the first possible moment, the best that a driver can do in the lane."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from safevar_sumo.ads.driver import Reaction, Start, in_the_way, react, unaware
 from safevar_sumo.records import Command, Nominal, Observation
 
 AS_HARD_AS_CAN_BE = 1e6
-"""More than any brake does [m/s^2]: the pedal is on the floor."""
+"""Deceleration beyond any brake [m/s^2], so that the pedal is fully pressed."""
 
 
 class FullBraking(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Holds its speed; brakes fully, at once, when somebody is in its way or on course to be there when it is.
+    """Holds its speed; brakes fully as soon as an obstacle is in its way or on course to be there in time.
 
     Parameters
     ----------
     cruise_speed
-        Speed that it holds [m/s], by default the one that it starts with.
+        Speed that it holds [m/s], by default its initial speed.
     corridor
-        Half the width of its way [m].
+        Half the width of the corridor that it watches [m].
     start_throttle
-        Throttle of the run's first steps, one value a step, as long as it does not brake [-].
+        Throttle in the run's first steps, one value per step, until it brakes [-].
     """
 
     cruise_speed: Positive | None = None

@@ -16,7 +16,7 @@ LEAST = 1e-9
 
 
 class _Memory(NamedTuple):
-    """Reaction, and the own speed a call ago [m/s], None at first."""
+    """Reaction, and the own speed at the last call [m/s], None at first."""
 
     reaction: Reaction
     speed: FloatArray | None
@@ -28,7 +28,7 @@ class FuzzySafety(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     Parameters
     ----------
     cruise_speed
-        Speed that it holds [m/s], by default the one that it starts with.
+        Speed that it holds [m/s], by default its initial speed.
     reaction_time
         rt [s].
     comfortable, hardest, leader_deceleration
@@ -36,7 +36,7 @@ class FuzzySafety(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     margin
         To the safe distance, and to the gap itself [m].
     corridor
-        Half the width of its way [m].
+        Half the width of the corridor that it watches [m].
     """
 
     cruise_speed: Positive | None = None

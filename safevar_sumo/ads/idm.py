@@ -27,7 +27,7 @@ class Idm(Following, frozen=True, kw_only=True):
     acceleration, deceleration
         a, b [m/s^2].
     corridor
-        Half the width of its way [m].
+        Half the width of the corridor that it watches [m].
     """
 
     cruise_speed: Positive = 13.89

@@ -18,11 +18,11 @@ class R157(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     Parameters
     ----------
     cruise_speed
-        Speed that it holds [m/s], by default the one that it starts with.
+        Speed that it holds [m/s], by default its initial speed.
     deceleration, reaction_time, margin
         6 m/s^2, 0.35 s and 0.1 s in the regulation.
     corridor
-        Half the width of its way [m].
+        Half the width of the corridor that it watches [m].
     """
 
     cruise_speed: Positive | None = None

@@ -18,13 +18,13 @@ class Rss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     Parameters
     ----------
     cruise_speed
-        Speed that it holds [m/s], by default the one that it starts with.
+        Speed that it holds [m/s], by default its initial speed.
     reaction_time
         rt [s].
     acceleration, deceleration, leader_deceleration
-        a while it reacts, b of its own braking, b_u of the one ahead [m/s^2].
+        a while it reacts, b of its own braking, b_u of the leader's braking [m/s^2].
     corridor
-        Half the width of its way [m].
+        Half the width of the corridor that it watches [m].
     """
 
     cruise_speed: Positive | None = None
@@ -44,7 +44,7 @@ class Rss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                      corridor=self.corridor, cruise_speed=self.cruise_speed)
 
     def safe_distance(self, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
-        """The least gap that is safe [m], at speeds [m/s] of shape (N,)."""
+        """Smallest safe gap [m], at speeds [m/s] of shape (N,)."""
         rt, faster = self.reaction_time, speed + self.reaction_time * self.acceleration
         own = speed * rt + self.acceleration * rt * rt / 2 + faster * faster / (2 * self.deceleration)
         return np.asarray(np.maximum(own - leader_speed * leader_speed / (2 * self.leader_deceleration), 0.0))

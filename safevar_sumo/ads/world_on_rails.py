@@ -16,7 +16,7 @@ SPEED_LIMIT = 20 / KMH
 SPEED_LEVELS = (0.0, 8 / 3, 16 / 3)
 """Speeds that the policy is interpolated over, as far as the limit lets it [m/s] (its source: four in 0..8 m/s)."""
 PASSED = -0.5
-"""Gap at which somebody is beside it rather than ahead [m]."""
+"""Gap at which an obstacle is beside the vehicle rather than ahead [m]."""
 
 
 class _Memory(NamedTuple):
@@ -28,7 +28,7 @@ class _Memory(NamedTuple):
 
 
 class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Full brake for somebody in its corridor and near, else throttle up to its speed limit.
+    """Full brake for a near obstacle in its corridor, else throttle up to its speed limit.
 
     Parameters
     ----------
@@ -37,12 +37,12 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     latency
         Time from an image to its command [s], rounded to whole steps.
     corridor
-        Half the width of what it watches: it brakes for nobody beyond, and releases the brake when he leaves it [m].
+        Half the width of the corridor in which it brakes for obstacles; it releases the brake when they leave it [m].
     brake_gap, brake_gap_per_speed
-        It brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s] for somebody at `brake_place`.
+        It brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s] for an obstacle at `brake_place`.
     brake_place, brake_gap_before, brake_gap_past
-        For every metre that he is short of that lateral place, or past it, the gap shrinks by as much [m, -, -]: whoever
-        is about to enter the way, or to leave it, is braked for later. The visibility is a factor on what is left.
+        For every metre that an obstacle is short of that lateral place, or past it, the gap shrinks by as much [m, -, -]: it brakes
+        later for obstacles that enter or leave the way. The visibility is a factor on the rest.
     throttle
         Throttle at the policy's speed levels 0, 2.7 and 5.3 m/s.
     """
@@ -69,7 +69,7 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         return command, memory._replace(brakes=brakes, under_way=tuple(under_way))
 
     def _brakes(self, seen: Observation, braked: BoolArray) -> BoolArray:
-        """Whether the brake probability exceeds one half: somebody is in the corridor and near enough."""
+        """Whether the brake probability exceeds one half: an obstacle is near, in the corridor."""
         past = seen.lateral - self.brake_place
         aside = self.brake_gap_past * np.maximum(past, 0.0) + self.brake_gap_before * np.maximum(-past, 0.0)
         near = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - aside)

@@ -1,4 +1,4 @@
-"""What an ADS learns about its vehicle by driving it: the tables behind a throttle and brake controller."""
+"""The calibration drive of an ADS: the tables of its throttle and brake controller."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
 STEP = 0.1  # s
 SPEEDS = np.arange(0.0, 20.5, 0.5)  # m/s, at which the tables hold
-LONGEST = 60.0  # s that a drive may take
-LIGHT_BRAKE = 0.1  # pedal at which the brake is tried: far from the limit of the tyres
+LONGEST = 60.0  # s, longest drive
+LIGHT_BRAKE = 0.1  # pedal of the braking drive, far from the limit of the tyres
 
 
 def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> Nominal:
-    """The original vehicle, driven on a dry road as soon as somebody asks for what it does there."""
+    """The original vehicle on a dry road; its tables are driven when first needed."""
     types = vehicle.sumo_type(vehicle.prepare(_original(characteristics), 1.0, STEP))
     tables = cache(partial(_driven, vehicle, characteristics))  # type: ignore[arg-type]
     mass, accel, decel, max_speed, lag = (float(values[0]) for values in types)
@@ -58,7 +58,7 @@ def _driven(vehicle: Vehicle, characteristics: CharacteristicSet) -> Tables:
 def _changes(speeds: list[float]) -> FloatArray:
     """Speed gained per time between one grid speed and the next, of a drive that gains speed [m/s^2].
 
-    Where the drive did not get to, the last that it got to; zero for a drive that keeps its speed.
+    Speeds that the drive does not reach get its last value; zero for a drive at constant speed.
     """
     highest = np.maximum.accumulate(np.array(speeds))
     reached, first = np.unique(highest, return_index=True)

@@ -82,7 +82,7 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return SumoState(nothing, nothing, nothing, nothing, nothing + 1, None, commands)
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> SumoState:
-        """Nothing but a slope resists: the pedals hold against that, released on a level road."""
+        """Only a slope resists: the pedals hold against it, and are released on a level road."""
         p, rest = prepared, self.at_rest(prepared)
         brake = np.minimum(np.maximum(-p.back / (p.brake_gain * p.decel), 0.0), 1.0)
         throttle = np.minimum(np.maximum(p.back / p.accel, 0.0), 1.0)
@@ -105,7 +105,7 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         wanted = np.where(brake > 0, -brake * p.brake_gain * p.decel, command.throttle * p.accel)
         wanted = np.minimum(np.maximum(wanted, -p.grip), p.grip)
         acceleration = state.acceleration + (wanted - state.acceleration) * (p.step / (p.actuator_lag + p.step))
-        # Whoever brakes is not driven on by what is left of the last acceleration.
+        # Braking ends what is left of an acceleration at once.
         acceleration = np.where(brake > 0, np.minimum(acceleration, 0.0), acceleration)
         speed = np.minimum(np.maximum(state.speed + (acceleration - p.back) * p.step, 0.0), np.maximum(p.max_speed, state.speed))
         return state._replace(

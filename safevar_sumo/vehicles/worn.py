@@ -1,4 +1,4 @@
-"""SUMO's vehicle type with what engineers call wear: tyres, brakes, load and sensors that are not what they were."""
+"""A car with worn tyres and brakes, a payload and degraded sensors."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     Deceleration a: of a = F / m, of an axle at its limit
     mu m (g x -+ a h) / L with the other braking its share, and of a = mu g, the least holds. On a slope g is what presses onto the
-    road, and what pulls along it acts beside a. Nobody rolls back.
+    road, and its component along the road acts beside a. The vehicle never rolls back.
     """
 
     UNITS = {
@@ -116,7 +116,7 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return WornState(nothing, nothing, nothing, nothing + 1, None, history(float(np.max(prepared.response)), prepared.step, nothing))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> WornState:
-        """Nothing but a slope resists: the pedals hold against that, released on a level road."""
+        """Only a slope resists: the pedals hold against it, and are released on a level road."""
         p, rest = prepared, self.at_rest(prepared)
         brake = np.minimum(np.maximum(-p.slope.back / p.brake, 0.0), 1.0)
         throttle = np.minimum(np.maximum(p.slope.back / p.drive, 0.0), 1.0)

@@ -29,7 +29,7 @@ CONNECT_TIMEOUT = 10.0
 """How long an address may take to answer [s]."""
 SECONDS_BETWEEN_COUNTS = 5.0
 VERSIONED = ("safevar_sumo", "libsumo", "numpy")
-"""What results depend on: the same version here and on every worker."""
+"""Packages that must have the same version here and on every worker."""
 _one_at_a_time = threading.Lock()
 
 
@@ -57,7 +57,7 @@ def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
     if not ADDRESS.fullmatch(address):
         raise InputError("cluster", repr(address), legal)
     for name in ("distributed", "distributed.client"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is told by us
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # this package reports errors itself
     try:
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
@@ -72,7 +72,7 @@ def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
 
 
 class ClusterPool:
-    """Computes batches on a Dask cluster, which itself tries a batch again when a worker dies."""
+    """Computes batches on a Dask cluster, which itself repeats the batch of a dead worker."""
 
     def __init__(self, client: Any, time_limit: float) -> None:
         self._executor = client.get_executor(pure=False)
@@ -81,7 +81,7 @@ class ClusterPool:
 
     @property
     def workers(self) -> int:
-        """Processes, whatever their threads: each computes one batch at a time. They come and go; the scheduler is asked now and then."""
+        """Number of worker processes, refreshed every few seconds; each computes one batch at a time."""
         now = time.monotonic()
         if now - self._counted > SECONDS_BETWEEN_COUNTS:
             try:
@@ -102,7 +102,7 @@ class ClusterPool:
 
 
 def _evaluate_within(time_limit: float, versions: dict[str, str], study: bytes, settings: FloatArray) -> Evaluations:
-    """What a worker of the cluster does: one batch at a time, for libsumo exists once in a process; if it hangs, the worker ends."""
+    """Evaluate one batch at a time in a worker (a process has one libsumo); end the worker if it hangs."""
     if _versions() != versions:
         raise PoolLostError(f"a worker of the cluster has other versions: {_versions()} there, {versions} here")
     with _one_at_a_time, open(os.devnull, "w") as nowhere:

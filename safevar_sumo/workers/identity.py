@@ -1,4 +1,4 @@
-"""What results depend on beside a study's file: resolved models and weather, code, network, versions, platform."""
+"""The identity of a study: what its results depend on beside its file."""
 
 from __future__ import annotations
 
@@ -29,8 +29,7 @@ def identity_of(study: Study, system: System, sources: Mapping[str, str] = Mappi
     """The layers of a manifest beside the study: plain values, the same in every process and for every worker.
 
     `resolved` are the study's tables with models' defaults and the weather's numbers, `network` and `sources` digests by file,
-    `results` the number that stands for the package's own code, `platform` the machine as far as the last bit of a result may
-    depend on it.
+    `results` the number of the package's results, `platform` the properties of the machine on which the last bit of a result may depend.
 
     Parameters
     ----------
@@ -63,6 +62,6 @@ def _platform() -> dict[str, str]:
 
 
 def powers_digest() -> str:
-    """Tells mathematical libraries apart that round powers differently; all else that results are made of is exact in IEEE 754."""
+    """Digest of powers, which mathematical libraries round differently; all other operations are exact in IEEE 754."""
     bases = [(number + 0.5) / POWERS * 2 for number in range(POWERS)]
     return sha256(repr([[base ** exponent for base in bases] for exponent in EXPONENTS]).encode()).hexdigest()[:DIGITS]

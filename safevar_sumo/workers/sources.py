@@ -1,4 +1,4 @@
-"""The files that a study's results hang on beside its own: what its models are seen to read, and what its parameters name."""
+"""Files that a study's results depend on beside its own: those that its models read, and those that its parameters name."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from safevar_sumo.workers.local import result_of
 from safevar_sumo.workers.retrying import RetryingPool
 
 _read: dict[tuple[bytes, str], Files] = {}
-"""What models were seen to read in this process, by packed study and working directory."""
+"""Files that models have read in this process, by packed study and working directory."""
 
 
 def inputs_of(study: Study, pool: Pool) -> Inputs:
@@ -26,10 +26,9 @@ def inputs_of(study: Study, pool: Pool) -> Inputs:
 
 
 def sources_of(study: Study, pool: Pool) -> Files:
-    """Digests of files by name: all that models from outside read while they are loaded, made and drive the original vehicle once.
+    """Digests, by name, of the files that models from outside read in one run of the original vehicle, and of files that parameters name.
 
-    That happens in a worker, with everything loaded anew. Files that parameters name count too, whoever reads them: compiled code
-    opens files without Python's knowledge.
+    The run takes place in a worker that loads everything anew.
 
     Raises
     ------
@@ -48,7 +47,7 @@ def sources_of(study: Study, pool: Pool) -> Files:
 
 
 def _parameters(study: Study) -> list[Any]:
-    """Everything in a study that its models and algorithms are given."""
+    """All parameters of a study's models and algorithms."""
     tests = [] if study.matrix is None else study.matrix.tests
     return [study.vehicle.parameters, study.ads.parameters, study.scenario.parameters, study.search.parameters,
             *(table for test in tests for table in (test.parameters, test.over))]
