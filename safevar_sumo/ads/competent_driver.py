@@ -14,7 +14,7 @@ from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observ
 
 
 class _Memory(NamedTuple):
-    """Reaction; lateral position of the obstacle at first sight, infinite before [m]; whether it was in the way; time since it strayed [s]."""
+    """Reaction; the obstacle's first lateral position, infinite before [m]; whether it was in the way then; time since it strayed [s]."""
 
     reaction: Reaction
     first: FloatArray
