@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,9 @@ from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.isolation import check_isolation
 from safevar_sumo.workers.local import first_of, result_of
 from safevar_sumo.workers.retrying import RetryingPool
+
+JOURNALS_AT_ONCE = 8
+"""Journals that wait for the disk together: each append is synced before its run goes on."""
 
 
 class Campaign(NamedTuple):
@@ -102,6 +106,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
         runs.discard(run)
         run.close()
 
+    journalling = ThreadPoolExecutor(JOURNALS_AT_ONCE, thread_name_prefix="journal")
     try:
         while waiting or runs:
             while waiting and len(runs) < batcher.runs_wanted(study.search.population):
@@ -119,14 +124,21 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
                     if ended := verification.take(future):
                         finish(ended)
                     continue
-                for run, evaluations in batcher.take(future):
-                    if run.take(evaluations):
+                shares = list(batcher.take(future))
+                for (run, _), is_whole in zip(shares, journalling.map(_take, shares), strict=True):
+                    if is_whole:
                         go_on(run)
     finally:
+        journalling.shutdown()
         for run in runs:
             run.close()
     return campaign._replace(solutions={key: campaign.solutions[key] for key in sorted(campaign.solutions)},
                              failures=sorted(campaign.failures))
+
+
+def _take(share: tuple[Run, Evaluations]) -> bool:
+    run, evaluations = share
+    return run.take(evaluations)
 
 
 def _original(study: Study, work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: RetryingPool,

@@ -18,6 +18,7 @@ BY_CHANCE = 10
 of 1 - 0.99^300 = 95 % in a study of 30 runs."""
 
 
+FAILED = Outcome.SIMULATOR_ERROR.value
 VERIFIED = 50
 """Evaluations of a run, beside its solutions, that are driven in SUMO again."""
 
@@ -79,8 +80,11 @@ class Run:
     def failures(self) -> list[Failure]:
         """Settings of this run that could not be simulated."""
         return [Failure(self.key.algorithm, self.key.run, position, evaluations.reason(i))
-                for position, evaluations, i in sorted(self._known.values(), key=lambda known: known[0])
-                if 0 <= position < self._budget and evaluations.failed[i]]
+                for position, evaluations, i in self._asked_for() if evaluations.outcome[i] == FAILED]
+
+    def _asked_for(self) -> list[tuple[int, Evaluations, int]]:
+        """What is known of the different settings that this run asked for, in their order."""
+        return sorted((known for known in self._known.values() if 0 <= known[0] < self._budget), key=lambda known: known[0])
 
     @property
     def collisions(self) -> int:
@@ -93,7 +97,8 @@ class Run:
         return self._number_of(Outcome.INVALID_TEST)
 
     def _number_of(self, outcome: Outcome) -> int:
-        return sum(evaluations.outcome[i] == outcome for position, evaluations, i in self._known.values()
+        value = outcome.value  # numpy looks into an enumeration's member at every comparison
+        return sum(evaluations.outcome[i] == value for position, evaluations, i in self._known.values()
                    if 0 <= position < self._budget)
 
     def advance(self) -> bool:
@@ -135,8 +140,7 @@ class Run:
     def solutions_and_others(self, rng: np.random.Generator) -> Evaluations:
         """What is driven in SUMO itself: all solutions, and `VERIFIED` other evaluations by chance."""
         solutions = {row.tobytes() for row in self.result.settings}
-        scored = [known for known in self._known.values() if 0 <= known[0] < self._budget and not known[1].failed[known[2]]]
-        scored.sort(key=lambda known: known[0])
+        scored = [known for known in self._asked_for() if known[1].outcome[known[2]] != FAILED]
         mine = [known[1].settings[known[2]].tobytes() in solutions for known in scored]
         others = [known for known, is_solution in zip(scored, mine, strict=True) if not is_solution]
         chosen = [known for known, is_solution in zip(scored, mine, strict=True) if is_solution]

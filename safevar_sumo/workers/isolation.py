@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.errors import ForeignError, InputError
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study, foreign_names
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.local import result_of
@@ -75,7 +75,8 @@ def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations
     InputError
         With the setting and both values.
     """
-    for row, setting in enumerate(recorded.settings):
+    for row in np.flatnonzero(~_alike(recorded, in_sumo, ROUNDING)).tolist():
+        setting = recorded.settings[row]
         one, other = recorded.take([row]), in_sumo.take([row])
         if other.failed[0]:
             difference: tuple[str, object, object] | None = ("outcome", str(one.outcome[0]), f"{other.outcome[0]} ({other.reason(0)})")
@@ -86,6 +87,14 @@ def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations
             values = ", ".join(f"{key} = {value:.17g}" for key, value in zip(study.vehicle.characteristics, setting, strict=True))
             raise InputError(f"study {study.name!r}", f"{name} is {here} in the recorded scene and {there} in SUMO with {values}",
                              "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or --engine sumo")
+
+
+def _alike(one: Evaluations, other: Evaluations, most: float) -> BoolArray:
+    """Settings whose outcome is the same and whose numbers differ by no more than `most`, shape (N,)."""
+    alike = (one.outcome == other.outcome) & ~other.failed
+    for here, there in ((one.collision_speed, other.collision_speed), *((one.metrics[name], other.metrics[name]) for name in one.metrics)):
+        alike &= np.isclose(here, there, rtol=0, atol=most, equal_nan=True)
+    return np.asarray(alike)
 
 
 def _far_apart(characteristics: CharacteristicSet) -> FloatArray:
