@@ -1,4 +1,4 @@
-"""What can go wrong in a way that a user can mend: told in one or two lines, never as a traceback."""
+"""Errors that a user can mend: one or two lines, never a traceback."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class InputError(SafevarError):
 
     def __str__(self) -> str:
         message = f"{self.source}: {self.problem}"
-        return f"{message}\nlegal: {self.legal}" if self.legal else message
+        return f"{message}\nexpected: {self.legal}" if self.legal else message
 
 
 class ForeignError(InputError):
@@ -50,7 +50,7 @@ class EnvironmentFault(SafevarError):
 
 
 def first_line(error: BaseException) -> str:
-    """What kind of error it is and the first line of what it says, whatever its author did to its text."""
+    """The class of an error and the first line of its message, even if `str(error)` fails."""
     try:
         lines = str(error).strip().splitlines()
     except Exception:

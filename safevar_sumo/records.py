@@ -1,4 +1,4 @@
-"""What passes between the stages: what an ADS sees and commands, what a run was, what it was worth."""
+"""Records that pass between the stages: observations and commands of an ADS, traces of runs, evaluations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STANDSTILL = 1e-3
 KMH = 3.6
 """km/h per m/s."""
 TIME_DECIMALS = 9
-"""Sums of steps are told as 0.15 s, not as 0.15000000000000002 s."""
+"""Rounds sums of steps: 0.15 s, not 0.15000000000000002 s."""
 
 
 class Outcome(StrEnum):
@@ -36,15 +36,15 @@ class Outcome(StrEnum):
 
 
 NOTHING: FloatArray = np.zeros(())
-"""A zero that stands for N zeros."""
+"""Scalar zero, broadcast to all N vehicles."""
 EVERYWHERE: BoolArray = np.ones((), dtype=bool)
-"""A truth that stands for N truths."""
+"""Boolean scalar, broadcast to all N vehicles."""
 for _constant in (NOTHING, EVERYWHERE):
     _constant.flags.writeable = False
 
 
 class Observation(NamedTuple):
-    """What the sensors of N vehicles tell their ADS; every array has shape (N,).
+    """Sensor values of N vehicles; every array has shape (N,).
 
     `gap` is the distance along the vehicle's path from its front bumper to the obstacle, infinite
     while the obstacle is not detected [m]; `lateral` is the obstacle's offset from the middle of the
@@ -199,7 +199,7 @@ class SimulationRuns:
     test_speed_error: FloatArray = field(default_factory=lambda: UNDEFINED)
 
     def of(self, vehicles: slice) -> SimulationRuns:
-        """The drives of some of the vehicles."""
+        """The runs of some of the vehicles."""
         def some(values: np.ndarray) -> np.ndarray:
             return values[vehicles] if values.ndim else values
 
@@ -222,9 +222,9 @@ class Evaluations:
 
     `settings` has shape (M, n) and holds the filtered values in their table units, all else (M,).
     `metrics` has the columns of `safevar_sumo.metrics.METRICS`; an undefined value is NaN.
-    `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count. `reasons` tells of settings, by their
-    bytes, why they could not be simulated. `files` are digests of files, by name, that other people's code read for a batch and
-    that nobody knew of before; they belong to the batch, not to its rows.
+    `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count. `reasons` says, by the bytes of a
+    setting, why it could not be simulated. `files` are digests, by name, of files that user code
+    read for the first time in a batch; they belong to the batch, not to its rows.
     """
 
     settings: FloatArray
@@ -266,12 +266,12 @@ class Evaluations:
 
     @property
     def failed(self) -> BoolArray:
-        """What could not be simulated."""
+        """Where the simulation failed."""
         return np.asarray(self.outcome == Outcome.SIMULATOR_ERROR)
 
     def reason(self, row: int) -> str:
         """Why a setting that is not valid could not be scored."""
-        return self.reasons.get(self.settings[row].tobytes(), "nobody told why")
+        return self.reasons.get(self.settings[row].tobytes(), "no reason was recorded")
 
     def take(self, rows: Sequence[int] | npt.NDArray[np.intp] | BoolArray) -> Evaluations:
         """The evaluations of `rows`, in that order."""

@@ -50,7 +50,7 @@ def refuse_inputs(path: Path, flag: str, *inputs: str | Path) -> None:
 
 
 class Within(click.FloatRange):
-    """A range of numbers: what is no number at all is outside of it, which comparisons with the bounds do not tell."""
+    """A range of numbers that refuses NaN."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The number, if it is one and within the range."""
@@ -127,7 +127,7 @@ def complete_study(ctx: click.Context, param: click.Parameter, incomplete: str) 
 
 
 def complete_changes(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """The characteristics of the study that stands before, each with its sign of equality and its domain."""
+    """`NAME=` for each characteristic of the study that is named before, with its domain as help."""
     study = str(ctx.params.get("study") or next(iter(ctx.args), ""))  # an option without its value yet keeps arguments unparsed
     if not study or Path(study).is_dir():
         return []

@@ -22,27 +22,27 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 COMMANDS = {
-    "study": ("study", "Search a study; the same command again goes on where it was stopped."),
-    "status": ("study", "Tell how far a study is that runs elsewhere: runs, front so far, collisions, time left."),
+    "study": ("study", "Search a study; run the same command again to continue where it stopped."),
+    "status": ("study", "Show the progress of a study running in another process: runs, front, collisions, time left."),
     "simulate": ("simulate", "Simulate a study once: how it ends, its safety metrics and objectives."),
     "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms and metrics."),
-    "explain": ("questions", "Explain failures: which changes did it, how little is enough, and why."),
+    "explain": ("questions", "Explain failures: which changes cause them, how small a change is enough, and why."),
     "tolerance": ("questions", "Find how far each characteristic may go: alone, in pairs, and all together."),
-    "risk": ("questions", "Estimate how likely an unsafe outcome is, and what decides."),
-    "rules": ("questions", "Find rules that tell where it is unsafe, in physical units."),
+    "risk": ("questions", "Estimate the probability of an unsafe outcome, and which characteristics decide it."),
+    "rules": ("questions", "Find rules that describe where it is unsafe, in physical units."),
     "tables": ("report", "Answer the research questions as tables."),
     "figures": ("report", "Draw the figures of results."),
     "report": ("report", "Write one page about results: verdict, causes, replays, tables, figures."),
-    "import": ("reference", "Make results of solutions in the published package's CSV format."),
+    "import": ("reference", "Import published CSV solutions as a results directory."),
     "validate": ("reference", "Compare a study with reference data, row by row."),
-    "replicate": ("reference", "Hold whole studies against published ones: tables, conclusions, and whether they hold."),
+    "replicate": ("reference", "Compare whole studies with published ones: tables, and which conclusions hold."),
     "calibrate": ("reference", "Fit a study's free parameters to reference data."),
 }
 """Every command, in the order of the help: the module of this folder that it lives in, and what the help says of it."""
 
 
 class OnDemand(click.Group):
-    """Loads a command's module when the command is called: most of the others need a lot that it does not."""
+    """Loads the module of a command when the command is called: modules of other commands take long to load."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -54,13 +54,13 @@ class OnDemand(click.Group):
         return super().get_command(ctx, name)
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
-        """Of a command that there is not, the nearest one is named."""
+        """Name the nearest command if there is none of this name."""
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
             ctx.fail(f"there is no command {args[0]!r}{did_you_mean(args[0], COMMANDS)}")
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Call a command; what the library says of one of its parameters is said of the flag that gives it."""
+        """Call a command; errors about one of its parameters name the flag that sets it."""
         try:
             return super().invoke(ctx)
         except InputError as error:
@@ -112,7 +112,7 @@ def main() -> None:
 
 @contextmanager
 def _interrupted_at_once() -> Iterator[None]:
-    """While modules load, Ctrl-C ends the program: nothing is under way, and compiled modules swallow an exception raised then."""
+    """End the program on Ctrl-C while modules load: compiled modules would swallow the exception."""
     def leave(*_: object) -> None:
         os.write(2, b"safevar-sumo: interrupted\n")
         os._exit(INTERRUPTED)
@@ -127,7 +127,7 @@ def _interrupted_at_once() -> Iterator[None]:
 
 
 def _have_standard_streams() -> None:
-    """Who starts us with a standard stream closed is not told what goes there; no file of ours may get its number."""
+    """Open standard streams that the caller has closed, so that no file gets their numbers."""
     while (handle := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(handle, True)
     os.close(handle)
@@ -136,7 +136,7 @@ def _have_standard_streams() -> None:
 
 
 def _drop_output() -> None:
-    """Nobody takes what is left to be printed; the interpreter must not try again."""
+    """Discard output after the reader of a pipe has gone; the interpreter must not flush it again."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -147,7 +147,7 @@ def _fail(message: str, code: int) -> None:
 
 
 def _leave(code: int) -> NoReturn:
-    """End the program, whatever threads other people's code has left running: the interpreter would wait for them, for ever."""
+    """End the program even if user code has left threads running, for which the interpreter would wait."""
     left = [one.name for one in threading.enumerate()
             if one is not threading.current_thread() and not one.daemon and one not in _threads_queues]
     if left:
@@ -159,6 +159,6 @@ def _leave(code: int) -> NoReturn:
 
 
 def tell_remarks(study: Study, others: Iterable[str] = ()) -> None:
-    """What of a study is left out or not used, on the standard error."""
+    """Print what a study names but does not use, on the standard error."""
     for remark in (*study.origin.remarks, *others):
         click.echo(f"note: {remark}", err=True)

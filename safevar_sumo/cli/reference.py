@@ -137,7 +137,7 @@ def calibrate_command(study: str, references: tuple[Path, ...], trials: int | No
 @click.option("--original", metavar="sd=2.7,tet=1.2,tit=0.44,ave_dece=5.97",
               help="The original vehicle's metrics.  [default: those published for STUDY]")
 def import_command(study: str, out: Path, original: str | None, **given: Path | None) -> None:
-    """Make results of STUDY from solutions in the published package's CSV format, or add those of another algorithm to them."""
+    """Import published CSV solutions of STUDY as a results directory, or add another algorithm's solutions to it."""
     chosen = load_study(study)
     files = {algorithm: path for algorithm, path in given.items() if path is not None}
     if not files:
@@ -195,7 +195,7 @@ class _TakesSeveral(click.Command):
 @click.option("--reference", "references", multiple=True, metavar="[STUDY=]FILE.csv...",
               help="Published rows to look for next to what the searches found; of which study, where several have one vehicle.")
 def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Path | None, references: tuple[str, ...]) -> None:
-    """Hold the results DIR... against published ones: every table cell beside cell, every conclusion marked."""
+    """Compare the results DIR... with published ones: tables side by side, and whether each conclusion holds."""
     if out is not None:
         refuse_inputs(out, "--out", *directories, *published, *references)
         check_writable(out)
@@ -212,7 +212,7 @@ def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Pat
 
 
 def _near(cases: Sequence[Case], references: Sequence[str]) -> list[Nearness]:
-    """Rows next to the solutions of the case that each file belongs to."""
+    """Published rows next to the solutions, for the case that each file belongs to."""
     rows: dict[str, list[ReferenceData]] = {}
     for given in references:
         name, _, place = given.rpartition("=")
@@ -228,7 +228,7 @@ def _near(cases: Sequence[Case], references: Sequence[str]) -> list[Nearness]:
 
 
 def _rows_by_case(path: Path, cases: Sequence[Case]) -> dict[str, ReferenceData]:
-    """The file's rows for every case whose vehicle it is of."""
+    """The rows of a file for every case with the vehicle of the file."""
     rows: dict[str, ReferenceData] = {}
     for case in cases:
         try:
@@ -266,7 +266,7 @@ def _number(value: float | None) -> str:
 
 
 def print_calibration(console: Console, study: Study, result: Calibration) -> None:
-    """Found values, and how well they do on both halves of the data."""
+    """Fitted values, and how well they agree with both halves of the data."""
     table = WholeTable("parameter", "unit", title=escape(study.title), title_justify="left")
     for head in ("found", "lower", "upper"):
         table.add_column(head, justify="right")

@@ -127,7 +127,7 @@ def _tell(target: Target, system: System, simulation: Simulation, as_json: bool)
 
 
 def _warn_of_differences(target: Target, simulation: Simulation) -> None:
-    """A replay gives what was recorded, or there is a reason to be told."""
+    """Warn if a replay differs from the recorded solution."""
     from safevar_sumo.replay.comparison import differences
 
     assert target.recorded is not None
@@ -145,7 +145,7 @@ def _write_trace(path: Path, simulation: Simulation) -> None:
 
 
 class Shown(NamedTuple):
-    """What is to be shown, and where."""
+    """The figure, animation or window that a command was asked for."""
 
     plot: Path | None
     animate: Path | None
@@ -158,7 +158,7 @@ class Shown(NamedTuple):
 
     @property
     def files(self) -> list[Path]:
-        """What is written, as whole paths."""
+        """Absolute paths of the files to write."""
         return [path.resolve() for path in (self.plot, self.animate) if path is not None]
 
     def check(self, study: str) -> None:

@@ -51,10 +51,10 @@ from safevar_sumo.workers.evaluation import Pool
 @click.option("--shard", metavar="K/N", help="Every N-th run, from the K-th (1..N): for job arrays that share --out.")
 @click.option("--retry-failed", is_flag=True, help="Simulate again what could not be simulated before (simulator-error).")
 @click.option("--quiet", is_flag=True, help="Print errors and warnings alone.")
-@click.option("--dry-run", is_flag=True, help="Tell what would run, how long and how much disk it would take.")
+@click.option("--dry-run", is_flag=True, help="Estimate time and disk space without running anything.")
 def study(study: str, batch: int | None, engine: str, out: Path | None, jobs: int | None, cluster: str | None, only: str | None,
           shard: str | None, retry_failed: bool, quiet: bool, dry_run: bool, **options: Any) -> None:
-    """Search STUDY; the same command again goes on where it was stopped."""
+    """Search STUDY; run the same command again to continue where it stopped."""
     chosen, system = prepared(_with_options(load_study(study), **options), study)
     tell_remarks(chosen, [*system.remarks, *vehicle_remarks(system)])
     keys = _selected(all_runs(chosen), only, shard)
@@ -103,12 +103,12 @@ def _selected(keys: list[RunKey], only: str | None, shard: str | None) -> list[R
 
 @commands.command()
 @click.argument("directory", metavar="DIR")
-@click.option("--watch", is_flag=True, help="Look again and again until the study is finished.")
+@click.option("--watch", is_flag=True, help="Keep showing progress until the study is finished.")
 @click.option("--every", type=Within(0.1, 86400), default=2.0, show_default=True, metavar="SECONDS",
-              help="How long --watch waits between two looks.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON; with --watch, a line for every look.")
+              help="Interval of --watch.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON; with --watch, a line at every interval.")
 def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
-    """Tell how far the study in DIR is, without disturbing it: runs, front so far, collisions, time left."""
+    """Show the progress of the study in DIR, without disturbing it: runs, front, collisions, time left."""
     from safevar_sumo.results import status as look
 
     progress, begun = look(directory), time.monotonic()
@@ -136,7 +136,7 @@ SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\n
 
 
 def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, engine: str) -> None:
-    """What a campaign would take."""
+    """Estimated time and disk space of a campaign."""
     console.print(study.title, soft_wrap=True, highlight=False, markup=False)
     table = WholeTable(show_header=False)
     table.add_row("algorithms", ", ".join(study.search.labels))
@@ -252,7 +252,7 @@ def _left(progress: Status, rate: float | None) -> str:
 
 
 def _front(progress: Status) -> RenderableType:
-    """The most severe points that no other one beats in all three objectives."""
+    """The most severe non-dominated points."""
     if not len(progress.points):
         return Text("Nothing simulated yet.")
     front = nondominated(progress.points)

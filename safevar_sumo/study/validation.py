@@ -41,7 +41,7 @@ def refuse(errors: Iterable[InputError]) -> None:
     if len(mistakes) == 1:
         raise mistakes[0]
     if mistakes:
-        texts = [f"{error.problem}{f' (legal: {error.legal})' if error.legal else ''}" for error in mistakes[:MOST_SHOWN]]
+        texts = [f"{error.problem}{f' (expected: {error.legal})' if error.legal else ''}" for error in mistakes[:MOST_SHOWN]]
         if len(mistakes) > MOST_SHOWN:
             texts.append(f"and {len(mistakes) - MOST_SHOWN} more")
         raise InputError(mistakes[0].source, f"{len(mistakes)} mistakes: {'; '.join(texts)}")

@@ -86,13 +86,13 @@ def test_a_trace_tells_where_the_obstacle_was_and_what_the_ads_saw_of_it() -> No
 
 @pytest.mark.parametrize("value", ["+8%", "heavy", None, [2500.0]])
 def test_what_is_no_number_is_refused(value: object) -> None:
-    with pytest.raises(sv.InputError, match=r"^changes: mass = .*\nlegal: a number in \[2040, 2700\] kg"):
+    with pytest.raises(sv.InputError, match=r"^changes: mass = .*\nexpected: a number in \[2040, 2700\] kg"):
         sv.simulate("rain", {"mass": value})  # type: ignore[dict-item]
 
 
 def test_what_is_neither_study_nor_results_is_told_as_both() -> None:
     for ask in (sv.explain, sv.tolerance, sv.risk, sv.rules):
-        with pytest.raises(sv.InputError, match=r"^nowhere: is no results directory, no study and no file\nlegal: a directory .* rain,"):
+        with pytest.raises(sv.InputError, match=r"^nowhere: is no results directory, no study and no file\nexpected: a directory .* rain,"):
             ask("nowhere")
 
 
@@ -105,9 +105,9 @@ def test_questions_take_a_directory_as_they_take_results(results: sv.Results) ->
 
 @pytest.mark.parametrize("value", [0.0, -5.0, 1e300])
 def test_what_no_vehicle_can_have_is_not_beyond_the_domain_but_refused(value: float) -> None:
-    with pytest.raises(sv.InputError, match=r"mass = .*\nlegal: a finite number above 0, up to 2.7e\+06 kg"):
+    with pytest.raises(sv.InputError, match=r"mass = .*\nexpected: a finite number above 0, up to 2.7e\+06 kg"):
         sv.simulate("sun", {"mass": value}, beyond=True)
-    with pytest.raises(sv.InputError, match=r"mass = .*\nlegal: a finite number above 0"):
+    with pytest.raises(sv.InputError, match=r"mass = .*\nexpected: a finite number above 0"):
         sv.evaluate("sun", pd.DataFrame({"mass": [2500.0, value]}), beyond=True)
 
 
@@ -120,7 +120,7 @@ def test_physics_that_break_down_are_told_and_do_not_pass_for_a_vehicle_that_sta
 
 
 def test_a_delay_that_nobody_simulates_is_refused_before_memory_is_out() -> None:
-    with pytest.raises(sv.InputError, match=r"delays is 1e\+12 s\nlegal: up to 3600 s"):
+    with pytest.raises(sv.InputError, match=r"delays is 1e\+12 s\nexpected: up to 3600 s"):
         sv.simulate(wide("native", "reactionTime"), {"reactionTime": 1e12})
 
 
@@ -190,7 +190,7 @@ def test_a_report_of_results_is_a_page(results: sv.Results, tmp_path: Path) -> N
 
 @pytest.mark.parametrize(("settings", "told"), [
     (pd.DataFrame({"weight": [1.0]}), "weight"), (pd.DataFrame({"mass": ["heavy"]}), "heavy"), ([[1.0, 2.0]], r"shape \(1, 2\)"),
-    ({"mass": [2500.0]}, "a dict\nlegal: a list of mappings"), ([{"mass": 2500.0}, {"weight": 1.0}], "weight"),
+    ({"mass": [2500.0]}, "a dict\nexpected: a list of mappings"), ([{"mass": 2500.0}, {"weight": 1.0}], "weight"),
     (pd.DataFrame({"mass": [2404.0, 9999.0]}), "row 1: mass = 9999"), (np.full((1, 17), np.nan), "shape|= nan"),
 ])
 def test_settings_that_cannot_be_used_are_told_before_any_is_simulated(settings: object, told: str) -> None:

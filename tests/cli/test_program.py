@@ -105,8 +105,8 @@ def test_a_thread_that_somebody_has_left_running_does_not_keep_the_program(monke
     ("report results/rain --only verdct", "did you mean 'verdict'?"),
     ("simulate weather.toml", "did you mean 'fog'?"), ("simulate model.toml", "did you mean 'world_on_rails'?"),
     ("simulate key.toml", "runns: there is no such key; did you mean 'runs'?"),
-    ("simulate rain --set mass=+8", "is outside its domain\nlegal: a number in [2040, 2700] kg, or mass=+8% of the original, or any with "
-                                    "--beyond"),
+    ("simulate rain --set mass=+8", "is outside its domain\nexpected: a number in [2040, 2700] kg, or mass=+8% of the original, or any "
+                                    "with --beyond"),
     ("simulate rain --set mass=2000", "a number in [2040, 2700] kg, or any with --beyond"),
     ("tables smoke", "did you mean results/smoke?"), ("status smoke", "did you mean results/smoke?"),
 ])

@@ -94,7 +94,7 @@ def vehicle(method: str, body: str) -> str:
     ("sense", "result = (result[0]._replace(speed=result[0].gap + np.inf), result[1])", "returned speed = inf from sense"),
     ("sumo_type", "result = result._replace(decel=0 * result.decel)", "returned decel = 0.0 from sumo_type"),
     ("sumo_type", "result = result[0]", "from sumo_type"),
-    ("sumo_type", "result = result._replace(max_speed=0 * result.max_speed + 2)", "legal: up to max_speed = 2 of its sumo_type"),
+    ("sumo_type", "result = result._replace(max_speed=0 * result.max_speed + 2)", "expected: up to max_speed = 2 of its sumo_type"),
 ])
 def test_a_vehicle_that_is_wrong(method: str, body: str, told: str, mine: Mine) -> None:
     def tried() -> None:

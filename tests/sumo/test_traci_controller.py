@@ -294,10 +294,10 @@ def test_a_wish_is_what_the_plant_makes_of_it(tmp_path: Path, monkeypatch: pytes
 
 
 @pytest.mark.parametrize(("table", "told"), [
-    ({"model": "my_controller:Hrash", "kind": "traci"}, r"has no 'Hrash'\nlegal: package.module:Name$"),
+    ({"model": "my_controller:Hrash", "kind": "traci"}, r"has no 'Hrash'\nexpected: package.module:Name$"),
     ({"model": "my_controller:Harsh", "kind": "traci", "parameters": {"margin": 2}}, r"^mine: ads.model = .* does not take ads.parameters"),
     ({"model": "my_controller:step", "kind": "traci", "parameters": {"margin": 2}}, r"^mine: ads.model = .* does not take ads.parameters"),
-    ({"model": "my_controller:step"}, r'not a class\nlegal: .*; or with ads.kind = "traci" a function step\('),
+    ({"model": "my_controller:step"}, r'not a class\nexpected: .*; or with ads.kind = "traci" a function step\('),
 ])
 def test_a_table_that_cannot_be_used_is_told_before_anything_is_simulated(
         table: dict[str, object], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
