@@ -14,7 +14,7 @@ ENDS = {
     Outcome.STOPPED: "stops", Outcome.PASSED: "passes", Outcome.TIMEOUT: "is still under way at the end",
     Outcome.NEVER_MOVED: "never moves", Outcome.SIMULATOR_ERROR: "could not be simulated",
     Outcome.INVALID_TEST: "leaves the tolerance of the test's speed"}
-"""How a run ended, as the verb of a sentence; a collision is told with its speed."""
+"""How a run ended, as the verb of a sentence; a collision is described by its speed instead."""
 
 
 def changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:

@@ -60,6 +60,9 @@ def test_sobol_indices_of_ishigamis_function() -> None:
     assert (frame["first_order_lower"] < frame["first_order"]).all()
     assert told.sensitivity_of_unsafe is not None
     assert told.sensitivity_of_unsafe["total"].isna().all()
+    outputs = told.to_frame().pivot(index="characteristic", columns="output", values="total")
+    assert outputs["safety_degree"].to_dict() == frame["total"].to_dict()
+    assert outputs["unsafe"].isna().all()
 
 
 @pytest.mark.parametrize(("variation", "says", "warns"), [
@@ -115,6 +118,7 @@ def test_correlations_are_those_of_the_copula() -> None:
     study = load_study(made_up_study(2), correlations=[{"between": ["a", "b"], "value": 0.8}])
     told = risk(study, unsafe="collision", samples=100, pool=Plant(study, box))
     assert told.to_dict()["sensitivity"] == []
+    assert told.to_frame().empty
 
 
 @pytest.mark.parametrize(("changes", "says"), [

@@ -72,5 +72,8 @@ def test_the_promised_record_the_same_again_and_in_words() -> None:
     (record,) = first.to_dict()
     assert list(record) == ["conditions", "density", "coverage", "density_interval", "coverage_interval"]
     assert [list(condition) for condition in record["conditions"]] == [["characteristic", "at_least", "at_most"]] * 2
+    frame = first.to_frame().astype(object)
+    assert frame.where(frame.notna(), None)[list(record["conditions"][0])].to_dict("records") == record["conditions"]
+    assert frame["rule"].tolist() == [0, 0]
     told = rule_in_words(first.rules[0], CharacteristicSet.of(first.study.vehicle.characteristics), first.unsafe)
     assert told.startswith("a above 7 N m and b below 3 N m: collides in 100% (")

@@ -36,7 +36,7 @@ class MinimalCause(NamedTuple):
 
 
 class _Subset(NamedTuple):
-    """Which changes of which setting."""
+    """A subset of the changes of one setting."""
 
     setting: int
     columns: tuple[int, ...]
@@ -99,11 +99,11 @@ FINER = 8
 """Into how many parts the last safe part is divided, again and again."""
 ROUNDS = 3
 RESOLUTION = 1 / (GRID * FINER**ROUNDS)
-"""How near to the truth a boundary is, as a share of the line."""
+"""Accuracy of a boundary, as a share of the line."""
 
 
 class End(StrEnum):
-    """What is just below the smallest unsafe share of a line."""
+    """State just below the smallest unsafe share of a line."""
 
     SAFE = "safe"
     FILTER = "filter threshold"
@@ -113,8 +113,8 @@ class End(StrEnum):
 class Boundary(NamedTuple):
     """The smallest unsafe share of a cause's changes, and the setting there, shape (n,).
 
-    `alone` are, by column, the values that the changes can be taken back to one at a time, the others as they are. `end` tells what is
-    just below the share; where the filter's threshold ends the line, `at_threshold` is the column of the change that it takes for none.
+    `alone` are, by column, the values that the changes can be taken back to one at a time, the others as they are. `end` is the
+    state just below the share; if that is the filter's threshold, `at_threshold` is the column whose change it puts back.
     """
 
     fraction: float
@@ -125,10 +125,7 @@ class Boundary(NamedTuple):
 
 
 def boundaries(bench: Bench, causes: list[MinimalCause], unsafe: Unsafe) -> list[Boundary]:
-    """Shrink causes, all changes by a common factor and each alone, as far as they stay unsafe.
-
-    No change is shrunk into what the filter takes for none.
-    """
+    """Shrink causes, all changes by a common factor and each alone, as far as they stay unsafe and above the filter's thresholds."""
     together = [(cause, cause.columns) for cause in causes]
     alone = [(cause, (column,)) for cause in causes for column in cause.columns]
     lines = [Line.moving(bench, cause, columns) for cause, columns in [*together, *alone]]

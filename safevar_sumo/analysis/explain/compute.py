@@ -29,20 +29,20 @@ Reasons = tuple[str, ...]
 
 
 LOOKED_AT = 4096
-"""Settings over the whole domain in which the failures of a study without results are looked for."""
+"""Settings over the whole domain that are searched for failures of a study without results."""
 
 
 class Failures(NamedTuple):
-    """Settings looked at, as they are evaluated today.
+    """Evaluated settings and which of them are to be explained.
 
     Attributes
     ----------
     evaluations
         Of filtered settings; solutions of several runs that are the same setting are there once.
     handles
-        What they are called as solutions; None for what did not come from results.
+        Their handles as solutions; None for settings that are not.
     unsafe
-        What counts as unsafe.
+        The criterion.
     rows
         Those to explain: the unsafe ones, or the ones asked for by name.
     otherwise
@@ -62,12 +62,12 @@ class Failures(NamedTuple):
 
 
 def failures_of(source: Study | Case, bench: Bench, original: Evaluations, named: Sequence[SolutionId], unsafe: Unsafe | None) -> Failures:
-    """Look at all solutions of results and evaluate them, or at settings all over a study's domain.
+    """Evaluate all solutions of results, or settings all over a study's domain.
 
     Raises
     ------
     InputError
-        If `named` holds what is no solution of the results.
+        If a handle of `named` is no solution of the results.
     """
     if isinstance(source, Study):
         if named:

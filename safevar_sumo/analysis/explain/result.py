@@ -1,4 +1,4 @@
-"""What `explain` returns: records, frames, and what they are as JSON."""
+"""Result records of `explain`, with their JSON and frames."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class Cause:
     alone
         How far each value alone can be taken back, the others as in `changes`.
     outcome, safety_degree
-        What `changes` do [m, or -m/s].
+        Result of `changes` alone [m, or -m/s].
     end, at_threshold
-        What is just below `fraction`; where the filter's threshold ends the line, the characteristic whose change it takes for none.
+        State just below `fraction`; if that is the filter's threshold, the characteristic whose change it puts back.
     """
 
     changes: dict[str, float]
@@ -51,7 +51,7 @@ class Cause:
 
     @property
     def limit(self) -> str:
-        """How little of the changes is enough, and what ends it, in a sentence."""
+        """The smallest unsafe share of the changes and the state just below it, in a sentence."""
         below = {End.SAFE: "slightly less is safe",
                  End.FILTER: f"with less, the change of {self.at_threshold} falls below the filter's threshold and counts as none",
                  End.NOT_SIMULATED: "slightly less could not be simulated"}[self.end]
@@ -60,10 +60,10 @@ class Cause:
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation:
-    """One failure explained; `handle` is None for what did not come from results, `reasons` tell why it was chosen.
+    """One failure explained; `handle` is None for a setting that is no solution, `reasons` are those it was chosen for.
 
-    `safety_degree` is in m, or -m/s; `changed` and `necessary` are names; `causes` are all minimal ones; `preventable` tells of
-    a collision who would have avoided it in the same vehicle; `points` are those of a matrix at which it is unsafe.
+    `safety_degree` is in m, or -m/s; `changed` and `necessary` are names; `causes` are all minimal ones; `preventable` is
+    the class of `PreventableBy` of a collision; `points` are those of a matrix at which it is unsafe.
     """
 
     handle: SolutionId | None
@@ -105,7 +105,7 @@ class Explained:
     looked_at, failures, analysed
         How many settings were looked at, how many of them are unsafe, and over how many of these the two frames are.
     otherwise
-        How many solutions do not end as the results say.
+        How many solutions end otherwise than the results say.
     preventability
         Who avoids the collisions among the settings looked at.
     """

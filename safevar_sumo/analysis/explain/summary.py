@@ -1,4 +1,4 @@
-"""The answer that a study's summary leads with: the failures that matter, each with its minimal cause in words."""
+"""The first lines of a study's summary: a paragraph for a manager, then the failures that matter with their minimal causes."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
 LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smallest largest change"}
-"""What a reader sees where the bare word `smallest` would leave open what of it is small."""
+"""Titles that say which quantity is small; others are titled by the reason itself."""
 LIMIT = 4000
-"""Simulations, about, in which the smallest robust failure is looked for at the end of a study; `explain` takes more."""
+"""About how many simulations the search for a robust failure takes at the end of a study; `explain` takes more."""
 
 
 def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Pool, place: str) -> list[str]:
-    """What solutions of a study come to, in lines, and which command tells more: first a paragraph that a manager understands.
+    """Summarise a study's solutions in lines: first a paragraph for a manager, last the command to go on with.
 
-    Unsafe is what `safevar_sumo.results.unsafe_rows` goes by.
+    The criterion of unsafe is that of `safevar_sumo.results.unsafe_rows`.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
 
 
 def _paragraph(bench: Bench, solutions: pd.DataFrame, is_unsafe: pd.Series[bool], original: Evaluations, unsafe: Unsafe, point: str) -> str:
-    """What the unsafe solutions come to, in short; in a matrix at the point that is named, by those that are unsafe there."""
+    """The unsafe solutions in one paragraph; with `point` those that are unsafe at that point of a matrix."""
     names, every = bench.characteristics.names, handles(solutions)
     kept = np.flatnonzero(is_unsafe.to_numpy() & ~solutions.duplicated(list(names)).to_numpy())
     if point:
@@ -101,7 +101,7 @@ def _paragraph(bench: Bench, solutions: pd.DataFrame, is_unsafe: pd.Series[bool]
 
 
 def _places(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple[list[str], str]:
-    """At which points of a matrix each setting fails, in words, and where the first comes off worst; nothing in a study without one."""
+    """Points of a matrix at which each setting fails, in words, and the first setting's worst point; empty without a matrix."""
     system = assemble(study)
     if not system.matrix:
         return [""] * len(settings), ""
@@ -124,20 +124,20 @@ NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight",
 NAMED = 4
 """Changes that are listed; of more the largest ones."""
 CONDITIONS = {"clear": "In clear weather", "wet": "On a wet road", "fog": "In fog", "night": "At night"}
-"""How a sentence tells of a weather; of others by name."""
+"""Weathers in words; others are named."""
 
 
 class Finding(NamedTuple):
-    """A failure as the paragraph tells of it.
+    """A failure as the paragraph describes it.
 
     Attributes
     ----------
     name
-        What it is called, such as a solution's handle.
+        Such as a solution's handle.
     changes
         All of its changes, values by name in their units.
     outcome, safety_degree
-        What they come to [m, or -m/s].
+        Result of the changes [m, or -m/s].
     robustness
         Of the failure.
     needed
@@ -164,7 +164,7 @@ def in_short(system: System, original: Evaluations, smallest: Finding | None, ro
     smallest
         The failure with the fewest changes; None if nothing is unsafe.
     robust
-        The smallest robust failure, None if there is none among those that were tried.
+        The robust failure with the fewest changes; None if none of those tried is robust.
     preventable
         Who avoids the collisions failure.
     """
@@ -195,7 +195,7 @@ def _weather(point: Point) -> str:
 
 
 def _end(system: System, original: Evaluations) -> str:
-    """How the original vehicle fares; short of whom, where the safety degree is the distance to a pedestrian's path."""
+    """How the original vehicle's run ends."""
     degree, outcome = float(original.f_safe[0]), Outcome(str(original.outcome[0]))
     if outcome == Outcome.COLLISION:
         return f"itself collides, at {_speed(degree)}"
@@ -231,7 +231,7 @@ def _outcome(failure: Finding) -> str:
 
 
 def _speed(degree: float) -> str:
-    """A collision's speed as one says it: whole km/h, below 3 km/h with a decimal."""
+    """A collision's speed in whole km/h, below 3 km/h with a decimal."""
     speed = -degree * KMH
     return f"{speed:.{int(speed < 3)}f} km/h"
 
@@ -251,7 +251,7 @@ def _how_robust(failure: Finding) -> str:
 
 
 def _avoided(preventable: Preventability) -> list[str]:
-    """Who avoids the collisions found, in a sentence; none without a collision."""
+    """Shares of the collisions by who avoids them, in a sentence; empty without a collision."""
     if not preventable.looked_at:
         return []
     words = {PreventableBy.COMPETENT_DRIVER: "a competent driver avoids {}", PreventableBy.FULL_BRAKING:

@@ -30,7 +30,7 @@ class VariationModel:
     Parameters
     ----------
     study
-        With its `[variation]` and `[[correlations]]`.
+        The study, with its `[variation]` and `[[correlations]]`.
 
     Raises
     ------
@@ -98,12 +98,12 @@ def _given(value: float | None, default: float) -> float:
 
 
 CHUNK = 1000
-"""Samples after which the interval is looked at."""
+"""Samples between two checks of the interval's width."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Risk:
-    """Probability of an unsafe outcome, with Clopper and Pearson's interval, and what decides.
+    """Probability of an unsafe outcome, with Clopper and Pearson's interval, and Sobol indices.
 
     Attributes
     ----------
@@ -199,7 +199,7 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
 BASE = 512
 """Base points of Saltelli's design; it has n + 2 times as many settings."""
 FEWEST = 100
-"""Unsafe and safe settings in the design that the sensitivity of being unsafe can be told from."""
+"""Unsafe, and safe, settings of the design that indices of being unsafe need at least."""
 RESAMPLES = 200
 """Bootstrap samples that the intervals come from."""
 

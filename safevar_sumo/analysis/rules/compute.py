@@ -29,7 +29,7 @@ from safevar_sumo.workers.evaluation import Pool
 CONFIDENCE = 0.95
 """Of the intervals of a rule's shares."""
 FEWEST = 10
-"""Unsafe and safe settings that rules can be made from."""
+"""Unsafe, and safe, settings that rules need at least."""
 FOLDS, DEEPEST, PRUNINGS = 5, 6, 24
 """Of the cross-validation; conditions of a rule before any is dropped; sizes of trees that are compared."""
 LEAST_ADDED = 0.01
@@ -42,13 +42,12 @@ Limits = dict[int, tuple[float | None, float | None]]
 
 @dataclass(frozen=True)
 class Rule:
-    """Settings within `limits` (by characteristic: at least, at most; None where open) are unsafe with some density.
+    """A box, `limits` by characteristic (at least, at most; None where open), in which settings are unsafe with some density.
 
     Attributes
     ----------
     inside, unsafe_inside, unsafe_everywhere
-        How many settings of those that the rule was not made from lie inside, how many of these are unsafe, and how many
-        are unsafe at all.
+        Numbers of validation settings: inside, unsafe inside, and unsafe anywhere.
     """
 
     limits: Mapping[str, tuple[float | None, float | None]]
@@ -76,7 +75,7 @@ class Rule:
         return clopper_pearson(self.unsafe_inside, self.unsafe_everywhere, self.confidence) if self.unsafe_everywhere else None
 
     def tells_more_than(self, share: float) -> bool:
-        """Whether what lies inside is surely unsafe more often than that share of all; what has no limits tells of all."""
+        """Whether settings inside are significantly more often unsafe than that share; always, of a rule without limits."""
         return not self.limits or (self.density_interval is not None and self.density_interval[0] > share)
 
     def to_dict(self) -> dict[str, Any]:
@@ -90,7 +89,7 @@ class Rule:
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """Rules of a study, the one that covers most first; `samples` settings were looked at, `unsafe_share` of them unsafe."""
+    """Rules of a study, ordered by coverage; of `samples` settings, `unsafe_share` were unsafe."""
 
     study: Study
     unsafe: Unsafe
@@ -147,7 +146,7 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
 
 
 def _design(bench: Bench, number: int, seed: int) -> Evaluations:
-    """Evaluated settings over the whole domain, those that could not be simulated left out."""
+    """Evaluated settings over the whole domain, without those that could not be simulated."""
     evaluations = bench.evaluate(spread(bench.characteristics, number, seed), "settings over the whole domain")
     return evaluations.take(evaluations.valid)
 
@@ -242,7 +241,7 @@ def within(limits: Limits, settings: FloatArray) -> BoolArray:
 
 
 def _judged(limits: Limits, settings: FloatArray, unsafe: BoolArray, members: CharacteristicSet) -> Rule:
-    """A rule with what it is worth on settings that it was not made from."""
+    """A rule with its numbers on validation settings, which did not make it."""
     inside = within(limits, settings)
     return Rule({members.names[column]: ends for column, ends in limits.items()}, int(np.count_nonzero(inside)),
                 int(np.count_nonzero(inside & unsafe)), int(np.count_nonzero(unsafe)), CONFIDENCE)
