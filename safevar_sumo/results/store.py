@@ -126,7 +126,7 @@ class ResultsDirectory:
     def _refuse_another_study(self) -> None:
         if not (self.path / MANIFEST).exists():
             foreign = sorted(name for path in self.path.iterdir() if (name := path.name) not in (RUNS, SOLUTIONS) and name[0] != ".")
-            if foreign:
+            if foreign and not (self.path / RUNS).exists():  # with journals, they decide whose directory it is
                 raise InputError("out", f"{self.path} holds other things: {foreign[0]}", "an empty directory, or one of this study")
             return
         stored, later = read_manifest(self.path), read_later(self.path)

@@ -286,3 +286,16 @@ def test_a_format_of_the_future_is_refused(tmp_path: Path) -> None:
     manifest.write_text(manifest.read_text().replace(f'"format": {FORMAT}', f'"format": {FORMAT + 1}'))
     with pytest.raises(InputError, match="is not a manifest of this version of the program"):
         load(tmp_path / "out")
+
+
+def test_an_edited_manifest_is_refused_until_it_is_removed(tmp_path: Path, study: Study) -> None:
+    directory = written(tmp_path, study)
+    directory.journal("original").close()
+    (tmp_path / "answers").mkdir()
+    file = tmp_path / "manifest.json"
+    file.write_text(file.read_text().replace('"safety_degree": 2.5', '"safety_degree": 9.5'))
+    with pytest.raises(InputError, match=r"manifest\.json: was edited"):
+        ResultsDirectory(tmp_path, study)
+    file.unlink()
+    ResultsDirectory(tmp_path, study).begin(evaluations(2.5))
+    assert json.loads(file.read_text())["original"]["safety_degree"] == 2.5
