@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
 import shlex
@@ -11,8 +12,10 @@ from typing import Any, NamedTuple
 import pytest
 from click.testing import CliRunner
 
+from safevar_sumo.ads import ADS
 from safevar_sumo.cli.program import commands
 from safevar_sumo.study import load_study, study_names
+from safevar_sumo.vehicles import VEHICLES
 
 ROOT = Path(__file__).parents[1]
 PAGES = ["README.md", *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").rglob("*.md")))]
@@ -71,6 +74,19 @@ def test_every_shipped_characteristic_is_explained_in_its_study_and_in_the_gloss
     for key, row in load_study(name).vehicle.characteristics.items():
         assert row.meaning, key
         assert f"| `{key}` | {row.meaning} | {row.counterpart} |" in glossary
+
+
+def test_every_generated_table_of_a_page_is_made_from_the_code() -> None:
+    spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
+    assert spec is not None
+    assert spec.loader is not None
+    generate = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(generate)
+    text = "\n".join(generate.on_page_markdown((ROOT / page).read_text()) for page in PAGES)
+    assert "<!-- generated" not in text
+    for heading in (*VEHICLES, *ADS, "SearchTable"):
+        assert f"\n### {heading}\n" in text
+    assert "| `evaluations` | integer, at least 1, at most 1e+07 | required |" in text
 
 
 class Numbers(NamedTuple):

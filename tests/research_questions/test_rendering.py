@@ -133,6 +133,14 @@ def test_significant_and_notable_cells_stand_out() -> None:
     assert next(line for line in even if " SD " in line).count("*") == 0
 
 
+@pytest.mark.parametrize("question", ["rq1-runs", "rq2-runs"])
+def test_a_large_effect_of_too_few_runs_does_not_stand_out(question: str) -> None:
+    document = latex(answer([rich_setting()], question))
+    assert "& large &" in document
+    assert r"\textbf" not in document
+    assert r"p \textless{} 0.01 after Holm)}" in document
+
+
 @pytest.mark.parametrize("kind", list(FORMATS))
 def test_what_cannot_be_told_is_never_a_nan(kind: str) -> None:
     cases = [made_up(row(sd=-1), row("rs", tet=None, ave_dece=None), original={"safety_degree": 0.5})]
