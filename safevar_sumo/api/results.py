@@ -132,9 +132,9 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     """
     from safevar_sumo.campaign import read_by_algorithms
     from safevar_sumo.sumo.system import assemble
+    from safevar_sumo.workers.batches import sources_of
     from safevar_sumo.workers.identity import identity_of
     from safevar_sumo.workers.local import local_pool
-    from safevar_sumo.workers.sources import sources_of
 
     manifest, study = read_manifest(directory), case.study
     if "imported" in manifest:

@@ -20,11 +20,11 @@ from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.system import System
+from safevar_sumo.workers.batches import sources_of
 from safevar_sumo.workers.cluster import cluster_pool
 from safevar_sumo.workers.evaluation import Pool
 from safevar_sumo.workers.identity import identity_of
 from safevar_sumo.workers.local import available_cores, local_pool
-from safevar_sumo.workers.sources import sources_of
 
 ENGINES = {Engine.RECORDED: "recorded", Engine.LIBSUMO: "sumo"}
 """What a command and a manifest call who moves the vehicles."""

@@ -19,11 +19,10 @@ from safevar_sumo.study import SAFETY_DEGREE, FreeParameter, Study
 from safevar_sumo.sumo import Engine, settings_per_batch
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.batches import evaluate_all
+from safevar_sumo.workers.batches import evaluate_all, inputs_of
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.local import result_of
 from safevar_sumo.workers.retrying import RetryingPool
-from safevar_sumo.workers.sources import inputs_of
 
 EDGE = 0.01
 """Nearer than this share of its width to an end, a value stands on its bound."""

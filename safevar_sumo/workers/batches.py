@@ -1,21 +1,24 @@
-"""Many settings of a study evaluated by a pool, in batches."""
+"""Many settings of a study evaluated by a pool, in batches, and the files on which their results depend."""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
+from safevar_sumo.plugins import Files, digest_of, digests, located, named_files
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, foreign_names
 from safevar_sumo.sumo import Engine, assemble, reason_for_sumo, settings_per_batch
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
+from safevar_sumo.workers.identity import Inputs, networks_of
 from safevar_sumo.workers.isolation import check_isolation, refuse_unlike_sumo
 from safevar_sumo.workers.local import first_of, result_of
 from safevar_sumo.workers.retrying import RetryingPool
-from safevar_sumo.workers.sources import inputs_of
 
 SHARES = 4
 """Batches for each worker, so that none waits long for another."""
@@ -27,6 +30,8 @@ _verified: set[bytes] = set()
 """Packed studies whose recorded scene was seen to be SUMO's."""
 _isolated: set[bytes] = set()
 """Packed studies whose models have been seen to keep settings apart."""
+_read: dict[tuple[bytes, str], Files] = {}
+"""Files that models have read in this process, by packed study and working directory."""
 
 
 def batches_of(study: Study) -> tuple[int, bool]:
@@ -65,3 +70,36 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
         refuse_unlike_sumo(study, found.take(verified[~found.failed[verified]]), result_of(in_sumo).take(~found.failed[verified]))
         _verified.add(work)
     return found.take(row_of.ravel())
+
+
+def inputs_of(study: Study, pool: Pool) -> Inputs:
+    """Digests of the files that every worker must have alike, by layer and name; raises as `sources_of`."""
+    return {"network": networks_of(assemble(study)), "sources": sources_of(study, pool)}
+
+
+def sources_of(study: Study, pool: Pool) -> Files:
+    """Digests, by name, of the files that models from outside read in one run of the original vehicle, and of files that parameters name.
+
+    The run takes place in a worker that loads everything anew.
+
+    Raises
+    ------
+    SafevarError
+        If the original vehicle cannot be simulated.
+    """
+    files = digests(named_files(_parameters(study), study.origin.places), study.origin.places)
+    if foreign_names(study):
+        work = packed(study, {}, afresh=True)
+        key = work, os.getcwd()
+        if any(digest_of(located(name, study.origin.places)) != digest for name, digest in _read.get(key, {"": "never read"}).items()):
+            original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
+            _read[key] = dict(result_of(RetryingPool(pool, study).submit(work, original, must_succeed=True)).files)
+        files |= _read[key]
+    return dict(sorted(files.items()))
+
+
+def _parameters(study: Study) -> list[Any]:
+    """All parameters of a study's models and algorithms."""
+    tests = [] if study.matrix is None else study.matrix.tests
+    return [study.vehicle.parameters, study.ads.parameters, study.scenario.parameters, study.search.parameters,
+            *(table for test in tests for table in (test.parameters, test.over))]

@@ -9,7 +9,7 @@ import pytest
 
 from safevar_sumo.plugins import digest_of
 from safevar_sumo.study import load_study
-from safevar_sumo.workers.sources import sources_of
+from safevar_sumo.workers.batches import sources_of
 from tests.in_process import Here
 
 ADS = """
