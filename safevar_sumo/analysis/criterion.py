@@ -6,12 +6,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 import scipy
 
 from safevar_sumo.analysis.evaluator import Bench, spread
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import BoolArray, Evaluations
-from safevar_sumo.results import HALF
+from safevar_sumo.records import BoolArray, Evaluations, Outcome
+from safevar_sumo.results import half_of
 
 EXPECTED = "collision, or below=X with a safety degree X [m, or minus a collision's speed in m/s]"
 PROBED = 1024
@@ -66,12 +67,13 @@ class Unsafe:
             return cls()
         if not original.f_safe[0] > 0:
             raise InputError("unsafe", "nothing collides, and the original vehicle has no safety degree to halve", EXPECTED)
-        return cls.half_of(float(original.f_safe[0]))
+        return cls(half_of(float(original.f_safe[0])))
 
     @classmethod
-    def half_of(cls, degree: float) -> Unsafe:
-        """Below half of a safety degree [m], rounded to six digits as it is printed."""
-        return cls(float(f"{HALF * degree:.6g}"))
+    def of_solutions(cls, solutions: pd.DataFrame, degree: float) -> Unsafe:
+        """The default for solutions, as `safevar_sumo.results.unsafe_rows` applies it; `degree` is the original's safety degree."""
+        collide = (solutions["outcome"] == str(Outcome.COLLISION)).any()
+        return cls() if collide or math.isnan(degree) else cls(half_of(degree))
 
 
 Criterion = Unsafe | float | str

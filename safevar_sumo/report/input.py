@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -18,7 +17,7 @@ from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import points_of
 from safevar_sumo.analysis.options import Options
-from safevar_sumo.analysis.research_questions.case import Case, collided, load_cases
+from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.tolerance import ToleranceOptions
@@ -153,7 +152,7 @@ class ReportInput:
     def unsafe(self) -> Unsafe:
         """What counts as unsafe: a collision if a solution is one, else half of the original's safety degree."""
         degree = self.case.original[SAFETY_DEGREE]
-        return Unsafe() if collided(self.case.solutions).any() or math.isnan(degree) else Unsafe.half_of(degree)
+        return Unsafe.of_solutions(self.case.solutions, degree)
 
     @cached_property
     def options(self) -> dict[str, Any]:

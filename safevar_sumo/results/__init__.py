@@ -15,11 +15,11 @@ from safevar_sumo.results.manifest import (
     read_later,
     read_manifest,
 )
-from safevar_sumo.results.solution_id import CHOICES, HALF, SolutionId, chosen_handle, handles, position_of, unsafe_rows
+from safevar_sumo.results.solution_id import CHOICES, SolutionId, chosen_handle, half_of, handles, position_of, unsafe_rows
 from safevar_sumo.results.store import ORIGINAL, SOLUTIONS, ResultsDirectory, evaluations_frame, record, solutions_frame
 
 __all__ = [
-    "CHOICES", "HALF", "MANIFEST", "ORIGINAL", "RESULTS", "SOLUTIONS", "SPARE", "UNKNOWN", "Failure", "Journal", "JournalBusy", "Results",
+    "CHOICES", "MANIFEST", "ORIGINAL", "RESULTS", "SOLUTIONS", "SPARE", "UNKNOWN", "Failure", "Journal", "JournalBusy", "Results",
     "ResultsDirectory", "RunStatus", "SolutionId", "Status", "begun_and_now", "chosen_handle", "differences_now", "evaluations_frame",
-    "failure_lines", "fixed", "handles", "load", "make_directory", "manifest_of", "places_of", "position_of", "read_later",
+    "failure_lines", "fixed", "half_of", "handles", "load", "make_directory", "manifest_of", "places_of", "position_of", "read_later",
     "read_manifest", "record", "solutions_frame", "status", "unsafe_rows", "write_imported", "write_whole"]

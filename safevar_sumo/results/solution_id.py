@@ -74,10 +74,15 @@ def position_of(solutions: pd.DataFrame, handle: SolutionId, source: object = "s
     raise InputError(source, f"there is no solution {handle}", legal)
 
 
+def half_of(degree: float) -> float:
+    """The limit below which a safety degree is unsafe where nothing collides [m]: half of the original's, to six digits as printed."""
+    return float(f"{HALF * degree:.6g}")
+
+
 def unsafe_rows(solutions: pd.DataFrame, original: float) -> pd.Series[bool]:
     """Which solutions are unsafe: collisions, or if none collides, those below half of the original's safety degree [m]."""
     collisions = solutions["outcome"] == str(Outcome.COLLISION)
-    return collisions if collisions.any() else solutions["f_safe"] < HALF * original
+    return collisions if collisions.any() else solutions["f_safe"] < half_of(original)
 
 
 CHOICES = {

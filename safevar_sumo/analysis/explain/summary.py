@@ -52,8 +52,7 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
         return ["The original vehicle itself collides: no change is needed."]
     bench, degree = Bench(study, pool), float(original.f_safe[0])
     unsafe = unsafe_rows(solutions, degree)
-    hits = bool((solutions["outcome"] == str(Outcome.COLLISION)).any())
-    means = Unsafe() if hits else Unsafe.half_of(degree)
+    means = Unsafe.of_solutions(solutions, degree)
     if not unsafe.any():
         return [f"Nothing unsafe found in {number_of(len(solutions), 'solution')}: no collision, no SD below half of the original's.",
                 f"How far each characteristic may go: {ask('tolerance', place)}"]
@@ -63,7 +62,8 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
     causes_of, (places, worst) = minimal_causes(bench, settings, means), _places(study, settings, means)
     counted = f"{int(unsafe.sum())} of {number_of(len(solutions), 'vehicle')} found"
     lines = [_paragraph(bench, solutions, unsafe, original, means, worst),
-             f"{counted} collide." if hits else f"No collision. {counted} keep less than half of the original's {degree:.2f} m."]
+             f"{counted} collide." if means.below is None else
+             f"No collision. {counted} keep less than half of the original's {degree:.2f} m."]
     for (reason, handle), row, causes, fails in zip(chosen.items(), rows.to_dict("records"), causes_of, places, strict=True):
         size = f"{number_of(int(row['f_num_diff']), 'change')} of up to {row['f_diff']:.0%}"
         end = f"{row['outcome']}, SD {row['f_safe']:.2f}"
