@@ -42,17 +42,18 @@ class Bench:
         self._pool, self.progress = pool, progress
         self.simulated = 0
 
-    def evaluate(self, settings: FloatArray, stage: str) -> Evaluations:
-        """Evaluate settings, shape (M, n); `stage` is what the progress calls them."""
+    def evaluate(self, settings: FloatArray, stage: str, before: int = 0, of: int | None = None) -> Evaluations:
+        """Evaluate settings, shape (M, n); `stage` is what the progress calls them, the part after the first `before` of that many."""
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
         done, total = 0, len(np.unique(settings, axis=0))
-        self.progress(stage, 0, total)
+        whole = total if of is None else of
+        self.progress(stage, before, whole)
 
         def count(number: int) -> None:
             nonlocal done
             done += number
-            self.progress(stage, done, total)
+            self.progress(stage, before + done, whole)
 
         evaluations = evaluate_all(self.study, settings, self._pool, count)
         self.simulated += total

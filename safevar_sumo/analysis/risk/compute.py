@@ -99,6 +99,8 @@ def _given(value: float | None, default: float) -> float:
 
 CHUNK = 1000
 """Samples between two checks of the interval's width."""
+LARGEST_CHUNK = 50_000
+"""Samples at once where no width is asked for: what a process keeps does not grow with their number."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,10 +181,10 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
     count = failures = errors = 0
     with open_bench(study, pool, jobs, progress) as bench:
         unsafe = criterion_of(options.unsafe, bench)
-        chunk = CHUNK if options.width is not None else options.samples
+        chunk = CHUNK if options.width is not None else LARGEST_CHUNK
         while count + errors < options.samples:
             probabilities = rng.random((min(chunk, options.samples - count - errors), len(bench.characteristics)))
-            evaluations = bench.evaluate(model.settings(probabilities), "vehicles as they vary")
+            evaluations = bench.evaluate(model.settings(probabilities), "vehicles as they vary", count + errors, options.samples)
             valid = int(np.count_nonzero(evaluations.valid))
             count, errors = count + valid, errors + len(probabilities) - valid
             failures += int(np.count_nonzero(unsafe.of(evaluations)))
