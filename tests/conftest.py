@@ -10,12 +10,16 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.explain.compute import explain_failures
+from safevar_sumo.analysis.explain.result import Explained
+from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers import local
 from tests.in_process import Here, searched
 
-collect_ignore = [] if os.name == "posix" else ["workers/test_local_pool.py", "end_to_end/test_cluster.py", "end_to_end/test_processes.py"]
+collect_ignore = [] if os.name == "posix" else ["workers/test_local_pool.py", "end_to_end/test_processes.py"]
 """Tests that kill, stop and interrupt processes as POSIX has it."""
 
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
@@ -79,3 +83,9 @@ def slippery(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("slippery")
     (folder / "slippery.toml").write_text(SLIPPERY)
     return searched(load_study(str(folder / "slippery.toml")), folder / "results")
+
+
+@pytest.fixture(scope="session")
+def explained(slippery: Path) -> Explained:
+    """The failures of those results, explained."""
+    return explain_failures(load_cases([slippery])[0], ExplainOptions(top=3), pool=Here())

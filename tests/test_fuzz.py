@@ -6,7 +6,7 @@ import math
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -67,16 +67,6 @@ def test_a_study_with_anything_in_one_place_is_read_or_refused(path: tuple[str, 
         assert isinstance(study, Study)
         numbers = list(study.vehicle.characteristics.values())
         assert all(math.isfinite(row.original) and row.lower < row.upper for row in numbers)
-
-
-@SLOW
-@given(text=st.one_of(st.binary(max_size=200), st.text(max_size=200).map(lambda text: text.encode("utf-8", "surrogatepass"))))
-def test_any_bytes_are_a_study_or_refused(text: bytes) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "mine.toml"
-        file.write_bytes(text)
-        with suppress(InputError):
-            load_study(str(file))
 
 
 FLAGS = st.lists(st.one_of(
@@ -152,7 +142,6 @@ def test_whatever_an_ads_commands_is_two_pedals_for_each_vehicle_or_an_error(wha
 
 SMOKE = CharacteristicSet.of(load_study("smoke").vehicle.characteristics)
 FEW = settings(max_examples=12, suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture], deadline=None)
-MANY = settings(FEW, max_examples=300)
 NUMBERS = st.one_of(st.integers(1, 20).map(str), st.text(max_size=5), st.sampled_from(
     ["0", "3", "2", "-1", "nan", "1e3", "\N{ARABIC-INDIC DIGIT THREE}", "1_0", "", " 2", "99999999999999999999", "0x1"]))
 RUNS = st.one_of(st.text(max_size=6), st.sampled_from(
@@ -214,20 +203,9 @@ def searched(flags: list[tuple[str, ...]]) -> None:
     tried("study", "smoke", "--runs", "1", "--evaluations", "10", *(part for flag in flags for part in flag))
 
 
-@pytest.mark.slow
-def test_study_takes_or_refuses_many_flags(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(safevar_sumo.cli.study, "open_pool", no_pool)
-    MANY(given(STUDY)(searched))()
-
-
 def simulated(flags: list[tuple[str, ...]]) -> None:
     tried("simulate", "smoke", *(part for flag in flags for part in flag))
 
 
 def test_simulate_takes_or_refuses_its_flags() -> None:
     FEW(given(SIMULATE)(simulated))()
-
-
-@pytest.mark.slow
-def test_simulate_takes_or_refuses_many_flags() -> None:
-    MANY(given(SIMULATE)(simulated))()

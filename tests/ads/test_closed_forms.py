@@ -83,12 +83,6 @@ def test_apollo_begins_where_a_comfortable_stop_and_the_way_lost_in_pedals_and_j
     assert expected - 2.5 * speed * STEP < begun < expected + 1e-9
 
 
-def test_apollo_knows_of_nothing_beyond_its_range_times_the_visibility() -> None:
-    clear, foggy = (onset(apollo(perception_range=30.0, cruise_speed=10.0), 10.0, visibility) for visibility in (1.0, 0.5))
-    assert clear > 25
-    assert 14 < foggy <= 15
-
-
 def test_apollo_asks_for_what_is_needed_to_stand_at_its_gap_through_the_originals_brake_table() -> None:
     """Once the jerk has let it: deceleration = v^2 / (2 (gap - stop gap)), up to the largest; pedal = (that - coasting) / braking."""
     ads = apollo(jerk=1e4)

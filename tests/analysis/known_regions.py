@@ -50,6 +50,8 @@ class Plant:
             f_diff=self._characteristics.largest_change(settings), f_num_diff=self._characteristics.number_changed(settings)))
         return future
 
+    def close(self) -> None: ...
+
 
 def made_up_bench(n: int, region: Region) -> Bench:
     study = made_up_study(n)

@@ -10,22 +10,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy
 from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.console import Console
 
+from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.evaluator import Bench
 from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.causes import RESOLUTION
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare, course, sentence
+from safevar_sumo.analysis.explain.causes import RESOLUTION, End, affordable, boundaries, involved, minimal_causes, necessary
 from safevar_sumo.analysis.explain.compute import explain_failures
-from safevar_sumo.analysis.explain.necessity import robustness
+from safevar_sumo.analysis.explain.necessity import distinct_causes, necessity, robustness, smallest_robust
 from safevar_sumo.analysis.explain.render import print_explained
 from safevar_sumo.analysis.explain.result import Explained
 from safevar_sumo.analysis.explain.summary import NUMBERS, lead
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
+from safevar_sumo.records import BoolArray, Encounter, FloatArray, Outcome, SimulationRuns, Trace
 from safevar_sumo.results import handles
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.analysis.known_regions import ORIGINAL, Plant, box, everywhere, made_up_bench, made_up_study, two_islands
 from tests.in_process import Here
 
 
@@ -34,9 +41,9 @@ def case(slippery: Path) -> Case:
     return load_cases([slippery])[0]
 
 
-@pytest.fixture(scope="module")
-def told(case: Case) -> Explained:
-    return explain_failures(case, ExplainOptions(top=3), pool=Here())
+@pytest.fixture
+def told(explained: Explained) -> Explained:
+    return explained
 
 
 def collides(case: Case, settings: list[dict[str, float]]) -> list[bool]:
@@ -191,3 +198,183 @@ def test_the_summary_of_a_study_leads_with_the_answer(case: Case, told: Explaine
     nothing, more = lead(case.study, safe, original, Here(), "out")
     assert nothing.startswith(f"Nothing unsafe found in {len(safe)} solutions")
     assert more == "How far each characteristic may go: python -m safevar_sumo tolerance out"
+
+
+STEP, OBSTACLE = 0.002, 20.0
+
+
+def drive_of(*vehicles: tuple[float, float, float, float]) -> SimulationRuns:
+    """Vehicles of (speed, gap at which the brake is commanded, delay, deceleration) towards an obstacle at 20 m."""
+    time = np.arange(0, 8, STEP)
+    columns = []
+    for v, gap, delay, deceleration in vehicles:
+        begins = (OBSTACLE - gap) / v
+        braking = np.maximum(time - begins - delay, 0.0)
+        speed = np.maximum(v - deceleration * braking, 0.0)
+        braking = np.minimum(braking, v / deceleration)
+        place = np.where(time < begins + delay, v * time, v * (begins + delay) + v * braking - deceleration * braking**2 / 2)
+        columns.append((speed, place, np.where(time >= begins, 1.0, 0.0), np.where(time >= begins + delay, 1.0, 0.0)))
+    speed, place, brake, pedal = (np.stack(part, axis=1) for part in zip(*columns, strict=True))
+    hit = place >= OBSTACLE
+    collision_speed = np.where(hit.any(axis=0), speed[np.argmax(hit, axis=0), np.arange(len(vehicles))], np.nan)
+    active = np.cumsum(hit, axis=0) <= 1
+    nothing = np.zeros_like(speed)
+    trace = Trace(step=STEP, vehicle_length=5.0, time=time, position=place, speed=speed, gap=OBSTACLE - place, lateral=nothing,
+                  lateral_speed=nothing, throttle=nothing, brake=brake, gear=nothing, active=active, pedal=pedal)
+    outcome = np.where(np.isnan(collision_speed), Outcome.STOPPED.value, Outcome.COLLISION.value)
+    return SimulationRuns(trace=trace, encounter=Encounter(trace.gap, trace.gap, speed, trace.gap > 0), outcome=outcome,
+                  collision_speed=collision_speed)
+
+
+def compared(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> BrakingComparison:
+    drives = drive_of(one, other)
+    return compare(*(course(drives, column, 1.0) for column in (0, 1)))
+
+
+SAME = (10.0, 15.0, 0.2, 6.0)
+
+
+@pytest.mark.parametrize(("other", "part", "lost"), [
+    ((10.0, 13.5, 0.2, 6.0), "place", 1.5),
+    ((10.0, 15.0, 0.4, 6.0), "delay", 10 * 0.2),
+    ((10.0, 15.0, 0.2, 5.0), "deceleration", 100 / 10 - 100 / 12),
+    ((11.0, 15.0, 0.2, 6.0), "speed", 1 * 0.2 + (121 - 100) / 12),
+    ((10.0, 15.0, 0.2, 3.5), "deceleration", 100 / 7 - 100 / 12),  # which hits
+    ((8.0, 15.0, 0.2, 6.0), "speed", -2 * 0.2 - (100 - 64) / 12)])  # which gains
+def test_one_difference_is_one_part(other: tuple[float, float, float, float], part: str, lost: float) -> None:
+    told = compared(SAME, other)
+    assert told.parts[part] == pytest.approx(lost, abs=0.05)
+    assert all(abs(value) < 0.05 for name, value in told.parts.items() if name != part)
+
+
+def test_the_parts_of_many_differences_add_up() -> None:
+    told = compared(SAME, (11.0, 14.0, 0.35, 5.0))
+    stops = [OBSTACLE - (OBSTACLE - gap) - v * delay - v**2 / (2 * a) for v, gap, delay, a in (SAME, (11.0, 14.0, 0.35, 5.0))]
+    assert told.lost == pytest.approx(stops[0] - stops[1], abs=0.05)
+    assert told.changed.outcome == "collision"
+    assert abs(told.parts["remainder"]) < 0.05
+
+
+def test_the_sentence_tells_the_largest_part_first_and_what_was_instead() -> None:
+    told = sentence(compared(SAME, (10.0, 14.0, 0.2, 3.0)))
+    assert told.startswith("The original stops, safety degree 1.00 m; this one hits at")
+    assert told.index("brakes more weakly (3.00 instead of 6.00 m/s^2)") < told.index("begins to brake nearer (14.00 instead of 15.00 m")
+    assert "They brake alike" in sentence(compared(SAME, SAME))
+
+
+def test_a_creeping_deceleration_is_no_late_pedal() -> None:
+    """Both pedals are down 0.1 s after the command; one vehicle decelerates with 6 m/s^2 at once, the other comes to 6 within a second."""
+    drives = drive_of((10.0, 15.0, 0.1, 6.0), (10.0, 15.0, 0.1, 6.0))
+    time, begins = drives.trace.time, 0.5
+    rises = np.clip(time - begins - 0.1, 0.0, None)
+    slower = 10 - np.where(rises < 1, 3 * rises**2, 3 + 6 * (rises - 1))
+    drives.trace.speed[:, 1] = np.maximum(slower, 0.0)
+    drives.trace.position[1:, 1] = np.cumsum((drives.trace.speed[1:, 1] + drives.trace.speed[:-1, 1]) / 2) * STEP
+    drives.trace.gap[:, 1] = OBSTACLE - drives.trace.position[:, 1]
+    told = compare(*(course(drives, column, 1.0) for column in (0, 1)))
+    assert told.parts["delay"] == 0
+    assert told.parts["deceleration"] == pytest.approx(told.lost)
+    assert "later" not in sentence(told)
+    assert "brakes more weakly" in sentence(told)
+
+
+COLLISION = Unsafe()
+
+
+@given(table=st.lists(st.booleans(), min_size=32, max_size=32), full=st.integers(0, 31))
+def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: list[bool], full: int) -> None:
+    def outcome(settings: FloatArray) -> BoolArray:
+        """Any function of which characteristics are changed, monotone or not."""
+        return np.array(table)[(settings != ORIGINAL) @ (1 << np.arange(5))]
+
+    setting = np.where(full >> np.arange(5) & 1, 9.0, ORIGINAL)
+    columns = np.flatnonzero(setting != ORIGINAL).tolist()
+    unsafe = [set(subset) for size in range(len(columns) + 1) for subset in combinations(columns, size)
+              if table[sum(1 << column for column in subset)]]
+    smallest = [subset for subset in unsafe if len(subset) == min(map(len, unsafe))]
+    (found,) = minimal_causes(made_up_bench(5, outcome), setting[np.newaxis], COLLISION)
+    assert [set(cause.columns) for cause in found] == smallest
+    for cause in found:
+        assert not any(set(subset) < set(cause.columns) for subset in unsafe)
+    assert necessary(found) == (set.intersection(*smallest) if smallest else set())
+    assert involved(found) == set().union(*smallest)
+
+
+def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None:
+    bench = made_up_bench(3, two_islands)
+    (causes,) = minimal_causes(bench, np.array([[9.5, 1.0, 8.0]]), COLLISION)
+    (found,) = boundaries(bench, causes, COLLISION)
+    assert found.fraction == pytest.approx(1.5 / 4.5, abs=2 * RESOLUTION)
+    assert found.setting[0] > 6.5 >= found.setting[0] - 2 * RESOLUTION * 4.5
+    assert found.alone == {0: found.setting[0]}
+    assert (found.end, found.at_threshold) == (End.SAFE, None)
+
+
+def test_each_value_of_a_cause_alone_goes_back_farther_than_all_together() -> None:
+    bench = made_up_bench(2, lambda settings: settings[:, 0] - settings[:, 1] >= 6)
+    (causes,) = minimal_causes(bench, np.array([[9.0, 1.0]]), COLLISION)
+    (found,) = boundaries(bench, causes, COLLISION)
+    assert found.fraction == pytest.approx(6 / 8, abs=2 * RESOLUTION)
+    assert found.setting == pytest.approx([8, 2], abs=1e-3)
+    assert found.alone == {0: pytest.approx(7, abs=1e-3), 1: pytest.approx(3, abs=1e-3)}
+
+
+def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
+    bench = made_up_bench(1, lambda settings: settings[:, 0] > ORIGINAL)
+    (causes,) = minimal_causes(bench, np.array([[9.0]]), COLLISION)
+    (found,) = boundaries(bench, causes, COLLISION)
+    threshold = bench.characteristics.threshold[0]
+    assert found.setting[0] == pytest.approx(ORIGINAL + threshold, rel=1e-3)
+    assert bench.characteristics.filter(found.setting)[0] == found.setting[0]
+    assert (found.end, found.at_threshold) == (End.FILTER, 0)
+
+
+def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
+    study = made_up_study(1)
+    bench = Bench(study, Plant(study, lambda rows: rows[:, 0] > 7, failing=lambda rows: (rows[:, 0] > 6) & (rows[:, 0] <= 7)))
+    (causes,) = minimal_causes(bench, np.array([[9.0]]), COLLISION)
+    (found,) = boundaries(bench, causes, COLLISION)
+    assert (found.setting[0], found.end) == (pytest.approx(7, abs=1e-3), End.NOT_SIMULATED)
+
+
+def test_robust_is_what_its_neighbours_are_too() -> None:
+    bench = made_up_bench(2, box)
+    threshold = bench.characteristics.threshold[0]
+    deep, edge = robustness(bench, np.array([[9.0, 1.0], [7.0, 1.0]]), 0.1, COLLISION)
+    assert deep.by_step == {0.1: 1.0, 0.05: 1.0, 0.2: 1.0}
+    assert edge.share == pytest.approx(0.5, abs=0.2)
+    assert (deep.borderline, edge.borderline) == (False, True)
+    (beyond,) = robustness(bench, np.array([[7.0 + 1.01 * threshold, 1.0]]), 0.1, COLLISION)
+    assert beyond.share == 1.0
+
+
+def test_the_smallest_robust_failure_is_the_first_whose_neighbours_are_unsafe_too() -> None:
+    """Largest changes of 40, 70 and 80 %; the first lies at the edge of the box."""
+    bench = made_up_bench(2, box)
+    failures = bench.evaluate(np.array([[9.0, 1.0], [7.01, 2.99], [8.5, 2.0]]), "failures")
+    assert smallest_robust(bench, failures, 0.1, COLLISION, limit=1) == 2
+    assert smallest_robust(bench, failures.take([1]), 0.1, COLLISION, limit=1) is None
+
+
+def test_necessary_and_changed_over_failures() -> None:
+    bench = made_up_bench(3, lambda settings: box(settings) | (settings[:, 2] > 9))
+    settings = np.array([[9.0, 1.0, 5.0], [9.0, 1.0, 8.0], [9.0, 1.0, 9.5]])
+    causes = minimal_causes(bench, settings, COLLISION)
+    frame = necessity(bench.characteristics, bench.characteristics.changed(settings), causes, 3).set_index("characteristic")
+    assert frame["changed"].to_dict() == pytest.approx({"a": 1, "b": 1, "c": 2 / 3})
+    assert frame["necessary"].to_dict() == pytest.approx({"a": 2 / 3, "b": 2 / 3, "c": 1 / 3})
+    assert frame["necessary_lower"].equals(frame["necessary"]), "of all failures the shares are exact"
+    sampled = necessity(bench.characteristics, bench.characteristics.changed(settings), causes, 4).set_index("characteristic").loc["c"]
+    ends = [scipy.stats.beta.ppf(q, *shape) for q, shape in ((0.025, (1, 3)), (0.975, (2, 2)))]
+    assert sampled[["necessary_lower", "necessary_upper"]].tolist() == pytest.approx(ends), "1 of a sample of 3"
+    distinct = distinct_causes(bench.characteristics, causes)
+    assert list(zip(distinct["cause"], distinct["failures"], strict=True)) == [(("a up", "b down"), 2), (("c up",), 1)]
+
+
+def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() -> None:
+    bench = made_up_bench(8, everywhere)
+    settings = np.random.default_rng(1).uniform(6, 9, (50, 8))
+    few = affordable(settings, bench, 2000)
+    assert few == affordable(settings, bench, 2000)
+    assert 0 < len(few) < 50
+    assert affordable(settings, bench, 10**6) == list(range(50))

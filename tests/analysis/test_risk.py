@@ -104,13 +104,6 @@ def test_every_distribution_has_its_moments() -> None:
     assert tight.max() <= 10
 
 
-def test_lognormal_has_its_median_and_spread() -> None:
-    study = load_study("smoke", variation={"mass": {"distribution": "lognormal", "sigma": 0.02}})
-    mass = VariationModel(study).settings(np.random.default_rng(1).random((20_000, 12)))[:, 6]
-    assert np.median(mass) == pytest.approx(2404, rel=0.001)
-    assert np.log(mass).std() == pytest.approx(0.02, rel=0.02)
-
-
 def test_correlations_are_those_of_the_copula() -> None:
     normal = {"distribution": "normal", "deviation": 0.5}
     settings = drawn(a=normal, b=normal, correlations=[{"between": ["a", "b"], "value": 0.8}])
@@ -141,12 +134,6 @@ def test_correlations_are_those_of_the_copula() -> None:
 def test_impossible_distributions_are_refused(changes: dict[str, Any], says: str) -> None:
     with pytest.raises(InputError, match=says.replace("[", r"\[").replace("+", r"\+")):
         VariationModel(load_study("smoke", **changes))
-
-
-def test_another_distribution_replaces_the_row_that_a_study_extends() -> None:
-    study = load_study("smoke", variation={"mass": {"distribution": "normal", "deviation": 50}})
-    assert msgspec.to_builtins(load_study(study, variation={"mass": {"distribution": "fixed"}}).variation)["mass"] == {
-        "distribution": "fixed", "value": None}
 
 
 def test_the_way_vehicles_vary_names_the_correlation_and_narrower_limits() -> None:

@@ -19,7 +19,7 @@ from safevar_sumo.analysis.tolerance import joint as safe_box
 from safevar_sumo.analysis.tolerance.compute import Tolerance
 from safevar_sumo.analysis.tolerance.render import profiles_figure
 from safevar_sumo.errors import InputError
-from tests.analysis.known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
+from tests.analysis.known_regions import Plant, Region, box, everywhere, made_up_study, nowhere, two_islands
 
 
 def of(n: int, region: Region, pairs: bool = False, unsafe: str | None = "collision", failing: Region = nowhere,
@@ -64,14 +64,6 @@ def test_a_plane_with_a_box_in_its_corner() -> None:
     assert told.verdict == "No single characteristic makes it unsafe, but 1 of 3 pairs: a with b."
 
 
-def test_a_diagonal_band_is_nearest_where_it_is_nearest() -> None:
-    told = of(2, diagonal_band, pairs=True)
-    assert told.pairs is not None
-    assert told.pairs[0].unsafe_share == pytest.approx(0.06, abs=0.03)
-    assert told.pairs[0].nearest == (pytest.approx(8, abs=0.01), pytest.approx(2, abs=0.01))
-    assert told.joint.factor == pytest.approx(3 / 5, rel=0.02)
-
-
 @pytest.mark.parametrize(("region", "n", "factor"), [
     (box, 2, 0.4), (two_islands, 3, 0.3), (nowhere, 4, 1.0), (everywhere, 2, 0.0),
     (lambda rows: np.sum(rows - 5, axis=1) > 12, 4, 0.6)])  # a corner of all four, which no pair reaches
@@ -83,15 +75,6 @@ def test_the_joint_factor_ends_before_what_is_unsafe(region: Region, n: int, fac
         error = 0.05 / 2**told.attempts
         assert told.unsafe_at_most == pytest.approx(1 - error ** (1 / told.samples))
         assert told.unsafe_at_most <= 0.003
-
-
-def test_the_nearest_unsafe_pair_lies_off_the_ray_through_the_nearest_of_the_grid() -> None:
-    """Beyond the line 2 a + b = 7, from the original: the nearest place is (2.8, 1.4); (3, 1) is the grid's, on the line itself."""
-    (pair,) = of(2, lambda rows: (rows - 5) @ [2, 1] >= 7, pairs=True).pairs or []
-    assert pair.nearest is not None
-    first, second = pair.nearest[0] - 5, pair.nearest[1] - 5
-    assert np.hypot(first, second) == pytest.approx(7 / 5**0.5, abs=0.003)
-    assert 2 * first + second >= 7
 
 
 def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
@@ -144,12 +127,6 @@ def test_nothing_and_everything() -> None:
     assert unsafe.alone[0].unsafe == [(0.0, 10.0)]
     assert unsafe.pairs is not None
     assert unsafe.pairs[0].unsafe_share == pytest.approx(1)
-
-
-def test_where_nothing_collides_half_of_the_original_is_the_limit() -> None:
-    told = of(1, nowhere, unsafe=None)
-    assert str(told.unsafe) == "below=4.0"
-    assert told.alone[0].safe == (pytest.approx(1.0, abs=1e-4), pytest.approx(9.0, abs=1e-4))
 
 
 def test_the_promised_record() -> None:

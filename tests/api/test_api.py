@@ -10,7 +10,6 @@ import warnings
 from importlib.metadata import version
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pandas as pd
 import pytest
@@ -90,12 +89,6 @@ def test_what_is_no_number_is_refused(value: object) -> None:
         sv.simulate("rain", {"mass": value})  # type: ignore[dict-item]
 
 
-def test_what_is_neither_study_nor_results_is_told_as_both() -> None:
-    for ask in (sv.explain, sv.tolerance, sv.risk, sv.rules):
-        with pytest.raises(sv.InputError, match=r"^nowhere: is no results directory, no study and no file\nexpected: a directory .* rain,"):
-            ask("nowhere")
-
-
 def test_questions_take_a_directory_as_they_take_results(results: sv.Results) -> None:
     case = study_or_case(str(results.directory))
     assert isinstance(case, Case)
@@ -117,17 +110,6 @@ def test_physics_that_break_down_are_told_and_do_not_pass_for_a_vehicle_that_sta
     settings[0, system.characteristics.names.index("radius")] = 1e200
     with warnings.catch_warnings(action="error"), pytest.raises(sv.InputError, match=r"vehicle: its speed is nan with radius = 1e\+200\n"):
         simulate(system, settings)
-
-
-def test_a_delay_that_nobody_simulates_is_refused_before_memory_is_out() -> None:
-    with pytest.raises(sv.InputError, match=r"delays is 1e\+12 s\nexpected: up to 3600 s"):
-        sv.simulate(wide("native", "reactionTime"), {"reactionTime": 1e12})
-
-
-def wide(study: str, characteristic: str) -> sv.Study:
-    """The study with a domain without a sensible end."""
-    row = msgspec.to_builtins(sv.load_study(study).vehicle.characteristics[characteristic])
-    return sv.load_study(study, vehicle={"characteristics": {characteristic: {**row, "upper": 1e12}}})
 
 
 def test_evaluate_is_simulate_row_by_row() -> None:
@@ -196,12 +178,6 @@ def test_a_report_of_results_is_a_page(results: sv.Results, tmp_path: Path) -> N
 def test_settings_that_cannot_be_used_are_told_before_any_is_simulated(settings: object, told: str) -> None:
     with pytest.raises(sv.InputError, match=told):
         sv.evaluate("sun", settings)  # type: ignore[arg-type]
-
-
-def test_no_setting_is_an_empty_frame_of_the_same_columns() -> None:
-    empty = sv.evaluate("sun", pd.DataFrame({"mass": []}))
-    assert len(empty) == 0
-    assert {"mass", "f_safe", "safety_degree", "collision_speed", "outcome"} <= set(empty.columns)
 
 
 def test_run_leaves_what_load_reads(results: sv.Results) -> None:

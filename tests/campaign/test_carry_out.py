@@ -7,6 +7,7 @@ from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pandas as pd
 import pytest
@@ -14,12 +15,16 @@ from rich.console import Console
 
 from safevar_sumo.campaign import RunKey, all_runs, forecast, run_campaign, run_generator
 from safevar_sumo.campaign.batcher import BATCHES_PER_WORKER
+from safevar_sumo.campaign.run import Run
+from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import ResultsDirectory, load, status
+from safevar_sumo.results import Journal, ResultsDirectory, load, status
+from safevar_sumo.results.journal import encoded, read_frames, read_journal
+from safevar_sumo.search import Search
 from safevar_sumo.study import Study, tables_of
-from safevar_sumo.workers.evaluation import PoolLostError
+from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError
 from tests.campaign.formulas import SUN, FormulaPool, Told, carried_out, evaluated, solutions, with_search
 
 
@@ -108,14 +113,6 @@ def test_a_finished_campaign_answers_without_simulating(study: Study, tmp_path: 
     assert told_again.finished_runs == told.finished_runs == dict.fromkeys(all_runs(study), study.search.evaluations)
 
 
-def test_a_setting_is_simulated_once_in_a_run(study: Study, tmp_path: Path) -> None:
-    one = with_search(study, algorithms=["nsga2"], runs=1)
-    pool = FormulaPool()
-    _, told = carried_out(one, tmp_path, pool)
-    assert len(pool.simulated) == len(set(pool.simulated)) == told.simulated + 1
-    assert told.simulated <= told.asked == study.search.evaluations
-
-
 def test_more_runs_extend_and_fewer_leave_out(study: Study, tmp_path: Path) -> None:
     pools = [FormulaPool() for _ in range(3)]
     carried_out(with_search(study, runs=3), tmp_path / "whole", pools[0])
@@ -170,15 +167,6 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
     carried_out(first, tmp_path / "out", FormulaPool(lasts=0))
 
 
-def test_while_there_are_more_evaluations_to_come_a_run_is_unfinished(study: Study, tmp_path: Path) -> None:
-    carried_out(study, tmp_path)
-    with pytest.raises(PoolLostError):
-        carried_out(with_search(study, evaluations=300), tmp_path, FormulaPool(lasts=3))
-    found = load(tmp_path)
-    assert found.finished == ()
-    assert not (tmp_path / "solutions.csv").exists()
-
-
 def test_every_evaluation_is_read_in_the_order_in_which_it_was_asked_for(study: Study, tmp_path: Path) -> None:
     carried_out(study, tmp_path, FormulaPool(workers=4, shuffled=True), batch=3)
     results = load(tmp_path)
@@ -217,3 +205,95 @@ def test_a_forecast_of_a_study_at_fault_tells_the_fault(study: Study) -> None:
         forecast(study, 6, FormulaPool(lasts=0))
     with pytest.raises(PoolLostError):
         forecast(study, 6, FormulaPool(lasts=2))
+
+
+def test_a_torn_tail_is_told_and_simulated_again(study: Study, tmp_path: Path) -> None:
+    carried_out(study, tmp_path)
+    before = solutions(tmp_path)
+    torn = tmp_path / "runs" / "nsga2-01.journal"
+    torn.write_bytes(torn.read_bytes()[:-700])
+    pool = FormulaPool()
+    _, told = carried_out(study, tmp_path, pool)
+    assert solutions(tmp_path) == before
+    assert len(told.warnings) == 1
+    assert str(torn) in told.warnings[0]
+    assert 0 < len(pool.simulated) <= 2 * study.search.population
+
+
+def test_a_setting_that_is_asked_for_twice_stands_where_it_was_asked_for_first(tmp_path: Path) -> None:
+    settings = np.stack([SUN.original, SUN.lower, SUN.original])
+
+    def twice() -> Search:
+        return (yield settings).take([0])
+
+    run = Run(RunKey("nsga2", 0), twice(), Journal(tmp_path / "a.journal", "study", "nsga2-00"), Told(), budget=3)
+    assert not run.advance()
+    assert run.take(evaluated(run.missing))
+    run.advance()
+    run.close()
+    assert read_journal(tmp_path / "a.journal", "study", "nsga2-00").positions == [0, 1]
+
+
+def test_failures_are_counted_kept_out_and_not_met_again(study: Study, tmp_path: Path) -> None:
+    class Deadly(FormulaPool):
+        """A worker dies of low tyre friction."""
+
+        def submit(self, work: bytes, settings: np.ndarray) -> Future[Evaluations]:
+            if np.any(settings[:, 8] < 1.3):
+                future: Future[Evaluations] = Future()
+                future.set_exception(WorkerLostError("died"))
+                return future
+            return super().submit(work, settings)
+
+    campaign, _ = carried_out(study, tmp_path, Deadly())
+    frame = load(tmp_path).evaluations
+    failed = frame["outcome"] == "simulator-error"
+    assert failed.sum() == len(campaign.failures) > 0
+    assert np.array_equal(failed, frame["tireFric"] < 1.3)
+    assert not (load(tmp_path).solutions["tireFric"] < 1.3).any()
+    before = solutions(tmp_path)
+    again, _ = carried_out(study, tmp_path, FormulaPool(lasts=0))
+    assert again.failures == campaign.failures
+    assert solutions(tmp_path) == before
+    for path in (tmp_path / "runs").glob("*-*.journal"):
+        path.write_bytes(path.read_bytes()[:-3])
+    again, _ = carried_out(study, tmp_path, FormulaPool(lasts=0))
+    assert again.failures == campaign.failures
+    assert solutions(tmp_path) == before
+
+
+def test_an_algorithm_that_asks_for_other_settings_than_its_journal_holds_is_told(study: Study, tmp_path: Path) -> None:
+    one = with_search(study, algorithms=["rs"], runs=1)
+    carried_out(one, tmp_path)
+    path = tmp_path / "runs" / "rs-00.journal"
+    frames, _ = read_frames(path.read_bytes(), path)
+    other = msgspec.structs.replace(frames[1], settings=(np.frombuffer(frames[1].settings) * 1.01).tobytes())  # type: ignore[union-attr]
+    path.write_bytes(b"".join(encoded(frame) for frame in [frames[0], other]))
+    with pytest.raises(InputError, match="holds other settings than this search asks for"):
+        carried_out(one, tmp_path)
+
+
+def test_failed_settings_are_tried_again_when_that_is_asked_for(study: Study, tmp_path: Path) -> None:
+    class Outage(FormulaPool):
+        """Cannot simulate low tyre friction today."""
+
+        def submit(self, work: bytes, settings: np.ndarray) -> Future[Evaluations]:
+            if np.any(settings[:, 8] < 1.3):
+                future: Future[Evaluations] = Future()
+                future.set_exception(SimulationError("SUMO failed: it has its day off"))
+                return future
+            return super().submit(work, settings)
+
+    failed, _ = carried_out(study, tmp_path / "out", Outage())
+    results = load(tmp_path / "out")
+    assert list(results.failures) == failed.failures != []
+    assert {one.reason for one in failed.failures} == {"SUMO failed: it has its day off"}
+    with pytest.raises(PoolLostError):  # a retry that breaks down is gone on with
+        run_campaign(study, all_runs(study), ResultsDirectory(tmp_path / "out", study), FormulaPool(lasts=7), Told(), retry_failed=True)
+    pool = FormulaPool()
+    campaign = run_campaign(study, all_runs(study), ResultsDirectory(tmp_path / "out", study), pool, Told(), retry_failed=True)
+    ResultsDirectory(tmp_path / "out", study).finish(campaign.solutions)
+    carried_out(study, tmp_path / "whole")
+    assert campaign.failures == []
+    assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")
+    pd.testing.assert_frame_equal(load(tmp_path / "out").evaluations, load(tmp_path / "whole").evaluations)

@@ -7,6 +7,7 @@ import importlib
 import os
 import pkgutil
 import re
+import shutil
 import subprocess
 import sys
 import threading
@@ -22,6 +23,7 @@ from rich.console import Console
 from safevar_sumo import cli
 from safevar_sumo.cli.program import COMMANDS, commands, main
 from safevar_sumo.errors import InputError
+from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.terminal import WholeTable
 
@@ -181,3 +183,21 @@ def test_what_a_characteristic_is_stands_with_its_name(command: list[str]) -> No
     gain = load_study("native").vehicle.characteristics["brakeGain"]
     assert f"brakeGain {gain.meaning}; counterpart: {gain.counterpart}" in re.sub(r"\s+", " ", done.stdout)
     assert command == ["list"] or "reactionTime age" not in re.sub(r"\s+", " ", done.stdout), "of what is changed alone"
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="POSIX alone has named pipes")
+@pytest.mark.parametrize("arguments", [
+    "validate sun pipe", "calibrate sun pipe", "calibrate sun", "calibrate mine.toml pipe", "import sun --out published --nsga2 pipe",
+    "import sun --out published --rs pipe", "study pipe", "simulate pipe", "simulate mine.toml", "tables stored", "status stored",
+    "simulate smoke --trace pipe", "simulate smoke --plot pipe.png", "simulate smoke --animate pipe.gif", "tolerance smoke --plot pipe.png",
+    "risk smoke --plot pipe.svg", "validate sun sun.csv --plot pipe.png", "replicate stored --published stored --out pipe"])
+def test_a_pipe_is_refused_by_its_name(arguments: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "stored").mkdir()
+    for pipe in ("pipe", "pipe.png", "pipe.gif", "pipe.svg", "stored/manifest.json", "sun-calibrated.toml"):
+        os.mkfifo(tmp_path / pipe)
+    shutil.copy(STUDIES / "sun.toml", "sun.csv")
+    (tmp_path / "mine.toml").write_text('extends = "pipe"\nname = "mine"\n')
+    error = CliRunner().invoke(commands, arguments.split()).exception
+    assert isinstance(error, InputError)
+    assert "is no regular file" in str(error)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from safevar_sumo.cli.options import read_changes, settings_of
+from safevar_sumo.cli.options import read_changes
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import load_study
@@ -42,13 +41,6 @@ def test_a_change_that_cannot_be_used_is_told(changes: tuple[str, ...], told: st
         read_changes(changes, SUN, beyond=False)
 
 
-def test_sweeps_are_combined_over_the_base() -> None:
-    rows = settings_of({"mass": [2100.0, 2200.0], "tireFric": [1.0, 2.0]}, SUN.original, SUN)
-    assert rows.shape == (4, 12)
-    assert rows[:, [6, 8]].tolist() == [[2100, 1], [2100, 2], [2200, 1], [2200, 2]]
-    assert np.array_equal(np.delete(rows, [6, 8], axis=1), np.repeat(np.delete(SUN.original, [6, 8])[np.newaxis], 4, axis=0))
-
-
 def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them() -> None:
     told = simulate("rain", "--set", "tireFric=1.1", "--set", "mass=2600", "--set", "dragCoeff=0.301")
     assert "original" in told.stdout
@@ -77,13 +69,3 @@ def test_nothing_that_is_read_is_written_over(in_tmp: Path) -> None:
     assert Path("mine.toml").read_text().startswith("extends")
     assert isinstance(simulate("sun", "--set", "mass=2100..2200", "--trace", "x.csv").exception, InputError)
     assert not Path("x.csv").exists()
-
-
-@pytest.mark.parametrize("width", ["20", "40", "80"])
-@pytest.mark.parametrize("title", ["[/m]", "[bold]x[/red] \\\\"])
-def test_titles_are_no_markup_and_control_nothing(title: str, width: str, in_tmp: Path) -> None:
-    Path("mine.toml").write_text(f'extends = "smoke"\nname = "mine"\ntitle = "{title}"\n')
-    told = CliRunner(env={"COLUMNS": width}).invoke(commands, ["simulate", "mine.toml"])
-    assert told.exception is None
-    assert "\x1b" not in told.stdout
-    assert max(map(len, told.stdout.partition("The original")[0].splitlines())) <= int(width)

@@ -73,18 +73,6 @@ def test_on_a_terminal_what_matters_fits_in_its_line_and_no_word_is_cut(
     assert not [line for line in lines if "…" in line]
 
 
-def test_no_time_left_is_told_before_the_throughput_has_settled(study: Study, clock: list[float]) -> None:
-    """Two batches that end within a moment say nothing of how fast the study is."""
-    out = StringIO()
-    with CampaignProgress(Console(file=out, force_terminal=True, width=120, _environ={}), study, all_runs(study), quiet=False) as progress:
-        for i in range(2):
-            progress.evaluated(RunKey("nsga2", i), found(100), 100)
-            clock[0] += 0.01
-    last = [line for line in out.getvalue().splitlines() if "rain" in line][-1]
-    assert "time left not known yet, 200 collisions" in last
-    assert "/s," not in last
-
-
 def test_quiet_says_nothing(study: Study, clock: list[float]) -> None:
     assert shown(study, clock, terminal_width=None, quiet=True) == ""
     assert shown(study, clock, terminal_width=80, quiet=True).strip("\n") == ""

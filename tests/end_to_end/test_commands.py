@@ -141,19 +141,6 @@ def test_a_bad_study_file_ends_with_code_2(old: str, new: str, told: tuple[str, 
     refused("simulate", "mine.toml", told=told)
 
 
-@pytest.mark.parametrize(("text", "told"), [
-    ('[ads.parameters]\nbrake_gap = nan\n', ("ads.parameters.brake_gap = nan",)),
-    ('[ads.parameters]\nlatency = 1e300\n', ("ads.parameters.latency = 1e+300",)),
-    ('[scenario.parameters]\nduration = inf\n', ("scenario.parameters.duration",)),
-    ('[vehicle.characteristics.mass]\nlower = -1e308\nupper = 1e308\n', ("vehicle.characteristics.mass",)),
-    ('[vehicle.characteristics.mass]\nlower = -5\n', ("vehicle.characteristics.mass.lower", "above 0")),
-    ('[published]\ntet = 0\n', ("published.tet = 0",)),
-])
-def test_numbers_that_make_no_sense_are_refused(text: str, told: tuple[str, ...], in_tmp: Path) -> None:
-    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n' + text)
-    refused("simulate", "mine.toml", told=told)
-
-
 @pytest.mark.parametrize("where", ["__init__", "drive"])
 def test_an_ads_that_exits_is_a_fault_and_no_success(where: str, in_tmp: Path) -> None:
     arguments = {"__init__": "self", "drive": "self, seen"}[where]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import random
-import resource
-import shutil
 import signal
 import subprocess
+import sys
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +16,11 @@ import pandas as pd
 import psutil
 import pytest
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.results import load
+from safevar_sumo.workers import cluster
 from tests.end_to_end.processes import STUDY, ended, killed, left_of_group, solutions, started, study, until, workers_of, written
-from tests.in_process import run
+from tests.in_process import refused, run
 
 pytestmark = pytest.mark.usefixtures("small")
 SLOW = pytest.mark.slow
@@ -69,23 +71,6 @@ def test_two_workers_that_are_killed_leave_the_same_bytes(whole: Path) -> None:
     assert (load(OUT).evaluations["outcome"] != "simulator-error").all()
 
 
-@SLOW
-@pytest.mark.parametrize("goes_on", [False, True])
-def test_workers_that_are_stopped_lose_nothing(goes_on: bool, whole: Path) -> None:
-    Path("small.toml").write_text(STUDY + "time_limit = 20\n")
-    process, moments = started("study", "small.toml", "--out", "out", "--jobs", "2", "--batch", "5"), random.Random(6)
-    until(lambda: written(OUT) > 0, process)
-    for _ in range(3):
-        for worker in workers_of(process)[:1]:
-            worker.suspend()
-            time.sleep(moments.uniform(0.5, 1.5))
-            if goes_on:
-                worker.resume()
-    process.communicate(timeout=300)
-    assert solutions("out") == solutions(whole)
-    assert not load("out").failures
-
-
 @pytest.mark.parametrize("when", ["mid-run", *(pytest.param(moment, marks=SLOW) for moment in ("loading", 0.0, 0.15, 0.4, "twice"))])
 def test_ctrl_c_ends_everything_with_code_130(when: float | str) -> None:
     process = started("study", "rain", "--out", "out", "--jobs", "1")
@@ -126,33 +111,6 @@ def test_a_worker_that_hangs_does_not_outlive_a_killed_study() -> None:
     until(Path("dozing").exists, process)
     killed(process)
     until(lambda: not left_of_group(process))
-
-
-@SLOW
-def test_a_full_disk_is_told_and_what_was_written_stays_valid(whole: Path) -> None:
-    def little_room() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (19_000, resource.RLIM_INFINITY))
-
-    told = ended(started("study", "small.toml", "--out", "out", "--jobs", "1", preexec_fn=little_room), 1)
-    assert "cannot be written: File too large; what was written before stays valid" in told
-    assert len(told.strip().splitlines()) == 1
-    frame = load("out").evaluations
-    assert len(frame) > 50
-    both = frame.merge(load(whole).evaluations, on=["algorithm", "run", "evaluation"], suffixes=("", "_whole"))
-    assert np.array_equal(both["f_safe"], frame["f_safe"])
-    assert np.array_equal(both["f_safe"], both["f_safe_whole"])
-    study("--out", "out")
-    assert solutions("out") == solutions(whole)
-
-
-@SLOW
-def test_a_directory_that_is_taken_away_is_told() -> None:
-    process = started("study", "small.toml", "--out", "out", "--jobs", "1")
-    until(lambda: written(OUT) > 3000, process)
-    shutil.rmtree("out")
-    told = ended(process, 1)
-    assert "out/" in told
-    assert "cannot be" in told
 
 
 SUMO_GOES_WRONG = """
@@ -224,72 +182,6 @@ def test_settings_that_sumo_dies_of_are_recorded_and_left_out(end: str, number: 
 
 
 @SLOW
-def test_an_outage_of_the_cache_ends_the_study_and_changes_no_byte(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cache = Path("cache").resolve()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
-    process = started("study", "small.toml", "--out", "out", "--jobs", "2", "--batch", "3")
-    until(lambda: written(OUT) > 3000, process)
-    cache.rename("away")
-    cache.write_text("")
-    for worker in workers_of(process):
-        worker.kill()
-    assert "cannot write the cache of networks" in ended(process, 1)
-    cache.unlink()
-    study("--out", "out")
-    assert solutions("out") == solutions(whole)
-    assert not load("out").failures
-
-
-@SLOW
-@pytest.mark.parametrize(("body", "told"), [
-    ("time.sleep(1000)", "took longer than 2 s"), ("os.kill(os.getpid(), 9)", "the worker process died (exit code -9)")])
-def test_an_ads_that_always_hangs_or_dies_ends_the_study_early_with_that_fault(body: str, told: str) -> None:
-    Path("my_ads.py").write_text(
-        f"import os\nimport time\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Bad(ScalarAds):\n    def drive(self, seen):\n"
-        f"        {body}\n        return 0.0, 0.0\n")
-    Path("bad.toml").write_text('extends = "small.toml"\nname = "bad"\n[ads]\nmodel = "my_ads:Bad"\n[search]\ntime_limit = 2\n')
-    errors = ended(started("study", "bad.toml", "--out", "out"), 2)
-    assert told in errors
-    assert len(errors.strip().splitlines()) <= 2
-    assert "simulate bad.toml" in errors
-
-
-GENTLE = """
-from safevar_sumo.ads import ScalarAds
-
-
-class Gentle(ScalarAds):
-    def drive(self, seen):
-        return (0.0, 1.0) if abs(seen.lateral) < 2.5 and seen.gap < 9.0 else (0.5, 0.0)
-"""
-
-
-@SLOW
-def test_files_that_are_edited_meanwhile_mix_nothing() -> None:
-    Path("my_ads.py").write_text(GENTLE)
-    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n[ads]\nmodel = "my_ads:Gentle"\n[search]\nalgorithms = ["rs"]\n'
-                                 "evaluations = 400\nruns = 1\n")
-
-    def under_way(*extra: str) -> subprocess.Popen[str]:
-        return started("study", "mine.toml", "--out", "out", "--jobs", "1", *extra)
-
-    process = under_way("--batch", "1")
-    until(lambda: written(OUT) > 0, process)
-    Path("my_ads.py").write_text(GENTLE.replace("0.5", "0.65"))
-    before = written(OUT)
-    until(lambda: written(OUT) > before + 500, process)
-    workers_of(process)[0].kill()
-    assert "safevar-sumo: my_ads.py: is not the file that this study began with" in ended(process, 2)
-    assert len(load("out").evaluations) > 1
-    Path("my_ads.py").write_text(GENTLE)
-    ended(under_way(), 0)
-    mixed = solutions("out")
-    shutil.rmtree("out")
-    ended(under_way(), 0)
-    assert solutions("out") == mixed
-
-
-@SLOW
 def test_of_two_studies_that_start_together_one_gets_the_directory() -> None:
     Path("other.toml").write_text('extends = "small.toml"\nname = "other"\n')
     both = [started("study", name, "--out", "out", "--jobs", "1") for name in ("small.toml", "other.toml")]
@@ -297,3 +189,104 @@ def test_of_two_studies_that_start_together_one_gets_the_directory() -> None:
     assert sorted(process.returncode for process in both) == [0, 2], outputs
     assert "another study" in "".join(errors for _, errors in outputs)
     assert len(load("out").solutions) > 0
+
+
+Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture
+def start(small: None) -> Iterator[Start]:
+    """Starts a program of Dask's in a process group of its own; all are ended with the test."""
+    running: list[subprocess.Popen[str]] = []
+
+    def begin(program: str, *arguments: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", f"distributed.cli.dask_{program}", *arguments, "--no-dashboard"]
+        environment = {**os.environ, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
+        with open(f"{program}-{len(running)}.log", "w") as log:
+            running.append(subprocess.Popen(command, stdout=log, stderr=log, text=True, start_new_session=True, env=environment))
+        return running[-1]
+
+    yield begin
+    for process in running:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+@pytest.fixture
+def scheduler(start: Start) -> tuple[subprocess.Popen[str], str]:
+    """A scheduler and its address."""
+    process = start("scheduler", "--host", "127.0.0.1", "--port", "0")
+    log = Path("scheduler-0.log")
+    until(lambda: "Scheduler at:" in log.read_text(), process)
+    return process, next(line.split()[-1] for line in log.read_text().splitlines() if "Scheduler at:" in line)
+
+
+def worker(start: Start, address: str, *options: str) -> subprocess.Popen[str]:
+    return start("worker", address, "--nthreads", "1", "--local-directory", "scratch", *options)
+
+
+def busy(process: subprocess.Popen[str]) -> bool:
+    """Whether a worker has loaded SUMO, so has computed."""
+    return any("libsumo" in one.path for one in psutil.Process(process.pid).memory_maps())
+
+
+@pytest.mark.slow
+def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(
+        scheduler: tuple[subprocess.Popen[str], str], start: Start, whole: Path) -> None:
+    _, address = scheduler
+    workers = [worker(start, address, "--no-nanny") for _ in range(2)]
+    until(lambda: all("Registered to" in Path(f"worker-{i}.log").read_text() for i in (1, 2)), workers[0])
+    process = started("study", "small.toml", "--cluster", address, "--out", "out")
+    until(lambda: written(Path("out")) > 4000 and all(busy(one) for one in workers), process)
+    assert process.poll() is None, "too late: the study is over"
+    killed(workers[0])
+    ended(process, 0)
+    assert workers[1].poll() is None
+    assert solutions("out") == solutions(whole)
+    assert (load("out").evaluations["outcome"] != "simulator-error").all()
+
+
+@pytest.mark.slow
+def test_a_simulation_that_hangs_is_stopped_on_a_cluster_too(scheduler: tuple[subprocess.Popen[str], str], start: Start) -> None:
+    Path("my_ads.py").write_text(
+        "import time\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Dozing(ScalarAds):\n    def drive(self, seen):\n"
+        "        time.sleep(1000)\n")
+    Path("dozing.toml").write_text(
+        'extends = "smoke"\nname = "dozing"\n[ads]\nmodel = "my_ads:Dozing"\n'
+        '[search]\nalgorithms = ["rs"]\nruns = 1\nevaluations = 10\ntime_limit = 2\n')
+    _, address = scheduler
+    worker(start, address, "--nanny")
+    errors = ended(started("study", "dozing.toml", "--cluster", address, "--out", "out"), 2)
+    assert "workers of the cluster died" in errors
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_dies_ends_the_study_and_what_was_written_stays(
+        scheduler: tuple[subprocess.Popen[str], str], start: Start) -> None:
+    process, address = scheduler
+    worker(start, address, "--no-nanny")
+    command = started("study", "small.toml", "--cluster", address, "--out", "out")
+    until(lambda: written(Path("out")) > 4000, command)
+    killed(process)
+    errors = ended(command, 1)
+    assert errors.startswith("safevar-sumo: the cluster does not answer any more")
+    assert len(errors.splitlines()) == 1
+    assert len(load("out").evaluations) >= 10
+
+
+def test_an_address_that_nobody_answers_is_told_in_time(in_tmp: Path) -> None:
+    began = time.monotonic()
+    refused("study", "smoke", "--cluster", "tcp://127.0.0.1:9", "--out", "out", told=("--cluster: nobody answers at 'tcp://127.0.0.1:9'",))
+    assert time.monotonic() - began < 15
+    assert not Path("out").exists()
+
+
+def test_an_encrypted_scheduler_needs_certificates_from_the_configuration() -> None:
+    with pytest.raises(InputError, match=r"certificates in Dask's configuration"), cluster.cluster_pool("tls://127.0.0.1:9", 9.0):
+        pass
+
+
+def test_a_worker_with_other_versions_computes_nothing() -> None:
+    with pytest.raises(cluster.PoolLostError, match=r"1\.20\.0"):
+        cluster._evaluate_within(9.0, {"libsumo": "1.20.0"}, b"", np.zeros((1, 12)))

@@ -93,13 +93,6 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
     assert Path("again/found.toml").read_bytes() == Path("found.toml").read_bytes()
 
 
-def test_calibrate_without_data_fits_the_original_vehicle_alone(in_tmp: Path) -> None:
-    run("calibrate", "rain", "--trials", "5", "--out", "rain.toml")
-    found = tomllib.loads(Path("rain.toml").read_text())
-    assert set(found["weather"]) == {"name", "road_friction", "visibility", "recognition_delay", "hesitation", "light", "wet"}
-    assert found["vehicle"]["parameters"] == load_study("sun").vehicle.parameters
-
-
 @pytest.mark.parametrize(("key", "told"), [
     ("vehicle.characteristics.mass.original", ("vehicle.characteristics.mass.original",)),
     ("ads.parameters.nothing", ("ads.parameters.nothing",)),
@@ -145,18 +138,6 @@ def test_an_interrupted_calibration_leaves_the_best_so_far(in_tmp: Path, monkeyp
     CliRunner().invoke(commands, ["calibrate", "sun", "--trials", "9", "--out", "best.toml"])
     assert "Best of 2 of 9 trials" in Path("best.toml").read_text()
     assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
-
-
-def test_calibrate_keeps_what_it_found_whatever_the_data(data: Path, in_tmp: Path) -> None:
-    """Too few rows for a rank correlation are no reason to lose the trials."""
-    pd.read_csv(data).head(1).to_csv("one.csv", index=False)
-    run("calibrate", "sun", "one.csv", "--trials", "1", "--out", "found.toml")
-    assert "undefined" in Path("found.toml").read_text()
-
-
-def test_a_picture_of_an_unknown_kind_is_refused_before_the_work(data: Path, in_tmp: Path) -> None:
-    refused("validate", "sun", str(data), "--plot", "picture.gif", told=("--plot", ".png"))
-    assert list(in_tmp.iterdir()) == []
 
 
 def test_calibrate_needs_something_to_fit(in_tmp: Path) -> None:

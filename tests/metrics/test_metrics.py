@@ -87,11 +87,6 @@ def test_time_to_collision_ends_with_the_first_standstill() -> None:
     assert np.all(np.isinf(ttc[run.trace.time > 2.0]))
 
 
-def test_average_deceleration_is_that_of_the_braking_cycle() -> None:
-    assert value("ave_dece", braking_run(10, 5, 12)) == pytest.approx(5.0, rel=1e-9)
-    assert value("ave_dece", braking_run(10, 5, 12), MetricsTable(ttc_threshold=2, sampling_interval=0.2)) == pytest.approx(5.0)
-
-
 def test_a_vehicle_that_never_brakes_has_no_average_deceleration() -> None:
     run = braking_run(10, 5, 12)
     coasting = Trace(**{**{name: getattr(run.trace, name) for name in run.trace.__dataclass_fields__}, "brake": run.trace.throttle})
@@ -111,12 +106,6 @@ def test_samples_after_a_vehicles_end_do_not_count() -> None:
 def ended(run: SimulationRuns, after: float) -> SimulationRuns:
     """The same drive of which only the samples before a moment count."""
     return dataclasses.replace(run, trace=dataclasses.replace(run.trace, active=run.trace.time[:, np.newaxis] < after))
-
-
-def test_no_encounter_is_undefined_not_infinitely_safe() -> None:
-    run = braking_run(10, 5, 12)
-    without = dataclasses.replace(run, encounter=Encounter(*run.encounter[:3], np.zeros_like(run.encounter.in_conflict)))
-    assert np.isnan(value("safety_degree", without))
 
 
 @pytest.mark.parametrize("name", ["tet", "tit", "ave_dece"])
@@ -164,3 +153,8 @@ def test_a_batch_that_failed_as_a_whole_has_no_valid_objective() -> None:
     scoring = Scoring(metrics=(), objectives=(F_SAFE, F_DIFF, Objective(name="jerk", title="jerk", unit="m/s^3")))
     assert scoring.valid(failed).tolist() == [False, False]
     assert np.isnan(scoring.values(failed)[:, 2]).all()
+
+
+def test_average_deceleration_is_that_of_the_braking_cycle() -> None:
+    assert value("ave_dece", braking_run(10, 5, 12)) == pytest.approx(5.0, rel=1e-9)
+    assert value("ave_dece", braking_run(10, 5, 12), MetricsTable(ttc_threshold=2, sampling_interval=0.2)) == pytest.approx(5.0)

@@ -63,12 +63,6 @@ def test_what_an_ads_does_to_what_it_was_given_changes_nothing_that_is_logged(mi
         assert np.array_equal(one, other, equal_nan=True)
 
 
-def test_commands_that_are_changed_afterwards_are_logged_as_given(mine: Mine) -> None:
-    system = mine("import numpy as np\n" + ADS.replace("return n", "return np.zeros(n)")
-                  + "        memory[:] = 0.1 if seen.time == 0 else 0.9\n        return (memory, 0), memory\n")
-    assert simulate(system, system.characteristics.original[None]).trace.throttle[0, 0] == 0.1
-
-
 def vehicle(method: str, body: str) -> str:
     return ("import numpy as np\nfrom safevar_sumo.vehicles.sumo import SumoVehicle\n\n\nclass Mine:\n    UNITS = SumoVehicle.UNITS\n\n"
             "    def __init__(self):\n        self.inner = SumoVehicle(reference_mass=1500)\n\n"

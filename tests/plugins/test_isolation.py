@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from concurrent.futures import Future
 from pathlib import Path
@@ -9,13 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from safevar_sumo.api.running import NullObserver, carried_out
+from safevar_sumo.campaign import all_runs
 from safevar_sumo.errors import ForeignError, InputError
 from safevar_sumo.records import Evaluations
+from safevar_sumo.results import load
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers.isolation import check_isolation
+from tests.in_process import Here, run
 from tests.plugins.beside import SCALAR, Mine
 
 ADS = ("import numpy as np\n\n\nclass Mine:\n    def start(self, n, nominal, step):\n        return 0\n\n"
@@ -60,3 +65,161 @@ def test_a_folder_whose_configuration_writes_files_or_opens_sockets_is_refused(o
     file.write_text(file.read_text().replace("</configuration>", f"{option}</configuration>"))
     with pytest.raises(InputError, match=r"sets SUMO's option '[a-z.-]+'"):
         assemble(load_study(str(folder / "mine.toml")))
+
+
+LATCH = """
+from safevar_sumo.ads import ScalarAds
+
+
+class Mine(ScalarAds):
+    seen_one = False
+
+    def drive(self, seen):
+        if seen.gap < 1.66:
+            Mine.seen_one = True
+        stopping = seen.speed**2 / (2 * 0.6 * self.nominal.decel)
+        if seen.gap < stopping + 2.0 and abs(seen.lateral) < 2.5:
+            return 0.0, 0.9 if Mine.seen_one else 1.0
+        return (0.5, 0.0) if seen.speed < 5 else (0.0, 0.0)
+"""
+
+
+def test_a_class_that_remembers_what_only_a_rare_setting_does(mine: Mine, folder: Path, tmp_path: Path) -> None:
+    system = mine(LATCH)
+    study = load_study(str(folder / "mine.toml"), search={"algorithms": ["nsga2"], "evaluations": 60, "runs": 1})
+    for _ in range(2):  # the same command again does not get by either
+        with pytest.raises(ForeignError, match=r"in run nsga2-00 and [\d.]+ alone; again by: python -m safevar_sumo simulate") as caught:
+            carried_out(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), 7)
+        assert "ads.model = 'mine:Mine' a result depends on what else is simulated" in str(caught.value)
+    assert not (tmp_path / "out/solutions.csv").exists()
+
+
+SEARCH = """
+class Mine:
+    best = None
+
+    def search(self, problem, rng):
+        settings = problem.characteristics.filter(problem.uniform(10, rng))
+        evaluated = yield settings
+        if {own}.best is None:
+            {own}.best = evaluated.settings[0].copy()
+        settings[1] = {own}.best
+        evaluated = yield settings
+        return evaluated.take([0])
+"""
+
+
+@pytest.mark.parametrize(("own", "shared"), [("Mine", True), ("self", False)])
+def test_an_algorithm_whose_runs_learn_from_each_other(own: str, shared: bool, mine: Mine, folder: Path, tmp_path: Path) -> None:
+    system = mine(SEARCH.format(own=own), '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 3\n')
+    study = load_study(str(folder / "mine.toml"))
+
+    def searched() -> object:
+        return carried_out(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
+
+    if shared:
+        with pytest.raises(ForeignError, match="'mine:Mine' asks for other settings when run 2 is repeated alone"):
+            searched()
+    else:
+        searched()
+
+
+SAFER = """
+from safevar_sumo.ads import ScalarAds
+
+
+class Mine(ScalarAds):
+    made = 0
+
+    def start(self, nominal, step):
+        super().start(nominal, step)
+        Mine.made += 1
+        self.margin = 4.0 if Mine.made > 40 and Mine.made % 12 == 0 else 2.0
+
+    def drive(self, seen):
+        stopping = seen.speed**2 / (2 * 0.6 * self.nominal.decel)
+        if seen.gap < stopping + self.margin and abs(seen.lateral) < 2.5:
+            return 0.0, 1.0
+        return (0.5, 0.0) if seen.speed < 5 else (0.0, 0.0)
+"""
+
+
+@pytest.mark.slow
+def test_a_class_that_makes_every_twelfth_vehicle_safer(mine: Mine, folder: Path, tmp_path: Path) -> None:
+    """Neither the most severe evaluation of a run nor its last one shows it."""
+    system = mine(SAFER)
+    study = load_study(str(folder / "mine.toml"), search={"algorithms": ["rs"], "evaluations": 100, "runs": 2})
+    with pytest.raises(ForeignError, match=r"ads.model = 'mine:Mine' a result depends on what else is simulated"):
+        carried_out(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
+
+
+CLOCK = """
+import time
+
+import numpy as np
+
+
+class Mine:
+    def search(self, problem, rng):
+        for _ in range(2):
+            rng = np.random.default_rng(1 + _ * time.time_ns())
+            evaluated = yield problem.characteristics.filter(problem.uniform(10, rng))
+        return evaluated.take([0])
+"""
+
+
+def test_an_algorithm_that_draws_from_the_clock(mine: Mine, folder: Path, tmp_path: Path) -> None:
+    system = mine(CLOCK, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 1\n')
+    study = load_study(str(folder / "mine.toml"))
+    with pytest.raises(ForeignError, match="'mine:Mine' asks for other settings when run 0 is repeated alone"):
+        carried_out(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
+
+
+GREEDY = """
+class Mine:
+    def search(self, problem, rng):
+        problem.characteristics.lower[:] = 0
+        yield problem.characteristics.filter(problem.uniform(10, rng))
+"""
+IDLE = """
+class Mine:
+    def search(self, problem, rng):
+        {body}
+        return problem.original.take([])
+"""
+
+
+@pytest.mark.parametrize(("module", "problem"), [
+    (GREEDY, "read-only"),
+    (IDLE.format(body="if problem.evaluations == 0:\n            yield"), "ended in search without asking for any setting"),
+    (IDLE.format(body="yield problem.characteristics.original[None][:0]"), "returned settings = .* from search"),
+], ids=["lower", "nothing", "empty"])
+def test_an_algorithm_that_changes_its_problem_or_asks_for_nothing(module: str, problem: str, mine: Mine, folder: Path,
+                                                                  tmp_path: Path) -> None:
+    system = mine(module, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 10\nruns = 1\n')
+    study = load_study(str(folder / "mine.toml"))
+    with pytest.raises(ForeignError, match=problem):
+        carried_out(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
+
+
+@pytest.fixture
+def six(in_tmp: Path) -> None:
+    shutil.copytree(Path(__file__).parent / "six", "six")
+
+
+def test_members_from_outside_are_simulated_and_scored(six: None) -> None:
+    told = json.loads(run("simulate", "six/mine.toml", "--set", "grip=5", "--json").stdout)
+    assert told["jerk"] > 0
+    assert told["mean_change"] == pytest.approx(3 / 8 / 3)
+
+
+@pytest.mark.slow
+def test_members_from_outside_are_searched_and_tabulated(six: None) -> None:
+    run("study", "six/mine.toml", "--out", "out", "--runs", "1", "--evaluations", "20", "--quiet")
+    solutions = load("out").solutions
+    assert set(solutions["algorithm"]) == {"nsga2", "Halving"}
+    assert np.isfinite(solutions[["jerk", "mean_change"]].to_numpy()).all()
+    assert solutions["f_diff"].max() <= 1 / 2 + 1e-9, "the weight of mass halves its changes"
+    for question in ("rq1", "rq2"):
+        rows = json.loads(run("tables", "out", "--rq", question, "--format", "json").stdout)
+        assert "jerk" in {row["metric"] for row in rows}

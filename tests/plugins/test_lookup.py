@@ -65,11 +65,6 @@ def test_a_file_with_the_name_of_an_installed_module_is_refused_where_it_is_mean
         mine("", '[ads]\nmodel = "numpy:Mine"\n')
 
 
-def test_nothing_is_left_behind_beside_the_study(mine: Mine, folder: Path) -> None:
-    mine(CONSTANT.format(0.1))
-    assert sorted(path.name for path in folder.iterdir()) == ["mine.py", "mine.toml"]
-
-
 @pytest.mark.parametrize(("model", "told"), [
     ("os:system", "is a function, not a class"),
     ("os:path", "is a module, not a class"),
@@ -97,11 +92,6 @@ def test_what_does_not_meet_the_contract_is_refused_before_it_is_called(model: s
 def test_vehicles_and_scenarios_are_held_to_their_contracts_too(table: str, mine: Mine) -> None:
     with pytest.raises(InputError, match=r"has no method (prepare|begin)"):
         mine("class Mine: ...\n", f'[{table}]\nmodel = "mine:Mine"\n' + (CHARACTERISTICS if table == "vehicle" else ""))
-
-
-def test_parameters_that_a_class_does_not_take_are_told(mine: Mine) -> None:
-    with pytest.raises(InputError, match="unexpected keyword argument 'margin'"):
-        mine(CONSTANT.format(0.1), ADS + "parameters = { margin = 1 }\n")
 
 
 @pytest.mark.parametrize(("module", "told"), [

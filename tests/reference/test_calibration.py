@@ -47,11 +47,6 @@ def test_a_fit_from_scratch_finds_the_truth_and_forgets_what_the_study_says(data
     assert (found[0].used["mine"].rows, found[0].held_back["mine"].rows) == (12, 12)
 
 
-def test_a_fit_from_scratch_with_too_few_trials_for_its_starts_knows_nothing_of_the_study_either(data: ReferenceData) -> None:
-    found = [calibrate(mine(gap, starts=8, trials=2), {"mine": data}, Here(), from_scratch=True) for gap in (0.4, 1.5)]
-    assert found[0].values == found[1].values
-
-
 def test_what_counts_for_nothing_in_the_study_costs_nothing(data: ReferenceData) -> None:
     """With all weights zero but that of the original vehicle, the rows have no part in the cost."""
     study = mine(1.1, trials=1, rank=0.0, collisions=0.0, weights={"tet": 0.0})

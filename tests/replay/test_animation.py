@@ -48,16 +48,6 @@ def test_both_vehicles_are_where_they_were_to_scale(crash: Comparison) -> None:
         assert columns.max() == pytest.approx((body.x[-1] - scene.view.left[-1]) * scale, abs=4)
 
 
-def test_the_scene_ends_where_the_drives_end(crash: Comparison) -> None:
-    scene = scene_of(crash)
-    assert scene.length == crash.film.last.max() + 1
-    changed = [body for body in scene.bodies if body.is_vut][1]
-    assert np.all(changed.x[crash.film.last[1]:] == changed.x[-1])
-    assert [body.name for body in scene.bodies].count("pedestrian") == 1, "both drives meet the same one"
-    assert changed.y[0] == pytest.approx(0)
-    assert changed.heading[0] == pytest.approx(0)
-
-
 @pytest.mark.parametrize("angle", [37.0, 180.0, 271.0])
 def test_a_road_in_any_direction_looks_the_same(angle: float, crash: Comparison) -> None:
     turn = np.deg2rad(angle)

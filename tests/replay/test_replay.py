@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner, Result
+from PIL import Image
 
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.replay.comparison import compare_setting, differences, divergence, moments
+from safevar_sumo.replay.comparison import Comparison, compare_setting, differences, divergence, moments
+from safevar_sumo.replay.figure import draw_comparison, write_figure
+from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.results import handles
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.film import film
-from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.matrix import simulate, study_at
 from safevar_sumo.sumo.system import System, assemble
 
 
@@ -59,13 +67,6 @@ def test_the_most_severe_the_smallest_and_the_fewest(flag: str, column: str, sli
     frame = pd.read_csv(slippery / "solutions.csv")
     told = json.loads(simulated(str(slippery), flag, "--json").stdout)
     assert told[column] == frame[frame["outcome"] == "collision"][column].min()
-
-
-def test_what_set_says_comes_over_the_solution(slippery: Path) -> None:
-    severe = json.loads(simulated(str(slippery), "--most-severe", "--json").stdout)["vcs"]
-    back = json.loads(simulated(str(slippery), "--most-severe", "--set", "tireFric=3.5", "--json").stdout)["vcs"]
-    assert severe["tireFric"] < 3.5
-    assert back == severe | {"tireFric": 3.5}
 
 
 def test_a_row_that_was_not_found_here_is_told(slippery: Path, case: Case) -> None:
@@ -125,3 +126,112 @@ def test_moments_of_a_drive(case: Case) -> None:
     assert apart is not None
     assert abs(trace.speed[apart, 0] - trace.speed[apart, 1]) > 0.1
     assert np.all(np.abs(trace.speed[:apart, 0] - trace.speed[:apart, 1]) <= 0.1)
+
+
+@pytest.fixture(scope="module")
+def comparison(slippery: Path) -> Comparison:
+    (case,) = load_cases([slippery])
+    return compare_setting(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
+
+
+def test_it_draws_both_drives_as_far_as_they_go(comparison: Comparison) -> None:
+    figure = draw_comparison(comparison)
+    trace = comparison.film.drives.trace
+    for axis, values in zip(figure.axes, (trace.speed, trace.gap, trace.throttle - trace.brake), strict=False):
+        for row, line in zip(comparison.rows, axis.lines[:1] + [one for one in axis.lines[1:] if len(one.get_xdata()) > 9], strict=False):
+            end = comparison.film.last[row] + 1
+            assert list(line.get_xdata()) == list(trace.time[:end])
+            assert list(line.get_ydata()) == list(values[:end, row])
+    assert [axis.get_ylabel() for axis in figure.axes] == [
+        "speed [m/s]", "gap to the obstacle [m]", "brake     |     throttle", "time to collision [s]"]
+    words = " ".join(text.get_text() for text in figure.legends[0].get_texts())
+    assert comparison.verdict(0) in words
+    assert comparison.verdict(1) in words
+    heading = figure.get_suptitle()
+    for change in comparison.changes:
+        assert change in heading
+
+
+def test_its_words_stand_within_their_axes_and_on_nothing_else(comparison: Comparison) -> None:
+    figure = draw_comparison(comparison)
+    figure.canvas.draw()
+    for axis in figure.axes[:2]:
+        words = [text.get_window_extent() for text in axis.texts if text.get_text()]
+        assert words
+        assert not any(one.overlaps(other) for one, other in combinations(words, 2))
+        for box in words:
+            assert axis.bbox.x0 < box.x0 < box.x1 < axis.bbox.x1
+            assert axis.bbox.y0 < box.y0 < box.y1 < axis.bbox.y1
+    impact = next(text for text in figure.axes[1].texts if text.get_text() == "impact").get_window_extent()
+    assert impact.y1 < figure.axes[1].transData.transform((0, 0))[1], "below the ground, where no line is"
+
+
+def test_at_an_impact_the_pedals_are_those_that_were_in_force() -> None:
+    """AEB lets go of the brake once the gap is gone, which is after the collision."""
+    study = study_at(load_study("euro_ncap_pedestrian"), "CPLA, speed 60, clear", "point")
+    system = assemble(study)
+    setting = system.characteristics.original.copy()
+    for name, value in (("tireFric", 1.0), ("mass", 2600.0)):
+        setting[system.characteristics.names.index(name)] = value
+    shown, drives = compare_setting(study, system, setting), simulate(system, setting[np.newaxis])
+    trace, end = shown.film.drives.trace, shown.film.last[-1]
+    assert shown.verdict(1).startswith("hits")
+    assert drives.trace.brake[end, 0] == 0
+    assert trace.brake[end, 1] == trace.brake[end - 1, 1] == drives.trace.brake[end - 1, 0] == 1
+    assert shown.evaluations.metrics["safety_degree"][1] == -drives.collision_speed[0]
+
+
+@pytest.mark.parametrize("kind", ["png", "svg"])
+def test_the_same_bytes_twice(kind: str, comparison: Comparison, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_figure(draw_comparison(comparison), tmp_path / f"{name}.{kind}")
+    assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
+
+
+@pytest.fixture
+def screen(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A virtual screen of its own; `SAFEVAR_BROWSER` says that one must be there."""
+    if shutil.which("Xvfb") is None and not os.environ.get("SAFEVAR_BROWSER"):
+        pytest.skip("Xvfb is not installed")
+    reading, writing = os.pipe()
+    server = subprocess.Popen(["Xvfb", "-displayfd", str(writing), "-screen", "0", "1280x800x24", "-nolisten", "tcp"],
+                              pass_fds=[writing], stderr=subprocess.DEVNULL)
+    os.close(writing)
+    with os.fdopen(reading) as told:
+        monkeypatch.setenv("DISPLAY", f":{told.readline().strip()}")
+    yield
+    server.terminate()
+    server.wait()
+
+
+def of_colour(picture: np.ndarray, red: int, green: int, blue: int) -> np.ndarray:
+    """Rows and columns of pixels of about that colour, shape (M, 2)."""
+    return np.argwhere(np.abs(picture.astype(int) - [red, green, blue]).max(axis=2) < 30)
+
+
+@pytest.mark.usefixtures("screen")
+def test_both_vehicles_are_in_the_window_at_the_nearest_moment(slippery: Path, tmp_path: Path) -> None:
+    (case,) = load_cases([slippery])
+    system = assemble(case.study)
+    comparison = compare_setting(case.study, system, case.solutions[list(case.characteristics.names)].to_numpy()[0])
+    show_in_gui(comparison, system.scenario.network, slower=0.01, rest=0.0, pictures=tmp_path)
+    told = [moments(comparison.film.drives, row) for row in comparison.rows]
+    assert {path.stem for path in tmp_path.iterdir()} == {f"{sample:04d}" for sample in (told[0].nearest, told[1].nearest, told[0].end)}
+    with Image.open(tmp_path / f"{told[1].nearest:04d}.png") as image:
+        picture = np.asarray(image.convert("RGB"))
+    original, changed = of_colour(picture, 0x00, 0x72, 0xb2), of_colour(picture, 0xd5, 0x5e, 0x00)
+    assert len(original) > 100
+    assert len(changed) > 100
+    assert original[:, 0].max() < changed[:, 0].min(), "the original's road is above"
+    assert original[:, 1].max() < changed[:, 1].max(), "the original keeps its distance"
+    assert len(of_colour(picture, 255, 51, 0)) > 20, "the changed vehicle's brake lights"
+
+
+def test_without_a_display_it_is_refused(slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    (case,) = load_cases([slippery])
+    system = assemble(case.study)
+    comparison = compare_setting(case.study, system, case.characteristics.original)
+    with pytest.raises(InputError, match="no display"):
+        show_in_gui(comparison, system.scenario.network)

@@ -18,7 +18,6 @@ from safevar_sumo.analysis.research_questions.changes import (
     collisions,
     combinations,
     critical,
-    effects,
     rq31,
     rq32,
     rq33,
@@ -31,7 +30,7 @@ from safevar_sumo.analysis.research_questions.indicators import indicators
 from safevar_sumo.analysis.research_questions.over_runs import brief, difference_line, holm, rq1_runs, rq2_runs
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable
-from tests.research_questions.made_up import CHARACTERISTICS, ORIGINAL, UNCHANGED, made_up, made_up_study, row
+from tests.research_questions.made_up import CHARACTERISTICS, ORIGINAL, made_up, made_up_study, row
 
 HEAVY, GRIPLESS, BOTH = (1100.0, 2.0, 0.1), (1000.0, 1.0, 0.1), (1200.0, 1.5, 0.1)
 
@@ -53,18 +52,6 @@ def test_rq1_is_small_where_solutions_are_more_unsafe() -> None:
     assert (frame["n2"] == 5).all()
     safer = rq1(made_up(*(row(sd=3, tet=0.5, tit=0.1, ave_dece=7) for _ in range(5))))
     assert safer["effect_size"].tolist() == [1, 1, 1, 1]
-
-
-def test_rq1_counts_ties_by_half() -> None:
-    frame = rq1(made_up(row(sd=1), row(sd=2), row(sd=2), row(sd=3)))
-    assert only(frame, metric="safety_degree")["effect_size"] == 0.5
-    assert only(frame, metric="safety_degree")["mean"] == 2
-
-
-def test_tet_and_tit_do_not_count_collisions_and_the_others_do() -> None:
-    frame = rq1(made_up(row(sd=-3, ave_dece=2), row(sd=1, tet=1.4, tit=0.7, ave_dece=4)))
-    assert frame["n1"].tolist() == [2, 1, 1, 2]
-    assert frame["mean"].tolist() == [-1, 1.4, 0.7, 3]
 
 
 def test_a_tet_that_stands_at_a_collision_is_not_counted() -> None:
@@ -114,12 +101,6 @@ def test_rq2_without_an_algorithm_is_refused(rows: list[dict[str, Any]], told: s
         answer([made_up(*rows)], "rq2")
 
 
-def test_a_finished_run_that_found_nothing_is_told_of() -> None:
-    told = answer([made_up(row(), row("rs"), finished=[("nsga2", 0), ("nsga2", 1), ("rs", 0)])], "rq2")[0]
-    assert only(told.frame, metric="igd")["n1"] == 1
-    assert any("1 finished runs found no solution" in note for note in told.notes)
-
-
 def test_critical_solutions_are_strictly_below_the_original() -> None:
     case = made_up(row(sd=2.0), row(sd=1.999), row(sd=-1), row("rs", sd=1), row(sd=math.nan))
     assert critical(case)["safety_degree"].tolist() == [1.999, -1]
@@ -141,15 +122,6 @@ def test_rq32_shares_and_ranks() -> None:
     assert only(frame, characteristic="lag", j="any")["percent"] == 0
     assert only(frame, characteristic="mass", j="3")["percent"] is None
     assert frame[frame["j"] == "any"]["rank"].tolist() == [1, 2, 3]
-
-
-def test_rq3_without_critical_solutions_is_empty_not_zero() -> None:
-    case = made_up(row(sd=5, values=HEAVY))
-    assert rq32(case)["percent"].isna().all()
-    assert rq32(case)["rank"].isna().all()
-    assert (rq33(case)["n"] == 0).all()
-    assert rq33_safety(case)["value"].isna().all()
-    assert rq31(case)["count"].sum() == 0
 
 
 def test_rq33_tells_increases_from_decreases() -> None:
@@ -213,11 +185,6 @@ def test_weather_compares_settings_that_differ_in_it_alone() -> None:
         answer([clear, other], "weather")
 
 
-def test_effects_are_all_changes_of_all_critical_solutions() -> None:
-    frame = effects(made_up(row(values=BOTH), row(values=HEAVY), row(values=GRIPLESS, sd=9), row(values=UNCHANGED)))
-    assert sorted(zip(frame["characteristic"], frame["change"], strict=True)) == [("grip", -0.5), ("mass", 100), ("mass", 200)]
-
-
 def test_every_question_at_once_tells_what_is_lacking() -> None:
     told = {one.name: one for one in answer([made_up(row(values=HEAVY))])}
     assert not told["rq1"].frame.empty
@@ -236,13 +203,6 @@ def test_several_settings_stand_in_one_frame_and_the_refused_in_the_notes() -> N
     told = answer([good, alone], "rq2")[0]
     assert set(told.frame["setting"]) == {"made-up"}
     assert any(note.startswith("alone: ") for note in told.notes)
-
-
-def test_unfinished_campaigns_say_so() -> None:
-    case = made_up(row(), row("rs"), row("rs", run=1))
-    assert any("unfinished, nsga2 1 of 2 runs" in note for note in answer([case], "rq1")[0].notes)
-    finished = made_up(row(), row(run=1), row("rs"), row("rs", run=1))
-    assert not finished.remarks
 
 
 def test_the_brief_lines_say_what_the_data_allows() -> None:
@@ -285,12 +245,6 @@ def test_no_share_of_an_original_that_is_zero() -> None:
     assert quantities["TET"]["value"] == 1.5
     assert quantities["TET"]["percent"] is None
     assert quantities["TIT"]["percent"] == 100
-
-
-def test_the_footer_of_collisions_alone_has_their_speed_and_deceleration_only() -> None:
-    told = rq33_safety(made_up(row(values=HEAVIER, sd=-2.0, ave_dece=4.0), row(values=HEAVIER, sd=-4.0, ave_dece=5.0)))
-    overall = {one["quantity"]: (one["value"], one["n"]) for one in told[told["j"] == "any"].to_dict("records")}
-    assert overall == {"avgSD_mD": (None, 0), "avgSD_cS": (3.0, 2), "TET": (None, 0), "TIT": (None, 0), "aveDece": (1.5, 2)}
 
 
 def test_what_a_table_tells_of_exposure_in_collisions_does_not_count() -> None:

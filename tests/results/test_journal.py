@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
-import portalocker
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -125,17 +123,6 @@ def test_any_changed_byte_is_a_cut_tail_or_an_error_that_tells_where(tmp_path: P
         assert str(path) in str(told.value)
         assert f"byte {start}" in str(told.value)
         assert path.read_bytes() == content, "a damaged file is left as it is"
-
-
-def test_a_tail_of_zeros_as_a_power_cut_leaves_it_is_cut_off(tmp_path: Path) -> None:
-    path = tmp_path / "a.journal"
-    write(path, finished=False)
-    with path.open("ab") as file:
-        file.write(bytes(5000))
-    journal = Journal(path, "study", "nsga2-00")
-    assert journal.cut == 5000
-    assert holds_the_first(BATCHES, journal.content)
-    journal.close()
 
 
 def test_a_frame_of_a_later_version_is_an_error(tmp_path: Path) -> None:
@@ -254,21 +241,3 @@ def test_what_is_no_journal_is_refused_and_left_alone(tmp_path: Path) -> None:
     path.mkdir()
     with pytest.raises(InputError, match="is no regular file"):
         Journal(path, "study", "nsga2-00")
-
-
-def test_a_disk_without_locks_is_not_told_as_another_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise portalocker.LockException(OSError(errno.ENOLCK, "No locks available"), "No locks available")
-
-    monkeypatch.setattr(portalocker, "lock", refuse)
-    with pytest.raises(SafevarError, match="cannot be locked: No locks available") as told:
-        Journal(tmp_path / "a.journal", "study", "nsga2-00")
-    assert not isinstance(told.value, JournalBusy)
-
-
-def test_a_new_journal_and_its_folder_are_known_to_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    synced: list[Path] = []
-    monkeypatch.setattr("safevar_sumo.results.files.sync_directory", synced.append)
-    monkeypatch.setattr("safevar_sumo.results.journal.sync_directory", synced.append)
-    Journal(tmp_path / "new" / "runs" / "a.journal", "study", "nsga2-00").close()
-    assert synced == [tmp_path / "new", tmp_path, tmp_path / "new" / "runs"]

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import math
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
@@ -11,9 +17,14 @@ from hypothesis import strategies as st
 from safevar_sumo.ads.aeb import Aeb
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
+from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.euro_ncap import VUT_WIDTH, Walk
-from tests.scenarios.holding import CARLA, Hold, at_contact, driven
+from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import evaluate, simulate
+from safevar_sumo.sumo.system import assemble
+from tests.scenarios.holding import CARLA, NATIVE, Hold, at_contact, driven
 
 STANDARD = [("CPFA", 50.0), ("CPNA", 25.0), ("CPNA", 50.0), ("CPNA", 75.0), ("CPNCO", 50.0)]
 NUMBERS = {"CPFA": (8 / 3.6, 6.0, 1.5), "CPNA": (5 / 3.6, 4.0, 1.0), "CPNCO": (5 / 3.6, 4.0, 1.0)}
@@ -131,3 +142,110 @@ def test_what_is_outside_the_protocol_is_allowed_with_a_word() -> None:
     assert "outside the protocol" in Crossing(speed=80.0).remarks()[0]
     assert "none of the protocol's" in Crossing(test="CPNA", impact_location=33.0).remarks()[0]
     assert driven(Crossing(speed=80.0)).outcome[0] == Outcome.COLLISION
+
+
+WORN = assemble(load_study("wear", matrix=None))
+
+
+@pytest.mark.parametrize("grade", [0.0, 10.0, -10.0])
+def test_the_braking_distance_is_v2_over_2_b_plus_g_sin(grade: float) -> None:
+    """The worn car on a dry road: b is what the brakes or tyres of mu g cos give."""
+    dry = replace(WORN, weather=CARLA.weather)
+    trace = driven(CarToCar(test="CCRs", speed=50, grade=grade), Hold(np.array([1.0])), system=dry).trace
+    speed, brakes = trace.speed[:, 0], WORN.vehicle.sumo_type(WORN.vehicle.prepare(values(), 1.0, 0.05)).decel[0]
+    angle = math.atan(grade / 100)
+    limit = min(brakes, 0.9 * 9.81 * math.cos(angle)) + 9.81 * math.sin(angle)
+    way = float(np.interp(-1.0, -speed, trace.position[:, 0]) - np.interp(-13.0, -speed, trace.position[:, 0]))
+    assert (13.0**2 - 1) / (2 * way) == pytest.approx(limit, rel=0.01)
+
+
+def values() -> dict[str, np.ndarray]:
+    return {name: np.full(1, value) for name, value in zip(WORN.characteristics.names, WORN.characteristics.original, strict=True)}
+
+
+@pytest.mark.parametrize("grade", [6.0, -6.0])
+def test_whoever_does_not_brake_keeps_his_speed_uphill_and_downhill(grade: float) -> None:
+    for system in (CARLA, NATIVE, WORN):
+        run = driven(Crossing(test="CPFA", speed=40.0, grade=grade), Aeb(reach=0.1), system=system)
+        assert run.trace.speed[:100, 0] == pytest.approx(40 / 3.6, rel=1e-3)
+    run = driven(Crossing(test="CPNA", speed=40.0, impact_location=25.0, grade=grade))
+    assert at_contact(run, run.trace.time) == pytest.approx(6.0, abs=0.01)
+    assert at_contact(run, run.trace.lateral[:, 0]) / VUT_WIDTH + 0.5 == pytest.approx(0.25, abs=0.02)
+
+
+def test_points_of_a_matrix_may_rise_and_fall_and_are_each_as_if_alone() -> None:
+    tests = [{"name": "CPLA", "model": "along", "parameters": {"speed": 40}, "over": {"grade": [-8, 0, 8]}}]
+    together = assemble(load_study("euro_ncap_pedestrian", matrix={"tests": tests}))
+    original = together.characteristics.original[None]
+    assert [point.name for point in together.points] == ["CPLA, grade -8, clear", "CPLA, grade 0, clear", "CPLA, grade 8, clear"]
+    degrees = [evaluate(together.at(point), original).f_safe[0] for point in together.points]
+    assert evaluate(together, original).f_safe[0] == min(degrees)
+    assert len(set(degrees)) == 3
+
+
+def test_a_grade_beyond_30_percent_is_refused_and_one_outside_the_protocol_told() -> None:
+    with pytest.raises(msgspec.ValidationError, match="grade"):
+        msgspec.convert({"grade": 31}, Crossing)
+    assert CarToCar(grade=-5.0).remarks() == ["CCRs: grade = -5 %, and the protocol's road is level"]
+
+
+def test_a_vehicle_that_knows_no_slope_is_refused_on_one_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "flat.py").write_text(
+        "from safevar_sumo.vehicles.sumo import SumoVehicle\n\n\nclass Flat(SumoVehicle, frozen=True):\n"
+        "    def prepare(self, characteristics, road_friction, step):\n"
+        "        return super().prepare(characteristics, road_friction, step)\n")
+    native = load_study("native")
+    vehicle = msgspec.structs.replace(native.vehicle, model="flat:Flat")
+    for grade in (0.0, 4.0):
+        scenario = msgspec.structs.replace(native.scenario, parameters={"grade": grade})
+        system = assemble(msgspec.structs.replace(native, vehicle=vehicle, scenario=scenario))
+        if grade:
+            with pytest.raises(InputError, match=r"has no slope in prepare.*the road has a grade"):
+                simulate(system, system.characteristics.original[None])
+        else:
+            assert simulate(system, system.characteristics.original[None]).trace.speed.max() > 5
+
+
+TURNS = {"north": (0.0, 1.0), "west": (-1.0, 0.0), "north-west": (-0.6, 0.8)}
+"""Where a road that leads east leads then."""
+
+
+def moved(folder: Path, network: str, forth: tuple[float, float], skew: float = 0.0) -> str:
+    """A copy of a network, turned, with its southern end shifted to the right by `skew` [m]."""
+    def place(match: re.Match[str]) -> str:
+        x, y = float(match[1]), float(match[2])
+        x += skew if y < -10 else 0
+        return f'x="{x * forth[0] - y * forth[1]}" y="{x * forth[1] + y * forth[0]}"'
+
+    shutil.copytree(NETWORKS / network, folder / "mine")
+    nodes = folder / "mine" / "network.nod.xml"
+    nodes.write_text(re.sub(r'x="([-\d.]+)" y="([-\d.]+)"', place, nodes.read_text()))
+    return str(folder / "mine")
+
+
+@pytest.mark.parametrize("forth", TURNS.values(), ids=TURNS)
+@pytest.mark.parametrize("study", ["rain", "native"])
+def test_a_turned_road_changes_nothing(study: str, forth: tuple[float, float], tmp_path: Path) -> None:
+    ours = load_study(study)
+    mine = load_study(study, scenario={"parameters": {"network": moved(tmp_path, ours.scenario.model, forth)}})
+    system = assemble(ours)
+    settings = np.vstack([system.characteristics.original, system.characteristics.lower])
+    here, there = simulate(system, settings), simulate(assemble(mine), settings)
+    assert here.outcome.tolist() == there.outcome.tolist()
+    for name in ("gap", "lateral", "speed"):
+        assert np.allclose(getattr(here.trace, name), getattr(there.trace, name), atol=0.02), name
+    way, same = (run.trace.position[-1] - run.trace.position[0] for run in (here, there))
+    assert np.allclose(way, same, atol=0.02), "a position is along the way"
+
+
+def test_a_skewed_way_across_is_refused(tmp_path: Path) -> None:
+    network = moved(tmp_path, "crossing", (1.0, 0.0), skew=4.0)
+    system = assemble(load_study("rain", scenario={"model": "crossing", "parameters": {"network": network}}, title="", published={}))
+    with pytest.raises(InputError, match=r"lane 'footpath_0' leads [\d.]+ m along the road"):
+        simulate(system, system.characteristics.original[np.newaxis])
+    crossings = Path(moved(tmp_path / "other", "pedestrian_crossing", (1.0, 0.0)), "network.con.xml")
+    crossings.write_text(crossings.read_text().replace("<crossing ", '<crossing shape="0.3,4 6,-4" '))
+    system = assemble(load_study("smoke", scenario={"parameters": {"network": str(crossings.parent)}}))
+    with pytest.raises(InputError, match=r"lane ':crossing_c0_0' leads [\d.]+ m along the road"):
+        simulate(system, system.characteristics.original[np.newaxis])

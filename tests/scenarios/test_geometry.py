@@ -7,7 +7,6 @@ import pytest
 
 from safevar_sumo.records import Trace
 from safevar_sumo.scenarios import Lane
-from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.lead_vehicle_stopped import LeadVehicleStopped
 from safevar_sumo.scenarios.pedestrian_crossing import PedestrianCrossing
 
@@ -111,11 +110,3 @@ def test_a_parked_vehicle_is_separated_by_centres_and_closed_in_on_by_bumpers() 
     assert encounter.distance[:, 0].tolist() == [3.0, -0.1]
     assert encounter.closing_speed[:, 0].tolist() == [2.0, 2.0]
     assert encounter.in_conflict[:, 0].tolist() == [True, False]
-
-
-def test_a_pedestrian_is_encountered_until_the_vehicles_rear_has_passed_him() -> None:
-    """A vehicle of 5 m and an adult 0.5 m deep; he walks beside it, 1 m from its side: a near miss, all along."""
-    scenario = Crossing(test="CPFA", vut_length=LENGTH, vut_width=2.0)
-    encounter = scenario.encounter(trace(np.array([1.0, -0.1, -5.4, -5.6]), np.full(4, 5.0), np.full(4, -1.0 - 0.3 - 1.0), np.zeros(4)))
-    assert encounter.in_conflict[:, 0].tolist() == [True, True, True, False]
-    assert encounter.separation[:3, 0] == pytest.approx([np.sqrt(2), 1.0, 1.0])

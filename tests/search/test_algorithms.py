@@ -4,12 +4,24 @@ from __future__ import annotations
 
 import random
 
+import moocore
 import numpy as np
 import pytest
+from deap import tools
+from hypothesis import given
+from hypothesis import strategies as st
+from jmetal.algorithm.multiobjective.nsgaii import NSGAII
+from jmetal.operator.crossover import SBXCrossover
+from jmetal.operator.mutation import PolynomialMutation
+from jmetal.problem import DTLZ2
+from jmetal.util.termination_criterion import StoppingByEvaluations
+from scipy.stats import mannwhitneyu
 
 from safevar_sumo.records import Evaluations, Outcome
-from safevar_sumo.search import ALGORITHMS
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.search import ALGORITHMS, Problem
+from safevar_sumo.search.nsga2 import _fitness, _Individual, _survivors, _tournament
+from safevar_sumo.search.safe_fuzzer import _improves, _Ranges, _scores
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.search.problems import POPULATION, SUN, begun, evaluated, searched, sphere
 
 
@@ -72,10 +84,233 @@ def test_a_setting_that_failed_never_gets_into_the_result(name: str) -> None:
     assert found.valid.all()
 
 
-def test_nothing_is_found_where_everything_fails(name: str) -> None:
-    def failing(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
-        lost = evaluated(characteristics, settings, np.full(len(settings), np.nan))
-        return Evaluations(settings=settings, outcome=np.full(len(settings), Outcome.SIMULATOR_ERROR.value), metrics=lost.metrics,
-                           collision_speed=lost.collision_speed, f_diff=lost.f_diff, f_num_diff=lost.f_num_diff)
+@pytest.mark.parametrize("name", ["nsga2", "rs"])
+def test_the_result_is_non_dominated(name: str) -> None:
+    found = searched(name, 7, 600)[0]
+    assert len(found) > 0
+    assert moocore.is_nondominated(found.objectives, keep_weakly=True).all()
 
-    assert len(searched(name, 1, 100, evaluate=failing)[0]) == 0
+
+def test_nsga2_finds_the_known_front_of_one_variable() -> None:
+    """Two conflicting objectives in one variable: everything between the original and the lower end is optimal."""
+    single = CharacteristicSet((Characteristic(name="c", unit="-", original=5.0, lower=1.0, upper=9.0),))
+
+    def linear(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
+        return evaluated(characteristics, settings, settings[:, 0].copy())
+
+    found = searched("nsga2", 1, 1000, single, linear)[0]
+    assert np.all(found.settings <= 5.0)
+    assert found.settings.min() == pytest.approx(1.0, abs=1e-3)
+    assert len(np.unique(found.settings)) > POPULATION / 2
+
+
+class _Dtlz2(Evaluations):
+    """Evaluations whose three objectives are those of the standard problem DTLZ2, not those of a vehicle."""
+
+    @property
+    def objectives(self) -> np.ndarray:
+        x, rest = self.settings[:, :2] - 1, self.settings[:, 2:] - 1
+        g = 1 + ((rest - 0.5) ** 2).sum(axis=1)
+        angles = x * np.pi / 2
+        return np.stack([g * np.cos(angles[:, 0]) * np.cos(angles[:, 1]), g * np.cos(angles[:, 0]) * np.sin(angles[:, 1]),
+                         g * np.sin(angles[:, 0])], axis=1)
+
+    def column(self, name: str) -> np.ndarray:
+        return self.objectives[:, ["f_safe", "f_diff", "f_num_diff"].index(name)]
+
+    def take(self, rows) -> Evaluations:  # type: ignore[no-untyped-def]
+        return _Dtlz2(**vars(super().take(rows)))
+
+
+def dtlz2(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
+    return _Dtlz2(**vars(evaluated(characteristics, settings, settings[:, 0])))
+
+
+def test_hypervolumes_are_those_of_jmetalpy_on_dtlz2() -> None:
+    """The package of the study used jMetalPy; ten runs each of the same settings do not differ significantly."""
+    variables, evaluations = 7, 3000
+
+    class Unfiltered(CharacteristicSet):
+        def filter(self, settings: np.ndarray) -> np.ndarray:
+            return settings
+
+    unit = Unfiltered(tuple(Characteristic(name=f"x{i}", unit="-", original=1.5, lower=1.0, upper=2.0) for i in range(variables)))
+    reference = np.full(3, 2.0)
+    ours, theirs = [], []
+    for seed in range(10):
+        found = _Dtlz2(**vars(searched("nsga2", seed, evaluations, unit, dtlz2)[0]))
+        ours.append(moocore.hypervolume(found.objectives, ref=reference))
+        random.seed(seed)
+        np.random.seed(seed)
+        problem = DTLZ2(number_of_variables=variables)
+        algorithm = NSGAII(problem=problem, population_size=POPULATION, offspring_population_size=POPULATION,
+                           mutation=PolynomialMutation(probability=1 / variables, distribution_index=20),
+                           crossover=SBXCrossover(probability=0.9, distribution_index=20),
+                           termination_criterion=StoppingByEvaluations(max_evaluations=evaluations))
+        algorithm.run()
+        front = np.array([solution.objectives for solution in algorithm.result()])
+        theirs.append(moocore.hypervolume(front[moocore.is_nondominated(front)], ref=reference))
+    assert mannwhitneyu(ours, theirs).pvalue > 0.05, (np.median(ours), np.median(theirs))
+
+
+def test_a_generation_is_fifty_and_changes_between_one_and_all() -> None:
+    _, asked = searched("safe_fuzzer", 1, 500)
+    assert [len(settings) for settings in asked] == [50] * 10
+    changed = np.concatenate([SUN.number_changed(settings) for settings in asked])
+    assert set(changed) == set(range(1, 13)), "k is uniform in 1..n before the first update"
+    assert np.bincount(changed.astype(int))[1:].min() > 500 / 12 / 2
+
+
+def test_values_are_uniform_outside_the_filters_band() -> None:
+    _, asked = searched("safe_fuzzer", 2, 500)
+    mass = np.concatenate(asked)[:, SUN.names.index("mass")]
+    drawn = mass[mass != 2404]
+    assert np.all(np.abs(drawn - 2404) >= 13.2)
+    below = (2404 - 13.2 - 2040) / (2700 - 2040 - 26.4)
+    assert np.mean(drawn < 2404) == pytest.approx(below, abs=0.1)
+
+
+def test_it_ends_after_five_generations_without_improvement() -> None:
+    single = CharacteristicSet((Characteristic(name="c", unit="-", original=5.0, lower=4.0, upper=6.0),))
+
+    def constant(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
+        return evaluated(characteristics, np.full_like(settings, 6.0), np.ones(len(settings)))
+
+    _, asked = searched("safe_fuzzer", 4, 5000, single, constant)
+    assert sum(len(settings) for settings in asked) == 500 + 5 * 50
+
+
+def test_an_improvement_begins_the_count_of_generations_without_one_anew() -> None:
+    single = CharacteristicSet((Characteristic(name="c", unit="-", original=5.0, lower=4.0, upper=6.0),))
+    generations = iter(range(1, 100))
+
+    def better_in_the_thirteenth(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
+        safety = 0.5 if next(generations) == 13 else 1.0
+        return evaluated(characteristics, np.full_like(settings, 6.0), np.full(len(settings), safety))
+
+    _, asked = searched("safe_fuzzer", 4, 5000, single, better_in_the_thirteenth)
+    assert len(asked) == 13 + 5
+
+
+def test_a_range_inside_the_filters_band_does_not_hang_it() -> None:
+    """The mean of the unsafe values lies so near the original that nothing outside the band is left."""
+    narrow = CharacteristicSet((Characteristic(name="c", unit="-", original=5.0, lower=4.95, upper=7.0),))
+    found, asked = searched("safe_fuzzer", 5, 1500, narrow)
+    assert len(found) == 50
+    assert sum(len(settings) for settings in asked) <= 1500
+
+
+def test_the_result_is_the_fifty_best_scores() -> None:
+    found, asked = searched("safe_fuzzer", 6, 1000)
+    everything = sphere(SUN, np.concatenate(asked))
+    safety = everything.f_safe
+    scores = (6 * (safety - safety.min()) / np.ptp(safety) + everything.f_diff + (everything.f_num_diff - 1) / 11) / 8
+    assert np.array_equal(found.settings, everything.settings[np.argsort(scores, kind="stable")[:50]])
+
+
+TWO = CharacteristicSet((Characteristic(name="a", unit="-", original=50.0, lower=0.0, upper=100.0),
+                         Characteristic(name="b", unit="-", original=50.0, lower=0.0, upper=100.0)))
+
+
+def individuals(*objectives: tuple[float, float, float]) -> list[_Individual]:
+    made = []
+    for values in objectives:
+        one = _Individual(list(values))
+        one.fitness = _fitness(3)(values)
+        made.append(one)
+    return made
+
+
+def test_survivors_are_the_better_ranks_and_of_the_last_rank_those_with_most_room() -> None:
+    """Room is the distance between both neighbours, each objective over its spread, here 4; the ends have infinitely much."""
+    front = individuals((0, 4, 1), (1, 3, 1), (1.5, 2.5, 1), (3, 1, 1), (4, 0, 1))
+    behind = individuals((5, 5, 1), (6, 6, 1))
+    kept = _survivors([*behind, *front], 4)
+    # (1, 3) has (1.5 - 0) / 4 + (4 - 2.5) / 4 = 0.75, (1.5, 2.5) has 1, (3, 1) has 1.25.
+    assert {tuple(one.fitness.values[:2]) for one in kept} == {(0, 4), (4, 0), (3, 1), (1.5, 2.5)}
+    assert {one.standing[0] for one in kept} == {0}
+    everybody = _survivors([*behind, *front], 7)
+    assert [one.standing[0] for one in everybody] == [0] * 5 + [1, 2]
+
+
+@given(st.lists(st.tuples(*[st.integers(-2, 2)] * 3), max_size=40), st.integers(1, 40))
+def test_survivors_are_those_of_deap(objectives: list[tuple[float, float, float]], number: int) -> None:
+    """The very same ones, in the same order: with ties of all kinds."""
+    ours, deaps = individuals(*objectives), individuals(*objectives)
+    fronts = tools.sortLogNondominated(deaps, number) if deaps else []
+    expected = []
+    for front in fronts:
+        tools.emo.assignCrowdingDist(front)
+        expected += sorted(front, key=lambda one: one.fitness.crowding_dist, reverse=True)
+    found = [next(i for i, one in enumerate(ours) if one is survivor) for survivor in _survivors(ours, number)]
+    assert found == [next(i for i, one in enumerate(deaps) if one is survivor) for survivor in expected[:number]]
+
+
+def test_a_tournament_is_won_by_rank_then_by_room() -> None:
+    better, worse = individuals((0, 0, 0), (1, 1, 1))
+    for one, rank, room in ((better, 0, 0.1), (worse, 1, 9.0)):
+        one.standing = rank, -room
+    assert all(_tournament([better, worse]) is better for _ in range(20))
+    worse.standing = 0, -9.0
+    assert all(_tournament([better, worse]) is worse for _ in range(20))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nsga2_returns_of_its_population_what_nothing_dominates(seed: int) -> None:
+    """After the first population alone most of it is dominated."""
+    found, asked = searched("nsga2", seed, POPULATION)
+    everything = sphere(SUN, asked[0])
+    optimal = everything.take(moocore.is_nondominated(everything.objectives, keep_weakly=True))
+    assert len(optimal) < POPULATION
+    assert sorted(map(tuple, found.objectives.tolist())) == sorted(map(tuple, optimal.objectives.tolist()))
+
+
+def test_random_search_keeps_all_of_equal_worth() -> None:
+    def equal(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
+        one = np.ones(len(settings))
+        return Evaluations(settings=settings, outcome=np.full(len(settings), Outcome.STOPPED.value, dtype="U16"),
+                           collision_speed=one * np.nan, metrics={"safety_degree": one}, f_diff=one, f_num_diff=one)
+
+    assert len(searched("rs", 1, 45, evaluate=equal)[0]) == 45
+
+
+def problem() -> Problem:
+    return Problem(characteristics=TWO, original=evaluated(TWO, TWO.original[np.newaxis], np.array([5.0])), evaluations=1000)
+
+
+def window(settings: list[list[float]], safety: list[float]) -> Evaluations:
+    return evaluated(TWO, np.array(settings), np.array(safety))
+
+
+def test_ranges_narrow_to_means_of_the_unsafe_alone_and_never_across_the_original() -> None:
+    ranges = _Ranges(problem())
+    ranges.narrow(window([[60, 50], [80, 40], [90, 10], [0, 0]], [4.0, 4.9, 5.0, 6.0]))
+    assert ranges.upper.tolist() == [70, 100]
+    assert ranges.lower.tolist() == [0, 40]
+
+
+@pytest.mark.parametrize(("settings", "most"), [([[60, 50], [60, 40]], 2), ([[60, 50], [60, 50], [60, 40]], 1), ([[60, 50]], 1)])
+def test_the_number_of_changes_is_rounded_half_up(settings: list[list[float]], most: int) -> None:
+    ranges = _Ranges(problem())
+    ranges.narrow(window(settings, [1.0] * len(settings)))
+    assert ranges.most_changed == most, "a mean of 1.5 makes 2, of 4/3 makes 1"
+
+
+def test_a_window_without_anything_unsafe_narrows_nothing() -> None:
+    ranges = _Ranges(problem())
+    ranges.narrow(window([[60, 40]], [5.0]))
+    assert ranges.upper.tolist() == [100, 100]
+    assert ranges.most_changed == 2
+
+
+def test_a_score_weighs_safety_six_times_and_the_others_once() -> None:
+    """SD 1, 2, 3 by min-max 0, 0.5, 1; numbers 1, 2, 2 of 2 give 0, 1, 1; changes 0.2, 0.4, 1."""
+    told = _scores(window([[60, 50], [70, 60], [100, 0]], [1.0, 2.0, 3.0]))
+    assert told == pytest.approx([0.2 / 8, (3 + 0.4 + 1) / 8, (6 + 1 + 1) / 8])
+
+
+def test_a_generation_improves_if_its_best_beats_the_worst_of_the_fifty_best() -> None:
+    earlier = window([[60, 50]] * 60, [float(i) for i in range(60)])
+    assert _improves(window([[60, 50]], [48.5]), earlier)
+    assert not _improves(window([[60, 50]], [49.0]), earlier)
+    assert not _improves(window([[60, 50]], [55.0]), earlier)

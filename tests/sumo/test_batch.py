@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from safevar_sumo.records import Evaluations, Outcome, Trace
-from safevar_sumo.study import load_study
-from safevar_sumo.sumo.batch import _Verdict
+from safevar_sumo.ads import ADS, GuardedAds, PerVehicle, ScalarAds
+from safevar_sumo.errors import EnvironmentFault
+from safevar_sumo.plugins import Guard
+from safevar_sumo.records import Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns, Trace
+from safevar_sumo.scenarios.base import Scene
+from safevar_sumo.study import Weather, load_study
+from safevar_sumo.sumo.batch import _Verdict, score
+from safevar_sumo.sumo.engine import Engine, open_world
+from safevar_sumo.sumo.kinematic import simulate_alone
 from safevar_sumo.sumo.matrix import evaluate, simulate
+from safevar_sumo.sumo.network import CopiedNetwork, copied_network
+from safevar_sumo.sumo.perception import Perception
 from safevar_sumo.sumo.system import System, assemble
 
 
@@ -78,28 +88,6 @@ def test_sumo_moves_the_vehicle_as_the_plant_says(any_system: System) -> None:
     assert np.allclose((trace.position[1:] - trace.position[0])[until], travelled[until], atol=1e-6)
 
 
-def test_the_sumo_type_is_that_of_the_setting() -> None:
-    import libsumo
-
-    from safevar_sumo.sumo.engine import open_world
-    from safevar_sumo.sumo.network import copied_network
-
-    for name in ("sun", "lgsvl", "native"):
-        system = assemble(load_study(name))
-        population = drawn(system, 4, 3)
-        values = dict(zip(system.characteristics.names, np.ascontiguousarray(population.T), strict=True))
-        types = system.vehicle.sumo_type(system.vehicle.prepare(values, 1.0, 0.05))
-        with open_world(copied_network(system.scenario.network, 4), 4) as world:
-            world.set_types(types)
-            world.depart()
-            for copy, vehicle in enumerate(world.ids("vut")):
-                told = [libsumo.vehicle.getMass(vehicle), libsumo.vehicle.getAccel(vehicle), libsumo.vehicle.getDecel(vehicle),
-                        libsumo.vehicle.getMaxSpeed(vehicle), libsumo.vehicle.getTau(vehicle)]
-                assert told == pytest.approx([values[copy] for values in types])
-        assert np.all(np.array(types) > 0)
-        assert types.mass.tolist() == values["mass"].tolist()
-
-
 def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool], float]:
     """Outcome, which samples are active, and the collision's speed of one vehicle: (speed, encounter over, speed of a collision)."""
     verdict, active = _Verdict(1), []
@@ -141,3 +129,183 @@ def test_no_sample_counts_once_the_encounter_is_over_but_a_collision_in_that_mom
 def test_the_last_sample_counts() -> None:
     assert judged((3, False, None), (3, False, None))[1] == [True, True]
     assert judged((3, False, None), (0, False, None))[0] == Outcome.STOPPED
+
+
+def both(system: System, settings: FloatArray) -> tuple[Evaluations, Evaluations]:
+    return score(system, settings, simulate(system, settings)), score(system, settings, simulate_alone(system, settings))
+
+
+@pytest.mark.parametrize("study", ["sun", "rain", "lgsvl"])
+def test_vehicles_beside_one_copy_do_what_they_do_in_copies_of_their_own(study: str) -> None:
+    system = assemble(load_study(study))
+    characteristics, rng = system.characteristics, np.random.default_rng(5)
+    settings = rng.uniform(characteristics.lower, characteristics.upper, (150, len(characteristics)))
+    copies, alone = both(system, settings)
+    assert np.array_equal(copies.outcome, alone.outcome)
+    for name, values in copies.metrics.items():
+        np.testing.assert_allclose(alone.metrics[name], values, atol=1e-9, err_msg=name)
+
+
+def test_collisions_are_those_that_sumo_finds() -> None:
+    """Brakes that come at every gap: hit by the front, by a corner, by the side, and missed."""
+    study = load_study("sun")
+    rng = np.random.default_rng(6)
+    found = []
+    for gap in rng.uniform(3.0, 9.0, 6):
+        ads = {**study.ads.parameters, "brake_gap": float(gap), "brake_gap_before": 1.0, "first_command": float(rng.uniform(0, 1.5))}
+        system = assemble(msgspec.structs.replace(study, ads=msgspec.structs.replace(study.ads, parameters=ads)))
+        characteristics = system.characteristics
+        copies, alone = both(system, rng.uniform(characteristics.lower, characteristics.upper, (40, len(characteristics))))
+        assert np.array_equal(copies.outcome, alone.outcome)
+        np.testing.assert_allclose(alone.collision_speed, copies.collision_speed, atol=1e-9)
+        found += copies.outcome.tolist()
+    assert 40 < found.count(Outcome.COLLISION) < 220
+
+
+class _Pedals:
+    """Drives vehicle i with a constant throttle of its own, and brakes it at a moment of its own."""
+
+    def __init__(self, throttle: np.ndarray, brakes_at: np.ndarray) -> None:
+        self._throttle, self._brakes_at = throttle, brakes_at
+
+    def start(self, n: int, nominal: Nominal, step: float) -> None:
+        return None
+
+    def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
+        brakes = seen.time >= self._brakes_at
+        return Command(np.where(brakes, 0.0, self._throttle), np.where(brakes, 1.0, 0.0)), memory
+
+
+def driven(study: str, n: int, brakes_until: float = 9.0) -> tuple[System, SimulationRuns]:
+    """The original vehicle n times, with pedals that make for n different encounters."""
+    system = assemble(load_study(study))
+    rng = np.random.default_rng(7)
+    ads = _Pedals(rng.uniform(0.3, 1.0, n), rng.uniform(1.5, brakes_until, n))
+    system = System(**{**{name: getattr(system, name) for name in System.__dataclass_fields__}, "ads": ads})
+    return system, simulate(system, np.repeat(system.characteristics.original[np.newaxis], n, axis=0))
+
+
+@pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
+def test_sumo_reports_a_collision_just_where_bodies_overlap(study: str) -> None:
+    _, run = driven(study, 120)
+    _held_against_geometry(study, run)
+    assert 10 < np.count_nonzero(run.outcome == Outcome.COLLISION) < 110
+
+
+def _held_against_geometry(study: str, run: SimulationRuns) -> None:
+    trace, collided = run.trace, run.outcome == Outcome.COLLISION
+    half_width, person, thickness = (2.1284 / 2, 0.478, 0.215) if study == "sun" else (1.85 / 2, 0.0, 0.0)
+    beside = np.abs(trace.lateral) <= half_width + thickness + 0.02 if study == "sun" else np.ones_like(trace.active)
+    within = (trace.gap < -0.02) & (trace.gap > -trace.vehicle_length - person + 0.02)
+    surely_beside = np.abs(trace.lateral) <= half_width - 0.02 if study == "sun" else beside
+    overlaps = (trace.active & within & surely_beside).any(axis=0)
+    touches = (trace.active & (trace.gap <= 0.02) & beside).any(axis=0)
+    assert np.all(collided[overlaps])
+    assert np.all(touches[collided])
+
+
+@pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
+def test_libsumo_and_traci_give_the_same_trace(study: str) -> None:
+    system = assemble(load_study(study))
+    settings = np.stack([system.characteristics.original, system.characteristics.upper])
+    here, socket = (simulate(system, settings, engine) for engine in (Engine.LIBSUMO, Engine.TRACI))
+    assert here.outcome.tolist() == socket.outcome.tolist()
+    for field in fields(Trace):
+        assert np.array_equal(getattr(here.trace, field.name), getattr(socket.trace, field.name)), field.name
+
+
+def test_broken_traffic_is_an_error_in_sumos_words(tmp_path: Path) -> None:
+    files = copied_network("lead_vehicle_stopped", 1)
+    broken = tmp_path / "traffic.rou.xml"
+    broken.write_text(files.traffic.read_text().replace("0.road", "nowhere"))
+    with pytest.raises(EnvironmentFault, match="nowhere"), open_world(CopiedNetwork(files.network, broken, files.options), 1) as world:
+        world.depart()
+    with open_world(files, 1) as world:  # and the process is as good as before
+        world.depart()
+
+
+STEP = 0.05
+TIMES = np.arange(12) * STEP
+
+
+def observed(delay: float) -> tuple[np.ndarray, np.ndarray]:
+    """Own speeds and (gap, closing speed, lateral, lateral speed) as seen over time, of one vehicle whose scene changes steadily."""
+    perception = Perception(Weather(name="any", road_friction=1.0, visibility=0.7, recognition_delay=delay), STEP)
+    seen = []
+    for time in TIMES:
+        scene = Scene(np.array([20 - 5 * time]), np.array([-3 + 2 * time]), np.array([2 + time]), np.zeros(1, dtype=bool))
+        seen.append(perception.observe(float(time), np.array([5 + time]), scene))
+    assert all(one.visibility == 0.7 for one in seen)
+    return (np.array([one.speed[0] for one in seen]),
+            np.array([[values[0] for values in (one.gap, one.closing_speed, one.lateral, one.lateral_speed)] for one in seen]))
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.05, 0.0863, 0.1, 0.15])
+def test_the_scene_is_seen_late_and_the_own_speed_at_once(delay: float) -> None:
+    speed, scene = observed(delay)
+    then = np.maximum(TIMES - delay, 0.0)
+    assert speed == pytest.approx(5 + TIMES)
+    if delay in (0.05, 0.15):
+        assert np.array_equal(scene[4:], observed(0.0)[1][4 - round(delay / STEP):-round(delay / STEP)]), "whole steps are exact"
+    assert scene == pytest.approx(np.stack([20 - 5 * then, 5 + then, -3 + 2 * then, 2 + then], axis=1))
+
+
+def test_what_appears_between_two_steps_is_not_there_yet() -> None:
+    perception = Perception(Weather(name="any", road_friction=1.0, visibility=1.0, recognition_delay=0.03), STEP)
+    nothing = np.zeros(1)
+    gaps = [perception.observe(time, nothing, Scene(np.array([gap]), nothing, nothing, nothing > 0)).gap[0]
+            for time, gap in zip(TIMES.tolist(), [np.inf, np.inf, 5.0, 4.0], strict=False)]
+    assert gaps == pytest.approx([np.inf, np.inf, np.inf, 4.6])
+
+
+def pressed(hesitation: float, wanted: list[float]) -> list[float]:
+    """How hard one vehicle brakes that wants to brake so hard."""
+    perception = Perception(Weather(name="any", road_friction=1.0, visibility=1.0, hesitation=hesitation), STEP)
+    return [float(perception.braked(Command(np.ones(1), np.array([brake]))).brake[0]) for brake in wanted]
+
+
+def test_who_hesitates_brakes_later_and_lets_go_at_once() -> None:
+    wanted = [0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.2, 0.0, 0.0]
+    assert pressed(0.0, wanted) == wanted
+    assert pressed(0.1, wanted) == [0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.2, 0.0, 0.0]
+    assert pressed(0.12, wanted) == pytest.approx([0.0, 0.0, 0.0, 0.0, 0.6, 1.0, 1.0, 0.2, 0.0, 0.0])
+
+
+class Careful:
+    """An ADS from outside that writes its commands into the same arrays again and again."""
+
+    def start(self, n: int, nominal: Nominal, step: float) -> Command:
+        return Command(np.zeros(n), np.zeros(n))
+
+    def drive(self, seen: Observation, memory: Command) -> tuple[Command, Command]:
+        memory.throttle[:], memory.brake[:] = np.where(seen.gap < 6, 0.0, 0.6), seen.gap < 6
+        return memory, memory
+
+
+class CarefulForOne(ScalarAds):
+    """The same for one vehicle."""
+
+    def drive(self, seen: Observation) -> tuple[float, float]:
+        return (0.0, 1.0) if seen.gap < 6 else (0.6, 0.0)
+
+
+def test_anybodys_ads_hesitates_whatever_it_does_with_its_arrays() -> None:
+    rain, guard = assemble(load_study("rain")), Guard("a test", "ads")
+    assert rain.weather.hesitation > 0
+    settings = np.tile(rain.characteristics.original, (3, 1))
+    guarded = GuardedAds(Careful(), guard), PerVehicle(CarefulForOne, guard)
+    many, each = (simulate(replace(rain, ads=ads), settings).trace for ads in guarded)
+    assert np.array_equal(many.brake, each.brake)
+    assert np.array_equal(many.speed, each.speed)
+    released, braked = (int(np.argmax(column)) for column in (many.gap[:, 0] < 6, many.brake[:, 0] == 1))
+    assert braked - released == np.ceil(rain.weather.hesitation / many.step)
+
+
+@pytest.mark.parametrize("name", ["competent_driver", "full_braking", "fuzzy_safety", "r157", "rss"])
+def test_a_driver_with_reactions_of_its_own_does_not_wait_like_world_on_rails(name: str) -> None:
+    """The study rain is sun but for its weather, of which nothing but the reactions differs from clear: these drive as in sun."""
+    rain, sun = (assemble(load_study(study)) for study in ("rain", "sun"))
+    driver = ADS[name](cruise_speed=5.5)
+    wet, dry = (simulate(replace(one, ads=driver), one.characteristics.original[np.newaxis]).trace for one in (rain, sun))
+    assert dry.brake.max() > 0
+    assert np.array_equal(wet.position, dry.position)

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import msgspec
 import numpy as np
 import pytest
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Evaluations
+from safevar_sumo.records import Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns
+from safevar_sumo.scenarios import Crossing, Scenario
+from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, Study, load_study
 from safevar_sumo.sumo import matrix
 from safevar_sumo.sumo.batch import score
-from safevar_sumo.sumo.matrix import at_every_point, evaluate, named_point, simulate
+from safevar_sumo.sumo.contact import touch_of
+from safevar_sumo.sumo.matrix import at_every_point, evaluate, named_point, simulate, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.world import Body
 
 BASE = load_study("euro_ncap_pedestrian")
 TESTS = [
@@ -77,17 +84,6 @@ def test_a_point_is_named() -> None:
         named_point(SYSTEM, "CPNCO", "--point")
 
 
-def test_who_names_no_point_is_told_the_nearest_ones_and_how_many_there_are() -> None:
-    with pytest.raises(InputError) as told:
-        named_point(assemble(load_study("euro_ncap_pedestrian")), "CPNA, speed 50", "--point")
-    ahead, _, names = told.value.legal.partition(": ")
-    assert ahead == "one of 72 points, the nearest of them"
-    assert all(name.startswith("CPNA, speed 50, ") for name in names.split("; "))
-    assert len(names.split("; ")) == matrix.NEAREST
-    with pytest.raises(InputError, match="a study with a matrix"):
-        named_point(assemble(load_study("sun")), "CPNA", "--point")
-
-
 @pytest.mark.parametrize(("tests", "told"), [
     ([TESTS[2], TESTS[2]], "2 points are 'CPLA"),
     ([MatrixTest(name="x", over={"spede": [1]})], "spede"),
@@ -98,3 +94,130 @@ def test_who_names_no_point_is_told_the_nearest_ones_and_how_many_there_are() ->
 def test_what_is_wrong_in_a_matrix_is_told(tests: list[MatrixTest], told: str) -> None:
     with pytest.raises(InputError, match=told):
         assemble(study(tests))
+
+
+SUN = assemble(load_study("sun"))
+WEAK = replace(SUN, vehicle=msgspec.structs.replace(SUN.vehicle, engine_torque=0.5))  # type: ignore[type-var]
+MAX_RPM = SUN.characteristics.names.index("max_rpm")
+EAST = np.array([1.0, 0.0])
+
+
+class Pedals:
+    """Gas and brake over time [s]."""
+
+    def __init__(self, throttle: float = 0.5, *, brakes: tuple[float, float] = (99.0, 99.0), lets_go: float = 99.0) -> None:
+        self._throttle, self._brakes, self._lets_go = throttle, brakes, lets_go
+
+    def start(self, n: int, nominal: Nominal, step: float) -> Any:
+        return None
+
+    def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
+        brakes, nothing = self._brakes[0] <= seen.time < self._brakes[1], np.zeros_like(seen.speed)
+        throttle = 0.0 if brakes or seen.time >= self._lets_go else self._throttle
+        return Command(nothing + throttle, nothing + (0.5 if brakes else 0.0)), memory
+
+
+def run(scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = SUN) -> SimulationRuns:
+    system = replace(system, scenario=scenario, ads=ads or Pedals())
+    return simulate(system, system.characteristics.original[np.newaxis] if settings is None else settings)
+
+
+def with_max_rpm(*values: float) -> FloatArray:
+    settings = np.tile(SUN.characteristics.original, (len(values), 1))
+    settings[:, MAX_RPM] = values
+    return settings
+
+
+@pytest.mark.parametrize(("scenario", "settings"), [
+    (Crossing(test="CPFA", speed=50.0), with_max_rpm(5800, 6567, 6570, 6575)),
+    (CarToCar(test="CCRm", speed=70.0), with_max_rpm(4200, 5800, 7000))])
+def test_unbraked_a_vehicle_holds_the_tests_speed_in_one_gear_and_hits_with_its_front(scenario: Any, settings: FloatArray) -> None:
+    found = run(scenario, settings=settings)
+    speed = np.where(found.trace.active, found.trace.speed * 3.6, scenario.speed)
+    assert speed.max() < scenario.speed + 1.0
+    assert speed.min() > scenario.speed - 0.5
+    assert (found.trace.gear == found.trace.gear[0]).all(where=found.trace.active)
+    assert set(found.contact.side) == {"front"}
+    assert found.contact.place == pytest.approx(np.full(len(settings), 50.0), abs=2.0)
+
+
+@pytest.mark.parametrize("location", [0.0, 25.0, 75.0])
+def test_the_place_of_an_unbraked_contact_is_the_tests_impact_location(location: float) -> None:
+    scenarios = (Crossing(test="CPNA", speed=40.0, impact_location=location), Crossing(test="CPFA", speed=40.0, impact_location=location),
+                 CarToCar(test="CCRs", speed=40.0, impact_location=location))
+    for scenario in scenarios:
+        contact = run(scenario).contact
+        assert contact.side[0] == "front"
+        assert contact.place[0] == pytest.approx(location, abs=1.0)
+
+
+def test_what_cannot_hold_the_speed_is_no_valid_test_and_one_that_brakes_before_is() -> None:
+    """2404 kg g sin(atan 0.2) 0.355 m / (1.35 * 4), 304 N m, is more than the engine's 500 N m times 0.5."""
+    steep = CarToCar(test="CCRs", speed=50.0, grade=20.0)
+    found = run(steep, system=WEAK)
+    assert found.outcome[0] == Outcome.INVALID_TEST
+    assert found.test_speed_error[0] * 3.6 < -0.5
+    assert np.isnan(found.collision_speed[0])
+    assert run(steep, Pedals(brakes=(0.0, 99.0)), system=WEAK).outcome[0] == Outcome.STOPPED
+
+
+def test_a_setting_with_an_invalid_test_is_neither_safe_nor_unsafe_but_a_collision_elsewhere_stands() -> None:
+    tests = [MatrixTest(name="CCRs", parameters={"test": "CCRs", "grade": 20.0}, over={"speed": [10, 50]})]
+    steep = assemble(msgspec.structs.replace(load_study("euro_ncap_car_to_car"), matrix=MatrixTable(tests=tests)))
+    steep = replace(steep, vehicle=WEAK.vehicle)
+    original = SUN.characteristics.original[np.newaxis]
+    assert [str(one.evaluations.outcome[0]) for one in at_every_point(steep, original)] == ["stopped", "invalid-test"]
+    found = evaluate(steep, original)
+    assert found.outcome[0] == Outcome.INVALID_TEST
+    assert not found.valid[0]
+    assert not found.failed[0]
+    assert np.isnan(found.f_safe[0])
+    assert evaluate(replace(steep, ads=Pedals()), original).outcome[0] == Outcome.COLLISION, "at 10 km/h, where the speed is held"
+
+
+def test_a_system_that_lets_go_of_the_accelerator_or_brakes_has_the_vehicle() -> None:
+    far = CarToCar(test="CCRs", speed=50.0, headway=20.0)
+    coasts = run(far, Pedals(lets_go=2.0))
+    assert coasts.outcome[0] != Outcome.INVALID_TEST
+    assert coasts.trace.throttle[41:, 0].max() == 0
+    faster = run(far, Pedals(1.0, brakes=(1.0, 1.1)))
+    assert abs(faster.test_speed_error[0]) * 3.6 < 0.5
+    assert faster.trace.speed.max() * 3.6 > 60
+
+
+def test_who_walks_into_the_side_is_listed_and_no_collision() -> None:
+    """It brakes for a moment, then drives faster than its test: the pedestrian from the far side, the left, meets the second half."""
+    found = run(Crossing(test="CPFA", speed=40.0, impact_location=0.0), Pedals(0.55, brakes=(0.0, 0.05)))
+    assert found.outcome[0] == Outcome.PASSED
+    assert np.isnan(found.collision_speed[0])
+    assert found.contact.side[0] == "left"
+    lateral, gap = found.trace.lateral[:, 0], found.trace.gap[:, 0]
+    touched = int(np.argmax(lateral > -(2.1284 + 0.6) / 2))
+    share = (-(2.1284 + 0.6) / 2 - lateral[touched - 1]) / (lateral[touched] - lateral[touched - 1])
+    behind = -(gap[touched - 1] + share * (gap[touched] - gap[touched - 1]) + 0.5 / 2)
+    assert found.contact.place[0] == pytest.approx(100 * behind / 4.9016, abs=0.5)
+
+
+@pytest.mark.parametrize(("middle", "along", "speed", "told"), [
+    # own: 4 m by 2 m at the origin, east at 10 m/s; the other: 0.6 m by 0.4 m
+    ((2.1, 0.0), (0.0, 1.0), 0.0, ("front", 0.01, 0.0)),  # reach 2 + 0.2; overlaps by 0.1
+    ((2.1, -1.2), (0.0, 1.0), 1.0, ("front", 0.01, 0.0)),  # across since 0.1 s, along since 0.01 s
+    ((1.0, -1.25), (0.0, 1.0), 1.0, ("right", 0.05, None)),  # along since 0.12 s, across by 0.05 m at 1 m/s
+    ((-1.0, 1.25), (0.0, -1.0), 1.0, ("left", 0.05, None)),
+    ((-2.2, 0.0), (1.0, 0.0), 12.0, ("rear", 0.05, None)),  # 2 m/s faster, reach 2 + 0.3
+])
+def test_the_side_is_the_one_in_which_bodies_began_to_overlap_last(
+        middle: tuple[float, float], along: tuple[float, float], speed: float, told: tuple[str, float, float | None]) -> None:
+    touch = touch_of(Body(np.zeros(2), EAST, 4.0, 2.0, 10.0), Body(np.array(middle), np.array(along), 0.6, 0.4, speed))
+    assert touch.side == told[0]
+    assert touch.ago == pytest.approx(told[1])
+    if told[2] is not None:
+        assert touch.behind_front == pytest.approx(told[2] - 0.2)
+
+
+def test_who_tests_a_vehicle_faster_than_it_was_fitted_is_told() -> None:
+    (remark,) = vehicle_remarks(assemble(load_study("euro_ncap_pedestrian")))
+    assert "22 km/h" in remark
+    assert "60 km/h" in remark
+    assert not vehicle_remarks(SUN)
+    assert not vehicle_remarks(assemble(load_study("wear")))

@@ -15,8 +15,8 @@ import sumo
 
 from safevar_sumo.errors import EnvironmentFault, InputError
 from safevar_sumo.shipped import NETWORKS
-from safevar_sumo.sumo import network
-from safevar_sumo.sumo.network import copied_network
+from safevar_sumo.sumo.engine import open_world
+from safevar_sumo.sumo.network import check_network, copied_network
 
 FOLDERS = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
 BINARIES = Path(sumo.SUMO_HOME) / "bin"
@@ -88,32 +88,11 @@ def test_a_disk_that_is_full_while_a_network_is_built_leaves_nothing_behind(loss
     ElementTree.parse(copied_network("lead_vehicle_stopped", n).network)
 
 
-def test_another_recipe_or_builder_is_another_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    before = copied_network("lead_vehicle_stopped", 1).network
-    monkeypatch.setattr(network, "RECIPE", ("--xml-validation", "never", "--junctions.corner-detail", "3"))
-    network._digest.cache_clear()
-    assert copied_network("lead_vehicle_stopped", 1).network != before
-    monkeypatch.setattr(network, "netconvert_version", lambda: "1.99.0")
-    network._digest.cache_clear()
-    assert "lead" in str(copied_network("lead_vehicle_stopped", 1).network)
-    monkeypatch.undo()
-    network._digest.cache_clear()
-
-
 def test_a_cache_that_cannot_be_written_is_the_surroundings_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path / "file")
     with pytest.raises(EnvironmentFault, match="cannot write the cache of networks"):
         copied_network("lead_vehicle_stopped", 1)
-
-
-def test_a_users_folder_serves_as_well_and_its_content_counts(tmp_path: Path) -> None:
-    mine = tmp_path / "mine"
-    shutil.copytree(NETWORKS / "lead_vehicle_stopped", mine)
-    before = copied_network(str(mine), 1).traffic
-    traffic = mine / "traffic.rou.xml"
-    traffic.write_text(traffic.read_text().replace('departPos="85"', 'departPos="90"').replace('endPos="85"', 'endPos="90"'))
-    assert copied_network(str(mine), 1).traffic != before
 
 
 def test_sources_that_netconvert_refuses_are_an_error(tmp_path: Path) -> None:
@@ -125,3 +104,105 @@ def test_sources_that_netconvert_refuses_are_an_error(tmp_path: Path) -> None:
     (mine / "network.edg.xml").write_text("<edges>")
     with pytest.raises(InputError, match="tags were ended"):
         copied_network(str(mine), 1)
+
+
+CAR = '<vType id="car" speedDev="0" sigma="0"/><vType id="walker" vClass="pedestrian" speedDev="0"/>'
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    shutil.copytree(NETWORKS / "pedestrian_crossing", tmp_path / "mine")
+    return tmp_path / "mine"
+
+
+def with_traffic(mine: Path, more: str) -> str:
+    file = mine / "traffic.rou.xml"
+    file.write_text(file.read_text().replace("</routes>", f"{CAR}{more}</routes>"))
+    return str(mine)
+
+
+GOOD = {
+    "a flow": '<flow id="f" type="car" from="oncoming" to="oncoming_on" begin="0" end="9" period="3"/>',
+    "a flow on a route": '<route id="r" edges="oncoming"/><flow id="f" type="car" route="r" begin="0" end="9" number="2"/>',
+    "a trip": '<trip id="t" type="car" depart="0" from="oncoming" to="oncoming_on"/>',
+    "a trip by a via": '<trip id="t" type="car" depart="0" from="oncoming" via="oncoming" to="oncoming_on"/>',
+    "a late vehicle": '<vehicle id="t" type="car" depart="0:0:2"><route edges="oncoming"/><stop edge="oncoming" duration="1"/></vehicle>',
+    "a person's trip": '<person id="w" type="walker" depart="0"><personTrip from="footpath" to="footpath_on"/></person>',
+    "a flow of persons":
+        '<personFlow id="w" type="walker" begin="0" end="4" period="2"><walk from="footpath" to="footpath_on"/></personFlow>',
+    "stop and walk": '<person id="w" type="walker" depart="0"><stop lane="footpath_0" duration="2"/><walk edges="footpath"/></person>',
+    "parameters": '<vehicle id="v" type="car" depart="0"><route edges="oncoming"/><param key="note" value="approach"/></vehicle>',
+}
+
+
+@pytest.mark.parametrize("what", sorted(GOOD))
+def test_it_drives_in_every_copy(mine: Path, what: str) -> None:
+    network = with_traffic(mine, GOOD[what])
+    check_network(network)
+    with open_world(copied_network(network, 2), 2) as world:
+        world.depart()
+        seen: set[str] = set()
+        for _ in range(60):
+            world.api.simulationStep()
+            there = world.whereabouts()
+            first, second = ({name[2:]: place for name, place in there.items() if name.startswith(copy)} for copy in ("0.", "1."))
+            assert first == second
+            seen |= set(first)
+        assert seen > {"vut", "pedestrian"}
+
+
+BAD = {
+    "random kinds of vehicles": ('<vTypeDistribution id="d"><vType id="x"/></vTypeDistribution>', "routes has a 'vTypeDistribution'"),
+    "random routes": ('<routeDistribution id="d"/>', "routes has a 'routeDistribution'"),
+    "a calibrator": ('<calibrator id="c" edge="approach"/>', "routes has a 'calibrator'"),
+    "a rerouter": ('<rerouter id="c" edges="approach"/>', "routes has a 'rerouter'"),
+    "a container": ('<container id="c" depart="0"/>', "routes has a 'container'"),
+    "a bus stop": ('<vehicle id="v" type="car" depart="0"><route edges="oncoming"/><stop busStop="b" duration="1"/></vehicle>',
+                   "stop: busStop = 'b'"),
+    "another file": ('<include href="more.rou.xml"/>', "includes another file"),
+    "a random flow": (
+        '<flow id="f" type="car" from="oncoming" begin="0" end="9" probability="0.5"/>', "probability = '0.5' draws at random"),
+    "a Poisson flow": ('<flow id="f" type="car" from="oncoming" begin="0" end="9" period="exp(0.5)"/>', "period = 'exp(0.5)' draws"),
+    "a random place": ('<trip id="t" type="car" from="oncoming" depart="0" departPos="random"/>', "departPos = 'random' draws at random"),
+    "SUMO's default type": ('<trip id="t" from="oncoming" depart="0"/>', "trip 't' has no type"),
+    "random speeds": ('<vType id="r" sigma="0"/><trip id="t" type="r" from="oncoming" depart="0"/>', "speedDev = SUMO default 0.1"),
+    "random driving": ('<vType id="r" speedDev="0"/><trip id="t" type="r" from="oncoming" depart="0"/>', "sigma = SUMO default 0.5"),
+    "a random model": ('<vType id="r" speedDev="0" carFollowModel="EIDM"/><trip id="t" type="r" from="oncoming" depart="0"/>', "'EIDM'"),
+    "a device": ('<vType id="r"><param key="has.ssm.device" value="true"/></vType>', "param 'has.ssm.device' gives a device"),
+    "no such edge": ('<trip id="t" type="car" from="nowhere" depart="0"/>', "trip 't': from = 'nowhere' is not there"),
+    "no such type": ('<trip id="t" type="lorry" from="oncoming" depart="0"/>', "trip 't': type = 'lorry' is not there"),
+    "no such route": ('<vehicle id="v" type="car" route="r" depart="0"/>', "vehicle 'v': route = 'r' is not there"),
+    "an id twice": ('<trip id="vut" type="car" from="oncoming" depart="0"/>', "trip has the id 'vut'"),
+    "the tested type for others": (
+        '<trip id="t" type="vut" from="oncoming" depart="0"/>', "type = 'vut', which changes with every setting"),
+    "a place beyond the road": (
+        '<trip id="t" type="car" from="oncoming" depart="0" departPos="900"/>', "departPos = 900 is not on 'oncoming'"),
+    "a stop beyond the road": (
+        '<trip id="t" type="car" from="oncoming" depart="0"><stop lane="oncoming_0" endPos="99"/></trip>', "endPos = 99 is not on"),
+    "a ride": ('<person id="w" type="walker" depart="0"><ride from="approach" to="departure" lines="vut"/></person>', "has a 'ride'"),
+    "a departure by chance": ('<trip id="t" type="car" from="oncoming" depart="triggered"/>', "depart = 'triggered'"),
+    "junction to junction": ('<trip id="t" type="car" depart="0" fromJunction="east" toJunction="west"/>', "fromJunction = 'east'"),
+    "district to district": ('<trip id="t" type="car" fromTaz="a" toTaz="b" depart="0"/>', "fromTaz = 'a'"),
+}
+
+
+@pytest.mark.parametrize("what", sorted(BAD))
+def test_it_is_refused_by_name(mine: Path, what: str) -> None:
+    more, told = BAD[what]
+    with pytest.raises(InputError, match=r"traffic\.rou\.xml: ") as caught:
+        check_network(with_traffic(mine, more))
+    assert told in str(caught.value)
+
+
+@pytest.mark.parametrize(("old", "new", "told"), [
+    ('<vehicle id="vut"', '<vehicle id="ego"', "has no vehicle 'vut'"),
+    ('id="vut" type="vut" depart="0"', 'id="vut" type="vut" depart="3"', "depart = '3'"),
+    ('id="vut" type="vut" depart', 'id="vut" type="pedestrian" depart', "type = 'pedestrian'"),
+    ('<route edges="approach departure"/>', '<route edges="approach departure"/><stop lane="departure_0" duration="9"/>', "has a stop")])
+def test_the_vehicle_under_test_is_there_from_the_beginning(mine: Path, old: str, new: str, told: str) -> None:
+    file = mine / "traffic.rou.xml"
+    assert old in file.read_text()
+    file.write_text(file.read_text().replace(old, new))
+    with pytest.raises(InputError) as caught:
+        check_network(str(mine))
+    assert told in str(caught.value)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import subprocess
 import xml.etree.ElementTree as ElementTree
@@ -12,14 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sumo
-from msgspec import structs
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo import matrix
-from safevar_sumo.sumo.matrix import evaluate, simulate
-from safevar_sumo.sumo.network import built_network, check_network, copied_network, lanes_of, network_fingerprint
+from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.network import built_network, check_network, copied_network, network_fingerprint
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.traffic import repeatable_traffic
 
@@ -45,14 +42,6 @@ def on(study: str, network: Path) -> System:
 
 def roads(network: Path, n: int = 1) -> ElementTree.Element:
     return ElementTree.parse(copied_network(str(network), n).network).getroot()
-
-
-def test_results_of_the_networks_name_do_not_hide_it(mine: Path) -> None:
-    (mine.parent / "results" / "mine").mkdir(parents=True)
-    study = load_study("sun", scenario={"parameters": {"network": "mine"}})
-    places = (str(mine.parent / "results"), str(mine.parent))
-    system = assemble(structs.replace(study, origin=structs.replace(study.origin, places=places)))
-    assert system.scenario.network == str(mine)
 
 
 def test_edge_types_of_a_file_of_their_own_count(mine: Path) -> None:
@@ -143,19 +132,6 @@ def test_options_of_sumo_that_are_not_honoured_are_refused(mine: Path, old: str,
     assert told in str(caught.value)
 
 
-@pytest.mark.parametrize(("old", "new", "told"), [
-    ("</net>", '<tlLogic id="t" type="static"><condition id="c" value="1"/></tlLogic></net>', "has a 'condition'"),
-    ("</net>", '<tlLogic id="t" type="actuated"><param key="file" value="x.xml"/></tlLogic></net>', "has the parameter 'file'"),
-    ("</net>", '<busStop id="b" lane="approach_0"/></net>', "has a 'busStop'"),
-    ("<location", "<include href='a.xml'/><location", "includes another file")])
-def test_what_cannot_be_copied_of_a_built_network_is_refused(mine: Path, old: str, new: str, told: str) -> None:
-    shutil.copy(mine / "network.net.xml", mine / "town.net.xml")
-    rewritten(mine / "town.net.xml", old, new)
-    with pytest.raises(InputError, match=r"town\.net\.xml: ") as caught:
-        check_network(str(mine / "town.net.xml"))
-    assert told in str(caught.value)
-
-
 @pytest.mark.parametrize(("file", "old", "new", "told"), [
     ("network.nod.xml", 'x="80" y="0"', 'x="80" y="0" z="4"', "lane 'departure_0', which climbs"),
     ("network.edg.xml", 'id="approach"', 'id="approach" friction="0.3"', "lane 'approach_0' of friction 0.3")])
@@ -166,21 +142,6 @@ def test_a_road_that_the_vehicle_would_not_feel_is_refused(mine: Path, file: str
     assert told in str(caught.value)
 
 
-@pytest.mark.parametrize(("file", "old", "new", "problem"), [
-    ("scenario.sumocfg", r'step-length value="[^"]*"', 'step-length value="0"', "scenario.sumocfg: step-length = '0'"),
-    ("scenario.sumocfg", r'step-length value="[^"]*"', 'step-length value="1e9"', "scenario.sumocfg: step-length = '1e9'"),
-    ("traffic.rou.xml", r'id="vut"(.*) length="[^"]*"', r'id="vut"\1 length="-4"', "traffic.rou.xml: vType 'vut': length = '-4'"),
-    ("network.edg.xml", r'id="approach"', r'id="approach" length="-20"', "network.edg.xml: edge 'approach': length = '-20'"),
-    ("scenario.sumocfg", r'collision.action value="[^"]*"', 'collision.action value="stop"', "Invalid collision.action 'stop'")])
-def test_numbers_that_nothing_can_have_are_refused(mine: Path, file: str, old: str, new: str, problem: str) -> None:
-    text, replaced = re.subn(old, new, (mine / file).read_text(), count=1)
-    assert replaced
-    (mine / file).write_text(text)
-    with pytest.raises(InputError) as caught:
-        check_network(str(mine))
-    assert problem in str(caught.value)
-
-
 def test_what_a_network_says_of_the_vehicle_and_is_not_used_is_mentioned(mine: Path) -> None:
     assert on("sun", mine).remarks == []
     rewritten(mine / "network.edg.xml", 'id="approach" from="west" to="crossing" numLanes="1" width="4" speed="70"',
@@ -189,26 +150,6 @@ def test_what_a_network_says_of_the_vehicle_and_is_not_used_is_mentioned(mine: P
     (remark,) = on("sun", mine).remarks
     assert remark.startswith(f"{mine / 'traffic.rou.xml'}: not used of vehicle 'vut': carFollowModel = IDM, speedFactor = 0.8, accel = 3, "
                              "the speed limit of lane 'approach_0' (8.33 m/s)")
-
-
-@pytest.mark.parametrize(("file", "old", "new", "told"), [
-    ("traffic.rou.xml", 'person id="pedestrian"', 'person id="walker"', "Person '0.pedestrian' is not known"),
-    ("network.con.xml", "<crossing node", "<!--", "Lane ':0.crossing_c0_0' is not known")])
-def test_what_a_scenario_does_not_find_is_told(mine: Path, file: str, old: str, new: str, told: str) -> None:
-    rewritten(mine / file, old, new)
-    if file == "network.con.xml":
-        rewritten(mine / file, 'width="0.65"/>', "-->")
-    with pytest.raises(InputError, match="the scenario does not find what it looks for") as caught:
-        simulate(on("smoke", mine), load_original("smoke"))
-    assert told in str(caught.value)
-
-
-def test_a_built_network_that_sumo_dies_of_is_refused(mine: Path) -> None:
-    for name in ("network.nod.xml", "network.edg.xml", "network.con.xml", "network.netccfg"):
-        (mine / name).unlink()
-    rewritten(mine / "network.net.xml", ' via=":crossing_0_0"', "")
-    with pytest.raises(InputError, match=r"network\.net\.xml: SUMO cannot load it: it dies"):
-        check_network(str(mine))
 
 
 def test_every_id_of_a_built_network_is_its_copys_alone(tmp_path: Path) -> None:
@@ -228,13 +169,3 @@ def test_every_id_of_a_built_network_is_its_copys_alone(tmp_path: Path) -> None:
     assert originals
     assert not originals & kept
     assert len(root.findall("edge")) == 2 * len(plain.findall("edge"))
-
-
-def test_a_network_of_many_lanes_is_simulated_in_parts(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    system = on("smoke", mine)
-    settings = np.vstack([system.characteristics.original * (1 + 0.01 * i) for i in range(5)])
-    whole = evaluate(system, settings)
-    monkeypatch.setattr(matrix, "LARGEST_ROADS", 2 * lanes_of(str(mine)))
-    parts = evaluate(system, settings)
-    assert parts.outcome.tolist() == whole.outcome.tolist()
-    assert all(np.array_equal(values, parts.metrics[name], equal_nan=True) for name, values in whole.metrics.items())

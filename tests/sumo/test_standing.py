@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import libsumo
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -99,11 +98,6 @@ def changed_network(folder: Path, network: str, **changes: tuple[str, str]) -> s
     return str(mine)
 
 
-def on_network(name: str, network: str) -> System:
-    system = SYSTEMS[name]
-    return replace(system, scenario=msgspec.structs.replace(system.scenario, network=network))
-
-
 @settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(batches=st.lists(st.tuples(st.sampled_from(sorted(SYSTEMS)), st.integers(1, 12), st.booleans()), min_size=2, max_size=5),
        seed=st.integers(0, 2**32 - 1))
@@ -138,29 +132,6 @@ def test_after_a_failure_it_starts_afresh(loadings: list[str]) -> None:
     assert len(loadings) == 1
 
 
-OTHERS = """
-    <vehicle id="leaves" type="parked" depart="0" departLane="1" departPos="{end}" departSpeed="10"><route edges="road"/></vehicle>
-    <vehicle id="waits" type="parked" depart="0" departLane="1" departPos="60" departSpeed="0" color="1,0,0"><route edges="road"/></vehicle>
-    <vehicle id="beside" type="parked" depart="0" departLane="0" departPos="40" departSpeed="0">
-        <route edges="road"/><stop lane="road_0" startPos="35" endPos="40" duration="3" parking="true"/>
-    </vehicle>
-    <vehicle id="vut\""""
-
-
-def test_actors_that_arrived_or_were_teleported_come_back(tmp_path: Path, loadings: list[str]) -> None:
-    """One leaves the road, one is taken off it after a wait behind the parked one, one parks for a while beside it."""
-    network = changed_network(
-        tmp_path, "lead_vehicle_stopped", traffic=('\n    <vehicle id="vut"', OTHERS.format(end=100)),
-        scenario=("<processing>", '<processing><time-to-teleport value="4"/>'))
-    system = on_network("lgsvl", network)
-    assert repeatable_traffic(network) is not None
-    asked = [drawn(system, n, n) for n in (7, 4, 10)]
-    here = [simulate(system, population) for population in asked]
-    assert len(loadings) == 1
-    for one, population in zip(here, asked, strict=True):
-        assert bits(one) == bits(fresh(system, population))
-
-
 UNREPEATABLE: dict[str, dict[str, tuple[str, str]]] = {
     "a flow": {"traffic": ("</routes>", '<flow id="f" type="parked" from="road" to="road" begin="0" end="9" number="2"/></routes>')},
     "a trip": {"traffic": ("</routes>", '<trip id="t" type="parked" from="road" to="road" depart="0"/></routes>')},
@@ -184,18 +155,6 @@ def test_what_cannot_be_put_back_is_not(tmp_path: Path, what: str) -> None:
     {"nod": ('type="priority"', 'type="traffic_light"')}], ids=["a pedestrian dawdles at random", "a traffic light"])
 def test_nor_is_a_pedestrian(tmp_path: Path, changes: dict[str, tuple[str, str]]) -> None:
     assert repeatable_traffic(changed_network(tmp_path, "pedestrian_crossing", **changes)) is None
-
-
-@pytest.mark.parametrize("changes", [
-    UNREPEATABLE["random driving"],
-    {"traffic": ('departPos="20"', 'departPos="20" insertionChecks="none"')}], ids=["random", "checked in part"])
-def test_what_cannot_be_put_back_is_loaded_every_time(tmp_path: Path, loadings: list[str], changes: dict[str, tuple[str, str]]) -> None:
-    network = changed_network(tmp_path, "lead_vehicle_stopped", **changes)
-    system = on_network("native", network)
-    population = drawn(system, 3, 1)
-    first, second = simulate(system, population), simulate(system, population)
-    assert bits(first) == bits(second)
-    assert len(loadings) == 2
 
 
 @pytest.mark.parametrize("network", sorted({path.name for path in NETWORKS.iterdir() if path.is_dir()}))

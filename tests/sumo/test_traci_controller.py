@@ -14,7 +14,6 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
 from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study import ModelTable, load_study
-from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import System, assemble
 
@@ -136,28 +135,6 @@ def test_what_a_controller_reads_of_others_has_passed_the_sensors(tmp_path: Path
     assert set(number[near]) <= {2, 3}
 
 
-@pytest.mark.parametrize(("values", "weather"), [
-    ({"sensorRange": 20.0}, None), ({"reactionTime": 0.8}, None),
-    ({}, {"visibility": 0.2}), ({}, {"recognition_delay": 1.0})], ids=["range", "reaction", "visibility", "recognition"])
-def test_worse_sensors_make_a_controller_brake_too_late(values: dict[str, float], weather: dict[str, float] | None, tmp_path: Path,
-                                                     monkeypatch: pytest.MonkeyPatch) -> None:
-    clear = {"name": "clear", "road_friction": 1.0, "visibility": 1.0, "recognition_delay": 0.0, "hesitation": 0.0, "light": "day"}
-    found = system("step", tmp_path, monkeypatch, weather={**clear, **(weather or {})})
-    assert simulate(found, changed(found, **values)).outcome[0] == Outcome.COLLISION
-    best = system("step", tmp_path, monkeypatch, weather=clear)
-    assert simulate(best, changed(best)).outcome[0] == Outcome.STOPPED
-
-
-def test_a_visibility_that_does_nothing_is_mentioned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "my_controller.py").write_text(SCRIPT)
-    monkeypatch.chdir(tmp_path)
-    table = ModelTable(model="my_controller:step", kind="traci")
-    far, near = (assemble(msgspec.structs.replace(load_study(name, weather="fog"), ads=table)) for name in ("sun", "native"))
-    assert far.remarks == ["weather 'fog': visibility = 0.6 does nothing: the vehicle has no sensor range, and a controller written for "
-                           "TraCI sees as far"]
-    assert near.remarks == []
-
-
 SUBSCRIBES = """
 import traci.constants as tc
 
@@ -269,20 +246,6 @@ def test_a_script_stops_the_original_and_not_a_vehicle_that_has_lost_its_brakes(
     length = len(alone.trace.time)
     assert alone.trace.speed[:, 0].tobytes() == np.ascontiguousarray(run.trace.speed[:length, 1]).tobytes()
     assert run.trace.speed.max() == pytest.approx(12, abs=0.7)
-
-
-def test_through_a_socket_it_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = system("step", tmp_path, monkeypatch)
-    one = found.characteristics.original[np.newaxis]
-    here, socket = (simulate(found, one, engine) for engine in (Engine.LIBSUMO, Engine.TRACI))
-    assert here.trace.speed.tobytes() == socket.trace.speed.tobytes()
-
-
-def test_without_a_command_sumos_own_driver_drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = system("idle", tmp_path, monkeypatch)
-    run = simulate(found, np.repeat(found.characteristics.original[np.newaxis], 2, axis=0))
-    assert run.trace.speed.max() > 5
-    assert run.trace.brake.max() > 0.5, "for the parked vehicle"
 
 
 def test_a_wish_is_what_the_plant_makes_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

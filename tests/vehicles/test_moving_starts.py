@@ -42,18 +42,6 @@ def test_nothing_changes_while_the_pedals_stay(model: str, kmh: float, grade: fl
 
 
 @pytest.mark.parametrize("model", sorted(SYSTEMS))
-def test_whoever_is_not_about_to_shift_keeps_his_speed_whatever_his_characteristics(model: str) -> None:
-    prepared, state = moving(model, drawn(model, 300, 5), 30 / 3.6)
-    gear, pedals = state.gear, Command(state.throttle, state.brake)  # type: ignore[attr-defined]
-    stays = np.ones(300, dtype=bool)
-    for _ in range(100):
-        state = SYSTEMS[model].vehicle.advance(prepared, state, pedals)
-        stays &= state.gear == gear
-    assert np.mean(stays) > 0.9
-    assert state.speed[stays] == pytest.approx(30 / 3.6, rel=1e-12)
-
-
-@pytest.mark.parametrize("model", sorted(SYSTEMS))
 def test_coasting_from_a_steady_start_has_no_transient(model: str) -> None:
     """What it loses grows to a peak as the driveline lets go, and falls: no jump, no swing; and just so after five steady seconds."""
     def coasting(after: float) -> np.ndarray:

@@ -94,19 +94,6 @@ def test_braking_never_raises_speed(model: str) -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_a_vehicle_at_rest_stays_at_rest(model: str) -> None:
-    for brake in (0.0, 1.0):
-        assert np.all(drive(model, drawn(model, 5, 1), lambda time, brake=brake: (0.0, brake), 3).speed == 0)  # type: ignore[misc]
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_full_braking_ends_in_standstill(model: str) -> None:
-    run = drive(model, drawn(model, 20, 2), braking_after(3.0), 20)
-    assert np.all(run.speed[-1] < 1e-3)
-    assert np.all(run.speed >= 0)
-
-
-@pytest.mark.parametrize("model", MODELS)
 def test_halving_the_time_step_changes_a_trajectory_by_little(model: str) -> None:
     """Stated bound: 2 % of the distance and 0.3 m/s while driving up, coasting and braking to a stop."""
     def pedals(time: float) -> tuple[float, float]:
@@ -123,13 +110,6 @@ def test_no_vehicle_knows_of_another(model: str) -> None:
     together = drive(model, population, braking_after(3.0, 0.5), 8).speed
     alone = drive(model, population[4:5], braking_after(3.0, 0.5), 8).speed
     assert together[:, 4].tobytes() == alone[:, 0].tobytes()
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_a_wet_road_makes_for_a_longer_way_to_stop(model: str) -> None:
-    worn = drawn(model, 6, 4)
-    dry, wet = (drive(model, worn, lambda time: (0.0, 1.0), 25, road=road, rolling=10.0).distance[-1] for road in (1.0, 0.15))
-    assert np.all(wet > 1.5 * dry)
 
 
 # Situations in which a characteristic acts: what is measured, at the end of its domain or of a fine grid over it.

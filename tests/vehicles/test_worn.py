@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.records import Command, Observation
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from safevar_sumo.vehicles.base import GRAVITY, LEVEL
 from safevar_sumo.vehicles.worn import WornVehicle
 
@@ -52,11 +57,6 @@ def test_deceleration_is_that_of_two_axles_of_which_none_brakes_more_than_its_lo
     assert CAR.sumo_type(p).decel[0] == pytest.approx(low, rel=1e-9)
 
 
-def test_where_the_load_lies_counts_once_an_axle_is_at_its_limit() -> None:
-    decel = [CAR.sumo_type(prepared(0.85, payload=525.0, payloadCentre=centre)).decel[0] for centre in (1.2, 2.2, 3.2)]
-    assert len(set(np.round(decel, 6))) > 1
-
-
 def test_stopping_distances_of_worn_tyres_are_in_the_published_ratios_on_a_wet_road_and_equal_on_a_dry_one() -> None:
     """MIRA for RoSPA: +36.8 % from 6.7 to 1.6 mm; MIRA for Continental, from 50 mph: 31.7 m at 3 mm, 39.9 m at 1.6 mm."""
     worn = stopping_distance(1.6)
@@ -89,3 +89,61 @@ def test_dirty_sensors_see_late_and_not_far() -> None:
     assert np.isinf(seen[:64]).all()
     assert seen[64] == pytest.approx(60 - 0.5 * 60)
     assert seen[100] == pytest.approx(60 - 0.5 * 96)
+
+
+SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
+
+
+def one(lower: float, original: float, upper: float) -> Characteristic:
+    return Characteristic(name="c", unit="-", original=original, lower=lower, upper=upper)
+
+
+@pytest.mark.parametrize(("lower", "upper", "threshold"), [
+    (2040, 2700, 13.2),  # the worked example of the paper: mass
+    (0, 1000, 10), (0, 999, 0.02 * 999), (0, 100, 2), (0, 99, 0.04 * 99), (0, 1, 0.04), (0, 0.5, 0.04),
+])
+def test_threshold_is_a_share_of_the_domains_width(lower: float, upper: float, threshold: float) -> None:
+    assert one(lower, upper, upper).threshold == pytest.approx(threshold)
+
+
+settings_in_domain = arrays(float, (5, 12), elements=st.floats(0, 1)).map(lambda share: SUN.lower + share * (SUN.upper - SUN.lower))
+
+
+@given(settings_in_domain)
+def test_filter_is_idempotent_and_keeps_or_restores(settings: np.ndarray) -> None:
+    filtered = SUN.filter(settings)
+    assert np.array_equal(SUN.filter(filtered), filtered)
+    assert np.all((filtered == settings) | (filtered == SUN.original))
+
+
+@given(settings_in_domain)
+def test_objectives_of_change_agree_with_a_loop(settings: np.ndarray) -> None:
+    filtered = SUN.filter(settings)
+    for row, largest, number in zip(filtered, SUN.largest_change(filtered), SUN.number_changed(filtered), strict=True):
+        relative = [abs(member.original - value) / member.original for member, value in zip(SUN, row, strict=True)]
+        assert largest == max(relative)
+        assert number == sum(value > 0 for value in relative)
+
+
+@pytest.mark.parametrize("value", [1.0, 5000.0, float("nan"), float("inf")])
+def test_a_value_outside_the_domain_is_refused(value: float) -> None:
+    with pytest.raises(InputError, match=r"mass = .*\nlegal: a number in \[2040, 2700\] kg"):
+        SUN.setting({"mass": value}, "--set")
+    with pytest.raises(InputError, match=r"\nlegal: a number in \[[\d.]+, [\d.]+\]$"):
+        SUN.setting({"tireFric": -abs(value)}, "--set")
+
+
+def test_an_unknown_characteristic_is_refused() -> None:
+    with pytest.raises(InputError, match="gearSwitchTime"):
+        SUN.setting({"weight": 2000.0}, "--set")
+
+
+def test_a_change_of_just_the_threshold_is_noise() -> None:
+    """Numbers that are exact in binary: 2 % of a width of 100."""
+    exact = CharacteristicSet((one(0, 50, 100),))
+    assert exact.filter(np.array([[52.0], [48.0], [52.5], [47.5]])).ravel().tolist() == [50, 50, 52.5, 47.5]
+
+
+@pytest.mark.parametrize("value", [2040.0, 2700.0])
+def test_the_ends_of_a_domain_belong_to_it(value: float) -> None:
+    assert SUN.setting({"mass": value}, "--set")[SUN.names.index("mass")] == value

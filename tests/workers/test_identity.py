@@ -10,14 +10,16 @@ import msgspec
 import pytest
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import changes
+from safevar_sumo.plugins import changes, digest_of
 from safevar_sumo.results.manifest import LAYERS
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.workers.batches import sources_of
 from safevar_sumo.workers.evaluation import evaluate_batch, packed
 from safevar_sumo.workers.identity import identity_of, networks_of, powers_digest
+from tests.in_process import Here
 
 
 def test_names_and_defaults_are_resolved_to_numbers() -> None:
@@ -32,11 +34,6 @@ def test_names_and_defaults_are_resolved_to_numbers() -> None:
     assert "duration" in identity["resolved"]["scenario"]["parameters"], "a default"
     assert not {"title", "published", "calibration"} & set(identity["resolved"])
     assert not {"runs", "algorithms", "evaluations", "time_limit"} & set(identity["resolved"]["search"])
-
-
-def test_other_numbers_of_a_weather_are_another_study() -> None:
-    one, other = (load_study("sun", weather={"name": "mine", "road_friction": friction, "visibility": 1.0}) for friction in (0.9, 0.8))
-    assert identity_of(one, assemble(one)) != identity_of(other, assemble(other))
 
 
 def test_what_a_characteristic_means_is_no_part_of_a_studys_identity() -> None:
@@ -75,3 +72,92 @@ def test_powers_that_are_rounded_differently_are_told_apart(monkeypatch: pytest.
     before = powers_digest()
     monkeypatch.setattr("safevar_sumo.workers.identity.EXPONENTS", (1 / 21 * (1 + 2**-52), 1 / 20, -21.0, 21.0))
     assert powers_digest() != before
+
+
+ADS = """
+import json
+import sqlite3
+from pathlib import Path
+
+import my_maps.rules
+from my_space import roads
+from safevar_sumo.ads import ScalarAds
+
+HERE = Path(__file__).parent
+
+
+class Mine(ScalarAds):
+    def __init__(self, weights, table="", outside=""):
+        self.gap = json.loads(Path(weights).read_text())["gap"]
+        self.seen = not outside or Path(outside).read_text()
+
+    def drive(self, seen):
+        import my_lazy
+        (HERE / "tiles" / "1.txt").read_bytes()
+        (HERE / "both.txt").open("r+").close()
+        sqlite3.connect(f"{(HERE / 'map.db').as_uri()}?mode=ro", uri=True).close()
+        (HERE / "log.txt").write_text("written, then read")
+        (HERE / "log.txt").read_text()
+        return (0.0, 1.0) if seen.gap < self.gap else (0.5, 0.0)
+"""
+FILES = {
+    "my_ads.py": ADS, "my_maps/__init__.py": "", "my_maps/rules.py": "import numpy\n", "my_maps/unused.py": "", "my_space/roads.py": "",
+    "my_lazy.py": "X = 1\n", "weights.json": '{"gap": 9.0}', "tiles/1.txt": "tile", "tiles/2.txt": "another tile", "unused.py": "",
+    "table.bin": "read by compiled code", "both.txt": "opened to be read and written", "map.db": ""}
+STUDY = """
+extends = "smoke"
+[ads]
+model = "my_ads:Mine"
+parameters = { weights = "weights.json", table = "table.bin" }
+"""
+READ = {
+    "my_ads.py", "my_maps/__init__.py", "my_maps/rules.py", "my_space/roads.py", "my_lazy.py", "weights.json", "tiles/1.txt", "table.bin",
+    "both.txt", "map.db"}
+
+
+@pytest.fixture
+def place(in_tmp: Path) -> Path:
+    """A study with its files, in a folder that is not the working directory."""
+    for name, text in FILES.items():
+        (in_tmp / "there" / name).parent.mkdir(exist_ok=True, parents=True)
+        (in_tmp / "there" / name).write_text(text)
+    (in_tmp / "there" / "mine.toml").write_text(STUDY)
+    return in_tmp / "there"
+
+
+def read(place: Path) -> dict[str, str]:
+    return sources_of(load_study(place / "mine.toml"), Here())
+
+
+def test_what_is_read_while_models_are_loaded_made_and_first_run_counts_wherever_the_command_is_started(
+        place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = read(place)
+    assert set(found) == READ
+    monkeypatch.chdir(place / "tiles")
+    assert read(place) == found
+    shutil.copytree(place, place.parent / "copy")
+    assert read(place.parent / "copy") == found, "no name holds where the study lies"
+
+
+@pytest.mark.parametrize("name", ["my_ads.py", "my_maps/rules.py", "my_space/roads.py", "my_lazy.py", "tiles/1.txt", "table.bin", "map.db"])
+def test_an_edit_of_whatever_was_read_is_seen(name: str, place: Path) -> None:
+    before = read(place)
+    (place / name).write_text((place / name).read_text().replace("9.0", "8.0").replace("0.5", "0.4") + "\n")
+    if name.startswith("my_"):
+        (place / name).write_text((place / name).read_text() + "\nY = 2\n")
+    after = read(place)
+    assert [one for one in after if after[one] != before.get(one)] == [name]
+
+
+def test_a_comment_a_docstring_and_ends_of_lines_are_no_difference(tmp_path: Path) -> None:
+    texts = ('"""One."""\ndef f(x):\n    """Two."""\n    return x + 1\n', "# three\ndef f(x):\r\n    'four'\n    return (x + 1)  # five\n",
+             "def f(x): return x + 2\n", "def f(x): return x + 2.0\n", "def f(x): 'one'; return 'one'\n")
+    files = [tmp_path / f"{number}.py" for number in range(len(texts))]
+    for file, text in zip(files, texts, strict=True):
+        file.write_bytes(text.encode())
+    one, other, *different = map(digest_of, files)
+    assert one == other
+    assert len({one, *different}) == 4
+    (tmp_path / "a").write_bytes(b"one\r\ntwo\r\n")
+    (tmp_path / "b").write_bytes(b"one\ntwo\n")
+    assert digest_of(tmp_path / "a") == digest_of(tmp_path / "b")

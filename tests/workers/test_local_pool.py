@@ -6,19 +6,23 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import suppress
 
+import msgspec
 import numpy as np
 import psutil
 import pytest
 
-from safevar_sumo.errors import InputError
-from safevar_sumo.study import load_study
+from safevar_sumo.errors import EnvironmentFault, ForeignError, InputError, SimulationError
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.records import Evaluations, Outcome
+from safevar_sumo.study import ModelTable, Origin, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, packed
 from safevar_sumo.workers.local import LocalPool, first_of, interrupts_noted, local_pool, result_of
+from safevar_sumo.workers.retrying import ATTEMPTS, RetryingPool
 
 pytestmark = pytest.mark.usefixtures("worker_processes")
 SMOKE = packed(load_study("smoke"))
@@ -119,3 +123,136 @@ def test_ctrl_c_during_a_wait_is_noticed_soon() -> None:
     with pytest.raises(KeyboardInterrupt), interrupts_noted():
         first_of([Future()])
     assert time.monotonic() - start < 5
+
+
+STUDY = load_study("sun")
+SUN = CharacteristicSet.of(STUDY.vehicle.characteristics)
+FOREIGN = msgspec.structs.replace(STUDY, ads=ModelTable(model="my_ads:Mine"), origin=Origin(called="my study.toml"))
+
+
+def settings(number: int) -> np.ndarray:
+    """Settings whose first value tells which it is."""
+    rows = np.repeat(SUN.original[np.newaxis], number, axis=0)
+    rows[:, 0] = 4300 + np.arange(number)
+    return rows
+
+
+def evaluated(rows: np.ndarray) -> Evaluations:
+    return Evaluations(
+        settings=rows, outcome=np.full(len(rows), "stopped", dtype="U16"), collision_speed=np.full(len(rows), np.nan),
+        metrics={name: rows[:, 0] / 3 for name in METRICS}, f_diff=SUN.largest_change(rows), f_num_diff=SUN.number_changed(rows))
+
+
+class ToldPool:
+    """Fails with what `fault` answers to (settings, how often they were tried before)."""
+
+    workers = 1
+
+    def __init__(self, fault: Callable[[np.ndarray, int], Exception | None]) -> None:
+        self.fault = fault
+        self.tried: list[int] = []
+        self._times: dict[bytes, int] = {}
+
+    def submit(self, study: bytes, settings: np.ndarray) -> Future[Evaluations]:
+        before = self._times.get(settings.tobytes(), 0)
+        self._times[settings.tobytes()] = before + 1
+        self.tried.append(len(settings))
+        error = self.fault(settings, before)
+        future: Future[Evaluations] = Future()
+        if error is None:
+            future.set_result(evaluated(settings))
+        else:
+            future.set_exception(error)
+        return future
+
+
+def died() -> WorkerLostError:
+    return WorkerLostError("the worker process died (exit code -9)")
+
+
+def deadly(*values: float) -> Callable[[np.ndarray, int], Exception | None]:
+    return lambda rows, before: died() if np.isin(rows[:, 0], values).any() else None
+
+
+def test_a_batch_that_lost_its_worker_once_is_tried_again() -> None:
+    pool = ToldPool(lambda rows, before: None if before else died())
+    found = RetryingPool(pool, STUDY).submit(b"", settings(8)).result(timeout=5)
+    assert pool.tried == [8, 8]
+    assert found.valid.all()
+
+
+def test_the_setting_that_kills_its_worker_alone_is_told_from_the_others() -> None:
+    pool = ToldPool(deadly(4302, 4305))
+    found = RetryingPool(pool, STUDY).submit(b"", settings(8)).result(timeout=5)
+    assert np.array_equal(found.settings, settings(8))
+    assert np.array_equal(found.valid, ~np.isin(settings(8)[:, 0], (4302, 4305)))
+    assert found.outcome[2] == Outcome.SIMULATOR_ERROR
+    assert np.isnan(found.objectives[2, 0])
+    assert np.array_equal(found.f_safe[found.valid], settings(8)[found.valid, 0] / 3)
+    assert np.array_equal(found.f_num_diff, SUN.number_changed(settings(8)))
+    assert pool.tried.count(1) == 6 + 2 * (ATTEMPTS + 2), "each twice alone, the original in between, and once more"
+
+
+def test_what_the_study_is_at_fault_for_ends_at_once_with_that_fault() -> None:
+    pool = ToldPool(lambda rows, before: InputError("study", "ads.model = 'x' cannot be imported"))
+    with pytest.raises(InputError, match="cannot be imported"):
+        RetryingPool(pool, STUDY).submit(b"", settings(1000)).result(timeout=5)
+    assert len(pool.tried) == 1
+
+
+@pytest.mark.parametrize("fault", [SimulationError("SUMO failed: no place"), WorkerLostError("died")])
+def test_a_setting_is_blamed_only_if_the_original_vehicle_can_be_simulated(fault: Exception) -> None:
+    with pytest.raises(EnvironmentFault, match=f"{fault}; the original vehicle cannot be simulated either"):
+        RetryingPool(ToldPool(lambda rows, before: fault), STUDY).submit(b"", settings(4)).result(timeout=5)
+
+
+def test_a_fault_of_the_surroundings_is_an_error_and_no_outcome() -> None:
+    pool = ToldPool(lambda rows, before: EnvironmentFault("the disk is full") if np.isin(rows[:, 0], 4302).any() else None)
+    with pytest.raises(EnvironmentFault, match="the disk is full"):
+        RetryingPool(pool, STUDY).submit(b"", settings(4)).result(timeout=5)
+    assert pool.tried == [4, 4]
+
+
+def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> None:
+    def fault(rows: np.ndarray, before: int) -> Exception | None:
+        return ForeignError("study", "ads.model = 'my_ads:Mine' raised in drive: ZeroDivisionError") if 4313 in rows[:, 0] else None
+
+    pool = ToldPool(fault)
+    with pytest.raises(ForeignError) as told:
+        RetryingPool(pool, FOREIGN).submit(b"", settings(50)).result(timeout=5)
+    assert "ZeroDivisionError; again by: python -m safevar_sumo simulate 'my study.toml' --set " in str(told.value)
+    assert f"--set {SUN.names[0]}=4313.0" in str(told.value)
+    assert str(told.value).count("--set") == 1, "what is not changed need not be set"
+    assert len(pool.tried) < 15
+
+
+def test_a_process_that_ends_with_a_users_code_in_it_is_an_error() -> None:
+    told = r"exit code -9\), again and again, with ads.model = 'my_ads:Mine' in it; .* cannot tell file and line; again by: .*=4302\.0"
+    with pytest.raises(ForeignError, match=told):
+        RetryingPool(ToldPool(deadly(4302)), FOREIGN).submit(b"", settings(8)).result(timeout=5)
+
+
+def test_settings_that_fail_one_after_the_other_without_end_are_a_fault_of_the_study() -> None:
+    pool = RetryingPool(ToldPool(deadly(*4300 + np.arange(40))), STUDY)
+    assert not pool.submit(b"", settings(19)).result(timeout=5).valid.any()
+    with pytest.raises(WorkerLostError, match="exit code -9"):
+        pool.submit(b"", settings(40)).result(timeout=5)
+
+
+def test_failures_between_successes_are_no_fault_of_the_study() -> None:
+    every_second = 4300 + np.arange(0, 200, 2)
+    found = RetryingPool(ToldPool(deadly(*every_second)), STUDY).submit(b"", settings(200)).result(timeout=5)
+    assert np.count_nonzero(~found.valid) == 100
+
+
+def test_the_original_vehicle_must_succeed() -> None:
+    with pytest.raises(WorkerLostError):
+        RetryingPool(ToldPool(deadly(4300)), STUDY).submit(b"", settings(1), must_succeed=True).result(timeout=5)
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError("a bug"), PoolLostError("gone")])
+def test_a_bug_and_a_lost_pool_are_not_tried_again(error: Exception) -> None:
+    pool = ToldPool(lambda rows, before: error)
+    with pytest.raises(type(error), match=str(error)):
+        RetryingPool(pool, STUDY).submit(b"", settings(5)).result(timeout=5)
+    assert pool.tried == [5]
