@@ -24,14 +24,12 @@ from safevar_sumo.errors import ForeignError, InputError, SafevarError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Evaluations, FloatArray, Nominal, Observation, Tables
-from safevar_sumo.reference.rows import read_reference
 from safevar_sumo.study import Study, load_study, tables_of
 from safevar_sumo.study.file import without_nothing
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
 TABLES = without_nothing(tables_of(load_study("smoke")))
-SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
 SCALARS = st.one_of(st.integers(), st.floats(), st.text(max_size=20), st.booleans(), st.dates(), st.datetimes(), st.times())
 ANYTHING = st.recursive(
     SCALARS, lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=8), inner, max_size=3)), max_leaves=6)
@@ -67,43 +65,6 @@ def test_a_study_with_anything_in_one_place_is_read_or_refused(path: tuple[str, 
         assert isinstance(study, Study)
         numbers = list(study.vehicle.characteristics.values())
         assert all(math.isfinite(row.original) and row.lower < row.upper for row in numbers)
-
-
-FLAGS = st.lists(st.one_of(
-    st.sampled_from(["--set", "--runs", "--only", "--shard", "--batch", "--seed", "--algorithms", "--json", "--no-filter", "--nothing"]),
-    st.text(max_size=10), st.integers().map(str), st.floats().map(str),
-    st.sampled_from(["mass=1", "mass=nan", "mass=1e999", "nsga2:0", "1/2"]),
-), max_size=4)
-
-
-@SLOW
-@pytest.mark.usefixtures("in_tmp")
-@given(command=st.sampled_from(["tables", "figures", "validate", "import", "calibrate"]), arguments=FLAGS)
-def test_flags_of_any_kind_are_taken_or_refused(command: str, arguments: list[str]) -> None:
-    done = CliRunner().invoke(commands, [command, *arguments])
-    assert done.exit_code != 0 or "--help" in arguments or "-h" in arguments
-    assert done.exception is None or isinstance(done.exception, SystemExit | SafevarError), (arguments, done.exception)
-
-
-CELLS = st.one_of(st.floats().map(str), st.text(max_size=6), st.just(""), st.just("1"))
-HEADER = [*SUN.names, "MaxPercentage", "SaftyDegree", "numbers", "TIT", "TET", "Dece"]
-
-
-@SLOW
-@given(header=st.one_of(st.just(HEADER), st.permutations(HEADER), st.lists(st.text(max_size=8), max_size=5)),
-       rows=st.lists(st.lists(CELLS, max_size=20), max_size=4), good=st.booleans())
-def test_any_csv_is_read_or_refused(header: list[str], rows: list[list[str]], good: bool) -> None:
-    original = [*map(str, SUN.original), "0.1", "2.5", "3", "0.4", "1.1", "5"]
-    lines = [",".join(header), *(",".join(row) for row in ([original] if good else [])), *(",".join(row) for row in rows)]
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "reference.csv"
-        file.write_bytes("\n".join(lines).encode("utf-8", "surrogatepass"))
-        try:
-            data = read_reference(file, SUN)
-        except InputError:
-            return
-        assert np.isfinite(data.settings).all()
-        assert ((data.settings >= SUN.lower) & (data.settings <= SUN.upper)).all()
 
 
 NOTHING = np.zeros(2)

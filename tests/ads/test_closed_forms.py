@@ -94,16 +94,6 @@ def test_apollo_asks_for_what_is_needed_to_stand_at_its_gap_through_the_original
         assert command.throttle[0] == 0
 
 
-def test_apollo_changes_what_it_asks_for_by_no_more_than_its_jerk() -> None:
-    ads = apollo(jerk=2.0)
-    memory, asked = ads.start(1, KNOWN, STEP), []
-    for k in range(30):
-        command, memory = ads.drive(seen(k * STEP, 0.0, FAR), memory)
-        asked.append(float(command.throttle[0]) * (FULL + COASTING) - COASTING)
-    assert asked[:15] == pytest.approx([2.0 * STEP * (k + 1) for k in range(15)])
-    assert asked[-1] == pytest.approx(1.5), "the largest cruise acceleration"
-
-
 def test_apollo_cruises_by_its_gain_waits_for_its_first_command_and_holds_after_the_creep() -> None:
     ads = apollo(jerk=1e4, first_command=0.1, creep_time=0.975)
     memory = ads.start(1, KNOWN, STEP)

@@ -164,11 +164,3 @@ def test_who_has_stopped_for_a_pedestrian_waits_until_the_way_is_clear() -> None
         assert speeds[clear - 1] < 0.2
         assert speeds[-1] > 1, "it goes on once he is out of the way"
         assert gaps[clear] > 0
-
-
-def test_the_competent_driver_follows_two_seconds_behind_without_the_brake() -> None:
-    for gap in (80.0, 34.0):
-        gaps, speeds, brakes = driven(CompetentDriver(cruise_speed=18.0), 90.0, 15.0, gap, leader=15.0)
-        assert gaps[-1] == pytest.approx(2 * 15, abs=0.3)
-        assert speeds[-1] == pytest.approx(15, abs=0.05)
-        assert brakes.max() <= 0.04 + 1e-9, "no more than the accelerator let go: 0.4 m/s^2 of the 10 m/s^2 of the whole pedal"

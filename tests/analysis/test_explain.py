@@ -247,21 +247,6 @@ def test_one_difference_is_one_part(other: tuple[float, float, float, float], pa
     assert all(abs(value) < 0.05 for name, value in told.parts.items() if name != part)
 
 
-def test_the_parts_of_many_differences_add_up() -> None:
-    told = compared(SAME, (11.0, 14.0, 0.35, 5.0))
-    stops = [OBSTACLE - (OBSTACLE - gap) - v * delay - v**2 / (2 * a) for v, gap, delay, a in (SAME, (11.0, 14.0, 0.35, 5.0))]
-    assert told.lost == pytest.approx(stops[0] - stops[1], abs=0.05)
-    assert told.changed.outcome == "collision"
-    assert abs(told.parts["remainder"]) < 0.05
-
-
-def test_the_sentence_tells_the_largest_part_first_and_what_was_instead() -> None:
-    told = sentence(compared(SAME, (10.0, 14.0, 0.2, 3.0)))
-    assert told.startswith("The original stops, safety degree 1.00 m; this one hits at")
-    assert told.index("brakes more weakly (3.00 instead of 6.00 m/s^2)") < told.index("begins to brake nearer (14.00 instead of 15.00 m")
-    assert "They brake alike" in sentence(compared(SAME, SAME))
-
-
 def test_a_creeping_deceleration_is_no_late_pedal() -> None:
     """Both pedals are down 0.1 s after the command; one vehicle decelerates with 6 m/s^2 at once, the other comes to 6 within a second."""
     drives = drive_of((10.0, 15.0, 0.1, 6.0), (10.0, 15.0, 0.1, 6.0))
@@ -308,15 +293,6 @@ def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None
     assert found.setting[0] > 6.5 >= found.setting[0] - 2 * RESOLUTION * 4.5
     assert found.alone == {0: found.setting[0]}
     assert (found.end, found.at_threshold) == (End.SAFE, None)
-
-
-def test_each_value_of_a_cause_alone_goes_back_farther_than_all_together() -> None:
-    bench = made_up_bench(2, lambda settings: settings[:, 0] - settings[:, 1] >= 6)
-    (causes,) = minimal_causes(bench, np.array([[9.0, 1.0]]), COLLISION)
-    (found,) = boundaries(bench, causes, COLLISION)
-    assert found.fraction == pytest.approx(6 / 8, abs=2 * RESOLUTION)
-    assert found.setting == pytest.approx([8, 2], abs=1e-3)
-    assert found.alone == {0: pytest.approx(7, abs=1e-3), 1: pytest.approx(3, abs=1e-3)}
 
 
 def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:

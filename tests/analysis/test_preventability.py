@@ -16,7 +16,6 @@ from safevar_sumo.analysis.explain.braking_comparison import sentence
 from safevar_sumo.analysis.explain.compute import Where, points_in_words, where
 from safevar_sumo.analysis.explain.summary import lead
 from safevar_sumo.analysis.preventability import PreventableBy, approach, preventability, preventable_by
-from safevar_sumo.analysis.words import command
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import solutions_frame
 from safevar_sumo.study import ModelTable, load_study
@@ -88,11 +87,6 @@ def test_in_a_matrix_the_worst_point_counts() -> None:
     assert preventable_by(Bench(study, Here()), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
 
 
-def test_without_a_collision_shares_are_undefined() -> None:
-    told = preventability(bench(test="CPFA", speed=30), np.zeros((0, len(NAMES))))
-    assert (told.to_dict()["competent_driver"], told.to_dict()["looked_at"], str(told)) == (None, 0, "")
-
-
 TESTS = [{"name": "CPLA", "model": "along", "over": {"speed": [20, 40]}, "weathers": ["clear", "night"]},
          {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [30]}}]
 
@@ -134,12 +128,6 @@ def test_points_in_words() -> None:
     assert points_in_words(("A, 1", "B"), 9) == "Fails at 2 of 9 points: A, 1; B."
     assert points_in_words(("A", "B", "C"), 9, most=1) == "Fails at 3 of 9 points: A and 2 more."
     assert points_in_words((), 9) == "Fails at 0 of 9 points."
-
-
-def test_what_was_asked_at_a_point_is_simulated_again_there() -> None:
-    again = command("results/a b", {"mass": 2600.5}, "CPNA, speed 40")
-    assert again == "python -m safevar_sumo simulate 'results/a b' --point 'CPNA, speed 40' --set mass=2600.5"
-    assert command("rain", {}) == "python -m safevar_sumo simulate rain"
 
 
 def test_the_summary_of_a_matrix_asks_why_at_the_worst_point_alone(system: System, weak: np.ndarray, told: Where) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import re
@@ -134,14 +133,3 @@ def test_correlations_are_those_of_the_copula() -> None:
 def test_impossible_distributions_are_refused(changes: dict[str, Any], says: str) -> None:
     with pytest.raises(InputError, match=says.replace("[", r"\[").replace("+", r"\+")):
         VariationModel(load_study("smoke", **changes))
-
-
-def test_the_way_vehicles_vary_names_the_correlation_and_narrower_limits() -> None:
-    study = load_study(made_up_study(2), correlations=[{"between": ["a", "b"], "value": 0.8}])
-    with Console(record=True, width=300, file=io.StringIO()) as console:
-        print_risk(console, risk(study, unsafe="collision", samples=100, pool=Plant(study, box)))
-        narrower = load_study(study, variation={"a": {"distribution": "uniform", "upper": 6.0}})
-        print_risk(console, risk(narrower, unsafe="collision", samples=100, pool=Plant(narrower, box)))
-    told = console.export_text()
-    assert "They vary uniformly over the whole domain, correlated: a with b 0.8." in told
-    assert "They vary as the study says: a uniform; the others uniformly, correlated: a with b 0.8." in told

@@ -18,7 +18,6 @@ from safevar_sumo.analysis.evaluator import Bench
 from safevar_sumo.analysis.tolerance import joint as safe_box
 from safevar_sumo.analysis.tolerance.compute import Tolerance
 from safevar_sumo.analysis.tolerance.render import profiles_figure
-from safevar_sumo.errors import InputError
 from tests.analysis.known_regions import Plant, Region, box, everywhere, made_up_study, nowhere, two_islands
 
 
@@ -137,12 +136,6 @@ def test_the_promised_record() -> None:
     assert list(record["pairs"][0]["nearest"]) == ["a", "b"]
     assert list(record["joint"]) == [
         "factor", "confidence", "samples", "failed", "attempts", "unsafe_at_most", "characteristics"]
-
-
-def test_an_unknown_characteristic_is_refused() -> None:
-    study = made_up_study(2)
-    with pytest.raises(InputError, match="'wings'"):
-        tolerance(study, characteristics=["wings"], pool=Plant(study, nowhere))
 
 
 @pytest.mark.parametrize(("region", "told"), [

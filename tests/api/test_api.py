@@ -15,9 +15,6 @@ import pandas as pd
 import pytest
 
 import safevar_sumo as sv
-from safevar_sumo import report
-from safevar_sumo.analysis.research_questions.case import Case
-from safevar_sumo.api.results import study_of, study_or_case
 from safevar_sumo.study import load_study, tables_of
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
@@ -70,30 +67,10 @@ def test_simulate_tells_of_the_setting_and_of_the_original_beside_it() -> None:
     assert sv.simulate("rain", {"mass": 2410.0}, filtered=False).objectives["f_num_diff"] == 1
 
 
-def test_a_trace_tells_where_the_obstacle_was_and_what_the_ads_saw_of_it() -> None:
-    """This weather has everything but the vehicle's own speed made out two steps late."""
-    late_by_two = {"name": "late", "road_friction": 1.0, "visibility": 1.0, "recognition_delay": 0.1}
-    trace = sv.simulate(sv.load_study("sun", weather=late_by_two)).trace
-    assert (trace["seen speed [m/s]"] == trace["speed [m/s]"]).all()
-    late = trace["lateral [m]"].shift(2).bfill()
-    assert np.allclose(trace["seen lateral [m]"][3:], late[3:])
-    gaps = trace["seen gap [m]"].dropna()
-    assert gaps.size > 0
-    clear = sv.simulate("sun").trace
-    assert np.allclose(clear["seen lateral [m]"], clear["lateral [m]"])
-
-
 @pytest.mark.parametrize("value", ["+8%", "heavy", None, [2500.0]])
 def test_what_is_no_number_is_refused(value: object) -> None:
     with pytest.raises(sv.InputError, match=r"^changes: mass = .*\nexpected: a number in \[2040, 2700\] kg"):
         sv.simulate("rain", {"mass": value})  # type: ignore[dict-item]
-
-
-def test_questions_take_a_directory_as_they_take_results(results: sv.Results) -> None:
-    case = study_or_case(str(results.directory))
-    assert isinstance(case, Case)
-    pd.testing.assert_frame_equal(case.solutions, results.solutions)
-    assert tables_of(study_of(results.directory)) == tables_of(study_of(results)) == tables_of(study_of("smoke"))
 
 
 @pytest.mark.parametrize("value", [0.0, -5.0, 1e300])

@@ -7,21 +7,20 @@ from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
 
-from safevar_sumo.campaign import RunKey, all_runs, forecast, run_campaign, run_generator
+from safevar_sumo.campaign import RunKey, all_runs, forecast, run_campaign
 from safevar_sumo.campaign.batcher import BATCHES_PER_WORKER
 from safevar_sumo.campaign.run import Run
-from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import Journal, ResultsDirectory, load, status
-from safevar_sumo.results.journal import encoded, read_frames, read_journal
+from safevar_sumo.results.journal import read_journal
 from safevar_sumo.search import Search
 from safevar_sumo.study import Study, tables_of
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError
@@ -131,13 +130,6 @@ def test_a_run_alone_is_the_same_as_in_the_whole(study: Study, tmp_path: Path, k
     assert np.array_equal(alone.solutions[key].objectives, campaign.solutions[key].objectives)
 
 
-def test_runs_have_random_numbers_of_their_own(study: Study) -> None:
-    first = {tuple(run_generator(study, key).random(3)) for key in all_runs(with_search(study, runs=30))}
-    assert len(first) == 90
-    one, other = (run_generator(which, RunKey("rs", 7)).random(3) for which in (study, with_search(study, runs=9)))
-    assert np.array_equal(one, other)
-
-
 def test_a_run_in_other_hands_is_left_to_them(study: Study, tmp_path: Path) -> None:
     carried_out(study, tmp_path / "whole")
     results = ResultsDirectory(tmp_path / "out", study)
@@ -200,13 +192,6 @@ def test_a_forecast_tells_what_all_workers_do_together(workers: int, study: Stud
     assert rate == 4 / 5 * (len(pool.simulated) - 1), "settings of the second probe, in a second; the first one warms up"
 
 
-def test_a_forecast_of_a_study_at_fault_tells_the_fault(study: Study) -> None:
-    with pytest.raises(PoolLostError):
-        forecast(study, 6, FormulaPool(lasts=0))
-    with pytest.raises(PoolLostError):
-        forecast(study, 6, FormulaPool(lasts=2))
-
-
 def test_a_torn_tail_is_told_and_simulated_again(study: Study, tmp_path: Path) -> None:
     carried_out(study, tmp_path)
     before = solutions(tmp_path)
@@ -260,17 +245,6 @@ def test_failures_are_counted_kept_out_and_not_met_again(study: Study, tmp_path:
     again, _ = carried_out(study, tmp_path, FormulaPool(lasts=0))
     assert again.failures == campaign.failures
     assert solutions(tmp_path) == before
-
-
-def test_an_algorithm_that_asks_for_other_settings_than_its_journal_holds_is_told(study: Study, tmp_path: Path) -> None:
-    one = with_search(study, algorithms=["rs"], runs=1)
-    carried_out(one, tmp_path)
-    path = tmp_path / "runs" / "rs-00.journal"
-    frames, _ = read_frames(path.read_bytes(), path)
-    other = msgspec.structs.replace(frames[1], settings=(np.frombuffer(frames[1].settings) * 1.01).tobytes())  # type: ignore[union-attr]
-    path.write_bytes(b"".join(encoded(frame) for frame in [frames[0], other]))
-    with pytest.raises(InputError, match="holds other settings than this search asks for"):
-        carried_out(one, tmp_path)
 
 
 def test_failed_settings_are_tried_again_when_that_is_asked_for(study: Study, tmp_path: Path) -> None:

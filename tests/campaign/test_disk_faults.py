@@ -119,14 +119,3 @@ def test_every_step_on_the_disk_may_fail(kinds: tuple[int, ...], stays: bool, ti
             break
     assert number < MOST_STEPS - 1, "no step is left that has not failed"
     assert errors > 30 or kinds == (0,)
-
-
-def test_clocks_that_jump_change_nothing(tiny: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = carried_out(tiny, tmp_path / "whole")
-    jumps = iter([0.0, 4e9, -1.0, 1e9, 1e9 - 86400] * 1000)
-    monkeypatch.setattr("time.time", lambda: next(jumps))
-    monkeypatch.setattr("time.time_ns", lambda: int(next(jumps) * 1e9))
-    assert carried_out(tiny, tmp_path / "out") == expected
-    for path in (tmp_path / "out").rglob("*.*"):
-        os.utime(path, (5e9, 5e9))
-    assert carried_out(tiny, tmp_path / "out") == expected

@@ -10,7 +10,6 @@ import re
 import shutil
 import subprocess
 import sys
-import threading
 from io import StringIO
 from pathlib import Path
 
@@ -87,20 +86,6 @@ def test_what_the_library_says_of_a_parameter_is_said_of_its_flag(in_tmp: Path) 
         assert told.source == arguments[-2]
 
 
-def test_a_thread_that_somebody_has_left_running_does_not_keep_the_program(monkeypatch: pytest.MonkeyPatch,
-                                                                           capsys: pytest.CaptureFixture[str]) -> None:
-    ended = threading.Event()
-    left = threading.Thread(target=ended.wait, name="left")
-    left.start()
-    monkeypatch.setattr(sys, "argv", ["safevar-sumo", "list"])
-    monkeypatch.setattr(os, "_exit", sys.exit)
-    with pytest.raises(SystemExit, match=r"^0$"):
-        main()
-    ended.set()
-    left.join()
-    assert capsys.readouterr().err == "note: still running and ended now: left\n"
-
-
 @pytest.mark.parametrize(("typed", "says"), [
     ("simulate rian", "did you mean 'rain'?"), ("explain rian", "did you mean 'rain'?"), ("simlate rain", "did you mean 'simulate'?"),
     ("simulate rain --set tirefric=1", "did you mean 'tireFric'?"), ("tolerance rain --characteristics mas", "did you mean 'mass'?"),
@@ -175,14 +160,6 @@ def test_every_name_of_the_list_can_be_read_and_typed() -> None:
         study = load_study(name)
         for text in (name, study.vehicle.model, study.ads.model, study.scenario.model, *study.vehicle.characteristics):
             assert text in told
-
-
-@pytest.mark.parametrize("command", [["list"], ["simulate", "native", "--set", "brakeGain=0.8"]])
-def test_what_a_characteristic_is_stands_with_its_name(command: list[str]) -> None:
-    done = CliRunner().invoke(commands, command, catch_exceptions=False)
-    gain = load_study("native").vehicle.characteristics["brakeGain"]
-    assert f"brakeGain {gain.meaning}; counterpart: {gain.counterpart}" in re.sub(r"\s+", " ", done.stdout)
-    assert command == ["list"] or "reactionTime age" not in re.sub(r"\s+", " ", done.stdout), "of what is changed alone"
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="POSIX alone has named pipes")

@@ -73,11 +73,6 @@ def test_on_a_terminal_what_matters_fits_in_its_line_and_no_word_is_cut(
     assert not [line for line in lines if "…" in line]
 
 
-def test_quiet_says_nothing(study: Study, clock: list[float]) -> None:
-    assert shown(study, clock, terminal_width=None, quiet=True) == ""
-    assert shown(study, clock, terminal_width=80, quiet=True).strip("\n") == ""
-
-
 def test_what_comes_from_journals_counts_as_done_and_not_as_fast(study: Study, clock: list[float]) -> None:
     """A run of 1000 that was finished before, of 600 different settings; 500 settings of the next one; then 100 simulated in 20 s."""
     out = StringIO()

@@ -181,16 +181,6 @@ def test_settings_that_sumo_dies_of_are_recorded_and_left_out(end: str, number: 
     pd.testing.assert_frame_equal(load("out").evaluations, healthy)
 
 
-@SLOW
-def test_of_two_studies_that_start_together_one_gets_the_directory() -> None:
-    Path("other.toml").write_text('extends = "small.toml"\nname = "other"\n')
-    both = [started("study", name, "--out", "out", "--jobs", "1") for name in ("small.toml", "other.toml")]
-    outputs = [process.communicate(timeout=60) for process in both]
-    assert sorted(process.returncode for process in both) == [0, 2], outputs
-    assert "another study" in "".join(errors for _, errors in outputs)
-    assert len(load("out").solutions) > 0
-
-
 Start = Callable[..., subprocess.Popen[str]]
 
 
@@ -259,20 +249,6 @@ def test_a_simulation_that_hangs_is_stopped_on_a_cluster_too(scheduler: tuple[su
     worker(start, address, "--nanny")
     errors = ended(started("study", "dozing.toml", "--cluster", address, "--out", "out"), 2)
     assert "workers of the cluster died" in errors
-
-
-@pytest.mark.slow
-def test_a_scheduler_that_dies_ends_the_study_and_what_was_written_stays(
-        scheduler: tuple[subprocess.Popen[str], str], start: Start) -> None:
-    process, address = scheduler
-    worker(start, address, "--no-nanny")
-    command = started("study", "small.toml", "--cluster", address, "--out", "out")
-    until(lambda: written(Path("out")) > 4000, command)
-    killed(process)
-    errors = ended(command, 1)
-    assert errors.startswith("safevar-sumo: the cluster does not answer any more")
-    assert len(errors.splitlines()) == 1
-    assert len(load("out").evaluations) >= 10
 
 
 def test_an_address_that_nobody_answers_is_told_in_time(in_tmp: Path) -> None:

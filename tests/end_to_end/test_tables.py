@@ -115,25 +115,6 @@ def test_imported_results_answer_what_needs_no_runs(imported: Path) -> None:
     assert "imported" in done.stderr
 
 
-def test_the_original_can_be_given(in_tmp: Path) -> None:
-    package_csv(in_tmp / "a.csv", 20, 3)
-    run("import", "sun", "--out", "a", "--nsga2", "a.csv", "--original", "sd=2.5,tet=1.1")
-    assert json.loads(Path("a/manifest.json").read_text())["original"] == {
-        "safety_degree": 2.5, "tet": 1.1, "tit": 0.44, "ave_dece": 5.97}
-    run("import", "sun", "--out", "a", "--safe-fuzzer", "a.csv")
-    assert set(pd.read_csv("a/solutions.csv")["algorithm"]) == {"nsga2", "safe_fuzzer"}
-    assert json.loads(Path("a/manifest.json").read_text())["original"]["safety_degree"] == 2.5, "an addition keeps what was given"
-    for wrong in ("sd", "sd=x", "ttc=1", "sd=nan", ""):
-        refused("import", "sun", "--out", "b", "--nsga2", "a.csv", "--original", wrong, told=("--original", "sd=NUMBER"))
-    assert not Path("b").exists()
-
-
-def test_an_import_never_mixes_with_a_campaign(results: Path, imported: Path) -> None:
-    refused("import", "sun", "--out", str(results), "--nsga2", "nsga2.csv", told=("holds results of a campaign",))
-    assert "runs" not in [path.name for path in imported.iterdir()]
-    refused("study", "sun", "--runs", "1", "--evaluations", "50", "--out", str(imported), told=("holds results of another study",))
-
-
 def test_a_csv_that_is_not_the_packages_is_refused(in_tmp: Path) -> None:
     frame = pd.read_csv(package_csv(in_tmp / "a.csv", 5, 1))
     frame.drop(columns=["TET", "mass"]).to_csv("lacking.csv", index=False)

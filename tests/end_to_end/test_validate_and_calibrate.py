@@ -64,16 +64,6 @@ def test_validate_warns_of_rows_outside_the_domains(data: Path, in_tmp: Path) ->
     assert "5 rows" in done.stderr
 
 
-def test_validate_refuses_what_is_no_reference_data(in_tmp: Path) -> None:
-    Path("text.csv").write_text("nothing\nhere\n")
-    refused("validate", "sun", "text.csv", told=("text.csv", "has one column, 'nothing'", "commas"))
-    Path("twice.csv").write_text("mass,SaftyDegree,mass\n2404,2.7,2000\n")
-    refused("validate", "sun", "twice.csv", told=("twice.csv", "'mass' twice"))
-    Path("few.csv").write_text("mass,SaftyDegree\n2404,2.7\n")
-    refused("validate", "sun", "few.csv", told=("few.csv", "lacks the columns"))
-    refused("validate", "sun", "nowhere.csv", told=("nowhere.csv", "cannot be read"))
-
-
 def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None:
     """A study that starts from another brake gap comes nearer to the one that the data was made with."""
     Path("mine.toml").write_text(
@@ -138,8 +128,3 @@ def test_an_interrupted_calibration_leaves_the_best_so_far(in_tmp: Path, monkeyp
     CliRunner().invoke(commands, ["calibrate", "sun", "--trials", "9", "--out", "best.toml"])
     assert "Best of 2 of 9 trials" in Path("best.toml").read_text()
     assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
-
-
-def test_calibrate_needs_something_to_fit(in_tmp: Path) -> None:
-    refused("calibrate", "native", "--trials", "1", told=("native", "[calibration]"))
-    refused("calibrate", "rain", "--trials", "1", "--out", "/proc/nowhere.toml", told=("--out",))

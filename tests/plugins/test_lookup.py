@@ -14,7 +14,6 @@ from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from tests.plugins.beside import ADS, SCALAR, Mine
 
-CHARACTERISTICS = "characteristics = { mass = { unit = 'kg', original = 1, lower = 0.5, upper = 2 } }\n"
 CONSTANT = SCALAR + "    def drive(self, seen):\n        return {}, 0.0\n"
 
 
@@ -31,12 +30,6 @@ def test_beside_the_study_comes_before_the_working_directory(mine: Mine, folder:
     assert throttle(folder / "mine.toml") == 0.9
     (folder / "mine.py").unlink()
     assert throttle(folder / "mine.toml") == 0.1
-
-
-def test_a_study_finds_what_lies_beside_the_study_that_it_extends(mine: Mine, folder: Path) -> None:
-    mine(CONSTANT.format(0.7))
-    Path("child.toml").write_text(f'extends = "{folder / "mine.toml"}"\nname = "child"\n')
-    assert throttle(Path("child.toml")) == 0.7
 
 
 def test_two_studies_with_modules_of_one_name_get_their_own_whatever_the_order(tmp_path: Path) -> None:
@@ -86,12 +79,6 @@ def test_what_does_not_meet_the_contract_is_refused_before_it_is_called(model: s
     assert told in str(caught.value)
     assert len(str(caught.value).splitlines()) <= 2
     assert not Path("called").exists()
-
-
-@pytest.mark.parametrize("table", ["vehicle", "scenario"])
-def test_vehicles_and_scenarios_are_held_to_their_contracts_too(table: str, mine: Mine) -> None:
-    with pytest.raises(InputError, match=r"has no method (prepare|begin)"):
-        mine("class Mine: ...\n", f'[{table}]\nmodel = "mine:Mine"\n' + (CHARACTERISTICS if table == "vehicle" else ""))
 
 
 @pytest.mark.parametrize(("module", "told"), [

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from hashlib import sha256
 from pathlib import Path
 
 import msgspec
@@ -155,13 +153,6 @@ def test_a_cell_that_is_no_number_is_told_with_row_and_column(tmp_path: Path, ce
         read_reference(tmp_path / "data.csv", SUN)
 
 
-def test_a_file_without_an_end_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("safevar_sumo.reference.rows.MOST_BYTES", 1000)
-    (tmp_path / "endless.csv").write_bytes(b"\0" * 1001)
-    with pytest.raises(InputError, match="more than 1000 bytes"):
-        read_reference(tmp_path / "endless.csv", SUN)
-
-
 def test_a_cell_is_told_by_its_line_though_lines_are_blank_and_cells_empty(tmp_path: Path) -> None:
     frame = table(SUN, SUN_COLUMNS).astype(object)
     frame.loc[1, "mass"] = ""
@@ -169,14 +160,3 @@ def test_a_cell_is_told_by_its_line_though_lines_are_blank_and_cells_empty(tmp_p
     (tmp_path / "data.csv").write_text("\n".join([*lines[:2], "", "", *lines[2:]]) + "\n\n")
     with pytest.raises(InputError, match="row 5, column mass is empty"):
         read_reference(tmp_path / "data.csv", SUN)
-
-
-def test_what_a_shell_hands_on_has_the_fingerprint_of_its_bytes() -> None:
-    """As `calibrate sun <(zcat data.csv.gz)` passes it."""
-    content = table(SUN, SUN_COLUMNS).to_csv(index=False).encode()
-    reading, writing = os.pipe()
-    os.write(writing, content)
-    os.close(writing)
-    data = read_reference(Path(f"/dev/fd/{reading}"), SUN)
-    os.close(reading)
-    assert (len(data.settings), data.fingerprint) == (3, sha256(content).hexdigest())

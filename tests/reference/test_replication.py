@@ -80,12 +80,6 @@ def test_a_test_holds_in_direction_magnitude_and_significance(
     assert grade(*here, *published) == verdict
 
 
-def test_what_is_the_same_holds(sides: Path) -> None:
-    verdicts = told(sides, "one", "same")
-    assert set(verdicts.values()) <= {HOLDS, OPEN}
-    assert {question for question, _ in verdicts} == {"RQ1", "RQ2", "RQ3.1", "RQ3.2", "RQ3.3", "collisions", "combinations"}
-
-
 def test_what_differs_is_marked_by_the_rules(sides: Path) -> None:
     verdicts = told(sides, "one", "other")
     assert verdicts["RQ1", "RS, safety_degree"] == HOLDS

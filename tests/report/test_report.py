@@ -37,6 +37,7 @@ from safevar_sumo.scenarios import Point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers import local
 from tests.analysis.known_regions import Plant
+from tests.in_process import Here
 
 
 class Outline(HTMLParser):
@@ -98,7 +99,7 @@ def never_again(few_samples: None, monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("asked twice")
 
     monkeypatch.setattr(findings, "explain", ask)
-    monkeypatch.setattr(local, "LocalPool", ask)
+    monkeypatch.setattr(Here, "submit", ask)
 
 
 def test_the_page_is_sound_html_and_whole_in_itself(page: str) -> None:

@@ -7,7 +7,6 @@ import math
 from typing import Any
 
 import msgspec
-import numpy as np
 import pandas as pd
 import pytest
 import scipy
@@ -25,8 +24,7 @@ from safevar_sumo.analysis.research_questions.changes import (
     weather,
     weather_pairs,
 )
-from safevar_sumo.analysis.research_questions.comparisons import ALPHA, ASYMPTOTIC, EXACT, compare, rq1, rq2
-from safevar_sumo.analysis.research_questions.indicators import indicators
+from safevar_sumo.analysis.research_questions.comparisons import ALPHA, rq1, rq2
 from safevar_sumo.analysis.research_questions.over_runs import brief, difference_line, holm, rq1_runs, rq2_runs
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable
@@ -261,28 +259,3 @@ def test_the_clearer_weather_comes_first(clear: str, wet: str) -> None:
     pair, = weather_pairs(friction_first)
     expected = sorted((clear, wet), key=lambda name: {"clear": (1, 1), "fog": (0.9, 0.6), "wet": (0.71, 1), "night": (1, 0.75)}[name])
     assert [one.name for one in pair] == expected[::-1]
-
-
-def test_weather_without_critical_solutions_on_one_side_has_no_difference() -> None:
-    clear, wet = (made_up(row(values=HEAVIER, sd=sd), study=made_up_study(name=name, weather=name))
-                  for name, sd in (("clear", 9), ("wet", 1)))
-    told = weather(clear, wet).set_index("characteristic").loc["mass"]
-    assert told["percent"] is None
-    assert told["percent_other"] == 100
-    assert told["difference"] is None
-
-
-def test_ties_in_small_samples_forbid_the_exact_p() -> None:
-    assert compare([1.0, 1.0, 2.0], [3.0, 4.0, 5.0]).method == ASYMPTOTIC
-    assert compare([1.0, 2.0, 3.0], [3.0, 4.0, 5.0]).method == ASYMPTOTIC
-    assert compare([0.0, 1.0, 2.0], [3.0, 4.0, 5.0]).method == EXACT
-    assert compare(np.arange(8.0), np.arange(100.0, 120)).method == EXACT
-    assert compare(np.arange(9.0), np.arange(100.0, 120)).method == ASYMPTOTIC
-
-
-def test_an_objective_that_is_the_same_everywhere_leaves_the_indicators_finite() -> None:
-    told = indicators(made_up(row(f_diff=0.5, sd=1.0), row(run=1, f_diff=0.5, sd=2.0), row("rs", f_diff=0.5, sd=1.5)))
-    assert np.isfinite(told[["igd", "igd_plus", "hypervolume"]].to_numpy(dtype=float)).all()
-    best = told[(told["algorithm"] == "nsga2") & (told["run"] == 0)].iloc[0]
-    assert best["igd"] == 0
-    assert best["hypervolume"] == pytest.approx(1.1**3)

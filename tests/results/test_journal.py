@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import Journal, JournalBusy
-from safevar_sumo.results.journal import HEAD, MAGIC, SPARE, Content, Result, batch_of, owner_of, read_journal
+from safevar_sumo.results.journal import SPARE, Content, Result, batch_of, owner_of, read_journal
 
 BATCHES = 4
 ROWS = 3
@@ -123,18 +123,6 @@ def test_any_changed_byte_is_a_cut_tail_or_an_error_that_tells_where(tmp_path: P
         assert str(path) in str(told.value)
         assert f"byte {start}" in str(told.value)
         assert path.read_bytes() == content, "a damaged file is left as it is"
-
-
-def test_a_frame_of_a_later_version_is_an_error(tmp_path: Path) -> None:
-    import zlib
-
-    path = tmp_path / "a.journal"
-    ends = write(path)
-    payload = b"\x81\xa4type\xa6future"
-    with path.open("ab") as file:
-        file.write(HEAD.pack(MAGIC, len(payload), zlib.crc32(payload)) + payload)
-    with pytest.raises(InputError, match=f"byte {ends[-1]}"):
-        read_journal(path, "study", "nsga2-00")
 
 
 @pytest.mark.parametrize(("study", "run"), [("other", "nsga2-00"), ("study", "nsga2-01")])

@@ -207,10 +207,6 @@ def test_rows_count_within_their_run() -> None:
         assert position_of(FRAME, SolutionId.parse(str(handle))) == place
 
 
-def test_imported_solutions_count_as_run_0() -> None:
-    assert list(map(str, handles(FRAME.drop(columns="run")))) == ["nsga2:0:0", "nsga2:0:1", "nsga2:0:2", "rs:0:0"]
-
-
 @pytest.mark.parametrize("text", [
     "", "nsga2", "nsga2:0", "nsga2:0:", ":0:0", "nsga2:-1:0", "nsga2:0:0:0", "nsga2:0:x", "nsga2:0:" + "9" * 30])
 def test_what_is_no_handle_is_refused(text: str) -> None:
@@ -326,13 +322,6 @@ def test_a_study_under_way(slippery: Path, tmp_path: Path) -> None:
     lines = CliRunner(env={"COLUMNS": "80"}).invoke(commands, ["status", str(tmp_path / "it")]).output.splitlines()
     assert max(map(len, lines)) <= 80
     assert "collisions" in "".join(lines), "no word is cut in two"
-
-
-def test_a_study_of_which_nothing_is_done_yet(slippery: Path, tmp_path: Path) -> None:
-    tmp_path.joinpath("it").mkdir()
-    shutil.copy(slippery / "manifest.json", tmp_path / "it")
-    assert status(tmp_path / "it").share == 0
-    assert "Nothing simulated yet" in CliRunner().invoke(commands, ["status", str(tmp_path / "it")]).output
 
 
 def test_watching_ends_with_the_study_and_json_is_json(slippery: Path) -> None:

@@ -137,13 +137,6 @@ def test_impossible_parameters_are_refused(parameters: dict[str, object], told: 
         driven(msgspec.convert(parameters, Crossing))
 
 
-def test_what_is_outside_the_protocol_is_allowed_with_a_word() -> None:
-    assert Crossing(speed=40.0).remarks() == []
-    assert "outside the protocol" in Crossing(speed=80.0).remarks()[0]
-    assert "none of the protocol's" in Crossing(test="CPNA", impact_location=33.0).remarks()[0]
-    assert driven(Crossing(speed=80.0)).outcome[0] == Outcome.COLLISION
-
-
 WORN = assemble(load_study("wear", matrix=None))
 
 
@@ -181,12 +174,6 @@ def test_points_of_a_matrix_may_rise_and_fall_and_are_each_as_if_alone() -> None
     degrees = [evaluate(together.at(point), original).f_safe[0] for point in together.points]
     assert evaluate(together, original).f_safe[0] == min(degrees)
     assert len(set(degrees)) == 3
-
-
-def test_a_grade_beyond_30_percent_is_refused_and_one_outside_the_protocol_told() -> None:
-    with pytest.raises(msgspec.ValidationError, match="grade"):
-        msgspec.convert({"grade": 31}, Crossing)
-    assert CarToCar(grade=-5.0).remarks() == ["CCRs: grade = -5 %, and the protocol's road is level"]
 
 
 def test_a_vehicle_that_knows_no_slope_is_refused_on_one_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -11,9 +10,8 @@ import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome, SimulationRuns
-from safevar_sumo.scenarios import SCENARIOS, WEATHERS, Crossing, Point, PreCrash, tags
+from safevar_sumo.scenarios import Crossing, tags
 from safevar_sumo.scenarios.along import Along
-from safevar_sumo.scenarios.base import pre_crash_of
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.euro_ncap import VUT_WIDTH
 from safevar_sumo.study import load_study
@@ -91,17 +89,6 @@ PEDESTRIAN = "pedestrian crash without prior vehicle manoeuvre"
 ])
 def test_the_tags_of_the_shipped_studies(study: str, told: str) -> None:
     assert tags(assemble(load_study(study)).points) == f"NHTSA's pre-crash types: {told}."
-
-
-def test_every_shipped_scenario_has_a_type_of_nhtsas_list() -> None:
-    assert all(pre_crash_of(kind()) in list(PreCrash) for kind in SCENARIOS.values())
-    assert {pre_crash_of(CarToCar(test=test)) for test in ("CCRs", "CCRm", "CCRb")} == {*list(PreCrash)[2:]}
-
-
-def test_it_is_night_where_the_weather_says_so_and_a_scenario_may_tell_no_type() -> None:
-    assert {name for name, weather in WEATHERS.items() if weather.light == "night"} == {"night"}
-    night = Point(SimpleNamespace(), WEATHERS["night"])  # type: ignore[arg-type]
-    assert not tags([night])
 
 
 KMH = 1 / 3.6

@@ -192,14 +192,6 @@ def test_an_improvement_begins_the_count_of_generations_without_one_anew() -> No
     assert len(asked) == 13 + 5
 
 
-def test_a_range_inside_the_filters_band_does_not_hang_it() -> None:
-    """The mean of the unsafe values lies so near the original that nothing outside the band is left."""
-    narrow = CharacteristicSet((Characteristic(name="c", unit="-", original=5.0, lower=4.95, upper=7.0),))
-    found, asked = searched("safe_fuzzer", 5, 1500, narrow)
-    assert len(found) == 50
-    assert sum(len(settings) for settings in asked) <= 1500
-
-
 def test_the_result_is_the_fifty_best_scores() -> None:
     found, asked = searched("safe_fuzzer", 6, 1000)
     everything = sphere(SUN, np.concatenate(asked))
@@ -219,18 +211,6 @@ def individuals(*objectives: tuple[float, float, float]) -> list[_Individual]:
         one.fitness = _fitness(3)(values)
         made.append(one)
     return made
-
-
-def test_survivors_are_the_better_ranks_and_of_the_last_rank_those_with_most_room() -> None:
-    """Room is the distance between both neighbours, each objective over its spread, here 4; the ends have infinitely much."""
-    front = individuals((0, 4, 1), (1, 3, 1), (1.5, 2.5, 1), (3, 1, 1), (4, 0, 1))
-    behind = individuals((5, 5, 1), (6, 6, 1))
-    kept = _survivors([*behind, *front], 4)
-    # (1, 3) has (1.5 - 0) / 4 + (4 - 2.5) / 4 = 0.75, (1.5, 2.5) has 1, (3, 1) has 1.25.
-    assert {tuple(one.fitness.values[:2]) for one in kept} == {(0, 4), (4, 0), (3, 1), (1.5, 2.5)}
-    assert {one.standing[0] for one in kept} == {0}
-    everybody = _survivors([*behind, *front], 7)
-    assert [one.standing[0] for one in everybody] == [0] * 5 + [1, 2]
 
 
 @given(st.lists(st.tuples(*[st.integers(-2, 2)] * 3), max_size=40), st.integers(1, 40))
@@ -294,13 +274,6 @@ def test_the_number_of_changes_is_rounded_half_up(settings: list[list[float]], m
     ranges = _Ranges(problem())
     ranges.narrow(window(settings, [1.0] * len(settings)))
     assert ranges.most_changed == most, "a mean of 1.5 makes 2, of 4/3 makes 1"
-
-
-def test_a_window_without_anything_unsafe_narrows_nothing() -> None:
-    ranges = _Ranges(problem())
-    ranges.narrow(window([[60, 40]], [5.0]))
-    assert ranges.upper.tolist() == [100, 100]
-    assert ranges.most_changed == 2
 
 
 def test_a_score_weighs_safety_six_times_and_the_others_once() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import msgspec
@@ -131,10 +130,3 @@ def test_a_written_study_is_called_as_its_file(tmp_path: Path) -> None:
     found = load_study(str(tmp_path / "fitted.toml"))
     assert found.name == "fitted"
     assert found.published == load_study("sun").published
-
-
-def test_a_study_may_extend_a_file_beside_it(tmp_path: Path) -> None:
-    shutil.copy(STUDIES / "sun.toml", tmp_path / "base.toml")
-    (tmp_path / "mine.toml").write_text('extends = "base.toml"\nname = "mine"\n[search]\nruns = 3\n')
-    study = load_study(str(tmp_path / "mine.toml"))
-    assert (study.name, study.search.runs, study.search.population) == ("mine", 3, 50)

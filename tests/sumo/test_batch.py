@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,16 +11,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from safevar_sumo.ads import ADS, GuardedAds, PerVehicle, ScalarAds
-from safevar_sumo.errors import EnvironmentFault
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather, load_study
 from safevar_sumo.sumo.batch import _Verdict, score
-from safevar_sumo.sumo.engine import Engine, open_world
+from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.kinematic import simulate_alone
 from safevar_sumo.sumo.matrix import evaluate, simulate
-from safevar_sumo.sumo.network import CopiedNetwork, copied_network
 from safevar_sumo.sumo.perception import Perception
 from safevar_sumo.sumo.system import System, assemble
 
@@ -47,19 +44,6 @@ def test_a_result_depends_neither_on_the_batch_nor_on_its_size(study: str, seed:
     some = data.draw(st.lists(st.integers(0, n - 1), min_size=1, max_size=n, unique=True))
     assert same_bits(together.take(some), evaluate(system, population[some]))
     assert same_bits(together.take([0]), evaluate(system, population[:1]))
-
-
-def test_a_whole_trace_does_not_depend_on_the_batch() -> None:
-    system = assemble(load_study("rain"))
-    population = drawn(system, 17, 5)
-    together, alone = simulate(system, population).trace, simulate(system, population[3:4]).trace
-    length = min(len(alone.time), len(together.time))
-    shown = alone.active[:length, 0]
-    assert np.array_equal(together.active[:length, 3], shown)
-    for field in fields(Trace):
-        values = getattr(alone, field.name)
-        if isinstance(values, np.ndarray) and values.ndim == 2:
-            assert values[:length][shown, 0].tobytes() == getattr(together, field.name)[:length][shown, 3].tobytes(), field.name
 
 
 def test_the_original_vehicle_does_not_collide(any_system: System) -> None:
@@ -212,16 +196,6 @@ def test_libsumo_and_traci_give_the_same_trace(study: str) -> None:
     assert here.outcome.tolist() == socket.outcome.tolist()
     for field in fields(Trace):
         assert np.array_equal(getattr(here.trace, field.name), getattr(socket.trace, field.name)), field.name
-
-
-def test_broken_traffic_is_an_error_in_sumos_words(tmp_path: Path) -> None:
-    files = copied_network("lead_vehicle_stopped", 1)
-    broken = tmp_path / "traffic.rou.xml"
-    broken.write_text(files.traffic.read_text().replace("0.road", "nowhere"))
-    with pytest.raises(EnvironmentFault, match="nowhere"), open_world(CopiedNetwork(files.network, broken, files.options), 1) as world:
-        world.depart()
-    with open_world(files, 1) as world:  # and the process is as good as before
-        world.depart()
 
 
 STEP = 0.05

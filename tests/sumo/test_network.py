@@ -44,13 +44,6 @@ def test_copies_share_coordinates_and_nothing_else() -> None:
     assert all(one["from"] == one["to"] for one in connections)
 
 
-def test_a_network_is_built_once() -> None:
-    first = copied_network("lead_vehicle_stopped", 3)
-    written = first.network.stat().st_mtime_ns
-    assert copied_network("lead_vehicle_stopped", 3) == first
-    assert first.network.stat().st_mtime_ns == written
-
-
 @pytest.mark.parametrize("spoil", [
     lambda path: path.write_text(path.read_text().replace('id="0', 'id="00')), lambda path: path.write_text("<net><edge id='x'/></net>"),
     lambda path: path.write_bytes(path.read_bytes()[:-500]), lambda path: path.write_bytes(b""), Path.unlink])
@@ -86,13 +79,6 @@ def test_a_disk_that_is_full_while_a_network_is_built_leaves_nothing_behind(loss
         copied_network("lead_vehicle_stopped", n)
     monkeypatch.setattr(subprocess, "run", ran)
     ElementTree.parse(copied_network("lead_vehicle_stopped", n).network)
-
-
-def test_a_cache_that_cannot_be_written_is_the_surroundings_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "file").write_text("")
-    monkeypatch.setattr("platformdirs.user_cache_path", lambda name: tmp_path / "file")
-    with pytest.raises(EnvironmentFault, match="cannot write the cache of networks"):
-        copied_network("lead_vehicle_stopped", 1)
 
 
 def test_sources_that_netconvert_refuses_are_an_error(tmp_path: Path) -> None:

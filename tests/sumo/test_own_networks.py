@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import xml.etree.ElementTree as ElementTree
@@ -110,26 +109,6 @@ def test_a_built_network_alone_is_simulated_as_its_sources_are(mine: Path) -> No
 
 def load_original(study: str) -> np.ndarray:
     return assemble(load_study(study)).characteristics.original[np.newaxis]
-
-
-def test_a_network_that_netedit_saved_after_its_sources_is_refused(mine: Path) -> None:
-    net = mine / "network.net.xml"
-    net.write_text(net.read_text().replace("SUMO netconvert", "SUMO netedit").replace('speed="70.0000"', 'speed="60.0000"'))
-    os.utime(net, (2e9, 2e9))
-    with pytest.raises(InputError, match=r"network\.net\.xml: was saved by netedit after network\.nod\.xml"):
-        check_network(str(mine))
-
-
-@pytest.mark.parametrize(("old", "new", "told"), [
-    ('net-file value="network', 'net-file value="../network', "net-file = '../network.net.xml' is in another folder"),
-    ("traffic.rou.xml", "traffic.rou.xml,more.rou.xml", "route-files = 'traffic.rou.xml,more.rou.xml'"),
-    ('pedestrian.striping.dawdling value="0"', 'pedestrian.striping.dawdling value="0.2"', "persons dawdle at random"),
-    ('<pedestrian.striping.dawdling value="0"/>', "", "persons dawdle at random")])
-def test_options_of_sumo_that_are_not_honoured_are_refused(mine: Path, old: str, new: str, told: str) -> None:
-    rewritten(mine / "scenario.sumocfg", old, new)
-    with pytest.raises(InputError, match=r"scenario\.sumocfg: ") as caught:
-        check_network(str(mine))
-    assert told in str(caught.value)
 
 
 @pytest.mark.parametrize(("file", "old", "new", "told"), [

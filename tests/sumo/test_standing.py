@@ -121,17 +121,6 @@ def test_the_network_is_loaded_once_for_batches_that_fit(loadings: list[str]) ->
     assert len(loadings) == 2
 
 
-def test_after_a_failure_it_starts_afresh(loadings: list[str]) -> None:
-    system = SYSTEMS["native"]
-    population = drawn(system, 5, 2)
-    expected = bits(simulate(system, population))
-    with pytest.raises(SimulationError, match="on fire"):
-        simulate(replace(system, ads=_Failing()), population)
-    loadings.clear()
-    assert bits(simulate(system, population)) == expected
-    assert len(loadings) == 1
-
-
 UNREPEATABLE: dict[str, dict[str, tuple[str, str]]] = {
     "a flow": {"traffic": ("</routes>", '<flow id="f" type="parked" from="road" to="road" begin="0" end="9" number="2"/></routes>')},
     "a trip": {"traffic": ("</routes>", '<trip id="t" type="parked" from="road" to="road" depart="0"/></routes>')},
@@ -148,13 +137,6 @@ UNREPEATABLE: dict[str, dict[str, tuple[str, str]]] = {
 @pytest.mark.parametrize("what", sorted(UNREPEATABLE))
 def test_what_cannot_be_put_back_is_not(tmp_path: Path, what: str) -> None:
     assert repeatable_traffic(changed_network(tmp_path, "lead_vehicle_stopped", **UNREPEATABLE[what])) is None
-
-
-@pytest.mark.parametrize("changes", [
-    {"scenario": ('<pedestrian.striping.dawdling value="0"/>', "")},
-    {"nod": ('type="priority"', 'type="traffic_light"')}], ids=["a pedestrian dawdles at random", "a traffic light"])
-def test_nor_is_a_pedestrian(tmp_path: Path, changes: dict[str, tuple[str, str]]) -> None:
-    assert repeatable_traffic(changed_network(tmp_path, "pedestrian_crossing", **changes)) is None
 
 
 @pytest.mark.parametrize("network", sorted({path.name for path in NETWORKS.iterdir() if path.is_dir()}))

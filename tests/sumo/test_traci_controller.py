@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import tomllib
 from pathlib import Path
 
 import msgspec
@@ -12,7 +11,6 @@ import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
-from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study import ModelTable, load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import System, assemble
@@ -192,46 +190,6 @@ def test_calls_that_are_not_a_controllers_are_refused_even_if_it_goes_on(line: s
         simulate(found, changed(found))
     assert problem in str(caught.value)
     assert "my_controller.py:3" in str(caught.value)
-
-
-def test_minus_one_gives_control_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    script = ("def step(traci, v):\n    traci.vehicle.setSpeed(v, 3 if traci.simulation.getTime() < 5 else -1)\n"
-              "def free(traci, v):\n    traci.vehicle.setSpeed(v, 3) if traci.simulation.getTime() < 5 else None\n")
-    systems = [system(name, tmp_path, monkeypatch, script) for name in ("step", "free")]
-    speeds = [simulate(one, changed(one)).trace.speed.max() for one in systems]
-    assert speeds[0] > 6
-    assert speeds[1] < 4
-
-
-SENSES = """
-from safevar_sumo.vehicles import SumoVehicle, Lgsvl
-
-
-class Dim:
-    def __init__(self):
-        self._base = SumoVehicle()
-        self.UNITS = self._base.UNITS
-
-    def __getattr__(self, name):
-        if name == "sensors" or name.startswith("__"):
-            raise AttributeError(name)
-        return getattr(self._base, name)
-
-    prepare = lambda self, c, f, s: self._base.prepare(c, f, s)
-    sumo_type = lambda self, p: self._base.sumo_type(p)
-    at_rest = lambda self, p: self._base.at_rest(p)
-    sense = lambda self, p, s, seen: self._base.sense(p, s, seen)
-    advance = lambda self, p, s, c: self._base.advance(p, s, c)
-"""
-
-
-def test_a_vehicle_whose_sensors_would_not_act_is_refused_before_anything_is_simulated(
-        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "my_vehicle.py").write_text(SENSES)
-    native = tomllib.loads((STUDIES / "native.toml").read_text())
-    with pytest.raises(InputError, match=r"vehicle.model = 'my_vehicle:Dim' changes gap in sense") as caught:
-        system("step", tmp_path, monkeypatch, vehicle={"model": "my_vehicle:Dim", "characteristics": native["vehicle"]["characteristics"]})
-    assert "sensors(prepared)" in caught.value.legal
 
 
 def test_a_script_stops_the_original_and_not_a_vehicle_that_has_lost_its_brakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

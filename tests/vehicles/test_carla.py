@@ -162,12 +162,3 @@ def test_beyond_the_limit_ours_holds_what_the_other_one_loses(friction: float, l
     limit = friction * GRAVITY
     assert ours(9.5, p_dx1=friction) == pytest.approx(limit, rel=0.03)
     assert least * limit < multi_body(9.5, p_dx1=friction) < limit
-
-
-@SLOW
-def test_a_brake_split_matters_only_at_the_limit() -> None:
-    """Ours has none: four wheels share the load and brake as one. Below the limit that is right, near it up to 15 % off."""
-    assert multi_body(5.0, T_sb=0.5) == pytest.approx(multi_body(5.0, T_sb=0.8), rel=0.02)
-    near = [multi_body(9.0, T_sb=split) for split in (0.5, 0.66, 0.8)]
-    assert max(near) / min(near) > 1.1
-    assert min(near) > 0.7 * ours(9.0)

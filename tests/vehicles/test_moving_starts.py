@@ -41,27 +41,6 @@ def test_nothing_changes_while_the_pedals_stay(model: str, kmh: float, grade: fl
             assert getattr(state, name) == pytest.approx(getattr(before, name), rel=1e-12), name
 
 
-@pytest.mark.parametrize("model", sorted(SYSTEMS))
-def test_coasting_from_a_steady_start_has_no_transient(model: str) -> None:
-    """What it loses grows to a peak as the driveline lets go, and falls: no jump, no swing; and just so after five steady seconds."""
-    def coasting(after: float) -> np.ndarray:
-        prepared, state = moving(model, original(model), 40 / 3.6)
-        held, nothing = Command(state.throttle, state.brake), np.zeros(1)  # type: ignore[attr-defined]
-        speeds = []
-        for k in range(round((after + 1.5) / STEP)):
-            speeds.append(float(state.speed[0]))  # type: ignore[attr-defined]
-            state = SYSTEMS[model].vehicle.advance(prepared, state, held if k * STEP < after else Command(nothing, nothing))
-        return -np.diff(speeds[round(after / STEP):]) / STEP
-
-    lost = coasting(0.0)
-    assert np.all(lost >= 0)
-    peak = int(np.argmax(lost))
-    assert np.all(np.diff(lost[:peak + 1]) >= -1e-9)
-    assert np.all(np.diff(lost[peak:]) <= 1e-9)
-    assert np.max(np.abs(np.diff(lost, prepend=0.0))) < 1.0
-    assert coasting(5.0) == pytest.approx(lost, abs=1e-9)
-
-
 def test_whoever_stands_and_whoever_rolls_start_together_and_each_as_if_alone() -> None:
     for model, system in SYSTEMS.items():
         settings = drawn(model, 4, 9)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.records import Command, Observation
-from safevar_sumo.vehicles.lgsvl import _roll, _tyre_stiffness
+from safevar_sumo.vehicles.lgsvl import _tyre_stiffness
 from tests.vehicles.drives import STEP, SYSTEMS, drive, full_throttle, original
 
 GRAVITY = 9.81
@@ -48,26 +48,6 @@ def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_
 
     assert [target(1, 0.649), target(1, 0.651), target(1, 0.651, 1.9)] == [1, 2, 1]
     assert [target(2, 0.501), target(2, 0.499), target(2, 0.499, 1.9), target(1, 0.1), target(4, 0.9)] == [2, 1, 2, 1, 4]
-
-
-def test_carlas_engine_pulls_nothing_beyond_its_limit_and_its_curve_has_its_points() -> None:
-    vehicle, p = SYSTEMS["carla"].vehicle, prepared("carla")
-    limit = 5800 * 2 * np.pi / 60
-
-    def torque(rpm: float) -> float:
-        state = vehicle.at_rest(p)._replace(engine_speed=np.full(1, rpm / 5800 * limit))
-        return float(vehicle._torque(p, state.engine_speed)[0]) / vehicle.engine_torque
-
-    assert [torque(rpm) for rpm in (0, 945, 1890, 3810, 5730)] == pytest.approx([400, 450, 500, 450, 400])
-    assert torque(5801) == 0
-
-
-def test_carlas_engine_turns_no_faster_than_its_limit_even_if_the_wheels_drive_it() -> None:
-    """In first gear at 30 m/s, through a clutch that hardly slips, they would turn it half as fast again."""
-    vehicle, p, one = SYSTEMS["carla"].vehicle, prepared("carla", clutchStrength=200.0, dampRateZeroT_CE=0.1), np.ones(1)
-    limit = 5800 * 2 * np.pi / 60
-    state = vehicle.at_rest(p)._replace(speed=30 * one, wheel_speed=30 / 0.355 * one, engine_speed=limit * one, gear=one, target_gear=one)
-    assert vehicle.advance(p, state, Command(np.zeros(1), np.zeros(1))).engine_speed[0] <= limit
 
 
 def test_carlas_pedals_rise_and_fall_at_their_own_rates() -> None:
@@ -121,16 +101,6 @@ def test_lgsvls_tyres_follow_unitys_curve(slip: float, share: float) -> None:
     speed = rim * (1 - slip)
     force = float(_tyre_stiffness(p, speed * one, rim * one, (rim - speed) * one)[0]) * (rim - speed)  # type: ignore[arg-type]
     assert force == pytest.approx(share * (2120 * GRAVITY + 2 * speed * speed))
-
-
-def test_lgsvls_engine_follows_its_wheels_with_a_lag_of_a_twentieth_of_a_second() -> None:
-    vehicle, p = SYSTEMS["lgsvl"].vehicle, prepared("lgsvl")
-    one, h = np.ones(1), STEP / 2
-    state = vehicle.at_rest(p)._replace(engine_rpm=2000.0 * one, wheel_speed=10.0 * one, speed=3.5 * one)
-    gearing = 4.17 * 2.56
-    wanted = 800 + 10 * gearing * 60 / (2 * np.pi)
-    told = _roll(p, state, gearing * one, 0 * one).engine_rpm[0]  # type: ignore[arg-type]
-    assert told == pytest.approx(2000 + (wanted - 2000) * 20 * h / (1 + 20 * h))
 
 
 @pytest.mark.parametrize(("visibility", "seen"), [(1.0, True), (0.8, True), (0.7, False)])

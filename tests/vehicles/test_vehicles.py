@@ -202,9 +202,3 @@ def test_a_slow_sensor_reports_the_past() -> None:
     gaps = sensed_gaps("reactionTime")[200]
     now = 130.0 - 10 * 200 * STEP
     assert np.allclose(gaps, now + 10 * np.linspace(0.1, 0.8, 5))
-
-
-def test_a_brake_command_waits_for_the_delay() -> None:
-    run = drive("sumo", ends("sumo", "brakeDelay"), lambda time: (0.0, 1.0), 1.0)
-    brake = np.stack([state.brake for state in run.states])
-    assert np.allclose([np.argmax(brake[:, i] > 0.5) * STEP for i in range(5)], np.linspace(0.05, 0.5, 5) + STEP, atol=STEP)

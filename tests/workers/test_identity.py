@@ -36,15 +36,6 @@ def test_names_and_defaults_are_resolved_to_numbers() -> None:
     assert not {"runs", "algorithms", "evaluations", "time_limit"} & set(identity["resolved"]["search"])
 
 
-def test_what_a_characteristic_means_is_no_part_of_a_studys_identity() -> None:
-    study = load_study("native")
-    bare = {name: msgspec.structs.replace(row, meaning="", counterpart="") for name, row in study.vehicle.characteristics.items()}
-    other = msgspec.structs.replace(study, vehicle=msgspec.structs.replace(study.vehicle, characteristics=bare))
-    assert study.vehicle.characteristics["mass"].meaning
-    assert identity_of(other, assemble(other)) == identity_of(study, assemble(study))
-    assert not {"meaning", "counterpart"} & set(identity_of(study, assemble(study))["resolved"]["vehicle"]["characteristics"]["mass"])
-
-
 @pytest.mark.parametrize("file", ["scenario.sumocfg", "network.nod.xml", "network.netccfg"])
 def test_every_file_of_a_network_that_results_hang_on_counts(file: str, tmp_path: Path) -> None:
     shutil.copytree(NETWORKS / "lead_vehicle_stopped", tmp_path / "mine")

@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import suppress
 
 import msgspec
 import numpy as np
@@ -68,19 +67,6 @@ def test_a_killed_worker_is_told_and_replaced(pool: LocalPool) -> None:
     with pytest.raises(WorkerLostError, match="exit code -9"):
         future.result(timeout=30)
     assert pool.submit(SMOKE, ORIGINAL).result(timeout=30).valid.all()
-
-
-def test_a_worker_that_was_killed_while_it_started_costs_nothing(pool: LocalPool) -> None:
-    future = pool.submit(SMOKE, ORIGINAL)
-    for _ in range(2):
-        while not (young := processes()):
-            time.sleep(0.005)
-        os.kill(young[0].pid, signal.SIGKILL)
-        with suppress(psutil.NoSuchProcess):
-            while young[0].status() != psutil.STATUS_ZOMBIE:
-                time.sleep(0.005)
-        time.sleep(0.05)
-    assert future.result(timeout=30).valid.all()
 
 
 def test_what_takes_too_long_is_stopped() -> None:
@@ -224,12 +210,6 @@ def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> No
     assert f"--set {SUN.names[0]}=4313.0" in str(told.value)
     assert str(told.value).count("--set") == 1, "what is not changed need not be set"
     assert len(pool.tried) < 15
-
-
-def test_a_process_that_ends_with_a_users_code_in_it_is_an_error() -> None:
-    told = r"exit code -9\), again and again, with ads.model = 'my_ads:Mine' in it; .* cannot tell file and line; again by: .*=4302\.0"
-    with pytest.raises(ForeignError, match=told):
-        RetryingPool(ToldPool(deadly(4302)), FOREIGN).submit(b"", settings(8)).result(timeout=5)
 
 
 def test_settings_that_fail_one_after_the_other_without_end_are_a_fault_of_the_study() -> None:
