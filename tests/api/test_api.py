@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo import report
 from safevar_sumo.study import load_study, tables_of
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble

@@ -12,14 +12,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner, Result
+from safevar_sumo.reference.validation import rank_correlation
 
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.reference import Agreement, keep_totals, published, quoted
-from safevar_sumo.reference.agreement import rank_correlation
-from safevar_sumo.reference.beside import paired, tables_beside
-from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, conclusions, grade
+from safevar_sumo.reference import Agreement, keep_totals, quoted, validation
+
+from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, conclusions, grade, paired, tables_beside
 from safevar_sumo.report.verdict import agreement
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.batch import score
@@ -135,7 +135,7 @@ def totals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The only entry is made up: 10 of 40 published collisions collide here, which are half of the 20 here."""
     path = tmp_path / "totals.toml"
     keep_totals(path, load_study("rain"), "made_up.csv", MADE_UP)
-    monkeypatch.setattr(published, "TOTALS", path)
+    monkeypatch.setattr(validation, "TOTALS", path)
     return path
 
 
