@@ -8,11 +8,11 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pytest
-from safevar_sumo.reference.validation import rank_correlation
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations
 from safevar_sumo.reference import ReferenceData, agreement, package_filter, plot_agreement, read_reference
+from safevar_sumo.reference.validation import rank_correlation
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 

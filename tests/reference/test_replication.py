@@ -12,18 +12,17 @@ import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner, Result
-from safevar_sumo.reference.validation import rank_correlation
 
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.reference import Agreement, keep_totals, quoted, validation
-
 from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, conclusions, grade, paired, tables_beside
+from safevar_sumo.reference.validation import rank_correlation
 from safevar_sumo.report.verdict import agreement
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo import simulate
 from safevar_sumo.sumo.batch import score
-from safevar_sumo.sumo.kinematic import simulate_alone
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -192,7 +191,7 @@ def test_the_original_vehicle_is_as_near_to_the_published_one_as_is_said(study: 
     read = load_study(study)
     system = assemble(read)
     settings = system.characteristics.original[np.newaxis]
-    here = score(system, settings, simulate_alone(system, settings)).metrics
+    here = score(system, settings, simulate(system, settings)).metrics
     for name, share in within.items():
         assert here[name][0] == pytest.approx(read.published[name], rel=share), name
 
@@ -205,5 +204,5 @@ def test_vehicles_come_in_the_order_of_the_published_effects(study: str, expecte
     width = characteristics.upper - characteristics.lower
     settings = np.random.default_rng(14).uniform(characteristics.lower, characteristics.upper, (150, len(width)))
     effects = np.array([PUBLISHED_EFFECTS.get(name, 0.0) for name in characteristics.names])
-    here = score(system, settings, simulate_alone(system, settings)).f_safe
+    here = score(system, settings, simulate(system, settings)).f_safe
     assert rank_correlation(((settings - characteristics.original) / width) @ effects, here) == pytest.approx(expected, abs=NEAR)

@@ -21,8 +21,7 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.report import input as material
 from safevar_sumo.report import make_report
-from safevar_sumo.report.page import gather
-from safevar_sumo.report.trust import reproduce
+from safevar_sumo.report.page import gather, reproduce
 from safevar_sumo.study import Study, load_study
 from tests.in_process import searched
 
