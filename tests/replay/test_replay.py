@@ -16,12 +16,13 @@ import pytest
 from click.testing import CliRunner, Result
 from PIL import Image
 
+from safevar_sumo.analysis.figures import save
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.replay.comparison import Comparison, compare_setting, differences, divergence, moments
-from safevar_sumo.replay.figure import draw_comparison, write_figure
+from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.results import handles
 from safevar_sumo.study import load_study
@@ -184,7 +185,7 @@ def test_at_an_impact_the_pedals_are_those_that_were_in_force() -> None:
 @pytest.mark.parametrize("kind", ["png", "svg"])
 def test_the_same_bytes_twice(kind: str, comparison: Comparison, tmp_path: Path) -> None:
     for name in ("a", "b"):
-        write_figure(draw_comparison(comparison), tmp_path / f"{name}.{kind}")
+        save(draw_comparison(comparison), tmp_path / f"{name}.{kind}")
     assert (tmp_path / f"a.{kind}").read_bytes() == (tmp_path / f"b.{kind}").read_bytes()
 
 

@@ -127,9 +127,9 @@ def test_objectives_of_change_agree_with_a_loop(settings: np.ndarray) -> None:
 
 @pytest.mark.parametrize("value", [1.0, 5000.0, float("nan"), float("inf")])
 def test_a_value_outside_the_domain_is_refused(value: float) -> None:
-    with pytest.raises(InputError, match=r"mass = .*\nlegal: a number in \[2040, 2700\] kg"):
+    with pytest.raises(InputError, match=r"mass = .*\nexpected: a number in \[2040, 2700\] kg"):
         SUN.setting({"mass": value}, "--set")
-    with pytest.raises(InputError, match=r"\nlegal: a number in \[[\d.]+, [\d.]+\]$"):
+    with pytest.raises(InputError, match=r"\nexpected: a number in \[[\d.]+, [\d.]+\]$"):
         SUN.setting({"tireFric": -abs(value)}, "--set")
 
 
