@@ -24,9 +24,7 @@ FORMATS = {"text": "smoke", "markdown": "| ", "latex": r"\toprule", "csv": "sett
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A study of two algorithms and two runs, as the command leaves it."""
     place = tmp_path_factory.mktemp("study") / "small"
-    done = run("study", "smoke", "--evaluations", "100", "--out", str(place))
-    for part in ("RQ1", "RQ2", "NSGA-II: SD", "too few runs for a test (8 are needed)", f"python -m safevar_sumo tables {place}"):
-        assert part in done.stdout
+    run("study", "smoke", "--evaluations", "100", "--out", str(place), "--quiet")
     return place
 
 
