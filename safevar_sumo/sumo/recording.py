@@ -195,6 +195,12 @@ def _way_of(api: Any, vut: str) -> tuple[Way, FloatArray]:
     return Way(first, vector, end, np.maximum(shape_length, POSITION_EPS) / end, shape_length), direction_of(api.vehicle.getAngle(vut))
 
 
+def distance(before: FloatArray, after: FloatArray, step: float) -> FloatArray:
+    """Way in a step from one speed to another at a constant acceleration [m], in SUMO's operations (`MSVehicle::getDeltaPos`)."""
+    acceleration = (after - before) / step
+    return np.asarray((before + 0.5 * (acceleration * step)) * step)
+
+
 class RecordedWorld:
     """N vehicles in each of several recorded scenes of one network; for a drive what `SumoWorld` is, of shapes (N,) and (N, 2)."""
 
@@ -243,7 +249,7 @@ class RecordedWorld:
         SimulationError
             If a vehicle leaves its last lane.
         """
-        self._place = self._place + (self._speeds + speeds) / 2 * self.step_length
+        self._place = self._place + distance(self._speeds, speeds, self.step_length)
         self._speeds, self._front, self._sample = speeds, None, self._sample + 1
         end = self._way.end
         while (beyond := self._place > end[self._lane]).any():
