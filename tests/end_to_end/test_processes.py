@@ -67,7 +67,6 @@ def test_two_workers_that_are_killed_leave_the_same_bytes(whole: Path) -> None:
     ended(process, 0)
     assert kills == 2
     assert solutions(OUT) == solutions(whole)
-    assert Path("out/manifest.json").read_bytes() == (whole / "manifest.json").read_bytes()
     assert (load(OUT).evaluations["outcome"] != "simulator-error").all()
 
 
