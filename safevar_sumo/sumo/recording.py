@@ -212,7 +212,9 @@ class RecordedWorld:
         self._way, self._sample = recordings[0].way, 0
         self._speeds = np.repeat([one.speed for one in recordings], n)
         self._lane, self._place = np.zeros(self.n, dtype=np.intp), np.repeat([one.start for one in recordings], n)
+        self._left = np.zeros(self.n, dtype=bool)
         self._front: FloatArray | None = None
+        self._front_before, self._speeds_before = np.full((self.n, 2), np.inf), self._speeds
         self._struck: dict[int, Body] = {}
         self.sensors = Sensors.perfect(self.n)
 
@@ -226,7 +228,8 @@ class RecordedWorld:
         """Everybody has departed."""
 
     def leave(self, copies: Sequence[int]) -> None:
-        """Nobody is in anybody's way."""
+        """Vehicles whose runs are over are told to be where and as fast as they were."""
+        self._left[copies] = True
 
     def walk(self, person: str, speed: float) -> None:
         """Everybody else moves as recorded."""
@@ -249,7 +252,11 @@ class RecordedWorld:
         SimulationError
             If a vehicle leaves its last lane.
         """
-        self._place = self._place + distance(self._speeds, speeds, self.step_length)
+        self._front_before, self._speeds_before = self.vehicle_positions(VUT), self._speeds
+        way = distance(self._speeds, speeds, self.step_length)
+        if self._left.any():
+            speeds, way = np.where(self._left, self._speeds, speeds), np.where(self._left, 0.0, way)
+        self._place = self._place + way
         self._speeds, self._front, self._sample = speeds, None, self._sample + 1
         end = self._way.end
         while (beyond := self._place > end[self._lane]).any():
@@ -317,17 +324,24 @@ class RecordedWorld:
         return self.lane(self._known(self._recordings[0].lane_of, vehicle))
 
     def collisions(self, open_: BoolArray) -> dict[int, float]:
-        """Vehicles of open runs whose body overlaps another, and their speeds [m/s]."""
-        self._struck = {}
+        """Vehicles of open runs whose body overlaps another, and their speeds [m/s].
+
+        SUMO looks twice in a step: when persons have moved, while vehicles are where and as fast as they were, and when vehicles have
+        moved too (`MSNet::simulationStep`: `STAGE_EVENTS`, `STAGE_MOVEMENTS`).
+        """
+        self._struck, found = {}, dict[int, float]()
         for k, recording in enumerate(self._recordings):
             rows = slice(k * self._size, (k + 1) * self._size)
-            front, of_open = self.vehicle_positions(VUT)[rows], open_[rows]
+            of_open = open_[rows]
+            moved, still = (self.vehicle_positions(VUT), self._speeds), (self._front_before, self._speeds_before)
             for track in recording.tracks.values():
                 if self._sample < len(track.angle) and not np.isnan(track.angle[self._sample]):
                     other = _body(track, self._sample)
-                    for row in _overlaps(front, of_open, recording, other, track.is_person).tolist():
-                        self._struck.setdefault(rows.start + row, other)
-        return {row: float(self._speeds[row]) for row in sorted(self._struck)}
+                    for fronts, speeds in (still, moved) if track.is_person else (moved,):
+                        for row in (rows.start + _overlaps(fronts[rows], of_open, recording, other, track.is_person)).tolist():
+                            if row not in found:
+                                found[row], self._struck[row] = float(speeds[row]), other
+        return dict(sorted(found.items()))
 
     def bodies(self, copy: int) -> tuple[Body, Body]:
         """A vehicle under test that collides in this step, and whom it collides with."""

@@ -19,7 +19,7 @@ from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.sumo.batch import drive
-from safevar_sumo.sumo.engine import open_world
+from safevar_sumo.sumo.engine import Engine, open_world
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.network import copied_network
 from safevar_sumo.sumo.staging import staged
@@ -105,19 +105,20 @@ def test_whatever_was_driven_before_leaves_no_trace(batches: list[tuple[str, int
     """Studies, sizes and drivers in any order; half of the batches end in collisions."""
     asked = [(replace(SYSTEMS[name], ads=_FullThrottle()) if crashes else SYSTEMS[name], drawn(SYSTEMS[name], n, seed + i))
              for i, (name, n, crashes) in enumerate(batches)]
-    for here, (system, population) in zip([simulate(*one) for one in asked], asked, strict=True):
-        assert bits(here) == bits(fresh(system, population))
+    for engine in (Engine.LIBSUMO, Engine.RECORDED):
+        for here, (system, population) in zip([simulate(*one, engine) for one in asked], asked, strict=True):
+            assert bits(here) == bits(fresh(system, population))
 
 
 def test_the_network_is_loaded_once_for_batches_that_fit(loadings: list[str]) -> None:
     system = SYSTEMS["rain"]
     with pytest.raises(SimulationError):
-        simulate(replace(system, ads=_Failing()), drawn(system, 2, 1))
+        simulate(replace(system, ads=_Failing()), drawn(system, 2, 1), Engine.LIBSUMO)
     loadings.clear()
     for n in (7, 3, 10, 1):
-        simulate(system, drawn(system, n, n))
+        simulate(system, drawn(system, n, n), Engine.LIBSUMO)
     assert len(loadings) == 1
-    simulate(system, drawn(system, 11, 1))
+    simulate(system, drawn(system, 11, 1), Engine.LIBSUMO)
     assert len(loadings) == 2
 
 
