@@ -89,7 +89,8 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     def begun(key: RunKey) -> Search:
         return search_of(key, study, problem, results.note)
 
-    batcher, verification = Batcher(persistent, work, batch or LARGEST_WORLD), Verification(study, results, persistent, begun, engine)
+    batcher = Batcher(persistent, work, batch or LARGEST_WORLD)
+    verification = Verification(study, results, persistent, begun, engine, observer)
 
     def go_on(run: Run) -> None:
         """Let a run go as far as it can, then ask for what it misses."""

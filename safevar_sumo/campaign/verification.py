@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from safevar_sumo.campaign.keys import RunKey, run_generator
-from safevar_sumo.campaign.run import Run
+from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.plugins import forget_foreign
 from safevar_sumo.records import Evaluations
@@ -37,8 +37,8 @@ class Verification:
     """
 
     def __init__(self, study: Study, results: ResultsDirectory, pool: RetryingPool, begun: Callable[[RunKey], Search],
-                 engine: Engine) -> None:
-        self._study, self._pool, self._begun = study, pool, begun
+                 engine: Engine, observer: Observer) -> None:
+        self._study, self._pool, self._begun, self._observer = study, pool, begun, observer
         self._alone = packed(study, results.inputs, engine=engine, afresh=True) if foreign_names(study) else None
         self._in_sumo = packed(study, results.inputs, engine=Engine.LIBSUMO) if engine is Engine.RECORDED else None
         self._begun_twice: set[str] = set()
@@ -81,7 +81,7 @@ class Verification:
         self._asked.add(run)
         if not known:
             return False
-        self._submit(self._in_sumo, run, known, partial(refuse_unlike_sumo, self._study))
+        self._submit(self._in_sumo, run, known, partial(self._refuse_unlike_sumo, run.key))
         return True
 
     def _submit(self, work: bytes | None, run: Run, known: Evaluations, refuse: Refusal) -> None:
@@ -90,6 +90,13 @@ class Verification:
 
     def _is_under_way(self, run: Run) -> bool:
         return any(run is other for other, *_ in self.under_way.values())
+
+    def _refuse_unlike_sumo(self, key: RunKey, known: Evaluations, in_sumo: Evaluations) -> None:
+        refuse_unlike_sumo(self._study, known, in_sumo)
+        failed = np.flatnonzero(in_sumo.failed).tolist()
+        if failed:
+            self._observer.warned(f"run {key}: {len(failed)} of {len(known)} settings could not be verified in SUMO: "
+                                  f"{in_sumo.reason(failed[0])}")
 
     def _refuse_leak(self, key: RunKey, known: Evaluations, alone: Evaluations) -> None:
         refuse_difference(self._study, {f"in run {key}": known, "alone": alone}, reproducing(self._study, known.settings[0]))

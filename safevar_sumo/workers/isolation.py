@@ -68,20 +68,17 @@ def refuse_difference(study: Study, ways: dict[str, Evaluations], again: str = "
 
 
 def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations) -> None:
-    """Refuse settings with different results in a recorded scene and in SUMO itself.
+    """Refuse settings with different results in a recorded scene and in SUMO itself; what SUMO could not simulate tells nothing.
 
     Raises
     ------
     InputError
         With the setting and both values.
     """
-    for row in np.flatnonzero(~_alike(recorded, in_sumo, ROUNDING)).tolist():
+    for row in np.flatnonzero(~_alike(recorded, in_sumo, ROUNDING) & ~in_sumo.failed).tolist():
         setting = recorded.settings[row]
         one, other = recorded.take([row]), in_sumo.take([row])
-        if other.failed[0]:
-            difference: tuple[str, object, object] | None = ("outcome", str(one.outcome[0]), f"{other.outcome[0]} ({other.reason(0)})")
-        else:
-            difference = _difference(one, other, ROUNDING)
+        difference = _difference(one, other, ROUNDING)
         if difference:
             name, here, there = difference
             values = ", ".join(f"{key} = {value:.17g}" for key, value in zip(study.vehicle.characteristics, setting, strict=True))
@@ -91,7 +88,7 @@ def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations
 
 def _alike(one: Evaluations, other: Evaluations, most: float) -> BoolArray:
     """Settings whose outcome is the same and whose numbers differ by no more than `most`, shape (N,)."""
-    alike = (one.outcome == other.outcome) & ~other.failed
+    alike = one.outcome == other.outcome
     for here, there in ((one.collision_speed, other.collision_speed), *((one.metrics[name], other.metrics[name]) for name in one.metrics)):
         alike &= np.isclose(here, there, rtol=0, atol=most, equal_nan=True)
     return np.asarray(alike)

@@ -148,14 +148,14 @@ def test_settings_that_sumo_dies_of_are_recorded_and_left_out(end: str, number: 
         'extends = "smoke"\nname = "deadly"\n[search]\nalgorithms = ["rs"]\nevaluations = 40\nruns = 1\n'
         + ("time_limit = 8.0\n" if end == "hang" else ""))
     run("study", "deadly.toml", "--out", "healthy")
-    healthy = load("healthy").evaluations
+    healthy = load("healthy").evaluations  # in a recorded scene, where nobody sets masses
     masses = np.sort(healthy["mass"].unique())
     heavy = float(masses[-number - 1] + masses[-number]) / 2
     Path("patch").mkdir()
     Path("patch/sitecustomize.py").write_text(SUMO_GOES_WRONG)
     for name, value in (("PYTHONPATH", "patch"), ("HEAVY", str(heavy)), ("END", end)):
         monkeypatch.setenv(name, value)
-    process = started("study", "deadly.toml", "--out", "out")
+    process = started("study", "deadly.toml", "--out", "out", "--engine", "sumo")
     output, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors
     failed = healthy["mass"] > heavy
@@ -170,7 +170,7 @@ def test_settings_that_sumo_dies_of_are_recorded_and_left_out(end: str, number: 
     journal = Path("out/runs/rs-00.journal")
     size = journal.stat().st_size
     os.truncate(journal, size - 1)
-    ended(started("study", "deadly.toml", "--out", "out", "--quiet"), 0)
+    ended(started("study", "deadly.toml", "--out", "out", "--quiet", "--engine", "sumo"), 0)
     assert journal.stat().st_size == size, "it was met again"
     assert solutions("out") == before
     assert why in run("tables", "out").stdout
