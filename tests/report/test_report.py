@@ -141,7 +141,9 @@ def test_bars_are_where_their_values_lie_in_the_domain(page: str) -> None:
     bar = r'<rect class="{}" x="([\d.]+)" y="[\d.]+" width="([\d.]+)"[^>]*><title>tireFric from {}'
     (start, safe), (left, unsafe) = (map(float, re.findall(bar.format(look, ends), page)[0])
                                      for look, ends in (("safe", "1.5"), ("unsafe", "1 to 1.5")))
-    assert (unsafe / (safe + unsafe), left + unsafe) == (pytest.approx(0.5 / 2.9, abs=1e-3), pytest.approx(start, abs=0.2))
+    (track, width) = map(float, re.findall(r'<rect class="track" x="([\d.]+)" y="[\d.]+" width="([\d.]+)"', page)[0])
+    assert (left, left + unsafe, start + safe) == pytest.approx((track, track + width * 0.5 / 2.9, track + width), abs=0.2)
+    assert left + unsafe == pytest.approx(start, abs=0.2)
 
 
 def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderline(

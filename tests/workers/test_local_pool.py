@@ -216,7 +216,7 @@ def test_settings_that_fail_one_after_the_other_without_end_are_a_fault_of_the_s
     pool = RetryingPool(ToldPool(deadly(*4300 + np.arange(40))), STUDY)
     assert not pool.submit(b"", settings(19)).result(timeout=5).valid.any()
     with pytest.raises(WorkerLostError, match="exit code -9"):
-        pool.submit(b"", settings(40)).result(timeout=5)
+        pool.submit(b"", settings(2)).result(timeout=5)
 
 
 def test_failures_between_successes_are_no_fault_of_the_study() -> None:
