@@ -68,6 +68,7 @@ def run(*arguments: str, expect: int = 0) -> Done:
     before = set(sys.modules)
     with redirect_stdout(out), redirect_stderr(err), pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["safevar-sumo", *arguments])
+        patch.setattr(os, "_exit", sys.exit)  # which the program calls where a thread is left: this process is to live on
         try:
             main()
         except SystemExit as end:
