@@ -31,8 +31,6 @@ SCENES = 256
 """Recorded scenes that a process keeps; one of ten seconds takes some ten kilobytes."""
 POSITION_EPS = 0.1
 """Least length of a lane's shape (SUMO, utils/common/StdDefs.h) [m]."""
-
-
 NUMERICAL_EPS = 0.001
 """SUMO, utils/common/StdDefs.h [m]."""
 

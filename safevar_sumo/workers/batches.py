@@ -25,9 +25,9 @@ SHARES = 4
 LEAST_BATCH = 100
 """A smaller one costs as much."""
 VERIFIED = 50
-"""Settings that are driven in SUMO, too."""
-_verified: set[bytes] = set()
-"""Packed studies whose recorded scene was seen to be SUMO's."""
+"""Settings of a study that are driven in SUMO, too, over as many calls as it takes."""
+_verified: dict[bytes, int] = {}
+"""How many settings of a packed study were driven in SUMO, too, with the same results."""
 _isolated: set[bytes] = set()
 """Packed studies whose models have been seen to keep settings apart."""
 _read: dict[tuple[bytes, str], Files] = {}
@@ -44,8 +44,7 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     """Evaluate many filtered settings, shape (M, n), row by row; equal rows are simulated once.
 
     Models that are not ours are first seen to keep settings apart (`check_isolation`), and a sample of what is driven in a recorded
-    scene is driven in SUMO too. `done` is called with the number of
-    settings of every batch that is finished.
+    scene is driven in SUMO too. `done` is called with the number of settings of every batch that is finished.
     """
     persistent, work = RetryingPool(pool, study), packed(study, inputs := inputs_of(study, pool))
     if work not in _isolated:
@@ -56,9 +55,9 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     size = min(most, max(math.ceil(len(unique) / (SHARES * pool.workers)), LEAST_BATCH))
     starts = range(0, len(unique), size)
     futures = {persistent.submit(work, unique[start:start + size]): start for start in starts}
-    verified = np.linspace(0, len(unique) - 1, min(VERIFIED, len(unique))).astype(int)
+    verified = np.linspace(0, len(unique) - 1, min(VERIFIED - _verified.get(work, 0), len(unique))).astype(int)
     in_sumo = None
-    if recorded and work not in _verified:
+    if recorded and len(verified):
         in_sumo = persistent.submit(packed(study, inputs, engine=Engine.LIBSUMO), unique[verified])
     parts: dict[int, Evaluations] = {}
     while len(parts) < len(futures):
@@ -68,7 +67,7 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     found = Evaluations.concatenate([parts[start] for start in starts])
     if in_sumo is not None:
         refuse_unlike_sumo(study, found.take(verified[~found.failed[verified]]), result_of(in_sumo).take(~found.failed[verified]))
-        _verified.add(work)
+        _verified[work] = _verified.get(work, 0) + len(verified)
     return found.take(row_of.ravel())
 
 
