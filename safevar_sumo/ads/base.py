@@ -19,14 +19,15 @@ NotNegative = Annotated[float, Meta(ge=0, le=1e3)]
 """A driver's parameter that may be 0, in SI units."""
 
 
+REACTIONS = ("recognition_delay", "hesitation")
+"""Parameters of an ADS that say how late it reacts in a weather [s]."""
+
+
 class Ads(Protocol):
     """An ADS that drives N vehicles at once. Its fields are the parameters of `ads.parameters`.
 
     It sees an `Observation` and knows the original vehicle (`Nominal`), never the setting.
     Element i of a command depends on element i of the observations alone, to the bit.
-
-    A class with `own_reactions = True` has its own reaction time: a weather's `recognition_delay` and `hesitation`, measured on
-    another driver, do not act on it. Without the attribute they do.
     """
 
     def start(self, n: int, nominal: Nominal, step: float) -> Any:
@@ -44,7 +45,6 @@ class ScalarAds(ABC):
 
     nominal: Nominal
     step: float
-    own_reactions = False
 
     def start(self, nominal: Nominal, step: float) -> None:
         """Called once before the run, with the original vehicle and the time between two calls of `drive` [s]."""
@@ -64,7 +64,6 @@ class GuardedAds:
 
     def __init__(self, ads: Ads, guard: Guard) -> None:
         self._ads, self._guard = ads, guard
-        self.own_reactions = bool(getattr(ads, "own_reactions", False))
 
     def start(self, n: int, nominal: Nominal, step: float) -> Any:
         return self._guard.call("start", self._ads.start, n, read_only_copy(nominal), step)
@@ -82,8 +81,8 @@ class GuardedAds:
 class PerVehicle:
     """Drives N vehicles with N instances of a `ScalarAds`."""
 
-    def __init__(self, make: Callable[[], ScalarAds], guard: Guard, own_reactions: bool = False) -> None:
-        self._make, self._guard, self.own_reactions = make, guard, own_reactions
+    def __init__(self, make: Callable[[], ScalarAds], guard: Guard) -> None:
+        self._make, self._guard = make, guard
 
     def start(self, n: int, nominal: Nominal, step: float) -> list[ScalarAds]:
         drivers = [self._guard.call("__init__", self._make) for _ in range(n)]

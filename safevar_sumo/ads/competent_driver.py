@@ -55,7 +55,6 @@ class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     headway: Positive = 2.0
     corridor: Positive = 1.4
     start_throttle: Start = ()
-    own_reactions = True
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         return _Memory(unaware(n, nominal, step), np.full(n, np.inf), np.zeros(n, dtype=bool), np.full(n, -1.0))

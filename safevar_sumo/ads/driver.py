@@ -19,6 +19,34 @@ def looked_up(speeds: FloatArray, speed: FloatArray, *tables: FloatArray) -> lis
     return [here + (there - here) * share for here, there in values]
 
 
+STEP_DECIMALS = 6
+"""Of a delay in steps: a whole number of steps is whole."""
+
+
+class Late(NamedTuple):
+    """Values that are told a delay late: it in whole steps and a part of one, and what has been shown, oldest first."""
+
+    whole: int
+    part: float
+    past: tuple[FloatArray, ...] = ()
+
+    @classmethod
+    def by(cls, delay: float, step: float) -> Late:
+        """By a delay [s], at steps of so many seconds."""
+        whole, part = divmod(round(delay / step, STEP_DECIMALS), 1)
+        return cls(int(whole), part)
+
+    def shown(self, now: FloatArray) -> tuple[FloatArray, Late]:
+        """What was there a delay ago, linear between two steps; before the first one nothing was different; then the next state."""
+        past = (*(self.past[1:] or (now,) * (self.whole + 1)), now)
+        before, after = past[0], past[1]
+        if self.part:
+            with np.errstate(invalid="ignore"):  # what appears or vanishes between the two is still as it was
+                between = after + (before - after) * self.part
+            after = np.where(np.isfinite(between), between, before)
+        return after, self._replace(past=past)
+
+
 class Trim(NamedTuple):
     """Pedal positions of a rolling vehicle beyond those that hold the original vehicle's speed on a level road [-]."""
 

@@ -29,7 +29,6 @@ class FullBraking(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     cruise_speed: Positive | None = None
     corridor: Positive = 1.4
     start_throttle: Start = ()
-    own_reactions = True
 
     def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
         return unaware(n, nominal, step)

@@ -46,7 +46,6 @@ class FuzzySafety(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     leader_deceleration: Positive = 7.0
     margin: NotNegative = 2.0
     corridor: Positive = 1.4
-    own_reactions = True
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         return _Memory(unaware(n, nominal, step), None)

@@ -30,7 +30,6 @@ class R157(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     reaction_time: Annotated[float, Meta(ge=0, le=60)] = 0.35
     margin: Annotated[float, Meta(ge=0, le=60)] = 0.1
     corridor: Positive = 1.4
-    own_reactions = True
 
     def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
         return unaware(n, nominal, step)

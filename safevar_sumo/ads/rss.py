@@ -33,7 +33,6 @@ class Rss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     deceleration: Positive = HARDEST
     leader_deceleration: Positive = HARDEST
     corridor: Positive = 1.4
-    own_reactions = True
 
     def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
         return unaware(n, nominal, step)

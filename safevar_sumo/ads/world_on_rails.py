@@ -7,10 +7,12 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
+from safevar_sumo.ads.driver import Late
 from safevar_sumo.records import KMH, BoolArray, Command, FloatArray, Nominal, Observation
 
 NotNegative = Annotated[float, Meta(ge=0, le=60)]
 Throttle = Annotated[float, Meta(ge=0, le=1)]
+Reaction = Annotated[float, Meta(ge=0, le=5)]
 SPEED_LIMIT = 20 / KMH
 """Above this speed the agent releases the throttle [m/s] (its source, 20 km/h)."""
 SPEED_LEVELS = (0.0, 8 / 3, 16 / 3)
@@ -20,11 +22,12 @@ PASSED = -0.5
 
 
 class _Memory(NamedTuple):
-    """Whether it brakes, and the commands on their way; newest last."""
+    """Whether it brakes; commands on their way, newest last; gap and lateral place, and the brake that it wants, on theirs."""
 
     brakes: BoolArray
     under_way: tuple[Command, ...]
-    step: float
+    recognised: Late
+    braked: Late
 
 
 class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -45,6 +48,10 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         later for obstacles that enter or leave the way. The visibility is a factor on the rest.
     throttle
         Throttle at the policy's speed levels 0, 2.7 and 5.3 m/s.
+    recognition_delay
+        By how much later than in clear weather it makes somebody out [s].
+    hesitation
+        By how much later than it lets go of the accelerator it then brakes [s]: it is not sure yet. It lets go of the brake at once.
     """
 
     first_command: NotNegative
@@ -56,17 +63,22 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     brake_gap_before: NotNegative
     brake_gap_past: NotNegative
     throttle: Annotated[tuple[Throttle, Throttle, Throttle], Meta()]
+    recognition_delay: Reaction = 0.0
+    hesitation: Reaction = 0.0
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         idle = Command(np.zeros(n), np.zeros(n))
-        return _Memory(np.zeros(n, dtype=bool), (idle,) * round(self.latency / step), step)
+        return _Memory(np.zeros(n, dtype=bool), (idle,) * round(self.latency / step), Late.by(self.recognition_delay, step),
+                       Late.by(self.hesitation, step))
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        brakes = self._brakes(seen, memory.brakes)
+        (gap, lateral), recognised = memory.recognised.shown(np.stack([seen.gap, seen.lateral]))
+        brakes = self._brakes(seen._replace(gap=gap, lateral=lateral), memory.brakes)
         waits = (seen.speed == 0) & (seen.time < self.first_command)
         throttle = np.where(brakes | waits | (seen.speed > SPEED_LIMIT), 0.0, self._throttle(seen.speed))
         command, *under_way = (*memory.under_way, Command(throttle, np.where(brakes, 1.0, 0.0)))
-        return command, memory._replace(brakes=brakes, under_way=tuple(under_way))
+        sure, braked = memory.braked.shown(command.brake)
+        return Command(command.throttle, np.minimum(command.brake, sure)), _Memory(brakes, tuple(under_way), recognised, braked)
 
     def _brakes(self, seen: Observation, braked: BoolArray) -> BoolArray:
         """Whether the brake probability exceeds one half: an obstacle is near, in the corridor."""

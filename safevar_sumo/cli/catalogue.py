@@ -72,9 +72,9 @@ def _print_catalogue(console: Console, studies: list[Study]) -> None:
         heads = ("characteristic", "unit", "original", "lower", "upper", "threshold")
         print_names(console, f"Vehicle {vehicle['name']}", rows, heads)
         print_meanings(console, members[vehicle["name"]])
-    numbers = ("road_friction", "visibility", "recognition_delay", "hesitation")
+    numbers = ("road_friction", "visibility", "recognition_delay")
     weathers = [(row["name"], *(f"{row[key]:g}" for key in numbers), row["light"], "wet" if row["wet"] else "dry")
                 for row in catalogue["weathers"]]
-    print_names(console, "Weathers", weathers, ("name", "friction", "sight", "delay, s", "pause, s", "light", "road"))
+    print_names(console, "Weathers", weathers, ("name", "friction", "sight", "delay, s", "light", "road"))
     for title, key in (("ADSs", "ads"), ("Scenarios", "scenarios"), ("Algorithms", "algorithms"), ("Metrics", "metrics")):
         print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "what"))

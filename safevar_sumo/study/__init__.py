@@ -1,7 +1,7 @@
 """A study: data only, read strictly from a TOML file."""
 
 from safevar_sumo.errors import refuse_other_than_file
-from safevar_sumo.study.file import check_writable, load_study, write_study
+from safevar_sumo.study.file import check_writable, load_study, of_today, write_study
 from safevar_sumo.study.schema import (
     SAFETY_DEGREE,
     WORDS,
@@ -30,5 +30,5 @@ from safevar_sumo.study.validation import converted, invalid
 __all__ = [
     "SAFETY_DEGREE", "WORDS", "CharacteristicTable", "FitTable", "FreeParameter", "MatrixTable", "MatrixTest", "MetricsTable", "ModelTable",
     "Origin", "SearchTable", "Study", "StudyLike", "VehicleTable", "Weather", "check_writable", "converted", "foreign_names",
-    "foreign_packages", "invalid", "label_of", "load_study", "refuse_other_than_file", "study_names", "study_path",
+    "foreign_packages", "invalid", "label_of", "load_study", "of_today", "refuse_other_than_file", "study_names", "study_path",
     "tables_of", "write_study"]

@@ -62,9 +62,25 @@ def _checked(raw: _Raw) -> Study:
     if "origin" in raw.tables:
         raise InputError(raw.source, "origin: there is no such key")
     refuse(unusable(raw.source, raw.tables))
-    study = converted(raw.source, _with_algorithms(raw.tables), Study)
+    tables = of_today(raw.tables)
+    remarks = raw.origin.remarks
+    if tables.get("ads") != raw.tables.get("ads"):
+        remarks = (*remarks, f"{raw.source}: weather.hesitation is read as ads.parameters.hesitation")
+    study = converted(raw.source, _with_algorithms(tables), Study)
     refuse(implausible(raw.source, study))
-    return msgspec.structs.replace(study, origin=raw.origin)
+    return msgspec.structs.replace(study, origin=msgspec.structs.replace(raw.origin, remarks=remarks))
+
+
+def of_today(tables: dict[str, Any]) -> dict[str, Any]:
+    """A study's tables of any time as they are now: a hesitation, once a weather's, is the driving system's."""
+    weather, ads = tables.get("weather"), tables.get("ads")
+    if not (isinstance(weather, dict) and "hesitation" in weather and isinstance(ads, dict)):
+        return tables
+    tables = {**tables, "weather": {key: value for key, value in weather.items() if key != "hesitation"}}
+    parameters = ads.get("parameters", {})
+    if weather["hesitation"] and isinstance(parameters, dict):
+        tables["ads"] = {**ads, "parameters": {**parameters, "hesitation": weather["hesitation"]}}
+    return tables
 
 
 def _with_algorithms(raw: dict[str, Any]) -> dict[str, Any]:

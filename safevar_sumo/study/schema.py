@@ -69,23 +69,16 @@ class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Weather as data: what it does to the road and to the sensors.
 
     `road_friction` and `visibility` are factors on the dry, clear case [-]; on a `wet` road worn treads lose further friction.
-    `recognition_delay` is the additional time in which an ADS recognises an obstacle [s], `hesitation` the additional time between
-    releasing the accelerator and braking [s]; both were measured on World On Rails and do not act on an ADS with its own reactions.
-    `light` is a label without an effect of its own.
+    `recognition_delay` is the additional time in which the sensors make somebody out [s], whatever ADS they serve; how an ADS itself
+    reacts is among its parameters. `light` is a label without an effect of its own.
     """
 
     name: str
     road_friction: Annotated[float, Meta(gt=0, le=1.5)]
     visibility: Annotated[float, Meta(gt=0, le=1.5)]
     recognition_delay: Annotated[float, Meta(ge=0, le=5)] = 0.0
-    hesitation: Annotated[float, Meta(ge=0, le=5)] = 0.0
     light: Literal["day", "night"] = "day"
     wet: bool = False
-
-    @property
-    def without_reactions(self) -> Weather:
-        """The weather for a driver with its own reactions."""
-        return msgspec.structs.replace(self, recognition_delay=0.0, hesitation=0.0)
 
 
 class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

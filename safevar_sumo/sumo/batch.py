@@ -106,7 +106,7 @@ def _driven(system: System, settings: FloatArray, world: Any, watch: Watcher | N
     if isinstance(system.ads, TraciController):  # any other is given what is sensed
         world.sensors = _sensors(system, prepared, n)
     driver = system.ads.start(n, system.nominal, step)
-    parts = Parts(system.points, world, n, own_reactions=_own_reactions(system))
+    parts = Parts(system.points, world, n)
     log = _Log(n, int(parts.last.max()) + 1, way)
     verdict, robot = _Verdict(n), DrivingRobot(system.points, vehicle, prepared, state, step)
     contacts = Contacts(n, robot.tested)
@@ -119,7 +119,7 @@ def _driven(system: System, settings: FloatArray, world: Any, watch: Watcher | N
         seen = parts.seen(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
         seen, state = vehicle.sense(prepared, state, seen)
         command, driver = system.ads.drive(seen, driver)
-        command, state = robot.drive(parts.braked(command), state, verdict.open)
+        command, state = robot.drive(command, state, verdict.open)
         log.write(sample, place=world.vehicle_positions(VUT), speed=speed, gap=scene.gap, lateral=scene.lateral,
                   lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active,
                   obstacle_speed=scene.obstacle_speed, pedal=state.brake)
@@ -169,15 +169,10 @@ def _sensors(system: System, prepared: Any, n: int) -> Sensors:
     """The vehicles' sensors in the weathers of their points, where it takes longer to recognise somebody and one does not see so far."""
     of_vehicle = getattr(system.vehicle, "sensors", None)
     own = (None if of_vehicle is None else of_vehicle(prepared)) or Sensors.perfect(n)
-    weathers = [point.weather.without_reactions if _own_reactions(system) else point.weather for point in system.points]
+    weathers = [point.weather for point in system.points]
     delay = np.repeat([weather.recognition_delay for weather in weathers], n // len(weathers))
     visibility = np.repeat([weather.visibility for weather in weathers], n // len(weathers))
     return Sensors(own.latency + delay, own.reach * visibility, own.scale)
-
-
-def _own_reactions(system: System) -> bool:
-    """Whether the ADS has reactions of its own, so that the weather's do not act on it."""
-    return bool(getattr(system.ads, "own_reactions", False))
 
 
 class _Log:

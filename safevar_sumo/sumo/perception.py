@@ -1,30 +1,28 @@
-"""What an ADS makes out of the scene, its own speed at once, everything else as late as the weather has it; and how late it brakes."""
+"""What an ADS makes out of the scene: its own speed at once, everything else as late as the weather has the sensors tell it."""
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import numpy as np
 
-from safevar_sumo.records import EVERYWHERE, Command, Encounter, FloatArray, Observation, Trace
+from safevar_sumo.ads.driver import Late
+from safevar_sumo.records import EVERYWHERE, Encounter, FloatArray, Observation, Trace
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather
 from safevar_sumo.sumo.world import begin
 
-STEP_DECIMALS = 6  # of a delay in steps: a whole number of steps is whole
 HIDDEN = np.array([[np.inf], [np.inf], [0.0], [0.0]])
 """Gap and lateral place [m], lateral speed and speed [m/s] of somebody who is not seen."""
 
 
 class Perception:
-    """Observations and commands of N vehicles in one weather, one step after the other."""
+    """Observations of N vehicles in one weather, one step after the other."""
 
     def __init__(self, weather: Weather, step: float) -> None:
-        self._visibility, self._hesitates = weather.visibility, weather.hesitation > 0
-        self._scenes, self._brakes = _Late(weather.recognition_delay, step), _Late(weather.hesitation, step)
+        self._visibility, self._scenes = weather.visibility, Late.by(weather.recognition_delay, step)
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
         """What is seen at this step; every step is to be shown. Who is hidden is infinitely far away and still."""
@@ -32,47 +30,22 @@ class Perception:
         now[0], now[1], now[2], now[3], now[4] = scene.gap, scene.lateral, scene.lateral_speed, scene.obstacle_speed, speed
         if scene.visible is not EVERYWHERE:
             now[:-1] = np.where(scene.visible, now[:-1], HIDDEN)
-        gap, lateral, lateral_speed, obstacle_speed, own = self._scenes.shown(now)
+        (gap, lateral, lateral_speed, obstacle_speed, own), self._scenes = self._scenes.shown(now)
         return Observation(time, speed, gap, own - obstacle_speed, lateral, lateral_speed, self._visibility, obstacle_speed)
-
-    def braked(self, command: Command) -> Command:
-        """What becomes of a command: who is not sure yet what he sees brakes no harder than he wanted a hesitation ago."""
-        if not self._hesitates:
-            return command
-        return Command(command.throttle, np.minimum(command.brake, self._brakes.shown(command.brake)))
-
-
-class _Late:
-    """Values that are told a delay [s] late."""
-
-    def __init__(self, delay: float, step: float) -> None:
-        self._whole, self._part = divmod(round(delay / step, STEP_DECIMALS), 1)
-        self._past: deque[FloatArray] = deque()
-
-    def shown(self, now: FloatArray) -> FloatArray:
-        """What was there a delay ago, linear between two steps; before the first one nothing was different."""
-        self._past = self._past or deque([now] * (int(self._whole) + 2), maxlen=int(self._whole) + 2)
-        self._past.append(now)
-        before, after = self._past[0], self._past[1]
-        if not self._part:
-            return after
-        with np.errstate(invalid="ignore"):  # what appears or vanishes between the two is still as it was
-            between = after + (before - after) * self._part
-        return np.where(np.isfinite(between), between, before)
 
 
 R = TypeVar("R", Scene, Observation)
 
 
 class Parts:
-    """A batch whose k-th part of equally many vehicles is in the k-th point; of drivers with reactions of their own, or not."""
+    """A batch whose k-th part of equally many vehicles is in the k-th point."""
 
-    def __init__(self, points: Sequence[Point], world: Any, n: int, own_reactions: bool = False) -> None:
+    def __init__(self, points: Sequence[Point], world: Any, n: int) -> None:
         self._size = size = n // len(points)
         self._points, self._step = points, world.step_length
         self._rows = [slice(k * size, (k + 1) * size) for k in range(len(points))]
         self._worlds = [world] if len(points) == 1 else [world.part(rows.start, size) for rows in self._rows]
-        weathers = [point.weather.without_reactions if own_reactions else point.weather for point in points]
+        weathers = [point.weather for point in points]
         self._perceptions = [(Perception(weather, self._step), np.repeat([one == weather for one in weathers], size).nonzero()[0])
                              for k, weather in enumerate(weathers) if weather not in weathers[:k]]
         self._order = np.argsort(np.concatenate([rows for _, rows in self._perceptions]))
@@ -95,13 +68,6 @@ class Parts:
                         for perception, rows in self._perceptions]
         joined = _joined(observations, [len(rows) for _, rows in self._perceptions])
         return Observation._make(np.asarray(values)[self._order] if np.ndim(values) else values for values in joined)
-
-    def braked(self, command: Command) -> Command:
-        """What becomes of all vehicles' commands."""
-        if len(self._perceptions) == 1:
-            return self._perceptions[0][0].braked(command)
-        commands = [perception.braked(Command(*(pedal[rows] for pedal in command))) for perception, rows in self._perceptions]
-        return Command(*(np.concatenate(pedals)[self._order] for pedals in zip(*commands, strict=True)))
 
     def encounter(self, trace: Trace) -> Encounter:
         """The geometry that the metrics are computed from."""

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
+from safevar_sumo.ads import ADS, ADS_CONTRACT, REACTIONS, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown
 from safevar_sumo.metrics import F_SAFE, METRICS, Metric, Objective, Scoring, foreign_metric
 from safevar_sumo.plugins import Guard, Lookup, Member, OwnModules, check_parameters, guard_process_state, instance_of
 from safevar_sumo.records import Nominal
-from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, GuardedScenario, Point, Scenario, weather_of
+from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, WEATHERS, GuardedScenario, Point, Scenario, weather_of
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, foreign_names
 from safevar_sumo.sumo.network import check_network, network_remarks
 from safevar_sumo.sumo.sources import is_network, is_shipped
@@ -147,7 +147,7 @@ class System:
 
     @property
     def remarks(self) -> list[str]:
-        """What of the networks and the weathers is not used."""
+        """What of the networks and the weathers is not used, or does nothing."""
         in_traci = isinstance(self.ads, TraciController)
         networks = dict.fromkeys(point.scenario.network for point in self.points)
         found = [remark for network in networks for remark in network_remarks(network, self.nominal.max_speed, sumo_drives=in_traci)]
@@ -155,6 +155,10 @@ class System:
         if in_traci and not self._sees_a_limited_way():
             found += [f"weather {name!r}: visibility = {value:g} does nothing: the vehicle has no sensor range, and a controller written "
                       "for TraCI sees as far" for name, value in hazy.items()]
+        if not any(getattr(self.ads, name, 0.0) for name in REACTIONS):
+            found += [f"weather {name!r} changes nothing: its road and its sight are those of clear weather, and nothing under "
+                      "[ads.parameters] says that the ADS reacts later in it"
+                      for name in dict.fromkeys(point.weather.name for point in self.points if _as_clear(point.weather))]
         return found
 
     def _sees_a_limited_way(self) -> bool:
@@ -162,6 +166,12 @@ class System:
         original = dict(zip(self.characteristics.names, self.characteristics.original[:, np.newaxis], strict=True))
         own = None if sensors is None else sensors(self.vehicle.prepare(original, 1.0, 0.1))
         return own is not None and bool(np.isfinite(own.reach).all())
+
+
+def _as_clear(weather: Weather) -> bool:
+    """Whether a weather is clear but for its name and light."""
+    clear = WEATHERS["clear"]
+    return weather.name != clear.name and weather.light == clear.light and msgspec.structs.replace(weather, name=clear.name) == clear
 
 
 def assemble(study: Study, source: str = "") -> System:
@@ -227,8 +237,7 @@ def _traci(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
         controller_of(what)
     places, attribute = [*lookup.places, os.getcwd()], choice.model.partition(":")[2]
     modules = partial(OwnModules, member, attribute, places, set())
-    guard, own_reactions = member.guard or Guard(lookup.source, name), bool(getattr(member.what, "own_reactions", False))
-    return TraciController(modules, controller_of, guard, own_reactions=own_reactions), member
+    return TraciController(modules, controller_of, member.guard or Guard(lookup.source, name)), member
 
 
 def _matrix(study: Study, source: str) -> tuple[Point, ...]:
@@ -310,8 +319,7 @@ def _ads(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
     name = f"ads.model = {choice.model!r}"
     parameters = lookup.with_paths(member, choice.parameters, "ads.parameters")
     make = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
-    driver = make()
+    driver = make()  # of a ScalarAds too: what is wrong with its parameters shows here
     if issubclass(member.what, ScalarAds):
-        guard = member.guard or Guard(lookup.source, name)
-        return PerVehicle(make, guard, driver.own_reactions), member
+        return PerVehicle(make, member.guard or Guard(lookup.source, name)), member
     return (driver if member.guard is None else GuardedAds(driver, member.guard)), member

@@ -32,13 +32,10 @@ class TraciController:
         Makes the user's modules once more for one vehicle, so that nothing which they keep passes from one to another.
     controller_of
         The controller, of what those modules call it.
-    own_reactions
-        Whether it has a reaction time of its own, as for any ADS.
     """
 
-    def __init__(self, modules: Callable[[], OwnModules], controller_of: Callable[[Any], Any], guard: Guard, *,
-                 own_reactions: bool = False) -> None:
-        self._modules, self._controller_of, self._guard, self.own_reactions = modules, controller_of, guard, own_reactions
+    def __init__(self, modules: Callable[[], OwnModules], controller_of: Callable[[Any], Any], guard: Guard) -> None:
+        self._modules, self._controller_of, self._guard = modules, controller_of, guard
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         world = present_world()

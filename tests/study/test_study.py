@@ -10,6 +10,7 @@ import pytest
 from safevar_sumo.errors import InputError
 from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study import load_study, write_study
+from safevar_sumo.sumo.system import assemble
 
 
 def test_the_published_settings_are_searched_as_published() -> None:
@@ -20,13 +21,25 @@ def test_the_published_settings_are_searched_as_published() -> None:
         assert len(study.vehicle.characteristics) == 12
 
 
-def test_rain_differs_from_sun_in_weather_alone() -> None:
+def test_rain_differs_from_sun_in_weather_and_in_how_late_its_driver_reacts_alone() -> None:
     sun, rain = load_study("sun"), load_study("rain")
     assert rain.weather != sun.weather
+    reactions = {name: rain.ads.parameters[name] for name in ("recognition_delay", "hesitation")}
+    assert msgspec.structs.replace(sun.ads, parameters={**sun.ads.parameters, **reactions}) == rain.ads
     same = {"name": sun.name, "title": sun.title, "published": sun.published, "calibration": sun.calibration,
             "repeatability": sun.repeatability, "fit": sun.fit}
-    assert msgspec.structs.replace(rain, weather=sun.weather, **same) == sun
-    assert set(rain.calibration) == {"weather.recognition_delay", "weather.hesitation"}
+    assert msgspec.structs.replace(rain, weather=sun.weather, ads=sun.ads, **same) == sun
+    assert set(rain.calibration) == {"ads.parameters.recognition_delay", "ads.parameters.hesitation"}
+
+
+def test_a_weathers_hesitation_of_former_files_is_the_drivers() -> None:
+    weather = {"name": "drizzle", "road_friction": 1.0, "visibility": 1.0, "hesitation": 0.1}
+    moved, still = load_study("sun", weather=weather), load_study("sun", weather={**weather, "hesitation": 0})
+    assert moved.ads.parameters["hesitation"] == 0.1
+    assert any("ads.parameters.hesitation" in remark for remark in moved.origin.remarks)
+    assert still.ads == load_study("sun").ads
+    with pytest.raises(InputError, match="hesitation"):
+        assemble(load_study("sun", weather=weather, ads={"model": "full_braking"}))
 
 
 def variant(tmp_path: Path, old: str, new: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -10,8 +10,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from safevar_sumo.ads import ADS, GuardedAds, PerVehicle, ScalarAds
-from safevar_sumo.plugins import Guard
+from safevar_sumo.ads import ADS
+from safevar_sumo.ads.driver import Late
 from safevar_sumo.records import Command, Evaluations, Nominal, Observation, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather, load_study
@@ -202,8 +202,11 @@ def test_what_appears_between_two_steps_is_not_there_yet() -> None:
 
 def pressed(hesitation: float, wanted: list[float]) -> list[float]:
     """How hard one vehicle brakes that wants to brake so hard."""
-    perception = Perception(Weather(name="any", road_friction=1.0, visibility=1.0, hesitation=hesitation), STEP)
-    return [float(perception.braked(Command(np.ones(1), np.array([brake]))).brake[0]) for brake in wanted]
+    late, brakes = Late.by(hesitation, STEP), []
+    for brake in wanted:
+        sure, late = late.shown(np.array([brake]))
+        brakes.append(float(np.minimum(brake, sure)[0]))
+    return brakes
 
 
 def test_who_hesitates_brakes_later_and_lets_go_at_once() -> None:
@@ -213,41 +216,32 @@ def test_who_hesitates_brakes_later_and_lets_go_at_once() -> None:
     assert pressed(0.12, wanted) == pytest.approx([0.0, 0.0, 0.0, 0.0, 0.6, 1.0, 1.0, 0.2, 0.0, 0.0])
 
 
-class Careful:
-    """An ADS from outside that writes its commands into the same arrays again and again."""
-
-    def start(self, n: int, nominal: Nominal, step: float) -> Command:
-        return Command(np.zeros(n), np.zeros(n))
-
-    def drive(self, seen: Observation, memory: Command) -> tuple[Command, Command]:
-        memory.throttle[:], memory.brake[:] = np.where(seen.gap < 6, 0.0, 0.6), seen.gap < 6
-        return memory, memory
+def test_rains_driver_lets_go_of_the_accelerator_and_brakes_a_hesitation_later() -> None:
+    rain = assemble(load_study("rain", ads={"parameters": {"hesitation": 0.2}}))
+    trace = simulate(rain, rain.characteristics.original[np.newaxis]).trace
+    braked = int(np.argmax(trace.brake[:, 0] == 1))
+    released = int(np.flatnonzero(trace.throttle[:braked, 0] > 0)[-1]) + 1
+    assert (braked - released) * trace.step == pytest.approx(0.2)
 
 
-class CarefulForOne(ScalarAds):
-    """The same for one vehicle."""
+@pytest.mark.parametrize("name", sorted({*ADS} - {"world_on_rails", "apollo"}))
+def test_with_another_driver_rain_is_sun_but_for_the_road_and_the_sensors(name: str) -> None:
+    """The shipped rain changes neither; a weather that does is the same for both studies."""
+    mine = {"name": "mine", "road_friction": 0.8, "visibility": 0.9, "recognition_delay": 0.1}
+    parameters = {"cruise_speed": 5.5} if "cruise_speed" in ADS[name].__struct_fields__ else {}
 
-    def drive(self, seen: Observation) -> tuple[float, float]:
-        return (0.0, 1.0) if seen.gap < 6 else (0.6, 0.0)
+    def driven(study: str, **changes: Any) -> Trace:
+        system = assemble(load_study(study, ads={"model": name, "parameters": parameters}, **changes))
+        return simulate(system, system.characteristics.original[np.newaxis]).trace
 
-
-def test_anybodys_ads_hesitates_whatever_it_does_with_its_arrays() -> None:
-    rain, guard = assemble(load_study("rain")), Guard("a test", "ads")
-    assert rain.weather.hesitation > 0
-    settings = np.tile(rain.characteristics.original, (3, 1))
-    guarded = GuardedAds(Careful(), guard), PerVehicle(CarefulForOne, guard)
-    many, each = (simulate(replace(rain, ads=ads), settings).trace for ads in guarded)
-    assert np.array_equal(many.brake, each.brake)
-    assert np.array_equal(many.speed, each.speed)
-    released, braked = (int(np.argmax(column)) for column in (many.gap[:, 0] < 6, many.brake[:, 0] == 1))
-    assert braked - released == np.ceil(rain.weather.hesitation / many.step)
+    rain, sun = driven("rain"), driven("sun")
+    assert sun.speed.max() > 0
+    assert np.array_equal(rain.position, sun.position)
+    assert np.array_equal(driven("rain", weather=mine).position, driven("sun", weather=mine).position)
 
 
-@pytest.mark.parametrize("name", ["competent_driver", "full_braking", "fuzzy_safety", "r157", "rss"])
-def test_a_driver_with_reactions_of_its_own_does_not_wait_like_world_on_rails(name: str) -> None:
-    """The study rain is sun but for its weather, of which nothing but the reactions differs from clear: these drive as in sun."""
-    rain, sun = (assemble(load_study(study)) for study in ("rain", "sun"))
-    driver = ADS[name](cruise_speed=5.5)
-    wet, dry = (simulate(replace(one, ads=driver), one.characteristics.original[np.newaxis]).trace for one in (rain, sun))
-    assert dry.brake.max() > 0
-    assert np.array_equal(wet.position, dry.position)
+def test_a_weather_that_changes_nothing_says_so() -> None:
+    told = "weather 'carla_hard_rain' changes nothing"
+    for driver, says in (({"model": "full_braking"}, True), ({}, False)):
+        assert any(told in remark for remark in assemble(load_study("rain", ads=driver)).remarks) is says
+    assert not any("changes nothing" in remark for remark in assemble(load_study("sun")).remarks)

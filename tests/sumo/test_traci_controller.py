@@ -117,7 +117,7 @@ def step(traci, vehicle_id):
 
 def test_what_a_controller_reads_of_others_has_passed_the_sensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The leader that it is told of is the trace's gap, linear between two steps, a reaction time and a recognition delay ago."""
-    weather = {"name": "haze", "road_friction": 1.0, "visibility": 0.5, "recognition_delay": 0.1, "hesitation": 0.0, "light": "day"}
+    weather = {"name": "haze", "road_friction": 1.0, "visibility": 0.5, "recognition_delay": 0.1, "light": "day"}
     found = system("step", tmp_path, monkeypatch, LOOKS, weather=weather)
     trace = simulate(found, changed(found, reactionTime=0.25, sensorRange=80)).trace
     leader, x, number, listed = np.loadtxt(tmp_path / "looks.csv", delimiter=",")[:len(trace.time)].T

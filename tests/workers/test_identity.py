@@ -27,7 +27,7 @@ def test_names_and_defaults_are_resolved_to_numbers() -> None:
     identity = identity_of(study, assemble(study))
     assert set(identity) <= set(LAYERS)
     assert json.dumps(identity, allow_nan=False)
-    assert identity["resolved"]["weather"]["hesitation"] > 0
+    assert identity["resolved"]["weather"]["road_friction"] == 1
     given = load_study("rain", ads={"parameters": {}}).ads.parameters
     resolved = identity["resolved"]["ads"]["parameters"]
     assert set(resolved) >= set(given)

@@ -17,7 +17,7 @@ from safevar_sumo.metrics import SAFEVAR, MetricFacts, Scoring
 from safevar_sumo.records import FloatArray, Outcome
 from safevar_sumo.results import Failure, failure_lines, load, places_of
 from safevar_sumo.scenarios import weather_of
-from safevar_sumo.study import Origin, Study, Weather, invalid
+from safevar_sumo.study import Origin, Study, Weather, invalid, of_today
 from safevar_sumo.vehicles import CharacteristicSet
 
 NSGA2 = "nsga2"
@@ -164,7 +164,7 @@ def load_case(directory: Path) -> Case:
     """Read one results directory."""
     manifest, evaluations, solutions, finished, failures = load(directory)
     try:
-        study = msgspec.structs.replace(msgspec.convert(manifest["study"], Study), origin=Origin(places=places_of(directory)))
+        study = msgspec.structs.replace(msgspec.convert(of_today(manifest["study"]), Study), origin=Origin(places=places_of(directory)))
     except msgspec.ValidationError as error:
         raise invalid(directory / "manifest.json", manifest["study"], error, "study") from None
     original = manifest.get("original")

@@ -11,7 +11,9 @@ from itertools import permutations
 
 import numpy as np
 import pandas as pd
+from msgspec.structs import replace
 
+from safevar_sumo.ads import REACTIONS
 from safevar_sumo.analysis.research_questions.case import NSGA2, Case, Unanswerable, collided
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import SAFETY_DEGREE
@@ -156,7 +158,7 @@ def combinations(case: Case) -> pd.DataFrame:
 
 
 def weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
-    """Settings that differ in the weather alone: the clearer one first (by friction, then sight, then delay).
+    """Settings that differ in the weather alone, and in how the ADS reacts in it: the clearer one first (by friction, sight, delays).
 
     Raises
     ------
@@ -206,9 +208,11 @@ def effects(case: Case) -> pd.DataFrame:
 
 def _clearness(case: Case) -> tuple[float, float, float]:
     weather = case.weather
-    return weather.road_friction, weather.visibility, -weather.recognition_delay - weather.hesitation
+    late = [float(case.study.ads.parameters.get(name, 0.0)) for name in REACTIONS]
+    return weather.road_friction, weather.visibility, -weather.recognition_delay - sum(late)
 
 
 def _without_weather(case: Case) -> tuple[object, ...]:
     study = case.study
-    return study.scenario, study.vehicle, study.ads, study.metrics
+    others = {name: value for name, value in study.ads.parameters.items() if name not in REACTIONS}
+    return study.scenario, study.vehicle, replace(study.ads, parameters=others), study.metrics
