@@ -139,8 +139,8 @@ class _Canvas:
             state = self._scene.comparison.verdict(row) if over else "brakes" if self._brakes(row, at) else ""
             y = 8 + 26 * row
             draw.rectangle((FINER * 132, FINER * (y + 3), FINER * 154, FINER * (y + 17)), fill=VEHICLES[row])
-            told_gap = f"gap {max(gap, 0):.1f} m" if np.isfinite(gap) else ""
-            words = (self._scene.comparison.name(row), f"{trace.speed[at, row]:.1f} m/s", told_gap, state)
+            gap_text = f"gap {max(gap, 0):.1f} m" if np.isfinite(gap) else ""
+            words = (self._scene.comparison.name(row), f"{trace.speed[at, row]:.1f} m/s", gap_text, state)
             for x, word in zip(COLUMNS, words, strict=True):
                 self._word(draw, (x, y), word, INK, 17)
 

@@ -1,4 +1,4 @@
-"""A scene as a piece of HTML that plays without anything else, and what its template is told."""
+"""A scene as a piece of HTML that plays without anything else, and the data of its template."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def animation_page(scene: Scene) -> str:
 
 
 def player_data(scene: Scene) -> dict[str, Any]:
-    """What the template `player` is told: the still picture, and under `played` what the script plays. y points down."""
+    """The data of the template `player`: the still picture, and under `played` what the script plays. y points down."""
     view, key = scene.view, scene.key_sample
     drives = [_drive(scene, row) for row in scene.comparison.rows]
     bodies = sorted(scene.bodies, key=lambda body: (body.is_vut, body.row))
@@ -56,7 +56,7 @@ def player_data(scene: Scene) -> dict[str, Any]:
     shared = {"step": scene.step, "length": scene.length, "key": key, "view": box, "drives": drives}
     return {
         **shared,
-        "told": _told(scene), "moments": _moments(scene), "bottom": round(-view.bottom, CENTIMETRES),
+        "description": _description(scene), "moments": _moments(scene), "bottom": round(-view.bottom, CENTIMETRES),
         "letters": round(view.width / LETTERS, CENTIMETRES),
         "road": [_lane(lane) for kind in ("area", "path", "road", "crossing") for lane in scene.road if lane.kind == kind],
         "ticks": list(range(int(np.floor(view.left.min() / TEN)) * TEN, int(view.left.max() + view.width) + TEN, TEN)),
@@ -64,7 +64,7 @@ def player_data(scene: Scene) -> dict[str, Any]:
         "played": {**shared, "bodies": [_moving(body) for body in bodies]}}
 
 
-def _told(scene: Scene) -> str:
+def _description(scene: Scene) -> str:
     """The picture in words."""
     comparison = scene.comparison
     who = " and ".join(f"the {comparison.name(row)} vehicle, which {comparison.verdict(row)}" for row in comparison.rows)

@@ -17,7 +17,7 @@ from safevar_sumo.report.svg import Bar, rows
 from safevar_sumo.results import SolutionId, chosen_handle, unsafe_rows
 from safevar_sumo.study import SAFETY_DEGREE
 
-Found = list[dict[str, Any]]
+Failures = list[dict[str, Any]]
 """What `explain --json` prints."""
 CAUSES = 6
 """Minimal causes that a report shows, at the most."""
@@ -28,16 +28,16 @@ FIRST = ("fewest", "smallest", "most_severe")
 OBJECTIVES = ["f_safe", "f_diff", "f_num_diff"]
 
 
-def explanations(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
+def explanations(material: ReportInput, jobs: int | None, progress: Progress) -> Failures:
     """The failures that matter, explained; computed once for these results."""
-    def compute() -> Found:
+    def compute() -> Failures:
         return explain(material.case, material.options["explain"], jobs=jobs,
                        progress=lambda what, done, total: progress(f"{material.case.name}: {what}", done, total)).to_dict()
 
     return list(stored(material, "explain", compute))
 
 
-def necessity(explained: Found, material: ReportInput) -> Markup | None:
+def necessity(explained: Failures, material: ReportInput) -> Markup | None:
     """How often each characteristic is changed in a failure, and how often it is needed."""
     shares: dict[str, dict[str, Any]] = next((one["summary"] for one in explained if "summary" in one), {})
     names = [name for name in shares.get("necessary", {}) if shares["changed"].get(name)]
@@ -58,7 +58,7 @@ def _interval(low: float, high: float) -> str:
     return f" ({low:.0%} to {high:.0%})" if low < high else ""
 
 
-def causes(explained: Found, material: ReportInput) -> list[dict[str, Any]]:
+def causes(explained: Failures, material: ReportInput) -> list[dict[str, Any]]:
     """The distinct minimal causes, the one of the fewest and smallest changes first, each with its replay at the boundary."""
     distinct: dict[tuple[str, ...], dict[str, Any]] = {}
     for failure in explained:
@@ -70,7 +70,7 @@ def causes(explained: Found, material: ReportInput) -> list[dict[str, Any]]:
     ordered = sorted(distinct.values(), key=lambda one: _size(material, one["cause"]))[:CAUSES]
     if ordered:
         material.again([material.setting_with(one["cause"]["changes"]) for one in ordered])
-    return [_told(material, place, one) for place, one in enumerate(ordered, 1)]
+    return [_shown(material, place, one) for place, one in enumerate(ordered, 1)]
 
 
 def _with_changes(failure: dict[str, Any]) -> list[dict[str, Any]]:
@@ -88,7 +88,7 @@ def _size(material: ReportInput, cause: dict[str, Any]) -> tuple[int, float]:
     return len(cause["changes"]), float(material.case.characteristics.largest_change(setting[np.newaxis])[0])
 
 
-def _told(material: ReportInput, place: int, one: dict[str, Any]) -> dict[str, Any]:
+def _shown(material: ReportInput, place: int, one: dict[str, Any]) -> dict[str, Any]:
     cause = one["cause"]
     setting = material.setting_with(cause["changes"])
     members = {member.name: member for member in material.case.characteristics}
@@ -105,7 +105,7 @@ def _told(material: ReportInput, place: int, one: dict[str, Any]) -> dict[str, A
             "fraction": cause["fraction"], "below": cause["end"], "replay": material.replay(setting)}
 
 
-def replays(material: ReportInput, explained: Found | None) -> list[dict[str, Any]]:
+def replays(material: ReportInput, explained: Failures | None) -> list[dict[str, Any]]:
     """The solutions worth a look: the chosen ones, the explained ones, and unsafe ones that no other beats in every objective."""
     shown, chosen = [], _chosen(material, explained)
     if material.system is not None and chosen:
@@ -121,7 +121,7 @@ def replays(material: ReportInput, explained: Found | None) -> list[dict[str, An
     return sorted(shown, key=lambda one: (one["f_safe"], one["handle"]))
 
 
-def _chosen(material: ReportInput, explained: Found | None) -> list[str]:
+def _chosen(material: ReportInput, explained: Failures | None) -> list[str]:
     """Their handles, each once."""
     solutions, degree = material.case.solutions, material.case.original[SAFETY_DEGREE]
     if solutions.empty:

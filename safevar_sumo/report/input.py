@@ -53,7 +53,7 @@ def failing_places(matrix: Sequence[Point], failing: Collection[str]) -> dict[st
 
     Returns
     -------
-    A sentence `told`, column `heads`, and `rows` of a name and a cell for each head; a cell is empty where nothing is tested.
+    A sentence `summary`, column `heads`, and `rows` of a name and a cell for each head; a cell is empty where nothing is tested.
     """
     places = [(point.name in failing, dict(point.place)) for point in matrix]
     speeds = sorted({place[SPEED] for _, place in places if SPEED in place})
@@ -67,7 +67,7 @@ def failing_places(matrix: Sequence[Point], failing: Collection[str]) -> dict[st
     columns = [*speeds, *([None] if any(None in cells for cells in rows.values()) else [])]
     has_location = any(LOCATION in dict(point.place) for point in matrix if point.name in failing)
     return {
-        "told": f"Fails at {len(failing)} of {len(matrix)} points.{' Percentages are impact locations.' if has_location else ''}",
+        "summary": f"Fails at {len(failing)} of {len(matrix)} points.{' Percentages are impact locations.' if has_location else ''}",
         "heads": ["" if speed is None else f"{speed:g} km/h" for speed in columns],
         "rows": [(name, [", ".join(cells[speed]) or AVOIDED if speed in cells else "" for speed in columns])
                  for name, cells in rows.items() if any(cells.values())]}

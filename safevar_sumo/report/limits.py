@@ -17,12 +17,12 @@ from safevar_sumo.report.input import ReportInput, stored
 from safevar_sumo.report.svg import Bar, rows
 from safevar_sumo.vehicles import Characteristic
 
-Found = dict[str, Any]
+Section = dict[str, Any]
 
 
-def tolerance(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
+def tolerance(material: ReportInput, jobs: int | None, progress: Progress) -> Section:
     """Every characteristic's safe interval alone, as bars over its domain, and the factor for all together."""
-    def compute() -> Found:
+    def compute() -> Section:
         tolerances = find_tolerances(material.case.study, material.options["tolerance"], jobs=jobs, progress=progress)
         return {**tolerances.to_dict(), "verdict": tolerances.verdict}
 
@@ -30,9 +30,9 @@ def tolerance(material: ReportInput, jobs: int | None, progress: Progress) -> Fo
     return {"verdict": result["verdict"], "unsafe": result["unsafe"], "joint": result["joint"], "chart": _bars(material, result["alone"])}
 
 
-def risk(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
+def risk(material: ReportInput, jobs: int | None, progress: Progress) -> Section:
     """The probability of a failure with its interval, and what decides, as bars."""
-    def compute() -> Found:
+    def compute() -> Section:
         return estimate_risk(material.case.study, material.options["risk"], jobs=jobs, progress=progress).to_dict()
 
     result = stored(material, "risk", compute)
@@ -41,9 +41,9 @@ def risk(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
             "chart": _sensitivity(material, result["sensitivity"])}
 
 
-def rules(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
+def rules(material: ReportInput, jobs: int | None, progress: Progress) -> Section:
     """Rules in words, with what they are worth on vehicles that they were not made from."""
-    def compute() -> Found:
+    def compute() -> Section:
         regions = find_rules(material.case.study, material.options["rules"], jobs=jobs, progress=progress)
         sure = [rule for rule in regions.rules if rule.tells_more_than(regions.unsafe_share)]
         words = [raised(rule_in_words(rule, material.case.characteristics, regions.unsafe)) for rule in sure]
@@ -52,15 +52,17 @@ def rules(material: ReportInput, jobs: int | None, progress: Progress) -> Found:
             f"Left out: {dropped} that so few vehicles do not tell from chance; the command rules looks at more.")
         return {"words": words, "samples": regions.samples, "share": regions.unsafe_share, "remark": remark, "unsafe": str(regions.unsafe)}
 
-    result: Found = stored(material, "rules", compute)
+    result: Section = stored(material, "rules", compute)
     return result
 
 
-LIMITS: Mapping[str, Callable[[ReportInput, int | None, Progress], Found]] = {"tolerance": tolerance, "risk": risk, "rules": rules}
+INDICES = {"first_order": "alone", "total": "with others"}
+"""What the Sobol indices are called beside a bar."""
+LIMITS: Mapping[str, Callable[[ReportInput, int | None, Progress], Section]] = {"tolerance": tolerance, "risk": risk, "rules": rules}
 """The sections that ask what the whole domain holds, by name."""
 
 
-def _bars(material: ReportInput, alone: list[Found]) -> Markup:
+def _bars(material: ReportInput, alone: list[Section]) -> Markup:
     members = {member.name: member for member in material.case.characteristics}
     names, pieces, marks, ends = [], [], [], []
     for one in alone:
@@ -86,16 +88,20 @@ def _part(name: str, share: float, look: str, how: str) -> Bar:
     return Bar(0, min(max(share, 0.0), 1.0), look, f"{name}: {share:.0%} {how}")
 
 
-def _percent(share: float) -> str:
-    """A share as it is told: an estimate just below 0 is 0."""
-    return f"{round(share, 2) + 0.0:.0%}"
+def _percent(share: float | None, interval: Sequence[float | None]) -> str:
+    """An estimated share with half of its interval, such as `41 % ± 7`; an estimate just below 0 is 0."""
+    if share is None:
+        return "-"
+    low, high = interval
+    error = "" if low is None or high is None else f" ± {50 * (high - low):.0f}"
+    return f"{100 * (round(share, 2) + 0.0):.0f} %{error}"
 
 
 def _share(member: Characteristic, value: float) -> float:
     return (value - member.lower) / (member.upper - member.lower)
 
 
-def _sensitivity(material: ReportInput, sensitivity: list[Found]) -> Markup | None:
+def _sensitivity(material: ReportInput, sensitivity: list[Section]) -> Markup | None:
     defined = [one for one in sensitivity if one["total"] is not None]
     ordered = sorted(defined, key=lambda one: (-one["total"], one["characteristic"]))
     if not ordered:
@@ -104,4 +110,5 @@ def _sensitivity(material: ReportInput, sensitivity: list[Found]) -> Markup | No
                _part(one["characteristic"], one["first_order"] or 0.0, "safe", "alone")] for one in ordered]
     return rows(f"{material.case.name}: share of the safety degree's variance that each characteristic decides",
                 [one["characteristic"] for one in ordered], pieces, [None] * len(ordered),
-                [("", f"alone {_percent(one['first_order'] or 0)}, with others {_percent(one['total'])}") for one in ordered])
+                [("", ", ".join(f"{words} {_percent(one[index], one[f'{index}_interval'])}" for index, words in INDICES.items()))
+                 for one in ordered])

@@ -18,7 +18,7 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import KMH, FloatArray, Outcome
 from safevar_sumo.reference import Totals, quoted
 from safevar_sumo.replay.comparison import number, raised
-from safevar_sumo.report.findings import Found, handle_of
+from safevar_sumo.report.findings import Failures, handle_of
 from safevar_sumo.report.input import ReportInput
 from safevar_sumo.results import SolutionId, chosen_handle, unsafe_rows
 from safevar_sumo.scenarios import SCENARIOS, Point, tags
@@ -90,7 +90,7 @@ TITLES = {ROBUST: "Smallest robust failure", REASONS["fewest"]: "Fewest changes"
 UNKNOWN = "–"  # noqa: RUF001
 
 
-def verdict(material: ReportInput, explained: Found | None, tolerance: Mapping[str, Any] | None) -> dict[str, Any]:
+def verdict(material: ReportInput, explained: Failures | None, tolerance: Mapping[str, Any] | None) -> dict[str, Any]:
     """What happened to the original vehicle, and what makes it unsafe: the smallest robust failure first, every other one with a badge.
 
     All values of a failure are those of its solution as it was found, nowhere shrunk.
@@ -122,7 +122,7 @@ def _original(material: ReportInput) -> str:
     return f"The original vehicle {material.compared(material.case.characteristics.original).verdict(0)}."
 
 
-def _findings(material: ReportInput, explained: Found, *, any_unsafe: bool) -> list[dict[str, Any]]:
+def _findings(material: ReportInput, explained: Failures, *, any_unsafe: bool) -> list[dict[str, Any]]:
     """The failures worth a sentence, each once, with all that it was chosen for; without explanations, chosen among the solutions alone."""
     reasons: dict[str, list[str]] = {}
     shares: dict[str, float] = {}
@@ -137,8 +137,9 @@ def _findings(material: ReportInput, explained: Found, *, any_unsafe: bool) -> l
             handle = chosen_handle(material.case.solutions, degree, choice, material.place)
             reasons.setdefault(str(handle), []).append(REASONS[choice])
     order = list(TITLES)
+    needed = {handle_of(failure): len(failure["minimal_causes"][0]["changes"]) for failure in explained if failure.get("minimal_causes")}
     chosen = sorted(reasons.items(), key=lambda one: min(order.index(reason) for reason in one[1]))
-    return [_finding(material, handle, group, shares.get(handle)) for handle, group in chosen]
+    return [{**_finding(material, handle, group, shares.get(handle)), "needed": needed.get(handle)} for handle, group in chosen]
 
 
 def _finding(material: ReportInput, handle: str, reasons: list[str], share: float | None) -> dict[str, Any]:
@@ -150,7 +151,7 @@ def _finding(material: ReportInput, handle: str, reasons: list[str], share: floa
             "anchor": material.anchor("replay", handle), "changes": changes, "end": _end(material, handle, setting),
             "where": material.where(setting), "share": share, "borderline": share is not None and is_borderline(share),
             "size": f"{len(changes)} of {len(setting)} characteristics changed, by at most {largest:.0%}",
-            "short": f"{_changes(len(changes))} of at most {largest:.0%}", "f_safe": material.solutions[handle]["f_safe"]}
+            "short": f"{number_of(len(changes), 'change')} of at most {largest:.0%}", "f_safe": material.solutions[handle]["f_safe"]}
 
 
 def _end(material: ReportInput, handle: str, setting: FloatArray) -> str:
@@ -160,27 +161,30 @@ def _end(material: ReportInput, handle: str, setting: FloatArray) -> str:
     return comparison.verdict(comparison.rows[-1])
 
 
-def _headline(result: Mapping[str, Any], material: ReportInput, explained: Found | None) -> str:
+def _headline(result: Mapping[str, Any], material: ReportInput, explained: Failures | None) -> str:
     if not result["unsafe"]:
         return f"Nothing unsafe among {result['solutions']} solutions; the nearest miss is shown below."
     if material.original_fails:
         return "No change is needed: the original vehicle itself collides."
     first = result["findings"][0]
+    if first["needed"] == 0:
+        return "No change is needed: the original vehicle itself is unsafe."
     what = "a collision" if result["hits"] else "an unsafe outcome"
-    number = len(first["changes"])
-    suffice = f"{_changes(number)} {'suffices' if number == 1 else 'suffice'} for {what}"
-    if ROBUST in first["reasons"]:
-        return f"{suffice} that is robust: the vehicle {first['end']}."
-    if explained:
-        return f"Every failure that was tried is borderline. {suffice} of the one with the fewest changes: the vehicle {first['end']}."
-    return f"{suffice}: the vehicle {first['end']}."
+    robust = f"{what} that is robust" if ROBUST in first["reasons"] else what
+    borderline = "Every failure that was tried is borderline. The one with the fewest changes: " if explained and robust == what else ""
+    return f"{borderline}{_enough(first, robust)}: the vehicle {first['end']}."
 
 
-def _changes(number: int) -> str:
-    return "1 change" if number == 1 else f"{number} changes"
+def _enough(finding: Mapping[str, Any], what: str) -> str:
+    """Such as `10 changes lead to a collision (3 of them suffice)`; how few suffice is known of explained failures alone."""
+    number, needed = len(finding["changes"]), finding["needed"]
+    if number == needed:
+        return f"{number_of(number, 'change')} suffice{'s' if number == 1 else ''} for {what}"
+    some = "" if needed is None else f" ({needed} of them suffice{'s' if needed == 1 else ''} to be unsafe)"
+    return f"{number_of(number, 'change')} lead{'s' if number == 1 else ''} to {what}{some}"
 
 
-def _figures(result: Mapping[str, Any], material: ReportInput, explained: Found,
+def _figures(result: Mapping[str, Any], material: ReportInput, explained: Failures,
              tolerance: Mapping[str, Any] | None) -> list[dict[str, str]]:
     """The four key figures, each a title, a value and a note."""
     by_reason = {reason: one for one in result["findings"] for reason in one["reasons"]}
@@ -189,7 +193,7 @@ def _figures(result: Mapping[str, Any], material: ReportInput, explained: Found,
             _avoided(preventable, result), _together(tolerance)]
 
 
-def _smallest(robust: Mapping[str, Any] | None, explained: Found, result: Mapping[str, Any]) -> dict[str, str]:
+def _smallest(robust: Mapping[str, Any] | None, explained: Failures, result: Mapping[str, Any]) -> dict[str, str]:
     title = TITLES[ROBUST]
     if robust is None:
         tried = "every failure that was tried is borderline" if explained else "not computed"
@@ -260,7 +264,7 @@ NOT_MODELLED = (
 )
 
 
-def trust(material: ReportInput, explained: Found | None) -> dict[str, Any]:
+def trust(material: ReportInput, explained: Failures | None) -> dict[str, Any]:
     """What a reader should hold against the findings of one study."""
     case = material.case
     rows = [{"name": name, "published": case.study.published[name], "here": case.original[name]}
@@ -281,4 +285,4 @@ def trust(material: ReportInput, explained: Found | None) -> dict[str, Any]:
                         f"fewer than {BORDERLINE:.0%} of their neighbours are unsafe too.")
     if not rows:
         remarks.append("No published values of the original vehicle are known to hold the study against.")
-    return {"published": rows, "told": remarks, "general": NOT_MODELLED, "agreement": agreement(material)["rows"]}
+    return {"published": rows, "remarks": remarks, "general": NOT_MODELLED, "agreement": agreement(material)["rows"]}

@@ -115,6 +115,7 @@ def _read(path: Path, seen: tuple[Path, ...]) -> _Raw:
 
 def _extended(raw: _Raw, path: Path, seen: tuple[Path, ...]) -> _Raw:
     """The tables of the study that `raw` extends, overridden by those of `raw`, with the folders of both."""
+    refuse(unusable(raw.source, raw.tables))
     tables = dict(raw.tables)
     base = tables.pop("extends", None)
     if base is None:

@@ -104,14 +104,19 @@ def _short(value: object) -> str:
 
 LARGEST = 1e12
 """Largest magnitude of a characteristic, in its unit."""
+DEEPEST = 32
+"""Tables and lists within each other that a study may have; Python gives up at about a thousand."""
 
-def unusable(source: object, value: object, where: str = "") -> Iterator[InputError]:
-    """Values anywhere in a study's tables that cannot be used the same way everywhere."""
-    if isinstance(value, Mapping | list | tuple):
+
+def unusable(source: object, value: object, where: str = "", depth: int = 0) -> Iterator[InputError]:
+    """Values anywhere in a study's tables that cannot be used the same way everywhere; `depth` tables and lists are around `value`."""
+    if isinstance(value, Mapping | list | tuple) and depth > DEEPEST:
+        yield InputError(source, f"{where.partition('.')[0]} is nested too deeply", f"at most {DEEPEST} tables within each other")
+    elif isinstance(value, Mapping | list | tuple):
         for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
             if not str(key).isprintable():
                 yield InputError(source, f"{where or 'a key'}: {key!r} is no name", "printable characters")
-            yield from unusable(source, inner, f"{where}.{key}" if where else str(key))
+            yield from unusable(source, inner, f"{where}.{key}" if where else str(key), depth + 1)
     elif reason := _unusable(value, where):
         yield InputError(source, f"{where} = {reason[0]}", reason[1])
 

@@ -123,7 +123,7 @@ def test_the_sections_stand_in_their_order_and_tell_what_was_found(page: str, sl
     assert f"collision at {-worst:.1f} m/s" in page
     assert f"{-3.6 * worst:.0f} km/h" in page
     assert f"stops with {case.original['safety_degree']:.2f} m to spare" in page
-    assert re.search(r"\d+ changes suffice for a collision that is robust: the vehicle hits at", page)
+    assert re.search(r"\d+ changes lead to a collision that is robust \(\d of them suffices? to be unsafe\): the vehicle hits at", page)
     assert "^2" not in re.sub("<(style|script).*?</(style|script)>", "", page, flags=re.DOTALL)
     by_reason = {reason: one for one in explained.explanations for reason in one.reasons}
     fewest = by_reason["fewest changes"]
@@ -164,7 +164,12 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
     first = told["findings"][0]
     setting = material.setting_of(SolutionId.parse(first["handle"]))
     assert [one["text"] for one in first["changes"]] == changes_in_words(material.case.characteristics, setting)
-    assert told["headline"].startswith(f"{len(first['changes'])} changes suffice for a collision that is robust")
+    number, needed = len(first["changes"]), len(robust["minimal_causes"][0]["changes"])
+    assert 0 < needed < number, "or the next line tells nothing"
+    assert told["headline"].startswith(f"{number} changes lead to a collision that is robust ({needed} of them suffice")
+    robust["minimal_causes"] = [{"changes": {one["text"]: 1.0 for one in first["changes"]}}]
+    every = verdict(material, [fewest, robust, summary], None)["headline"]
+    assert every.startswith(f"{number} changes suffice for a collision that is robust: the vehicle hits")
     assert [one["value"] for one in told["figures"][2:]] == ["14% of the collisions", "42.0% of the way"]
     assert told["figures"][0]["value"].startswith(f"{len(first['changes'])} changes")
 
@@ -287,7 +292,7 @@ def test_tests_and_weathers_stand_down_and_speeds_across() -> None:
               point("along 30", test="along", speed=30, weather="clear"), point("along 40", test="along", speed=40, weather="clear"),
               point("safe 10", test="safe", speed=10, weather="clear")]
     found = failing_places(matrix, ("near 20 50", "near 30 25", "near 30 50", "along 40"))
-    assert found["told"] == "Fails at 4 of 9 points. Percentages are impact locations."
+    assert found["summary"] == "Fails at 4 of 9 points. Percentages are impact locations."
     assert found["heads"] == ["10 km/h", "20 km/h", "30 km/h", "40 km/h"]
     assert dict(found["rows"]) == {"near, night": [AVOIDED, "50 %", "25 %, 50 %", ""], "along, clear": ["", "", AVOIDED, "fails"]}
 
@@ -338,5 +343,6 @@ def test_what_comes_from_outside_is_called_by_its_name_once(slippery: Path) -> N
     assert not told["tags"]
 
 
-def test_an_estimate_just_below_nothing_is_nothing() -> None:
-    assert [_percent(share) for share in (-0.002, 0.0, 0.126)] == ["0%", "0%", "13%"]
+def test_an_estimate_stands_beside_its_error_and_just_below_nothing_it_is_nothing() -> None:
+    estimates = [(-0.002, (-0.01, 0.006)), (0.126, (0.106, 0.146)), (1.04, (0.94, 1.14)), (0.3, (None, None)), (None, (None, None))]
+    assert [_percent(share, interval) for share, interval in estimates] == ["0 % ± 1", "13 % ± 2", "104 % ± 10", "30 %", "-"]

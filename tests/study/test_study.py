@@ -98,6 +98,7 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
     ("[vehicle]\ncharacteristics = 3", "vehicle.characteristics = 3"),
     ("search = 3", "search = 3"),
     ("extends = 3\n", "extends"),
+    (f"[ads.parameters.{'.'.join(['deep'] * 1500)}]\nx = 1", "ads is nested too deeply\nexpected: at most 32 tables"),
 ])
 def test_what_nobody_can_use_is_refused_by_its_key(text: str, told: str, tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"

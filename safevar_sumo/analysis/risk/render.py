@@ -45,7 +45,8 @@ def print_risk(console: Console, result: Risk) -> None:
     if result.sensitivity_of_unsafe["total"].isna().all():
         print_text(console, "Too few settings are unsafe, or safe, to tell what decides that; the safety degree tells more.")
     print_meanings(console, CharacteristicSet.of(result.study.vehicle.characteristics))
-    console.print(f"Sobol indices, first order and total, with half of their {result.confidence:.0%} intervals.", highlight=False)
+    print_text(console, f"Sobol indices, first order and total, with half of their {result.confidence:.0%} intervals: estimates, which may "
+                        "exceed 1 or fall below 0 by their error.")
 
 
 def _variation(study: Study) -> str:
