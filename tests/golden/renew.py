@@ -1,4 +1,7 @@
-"""The originals of the shipped studies and small searches of them, computed in this process; run as a program, renews golden.json."""
+"""The originals of the shipped studies and small searches of them, computed in this process; run as a program, renews golden.json.
+
+Every entry has rounded values that a person can compare, `why` it is kept, and digests of the same values to the last bit.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,21 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import pandas as pd
 
-from safevar_sumo.results import RESULTS, load
+from safevar_sumo.results import CHOICES, RESULTS, load
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers.identity import identity_of
 from tests.in_process import searched
 
-STUDIES = ("sun", "rain", "lgsvl", "native", "smoke")
+WHY = {
+    "sun": "the published vehicle and driving system in dry clear weather: the case to which they were fitted",
+    "rain": "the same in rain: friction, sight, recognition delay and hesitation act",
+    "lgsvl": "another vehicle model, driving system and scenario: a lead vehicle stands",
+    "native": "SUMO's own car-following model with modelled sensors and actuators",
+    "smoke": "the study that a user runs first"}
+"""Every study, and what would go unseen without its entry."""
 FILE = Path(__file__).with_name("golden.json")
 
 
@@ -28,24 +38,44 @@ def small(name: str) -> Study:
 
 
 def computed(name: str) -> dict[str, Any]:
-    """The original vehicle's evaluation, and a digest of the solutions of every algorithm."""
+    """The entry of a study: the original vehicle, and every algorithm's solutions."""
     study = small(name)
     with tempfile.TemporaryDirectory() as folder:
-        found = load(searched(study, Path(folder)))
-    digests = {algorithm: sha256(rows.to_csv(index=False, lineterminator="\n").encode()).hexdigest()
-               for algorithm, rows in found.solutions.groupby("algorithm")}
-    return {"original": found.manifest["original"], "solutions": digests}
+        results = load(searched(study, Path(folder)))
+    original = results.manifest["original"]
+    changed = {member: row.original for member, row in study.vehicle.characteristics.items()}
+    solutions = {str(algorithm): _of_algorithm(rows, changed) for algorithm, rows in results.solutions.groupby("algorithm")}
+    return {"why": WHY[name], "original": {**_rounded(original), "digest": _digest(json.dumps(original, sort_keys=True))},
+            "solutions": solutions}
+
+
+def _of_algorithm(rows: pd.DataFrame, original: dict[str, float]) -> dict[str, Any]:
+    """How many solutions there are and collide, and the most severe one: its objectives and its changes."""
+    worst = rows.sort_values(CHOICES["most_severe"], kind="stable").iloc[0]
+    severe = {name: float(worst[name]) for name in CHOICES["most_severe"]}
+    severe |= {name: float(worst[name]) for name, value in original.items() if worst[name] != value}
+    return {"number": len(rows), "collisions": int((rows["outcome"] == "collision").sum()), "most_severe": _rounded(severe),
+            "digest": _digest(rows.to_csv(index=False, lineterminator="\n"))}
+
+
+def _rounded(values: dict[str, Any]) -> dict[str, Any]:
+    """Five digits: enough to see by how much a value has changed."""
+    return {name: float(f"{value:.5g}") if isinstance(value, float) else value for name, value in values.items()}
+
+
+def _digest(text: str) -> str:
+    return sha256(text.encode()).hexdigest()[:16]
 
 
 def platform_here() -> dict[str, str]:
-    """The platform as manifests tell it."""
+    """The platform as a manifest records it."""
     study = small("native")
-    told: dict[str, str] = identity_of(study, assemble(study))["platform"]
-    return told
+    platform: dict[str, str] = identity_of(study, assemble(study))["platform"]
+    return platform
 
 
 if __name__ == "__main__":
-    stored, studies = json.loads(FILE.read_text(encoding="utf-8")), {name: computed(name) for name in STUDIES}
+    stored, studies = json.loads(FILE.read_text(encoding="utf-8")), {name: computed(name) for name in WHY}
     if studies != stored["studies"] and stored["results"] == RESULTS:
         raise SystemExit(f"results have changed: raise RESULTS in safevar_sumo/results/manifest.py above {RESULTS} first")
     golden = {"platform": platform_here(), "results": RESULTS, "studies": studies}
