@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from safevar_sumo.campaign import RunKey
 from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study
-from safevar_sumo.terminal import SECONDS_BETWEEN_LINES, stages
+from safevar_sumo.terminal import SECONDS_BETWEEN_LINES, print_text, stages
 
 if TYPE_CHECKING:
     from safevar_sumo.analysis.evaluator import Progress as StageProgress
@@ -69,7 +69,7 @@ class CampaignProgress:
         self._show()
 
     def warned(self, message: str) -> None:
-        self._console.print(f"warning: {message}", soft_wrap=True, markup=False, highlight=False)
+        print_text(self._console, f"warning: {message}")
 
     def _show(self) -> None:
         tally = self._tally
@@ -77,7 +77,7 @@ class CampaignProgress:
         now = time.monotonic()
         if not self._console.is_terminal and not self._quiet and now - self._spoke >= SECONDS_BETWEEN_LINES:
             self._spoke = now
-            self._console.print(f"{self._name}: {tally.text()}", soft_wrap=True, highlight=False)
+            print_text(self._console, f"{self._name}: {tally.text()}")
 
 
 class _Tally:

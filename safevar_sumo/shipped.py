@@ -1,10 +1,12 @@
-"""The data that ships with the code: studies and SUMO networks."""
+"""The data that ships with the code: studies and SUMO networks; and how the program is called."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parent
+RUN = "python -m safevar_sumo"
+"""Begins every command of this package."""
 
 
 def _folder(name: str) -> Path:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
-from rich.console import Console, ConsoleOptions, RenderResult
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -16,7 +17,21 @@ from safevar_sumo.vehicles import Characteristic
 
 
 class WholeTable(Table):
-    """A table whose first column keeps its words, the names; what else does not fit goes on in the next line."""
+    """A table of plain text whose first column keeps its words, the names; what else does not fit goes on in the next line.
+
+    Columns with the heads `left` hold text, those with the heads `right` numbers. Text is shown as it is, without markup.
+    """
+
+    def __init__(self, *left: str, right: Iterable[str] = (), title: str = "", **options: Any) -> None:
+        super().__init__(title=plain(title) if title else None, title_justify="left", **options)
+        for head in left:
+            self.add_column(Text(head))
+        for head in right:
+            self.add_column(Text(head), justify="right")
+
+    def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
+        """A row of texts, or of cells with a style of their own."""
+        super().add_row(*(plain(cell) if isinstance(cell, str) else cell for cell in cells), **options)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for column in self.columns:
@@ -53,9 +68,9 @@ def print_meanings(console: Console, members: Iterable[Characteristic]) -> None:
 
 def print_names(console: Console, title: str, rows: Iterable[tuple[str, ...]], heads: tuple[str, ...]) -> None:
     """A plain table of what there is."""
-    table = WholeTable(*heads, title=plain(title), title_justify="left")
+    table = WholeTable(*heads, title=title)
     for row in rows:
-        table.add_row(*(plain(cell) for cell in row))
+        table.add_row(*row)
     console.print(table)
 
 
@@ -77,6 +92,6 @@ def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
             bar.update(task, description=stage, completed=number)
             if not console.is_terminal and time.monotonic() - spoke >= SECONDS_BETWEEN_LINES:
                 spoke = time.monotonic()
-                console.print(f"{stage}: {number} of {total}", markup=False, highlight=False, soft_wrap=True)
+                print_text(console, f"{stage}: {number} of {total}")
 
         yield done

@@ -15,6 +15,8 @@ from safevar_sumo.records import BoolArray, Evaluations, Outcome
 from safevar_sumo.results import half_of
 
 EXPECTED = "collision, or below=X with a safety degree X [m, or minus a collision's speed in m/s]"
+CONFIDENCE = 0.95
+"""Of the intervals of shares, where no option says otherwise."""
 PROBED = 1024
 """Settings over the whole domain that decide whether a study has collisions at all."""
 
@@ -88,7 +90,7 @@ def criterion_of(text: str | None, bench: Bench, original: Evaluations | None = 
     return Unsafe.usual(bench.evaluate(spread(bench.characteristics, PROBED), "settings over the whole domain"), original)
 
 
-def clopper_pearson(count: int, total: int, confidence: float) -> tuple[float, float]:
+def clopper_pearson(count: int, total: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Clopper and Pearson's exact interval of the share count / total."""
     interval = scipy.stats.binomtest(count, total).proportion_ci(confidence, method="exact")
     return float(interval.low), float(interval.high)

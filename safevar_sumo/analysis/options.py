@@ -13,9 +13,7 @@ from shlex import quote
 from typing import Any, ClassVar, NamedTuple
 
 from safevar_sumo.errors import InputError
-
-RUN = "python -m safevar_sumo"
-"""Begins every command of this package."""
+from safevar_sumo.shipped import RUN
 
 
 class Option(NamedTuple):

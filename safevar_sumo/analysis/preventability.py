@@ -24,8 +24,6 @@ from safevar_sumo.study import ModelTable, Study
 from safevar_sumo.sumo.matrix import at_every_point, simulate, study_at, worst_points
 from safevar_sumo.sumo.system import System, assemble
 
-CONFIDENCE = 0.95
-"""Of the interval of a sample's share."""
 LIMIT = 20_000
 """Simulations, about, that a study's preventability may take; of more collisions a random sample is looked at."""
 
@@ -74,7 +72,7 @@ class Preventability:
         share = self.share(by)
         if share is None or self.looked_at == self.collisions:
             return None if share is None else (share, share)
-        return clopper_pearson(self.numbers.get(by, 0), self.looked_at, CONFIDENCE)
+        return clopper_pearson(self.numbers.get(by, 0), self.looked_at)
 
     def to_dict(self) -> dict[str, Any]:
         """As `explain --json` prints it; shares and interval are None without any collision."""

@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterable, Mapping
 from shlex import quote
 
-from safevar_sumo.analysis.options import RUN
 from safevar_sumo.records import Outcome
+from safevar_sumo.shipped import RUN
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 ENDS = {

@@ -10,7 +10,6 @@ import click
 import msgspec
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.options import PICTURES, check_output, complete_study, refuse_inputs
@@ -241,9 +240,8 @@ def _rows_by_case(path: Path, cases: Sequence[Case]) -> dict[str, ReferenceData]
 
 def print_agreement(console: Console, study: Study, result: Agreement) -> None:
     """Comparison with reference data, metric by metric."""
-    table = WholeTable("", title=escape(f"{study.title}: {result.rows} rows"), title_justify="left")
-    for head in ("Spearman's rho", "mean abs. error", "in repeats", "bias", "original there", "original here"):
-        table.add_column(head, justify="right")
+    table = WholeTable("", right=("Spearman's rho", "mean abs. error", "in repeats", "bias", "original there", "original here"),
+                       title=f"{study.title}: {result.rows} rows")
     for name in result.spearman:
         head = METRICS[name].heading
         numbers = (result.spearman[name], result.mean_absolute_error[name], result.in_repeats[name], result.bias[name],
@@ -267,18 +265,13 @@ def _number(value: float | None) -> str:
 
 def print_calibration(console: Console, study: Study, result: Calibration) -> None:
     """Fitted values, and how well they agree with both halves of the data."""
-    table = WholeTable("parameter", "unit", title=escape(study.title), title_justify="left")
-    for head in ("found", "lower", "upper"):
-        table.add_column(head, justify="right")
+    table = WholeTable("parameter", "unit", right=("fitted", "lower", "upper"), title=study.title)
     for name, value in result.values.items():
         row = study.calibration[name]
         table.add_row(name, row.unit, *(f"{number:.5g}" for number in (value, row.lower, row.upper)))
     console.print(table)
     for name in result.used:
-        both = WholeTable(title=escape(f"{name}: rows used / held back"), title_justify="left")
-        both.add_column("")
-        for head in ("Spearman's rho", "mean abs. error", "bias"):
-            both.add_column(head, justify="right")
+        both = WholeTable("", right=("Spearman's rho", "mean abs. error", "bias"), title=f"{name}: rows used / held back")
         halves = (result.used[name], result.held_back[name])
         for metric in halves[0].spearman:
             head = METRICS[metric].heading

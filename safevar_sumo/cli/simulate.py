@@ -33,7 +33,7 @@ from safevar_sumo.scenarios import tags
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable
 from safevar_sumo.sumo.matrix import AtPoint, at_every_point, named_point, point_record, remarks_of, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.terminal import WholeTable, plain, print_meanings
+from safevar_sumo.terminal import WholeTable, print_meanings, print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 FILE = click.Path(path_type=Path)
@@ -117,7 +117,7 @@ def _tell(target: Target, system: System, simulation: Simulation, as_json: bool)
         print_simulation(Console(), simulation)
         print_matrix(Console(), points)
         if types := tags(system.points):
-            _say(Console(), types)
+            print_text(Console(), types)
     remarks = [remark for one in system.points for remark in remarks_of(one.scenario)]
     for remark in dict.fromkeys([*remarks, *system.remarks, *vehicle_remarks(system)]):
         click.echo(f"note: {remark}", err=True)
@@ -198,31 +198,23 @@ def print_simulation(console: Console, simulation: Simulation) -> None:
     members = CharacteristicSet.of(simulation.study.vehicle.characteristics)
     print_meanings(console, [member for member in members if simulation.setting[member.name] != member.original])
     records = (simulation.original.to_dict(), simulation.to_dict())
-    table = WholeTable()
-    table.add_column("result")
-    table.add_column("unit")
-    for head in ("original", "simulated"):
-        table.add_column(head, justify="right")
+    table = WholeTable("result", "unit", right=("original", "simulated"))
     table.add_row("outcome", "", *(record["outcome"] for record in records))
     for name, unit in simulation.units.items():
         table.add_row(name, unit, *("undefined" if record[name] is None else f"{record[name]:.4g}" for record in records))
     console.print(table)
-    _say(console, f"The original vehicle {simulation.original.verdict}.")
+    print_text(console, f"The original vehicle {simulation.original.verdict}.")
     if simulation is not simulation.original and simulation.setting != simulation.original.setting:
-        _say(console, f"The changed vehicle {simulation.verdict}: {_against(simulation)}.")
+        print_text(console, f"The changed vehicle {simulation.verdict}: {_against(simulation)}.")
 
 
 def _print_setting(console: Console, simulation: Simulation) -> None:
-    table = WholeTable(title=plain(simulation.study.title))
-    table.add_column("characteristic")
-    table.add_column("unit")
-    for head in ("original", "simulated"):
-        table.add_column(head, justify="right")
+    table = WholeTable("characteristic", "unit", right=("original", "simulated"), title=simulation.study.title)
     for member in CharacteristicSet.of(simulation.study.vehicle.characteristics):
         value = simulation.setting[member.name]
         changed = value != member.original
         note = f"{value:g}" + ("" if member.lower <= value <= member.upper else " (beyond)")
-        table.add_row(plain(member.name), plain(member.unit), f"{member.original:g}", note, style="bold" if changed else None)
+        table.add_row(member.name, member.unit, f"{member.original:g}", note, style="bold" if changed else None)
     console.print(table)
 
 
@@ -239,23 +231,19 @@ def print_sweep(console: Console, study: Study, names: Sequence[str], original: 
     """Many settings, a row each under the original vehicle's, by the values of the named characteristics."""
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     columns = [characteristics.names.index(name) for name in names]
-    table = WholeTable(title=plain(study.title))
-    for column in columns:
-        unit = characteristics.members[column].unit
-        table.add_column(plain(f"{names[columns.index(column)]}{'' if unit == '-' else f', {unit}'}"), justify="right")
-    for head in ("outcome", *(METRICS[name].heading if name in METRICS else name for name in variants.metrics)):
-        table.add_column(head, justify="left" if head == "outcome" else "right")
+    units = [characteristics.members[column].unit for column in columns]
+    table = WholeTable(right=(f"{name}{'' if unit == '-' else f', {unit}'}" for name, unit in zip(names, units, strict=True)),
+                       title=study.title)
+    table.add_column("outcome")
+    for name in variants.metrics:
+        table.add_column(METRICS[name].heading if name in METRICS else name, justify="right")
     for which in (original, variants):
         for row in range(len(which)):
             metrics = [which.metrics[name][row] for name in variants.metrics]
             table.add_row(*(f"{which.settings[row, column]:g}" for column in columns), str(which.outcome[row]),
                           *("-" if np.isnan(value) else f"{value:.3f}" for value in metrics), end_section=which is original)
     console.print(table)
-    _say(console, "First the original vehicle. SD: least distance in m, or minus the collision's speed in m/s.")
-
-
-def _say(console: Console, sentence: str) -> None:
-    console.print(sentence, soft_wrap=True, markup=False, highlight=False)
+    print_text(console, "First the original vehicle. SD: least distance in m, or minus the collision's speed in m/s.")
 
 
 BANDS = ((5.0, "green"), (15.0, "yellow"), (25.0, "dark_orange"), (35.0, "orange4"))
@@ -281,20 +269,17 @@ def print_matrix(console: Console, results: Sequence[AtPoint], row: int = 0) -> 
         invalid = sum(result["outcome"] == Outcome.INVALID_TEST for result in records)
         if invalid:
             summary += f" {invalid} are no valid tests: the vehicle leaves the tolerance of their speed before the ADS acts."
-        console.print(summary, soft_wrap=True, markup=False, highlight=False)
+        print_text(console, summary)
 
 
 def _print_table(console: Console, title: str, points: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> None:
     columns = list(dict.fromkeys(place.get(COLUMN) for place, _ in points))
-    table = WholeTable(title=plain(title), title_justify="left")
-    table.add_column("speed")
-    for column in columns:
-        table.add_column("" if column is None else f"{column:g} %", justify="right")
+    table = WholeTable("speed", right=("" if column is None else f"{column:g} %" for column in columns), title=title)
     cells: dict[str, dict[Any, Text]] = {}
     for place, result in points:
         cells.setdefault(_row(place), {})[place.get(COLUMN)] = _cell(result)
     for name, by_column in cells.items():
-        table.add_row(plain(name), *(by_column.get(column, Text("")) for column in columns))
+        table.add_row(name, *(by_column.get(column, Text("")) for column in columns))
     console.print(table)
 
 

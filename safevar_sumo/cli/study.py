@@ -14,7 +14,6 @@ import msgspec
 import numpy as np
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
-from rich.markup import escape
 from rich.text import Text
 
 from safevar_sumo.analysis.research_questions.indicators import nondominated
@@ -26,9 +25,10 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import RunStatus, Status, failure_lines, record, solutions_frame
+from safevar_sumo.shipped import RUN
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo import Engine, settings_per_batch, vehicle_remarks
-from safevar_sumo.terminal import WholeTable
+from safevar_sumo.terminal import WholeTable, print_text
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
@@ -74,7 +74,7 @@ def study(study: str, batch: int | None, engine: str, out: Path | None, jobs: in
         if not quiet:
             print_summary(Console(), chosen, campaign, directory, pool)
     if not quiet:
-        Console().print(f"Results: {directory}", soft_wrap=True, markup=False, highlight=False)
+        print_text(Console(), f"Results: {directory}")
 
 
 def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:
@@ -137,7 +137,7 @@ SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\n
 
 def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, engine: str) -> None:
     """Estimated time and disk space of a campaign."""
-    console.print(study.title, soft_wrap=True, highlight=False, markup=False)
+    print_text(console, study.title)
     table = WholeTable(show_header=False)
     table.add_row("algorithms", ", ".join(study.search.labels))
     table.add_row("runs", str(runs))
@@ -159,37 +159,35 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     solutions = solutions_frame(names, campaign.solutions.items())
     if len(solutions):
         for line in lead(study, solutions, campaign.original, pool, str(directory)):
-            console.print(line, soft_wrap=True, markup=False, highlight=False)
+            print_text(console, line)
     by_vehicle = {"original vehicle": campaign.original}
     for algorithm in study.search.labels:
         group = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]
         if group:
             by_vehicle[algorithm] = Evaluations.concatenate(group)
-    table = WholeTable("", title=escape(study.title), title_justify="left")
-    for head in by_vehicle:
-        table.add_column(head, justify="right")
+    table = WholeTable("", right=by_vehicle, title=study.title)
     table.add_row("solutions", "-", *(str(len(one)) for one in list(by_vehicle.values())[1:]))
     table.add_row("solutions that collide", *(str(int(np.count_nonzero(one.collided))) for one in by_vehicle.values()))
     collisions = [sum(number for key, number in campaign.collisions.items() if key.algorithm == name) for name in list(by_vehicle)[1:]]
     table.add_row("collisions simulated", *map(str, [int(campaign.original.collided[0]), *collisions]))
     for metric in campaign.scoring.metrics:
-        table.add_row(escape(f"mean {metric.heading}"), *(_mean(one.metrics[metric.name]) for one in by_vehicle.values()))
+        table.add_row(f"mean {metric.heading}", *(_mean(one.metrics[metric.name]) for one in by_vehicle.values()))
     console.print(table)
     console.print(SAFETY_NOTE)
     if campaign.failures:
         console.print(f"{len(campaign.failures)} settings could not be simulated (simulator-error); they are in no result:")
         for line in failure_lines(campaign.failures):
-            console.print(f"  {line}", soft_wrap=True, markup=False, highlight=False)
+            print_text(console, f"  {line}")
     invalid = sum(campaign.invalid_tests.values())
     if invalid:
-        console.print(f"{invalid} settings leave the tolerance of a test's speed before the ADS acts (invalid-test): "
-                      "neither failures nor successes, they are in no result.", soft_wrap=True, markup=False, highlight=False)
+        print_text(console, f"{invalid} settings leave the tolerance of a test's speed before the ADS acts (invalid-test): "
+                            "neither failures nor successes, they are in no result.")
     _print_most_critical(console, study, campaign)
     case = case_of(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
                    scoring=campaign.scoring)
     for line in brief(case):
-        console.print(line, soft_wrap=True, markup=False, highlight=False)
-    console.print(f"All tables: python -m safevar_sumo tables {shlex.quote(str(directory))}", soft_wrap=True, markup=False, highlight=False)
+        print_text(console, line)
+    print_text(console, f"All tables: {RUN} tables {shlex.quote(str(directory))}")
 
 
 def _mean(values: FloatArray) -> str:
@@ -221,12 +219,11 @@ RUNS_SHOWN = 12
 
 def status_view(progress: Status, rate: float | None) -> RenderableType:
     """A study's runs by algorithm and the front so far; `rate` is the share of the work done per second, if it is known."""
-    table = WholeTable("algorithm", title=Text(progress.title), title_justify="left")
-    for head in ("runs", "under\nway", "simulated", "collisions", "simulator\nerrors", "best\nSD"):
-        table.add_column(head, justify="right")
+    table = WholeTable("algorithm", right=("runs", "under\nway", "simulated", "collisions", "simulator\nerrors", "best\nSD"),
+                       title=progress.title)
     for algorithm in dict.fromkeys(run.algorithm for run in progress.runs):
         group = [run for run in progress.runs if run.algorithm == algorithm]
-        table.add_row(Text(algorithm), *_cells(group))
+        table.add_row(algorithm, *_cells(group))
     return Group(table, Text(_under_way(progress)), Text(_left(progress, rate)), _front(progress))
 
 
@@ -257,9 +254,8 @@ def _front(progress: Status) -> RenderableType:
         return Text("Nothing simulated yet.")
     front = nondominated(progress.points)
     front = front[front[:, 0].argsort(kind="stable")]
-    table = WholeTable(title=f"Front so far: {len(front)} points, the most severe ones", title_justify="left")
-    for head in ("safety degree [m, -m/s]", "f_diff [fraction]", "changed"):
-        table.add_column(head, justify="right")
+    table = WholeTable(right=("safety degree [m, -m/s]", "f_diff [fraction]", "changed"),
+                       title=f"Front so far: {len(front)} points, the most severe ones")
     for f_safe, f_diff, number in front[:FRONT].tolist():
         table.add_row(f"{f_safe:.2f}", f"{f_diff:.3f}", f"{number:.0f}")
     return table

@@ -17,7 +17,6 @@ import numpy as np
 from markupsafe import Markup
 
 from safevar_sumo.analysis.evaluator import Progress, silent
-from safevar_sumo.analysis.options import RUN
 from safevar_sumo.analysis.research_questions.answer import answer
 from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
 from safevar_sumo.analysis.research_questions.figures import draw
@@ -30,6 +29,7 @@ from safevar_sumo.report.input import ReportInput, gather
 from safevar_sumo.report.limits import LIMITS
 from safevar_sumo.report.svg import Dot, scatter
 from safevar_sumo.report.verdict import tested, trust, verdict
+from safevar_sumo.shipped import RUN
 from safevar_sumo.study import Study, load_study, study_names
 
 if TYPE_CHECKING:

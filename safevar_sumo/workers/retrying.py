@@ -17,6 +17,7 @@ import numpy as np
 from safevar_sumo.errors import EnvironmentFault, ForeignError, SafevarError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.shipped import RUN
 from safevar_sumo.study import Study, foreign_names
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, PoolLostError, WorkerLostError
@@ -191,4 +192,4 @@ def reproducing(study: Study, setting: FloatArray) -> str:
     changes = [f"--set {member.name}={value!r}"
                for member, value in zip(CharacteristicSet.of(study.vehicle.characteristics), setting.tolist(), strict=True)
                if value != member.original]
-    return " ".join(["python -m safevar_sumo simulate", shlex.quote(study.origin.called or study.name), *changes])
+    return " ".join([f"{RUN} simulate", shlex.quote(study.origin.called or study.name), *changes])

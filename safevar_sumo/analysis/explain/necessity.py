@@ -16,8 +16,6 @@ from safevar_sumo.analysis.words import direction
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
-CONFIDENCE = 0.95
-"""Of the interval of a sample's share."""
 Key = tuple[str, ...]
 """A cause without its sizes: its changes with their directions, such as ('mass up', 'tireFric down')."""
 
@@ -43,7 +41,7 @@ def necessity(characteristics: CharacteristicSet, changed: BoolArray, causes: Se
     -------
     pandas.DataFrame
         One row per characteristic: `characteristic`, and shares of the failures: `changed`; `necessary`, in every minimal
-        cause; `involved`, in one at least; and `necessary_lower` and `necessary_upper`, the `CONFIDENCE` interval of `necessary` among
+        cause; `involved`, in one at least; and `necessary_lower` and `necessary_upper`, the 95 % interval of `necessary` among
         all failures: Clopper and Pearson's for a sample (a little too wide, as it is drawn without replacement from finitely many),
         the share itself where all failures were analysed. Ordered by necessary, involved, changed; without rows if there is no failure.
     """
@@ -52,7 +50,7 @@ def necessity(characteristics: CharacteristicSet, changed: BoolArray, causes: Se
               "necessary": Counter(column for group in causes for column in necessary(group)),
               "involved": Counter(column for group in causes for column in involved(group))}
     sampled = len(changed) < failures
-    intervals = [clopper_pearson(counts["necessary"][column], len(changed), CONFIDENCE) if sampled
+    intervals = [clopper_pearson(counts["necessary"][column], len(changed)) if sampled
                  else (counts["necessary"][column] / len(changed),) * 2 for column in columns]
     frame = pd.DataFrame({
         "characteristic": pd.Series([characteristics.names[column] for column in columns], dtype=object),

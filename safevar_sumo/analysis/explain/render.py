@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.markup import escape
 
+from safevar_sumo.analysis.criterion import CONFIDENCE
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
 from safevar_sumo.analysis.explain.compute import points_in_words
-from safevar_sumo.analysis.explain.necessity import CONFIDENCE
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
 from safevar_sumo.analysis.explain.summary import LABELS, Finding, in_short
 from safevar_sumo.analysis.figures import CHANGED, FONT, INVOLVED, NECESSARY, new_figure, plain
@@ -141,13 +141,11 @@ def _print_cause(console: Console, again: Again, cause: Cause, members: Characte
         print_text(console, "No change is needed: the original vehicle itself is unsafe.")
         return
     print_text(console, f"Minimal cause: {changes(members, cause.changes)}: {cause.outcome}, SD {decimal(cause.safety_degree)}")
-    table = WholeTable("characteristic", "unit")
-    for head in ("original", "here", "limit (all scaled)", "limit (this one only)"):
-        table.add_column(head, justify="right")
+    table = WholeTable("characteristic", "unit", right=("original", "here", "limit (all scaled)", "limit (this one only)"))
     for member in members:
         if member.name in cause.changes:
             values = (cause.changes[member.name], cause.boundary[member.name], cause.alone[member.name])
-            table.add_row(escape(member.name), escape(member.unit), f"{member.original:g}", *(member.text(value) for value in values))
+            table.add_row(member.name, member.unit, f"{member.original:g}", *(member.text(value) for value in values))
     console.print(table)
     print_meanings(console, [member for member in members if member.name in cause.changes])
     print_text(console, f"{cause.limit} {again(cause.changes)}")
@@ -155,9 +153,7 @@ def _print_cause(console: Console, again: Again, cause: Cause, members: Characte
 
 def _side_by_side(comparison: BrakingComparison) -> WholeTable:
     """Original and changed vehicle, and what each line explains of the lost distance."""
-    table = WholeTable("", "unit")
-    for head in ("original", "changed", "explains, m"):
-        table.add_column(head, justify="right")
+    table = WholeTable("", "unit", right=("original", "changed", "explains, m"))
     parts = comparison.parts
     brakings = comparison.original.braking, comparison.changed.braking
     rows = (("brakes first at", "s", "time", None), ("distance there", "m", "gap", "place"), ("speed there", "m/s", "speed", "speed"),
@@ -174,20 +170,17 @@ def _side_by_side(comparison: BrakingComparison) -> WholeTable:
 
 
 def _print_common(console: Console, result: Explained) -> None:
-    table = WholeTable("characteristic", title=f"Changed vs. necessary ({_looked_at(result)})", title_justify="left")
-    for head in ("changed", "necessary", "in some cause"):
-        table.add_column(head, justify="right")
+    table = WholeTable("characteristic", right=("changed", "necessary", "in some cause"),
+                       title=f"Changed vs. necessary ({_looked_at(result)})")
     for row in result.necessity.to_dict("records"):
-        table.add_row(escape(row["characteristic"]), f"{row['changed']:.0%}", _necessary(row), f"{row['involved']:.0%}")
+        table.add_row(row["characteristic"], f"{row['changed']:.0%}", _necessary(row), f"{row['involved']:.0%}")
     console.print(table)
     sampled = "" if result.analysed == result.failures else (
         f" In brackets: {CONFIDENCE:.0%} intervals for all {result.failures} (Clopper and Pearson's, slightly too wide).")
     print_text(console, f"necessary: in every minimal cause of a failure; shares of the failures.{sampled}")
-    causes = WholeTable("minimal cause", title=f"Distinct minimal causes: {len(result.distinct)}", title_justify="left")
-    for head in ("failures", "share"):
-        causes.add_column(head, justify="right")
+    causes = WholeTable("minimal cause", right=("failures", "share"), title=f"Distinct minimal causes: {len(result.distinct)}")
     for row in result.distinct.head(DISTINCT_SHOWN).to_dict("records"):
-        causes.add_row(escape(", ".join(row["cause"]) or "none: the original vehicle"), str(row["failures"]), f"{row['share']:.0%}")
+        causes.add_row(", ".join(row["cause"]) or "none: the original vehicle", str(row["failures"]), f"{row['share']:.0%}")
     console.print(causes)
 
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 
 from safevar_sumo.analysis.figures import CHANGED, FONT, NECESSARY, new_figure, plain
 from safevar_sumo.analysis.risk.compute import Risk
@@ -33,14 +32,12 @@ def print_risk(console: Console, result: Risk) -> None:
     print_text(console, _variation(result.study))
     if result.sensitivity is None or result.sensitivity_of_unsafe is None:
         return
-    table = WholeTable("characteristic", title="What decides: share of the variance", title_justify="left")
-    for what in ("SD", "unsafe"):
-        table.add_column(f"{what}: alone", justify="right")
-        table.add_column("in all", justify="right")
+    table = WholeTable("characteristic", right=("SD: alone", "in all", "unsafe: alone", "in all"),
+                       title="What decides: share of the variance")
     second = result.sensitivity_of_unsafe.set_index("characteristic")
     for row in result.sensitivity.sort_values("total", ascending=False, kind="stable").to_dict("records"):
         other = second.loc[row["characteristic"]]
-        table.add_row(escape(row["characteristic"]), *(_index(one, name) for one in (row, other) for name in ("first_order", "total")))
+        table.add_row(row["characteristic"], *(_index(one, name) for one in (row, other) for name in ("first_order", "total")))
     console.print(table)
     if result.sensitivity_of_unsafe["total"].isna().all():
         print_text(console, "Too few settings are unsafe, or safe, to tell what decides that; the safety degree tells more.")

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
-from safevar_sumo.analysis.criterion import Unsafe, clopper_pearson, criterion_of
+from safevar_sumo.analysis.criterion import CONFIDENCE, Unsafe, clopper_pearson, criterion_of
 from safevar_sumo.analysis.evaluator import Bench, Progress, open_bench, silent, spread
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.words import joined
@@ -26,8 +26,6 @@ from safevar_sumo.terminal import print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
-CONFIDENCE = 0.95
-"""Of the intervals of a rule's shares."""
 FEWEST = 10
 """Unsafe, and safe, settings that rules need at least."""
 FOLDS, DEEPEST, PRUNINGS = 5, 6, 24
@@ -209,7 +207,7 @@ def _without_idle_conditions(limits: Limits, settings: FloatArray, unsafe: BoolA
     def least_density(some: Limits) -> float:
         inside = within(some, settings)
         count = int(np.count_nonzero(inside))
-        return clopper_pearson(int(np.count_nonzero(unsafe & inside)), count, CONFIDENCE)[0] if count else 0.0
+        return clopper_pearson(int(np.count_nonzero(unsafe & inside)), count)[0] if count else 0.0
 
     while limits:
         shorter = [{column: ends for column, ends in limits.items() if column != dropped} for dropped in limits]

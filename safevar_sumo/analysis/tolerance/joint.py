@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from safevar_sumo.analysis.criterion import Unsafe
+from safevar_sumo.analysis.criterion import CONFIDENCE, Unsafe
 from safevar_sumo.analysis.evaluator import Bench, sobol_points
 from safevar_sumo.analysis.explain.causes import Line, first_unsafe
 from safevar_sumo.records import BoolArray, FloatArray
@@ -134,9 +134,8 @@ def _with_unsafe_corner(grids: BoolArray) -> BoolArray:
     return np.asarray(grids[:, 1:, 1:] | grids[:, :-1, 1:] | grids[:, 1:, :-1] | grids[:, :-1, :-1])
 
 
-CONFIDENCE = 0.95
 UNSAFE_AT_MOST = 0.003
-"""Share of a box that may be unsafe, with that confidence, if every sampled setting is safe."""
+"""Share of a box that may be unsafe, with 95 % confidence, if every sampled setting is safe."""
 PROBE, SEARCHED = 256, 1024
 """Sobol points, and as many corners, that look for unsafe settings: in every box that is tried, and in one in which the first find none."""
 FOLLOWED = 16

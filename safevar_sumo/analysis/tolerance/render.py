@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 
 from safevar_sumo.analysis.figures import DEGREE, FONT, NECESSARY, UNSAFE, new_figure, plain, raised
 from safevar_sumo.analysis.tolerance.compute import OneAtATimeScan, Tolerance
@@ -53,13 +52,12 @@ def _together(result: Tolerance) -> str:
 
 
 def _alone(result: Tolerance) -> WholeTable:
-    table = WholeTable("characteristic", title="Each alone", title_justify="left")
     failing = any(scan.not_simulated for scan in result.alone)
-    for head in ("original", "safe from", "to", "SD at the ends", "unsafe", *(["could not be simulated"] if failing else [])):
-        table.add_column(head, justify="right")
+    heads = ("original", "safe from", "to", "SD at the ends", "unsafe", *(["could not be simulated"] if failing else []))
+    table = WholeTable("characteristic", right=heads, title="Each alone")
     for scan in result.alone:
         member = scan.characteristic
-        table.add_row(escape(f"{member.name} [{member.unit}]"), f"{member.original:g}", *_ends(scan),
+        table.add_row(f"{member.name} [{member.unit}]", f"{member.original:g}", *_ends(scan),
                       *(", ".join(f"{low:.5g} to {high:.5g}" for low, high in intervals) or "nowhere"
                         for intervals in (scan.unsafe, *([scan.not_simulated] if failing else []))))
     return table
@@ -82,14 +80,13 @@ def _print_pairs(console: Console, result: Tolerance) -> None:
     unsafe_pairs = sorted((pair for pair in result.pairs or [] if pair.nearest is not None), key=lambda pair: -pair.unsafe_share)
     if not unsafe_pairs:
         return
-    table = WholeTable("pair", title=f"Pairs with unsafe settings: {len(unsafe_pairs)} of {len(result.pairs or [])}", title_justify="left")
-    for head in ("unsafe share", "nearest unsafe setting"):
-        table.add_column(head, justify="right")
+    table = WholeTable("pair", right=("unsafe share", "nearest unsafe setting"),
+                       title=f"Pairs with unsafe settings: {len(unsafe_pairs)} of {len(result.pairs or [])}")
     for pair in unsafe_pairs[:PAIRS_SHOWN]:
         names = [member.name for member in pair.characteristics]
         nearest = ", ".join(f"{name} {value:.5g}" for name, value in zip(names, pair.nearest or (), strict=True))
         failed = f" ({pair.not_simulated_share:.1%} could not be simulated)" if pair.not_simulated_share else ""
-        table.add_row(escape(" with ".join(names)), f"{pair.unsafe_share:.1%}{failed}", escape(nearest))
+        table.add_row(" with ".join(names), f"{pair.unsafe_share:.1%}{failed}", nearest)
     console.print(table)
     if len(unsafe_pairs) > PAIRS_SHOWN:
         print_text(console, f"... and {len(unsafe_pairs) - PAIRS_SHOWN} more (--json has all).")
