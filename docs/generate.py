@@ -12,6 +12,7 @@ from msgspec.inspect import type_info
 
 from safevar_sumo.ads import ADS
 from safevar_sumo.metrics import METRICS, SAFEVAR
+from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import VEHICLES
 
@@ -113,4 +114,5 @@ def metric_columns() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    "study_keys": study_keys, "vehicles": models(VEHICLES), "ads": models(ADS), "metric_columns": metric_columns}
+    "study_keys": study_keys, "vehicles": models(VEHICLES), "ads": models(ADS), "algorithms": models(ALGORITHMS),
+    "metric_columns": metric_columns}

@@ -10,7 +10,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.plugins import Files, Lookup, Member, digests, forget_foreign, guard_process_state, instance_of, noted_reading
-from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm, Problem, Search
+from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm, MoCell, Problem, Search
 from safevar_sumo.study import SearchTable, Study
 
 
@@ -49,6 +49,8 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     with guard_process_state(source, [name] if member.guard else []):
         parameters = Lookup(source, study.origin.places).with_paths(member, search.parameters.get(label, {}), key)
         algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)
+    if isinstance(algorithm, MoCell):
+        algorithm.sides(search.population, source)
     return algorithm if member.guard is None else GuardedAlgorithm(algorithm, member.guard)
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import msgspec
 import pytest
 
+from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study
 
 
 @pytest.fixture
 def study() -> Study:
     smoke = load_study("smoke")
-    return msgspec.structs.replace(smoke, search=msgspec.structs.replace(smoke.search, algorithms=["nsga2", "rs", "safe_fuzzer"]))
+    return msgspec.structs.replace(smoke, search=msgspec.structs.replace(smoke.search, algorithms=sorted(ALGORITHMS)))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from safevar_sumo.records import Evaluations, Outcome
-from safevar_sumo.search import ALGORITHMS, Problem, Search
+from safevar_sumo.search import ALGORITHMS, Algorithm, Problem, Search
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -30,16 +30,17 @@ def sphere(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluati
     return evaluated(characteristics, settings, np.add.accumulate(share**2, axis=1)[:, -1])
 
 
-def begun(name: str, seed: int, evaluations: int, characteristics: CharacteristicSet = SUN) -> Search:
+def begun(name: str, seed: int, evaluations: int, characteristics: CharacteristicSet = SUN,
+          algorithm: Algorithm | None = None) -> Search:
     original = sphere(characteristics, characteristics.original[np.newaxis])
     problem = Problem(characteristics=characteristics, original=original, evaluations=evaluations, population=POPULATION)
-    return ALGORITHMS[name]().search(problem, np.random.default_rng(seed))
+    return (algorithm or ALGORITHMS[name]()).search(problem, np.random.default_rng(seed))
 
 
 def searched(name: str, seed: int, evaluations: int, characteristics: CharacteristicSet = SUN,
-             evaluate: Evaluate = sphere) -> tuple[Evaluations, list[np.ndarray]]:
+             evaluate: Evaluate = sphere, algorithm: Algorithm | None = None) -> tuple[Evaluations, list[np.ndarray]]:
     """Run an algorithm to its end; returns its result and all populations that it asked for."""
-    search = begun(name, seed, evaluations, characteristics)
+    search = begun(name, seed, evaluations, characteristics, algorithm)
     asked = [next(search)]
     while True:
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 
 import moocore
+import msgspec
 import numpy as np
 import pytest
 from deap import tools
@@ -17,10 +18,14 @@ from jmetal.problem import DTLZ2
 from jmetal.util.termination_criterion import StoppingByEvaluations
 from scipy.stats import mannwhitneyu
 
+from safevar_sumo.api.running import prepared
+from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, Outcome
-from safevar_sumo.search import ALGORITHMS, Problem
-from safevar_sumo.search.nsga2 import _fitness, _Individual, _survivors, _tournament
+from safevar_sumo.search import ALGORITHMS, MoCell, Problem
+from safevar_sumo.search.evolution import Individual, fitness_of, tournament
+from safevar_sumo.search.nsga2 import survivors
 from safevar_sumo.search.safe_fuzzer import _improves, _Ranges, _scores
+from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.search.problems import POPULATION, SUN, begun, evaluated, searched, sphere
 
@@ -84,7 +89,7 @@ def test_a_setting_that_failed_never_gets_into_the_result(name: str) -> None:
     assert found.valid.all()
 
 
-@pytest.mark.parametrize("name", ["nsga2", "rs"])
+@pytest.mark.parametrize("name", ["mocell", "nsga2", "rs", "spea2"])
 def test_the_result_is_non_dominated(name: str) -> None:
     found = searched(name, 7, 600)[0]
     assert len(found) > 0
@@ -204,11 +209,11 @@ TWO = CharacteristicSet((Characteristic(name="a", unit="-", original=50.0, lower
                          Characteristic(name="b", unit="-", original=50.0, lower=0.0, upper=100.0)))
 
 
-def individuals(*objectives: tuple[float, float, float]) -> list[_Individual]:
+def individuals(*objectives: tuple[float, float, float]) -> list[Individual]:
     made = []
     for values in objectives:
-        one = _Individual(list(values))
-        one.fitness = _fitness(3)(values)
+        one = Individual(list(values))
+        one.fitness = fitness_of(3)(values)
         made.append(one)
     return made
 
@@ -222,7 +227,7 @@ def test_survivors_are_those_of_deap(objectives: list[tuple[float, float, float]
     for front in fronts:
         tools.emo.assignCrowdingDist(front)
         expected += sorted(front, key=lambda one: one.fitness.crowding_dist, reverse=True)
-    found = [next(i for i, one in enumerate(ours) if one is survivor) for survivor in _survivors(ours, number)]
+    found = [next(i for i, one in enumerate(ours) if one is survivor) for survivor in survivors(ours, number)]
     assert found == [next(i for i, one in enumerate(deaps) if one is survivor) for survivor in expected[:number]]
 
 
@@ -230,9 +235,9 @@ def test_a_tournament_is_won_by_rank_then_by_room() -> None:
     better, worse = individuals((0, 0, 0), (1, 1, 1))
     for one, rank, room in ((better, 0, 0.1), (worse, 1, 9.0)):
         one.standing = rank, -room
-    assert all(_tournament([better, worse]) is better for _ in range(20))
+    assert all(tournament([better, worse]) is better for _ in range(20))
     worse.standing = 0, -9.0
-    assert all(_tournament([better, worse]) is worse for _ in range(20))
+    assert all(tournament([better, worse]) is worse for _ in range(20))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -287,3 +292,39 @@ def test_a_generation_improves_if_its_best_beats_the_worst_of_the_fifty_best() -
     assert _improves(window([[60, 50]], [48.5]), earlier)
     assert not _improves(window([[60, 50]], [49.0]), earlier)
     assert not _improves(window([[60, 50]], [55.0]), earlier)
+
+
+@pytest.mark.parametrize(("population", "sides"), [(50, (5, 10)), (36, (6, 6)), (7, (1, 7)), (2, (1, 2))])
+def test_a_grid_is_as_near_to_a_square_as_the_population_allows(population: int, sides: tuple[int, int]) -> None:
+    assert MoCell().sides(population) == sides
+
+
+def test_a_grid_closes_on_itself() -> None:
+    around = MoCell(grid=(3, 4))._neighbours(12)
+    assert sorted(around[0]) == [0, 1, 3, 4, 5, 7, 8, 9, 11], "the corner's neighbours are on all sides"
+    assert all(len(place) == 9 for place in around)
+    assert sorted(MoCell(neighbourhood="von_neumann", grid=(3, 4))._neighbours(12)[5]) == [1, 4, 5, 6, 9]
+    assert MoCell()._neighbours(2) == [[0, 1], [1, 0]]
+
+
+@pytest.mark.parametrize(("search", "problem"), [
+    ({"mocell": {"grid": [3, 4]}}, "search.mocell.grid = [3, 4] has 12 cells\nexpected: two sides whose product is search.population = 10"),
+    ({"mocell": {"neighbourhood": "hexagonal"}}, "search.mocell.neighbourhood = 'hexagonal'"),
+    ({"spea2": {"archive": 0}}, "search.spea2.archive = 0"),
+    ({"spea2": {"archives": 7}}, "did you mean 'archive'?"),
+    ({"spea": {"archive": 7}}, "did you mean 'spea2'?"),
+])
+def test_options_that_cannot_be_used_are_refused(search: dict[str, object], problem: str) -> None:
+    with pytest.raises(InputError) as refused:
+        prepared(load_study("smoke", search={"algorithms": ["spea2", "mocell"], **search}))
+    assert problem in str(refused.value)
+
+
+@pytest.mark.parametrize(("name", "options"), [
+    ("spea2", {"archive": 5}), ("spea2", {"normalised": False}), ("mocell", {"archive": 5}), ("mocell", {"grid": [2, 10]}),
+    ("mocell", {"neighbourhood": "von_neumann"}), ("nsga2", {"tournament_size": 3}), ("mocell", {"mutation_probability": 1.0})])
+def test_options_change_what_a_search_asks_for(name: str, options: dict[str, object]) -> None:
+    algorithm = msgspec.convert(options, ALGORITHMS[name])
+    found, asked = searched(name, 1, 200, algorithm=algorithm)
+    assert not np.array_equal(asked[-1], searched(name, 1, 200)[1][-1])
+    assert len(found) <= options.get("archive", POPULATION)

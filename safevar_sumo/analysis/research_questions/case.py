@@ -22,7 +22,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 NSGA2 = "nsga2"
 """The algorithm that RQ2 asks about and whose solutions RQ3 looks at."""
-ALGORITHM_TITLES = {"nsga2": "NSGA-II", "rs": "RS", "safe_fuzzer": "SafeFuzzer"}
+ALGORITHM_TITLES = {"nsga2": "NSGA-II", "spea2": "SPEA2", "mocell": "MOCell", "rs": "RS", "safe_fuzzer": "SafeFuzzer"}
 
 
 class Unanswerable(InputError):

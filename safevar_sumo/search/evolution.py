@@ -1,0 +1,188 @@
+"""What evolutionary algorithms share: individuals, constrained domination, SBX and polynomial mutation by DEAP."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from typing import Annotated, Any
+
+import moocore
+import numpy as np
+from deap import base, tools
+from msgspec import Meta, Struct
+
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.search.base import Problem
+from safevar_sumo.vehicles import CharacteristicSet
+
+Probability = Annotated[float, Meta(ge=0, le=1)]
+Index = Annotated[float, Meta(ge=0, le=1000)]
+Size = Annotated[int, Meta(ge=1, le=100_000)]
+TournamentSize = Annotated[int, Meta(ge=2, le=1000)]
+REDRAWS = 10
+"""How often a child that there is already is drawn anew, before it is taken all the same."""
+
+
+@cache
+def fitness_of(objectives: int) -> type[Any]:
+    """The class of a fitness with a number of objectives, all minimised."""
+    return type("Fitness", (base.Fitness,), {"weights": (-1.0,) * objectives})
+
+
+class Individual(list[float]):
+    """Unfiltered values of a setting; once evaluated, its fitness, and its `evaluation`: a batch and its row in it.
+
+    `failed` tells whether it was simulated in vain. A survivor's `standing` is what its algorithm compares: less is better.
+    """
+
+    fitness: base.Fitness
+    evaluation: tuple[Evaluations, int]
+    standing: tuple[float, ...]
+    failed: bool = False
+
+
+class Operators(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Simulated binary crossover and polynomial mutation, both bounded by the domains.
+
+    Mutation has by default the probability 1/n per variable. Tournaments are between `tournament_size` individuals.
+    """
+
+    crossover_probability: Probability = 0.9
+    crossover_index: Index = 20.0
+    mutation_probability: Probability | None = None
+    mutation_index: Index = 20.0
+    tournament_size: TournamentSize = 2
+
+
+class Variation:
+    """Draws offspring; DEAP's own random state is set and restored around every draw."""
+
+    def __init__(self, operators: Operators, characteristics: CharacteristicSet, rng: np.random.Generator) -> None:
+        self._operators, self._state = operators, random.Random(int(rng.integers(2**63))).getstate()
+        self._candidates: list[Individual] = []
+        given = operators.mutation_probability
+        self._mutation = 1 / len(characteristics) if given is None else given
+        self._lower, self._upper = characteristics.lower.tolist(), characteristics.upper.tolist()
+
+    @contextmanager
+    def randomness(self) -> Iterator[None]:
+        """Run with this run's state of the global `random`, which DEAP draws from; restore the caller's."""
+        callers = random.getstate()
+        random.setstate(self._state)
+        try:
+            yield
+        finally:
+            self._state = random.getstate()
+            random.setstate(callers)
+
+    def offspring(self, population: list[Individual], number: int) -> list[Individual]:
+        """`number` new individuals: two tournaments, crossover, mutation, pair by pair."""
+        children: list[Individual] = []
+        with self.randomness():
+            while population and len(children) < number:
+                first, second = self._crossed(self.winner(population), self.winner(population))
+                children += [self._mutated(first), self._mutated(second)]
+        return children[:number]
+
+    def distinct_offspring(self, population: list[Individual], number: int) -> list[Individual]:
+        """As `offspring`, but everybody is in as many tournaments as everybody else, and what there is already is drawn anew."""
+        there, children, drawn = set(map(tuple, population)), list[Individual](), 0
+        self._candidates = []
+        with self.randomness():
+            while population and len(children) < number:
+                for child in self._crossed(*self._winners(population)):
+                    known, drawn = tuple(self._mutated(child)) in there, drawn + 1
+                    if not known or drawn > REDRAWS * number:
+                        there.add(tuple(child))
+                        children.append(child)
+        return children[:number]
+
+    def child(self, mothers: list[Individual], fathers: list[Individual]) -> Individual:
+        """One new individual of the winners of two tournaments, none of their candidates; call it within `randomness`."""
+        for _ in range(REDRAWS):
+            child = self._mutated(self._crossed(self.winner(mothers), self.winner(fathers))[0])
+            if child not in mothers and child not in fathers:
+                break
+        return child
+
+    def _winners(self, population: list[Individual]) -> tuple[Individual, Individual]:
+        """Of two tournaments, whose candidates are drawn without replacement until the population is used up."""
+        size, won = min(self._operators.tournament_size, len(population)), list[Individual]()
+        for _ in range(2):
+            if len(self._candidates) < size:
+                self._candidates = random.sample(population, len(population))
+            won.append(tournament(self._candidates[:size], size))
+            del self._candidates[:size]
+        return won[0], won[1]
+
+    def winner(self, population: list[Individual]) -> Individual:
+        return tournament(population, self._operators.tournament_size)
+
+    def _crossed(self, first: Individual, second: Individual) -> tuple[Individual, Individual]:
+        children = Individual(first), Individual(second)
+        if random.random() <= self._operators.crossover_probability:
+            tools.cxSimulatedBinaryBounded(*children, self._operators.crossover_index, self._lower, self._upper)
+        return children
+
+    def _mutated(self, child: Individual) -> Individual:
+        tools.mutPolynomialBounded(child, self._operators.mutation_index, self._lower, self._upper, self._mutation)
+        return child
+
+
+def first_brood(problem: Problem, rng: np.random.Generator) -> list[Individual]:
+    """The first population, uniform in the domains."""
+    return [Individual(values) for values in problem.uniform(min(problem.population, problem.evaluations), rng).tolist()]
+
+
+def simulated(brood: Sequence[Individual], problem: Problem) -> Generator[FloatArray, Evaluations, int]:
+    """Have a brood evaluated; returns how many evaluations that took."""
+    evaluated = yield problem.characteristics.filter(np.array(brood))
+    fitness, valid = fitness_of(len(problem.scoring.objectives)), problem.scoring.valid(evaluated).tolist()
+    for i, (individual, objectives) in enumerate(zip(brood, problem.scoring.values(evaluated).tolist(), strict=True)):
+        individual.evaluation, individual.fitness, individual.failed = (evaluated, i), fitness(tuple(objectives)), not valid[i]
+    return len(brood)
+
+
+def objectives_of(individuals: Sequence[Individual]) -> FloatArray:
+    """Their objectives, shape (M, objectives)."""
+    return np.array([individual.fitness.values for individual in individuals])
+
+
+def fronts(individuals: Sequence[Individual]) -> list[list[Individual]]:
+    """Individuals by non-domination rank, in their given order."""
+    if not individuals:
+        return []
+    ranks = moocore.pareto_rank([individual.fitness.wvalues for individual in individuals], maximise=True).tolist()
+    found: list[list[Individual]] = [[] for _ in range(max(ranks) + 1)]
+    for individual, rank in zip(individuals, ranks, strict=True):
+        found[rank].append(individual)
+    return found
+
+
+def stand_by_crowding(individuals: Sequence[Individual]) -> list[list[Individual]]:
+    """The fronts of individuals, whose `standing` becomes their rank, from 0, and minus their crowding distance."""
+    found = fronts(individuals)
+    for rank, front in enumerate(found):
+        tools.emo.assignCrowdingDist(front)
+        for individual in front:
+            individual.standing = rank, -individual.fitness.crowding_dist
+    return found
+
+
+def tournament(population: list[Individual], size: int = 2) -> Individual:
+    """The best of `size` individuals drawn without replacement: by their standing, then by chance."""
+    if len(population) == 1:
+        return population[0]
+    best, *others = random.sample(population, min(size, len(population)))
+    for other in others:
+        if other.standing < best.standing or (other.standing == best.standing and random.random() >= 0.5):
+            best = other
+    return best
+
+
+def result_of(individuals: Sequence[Individual], nothing: Problem) -> Evaluations:
+    """The evaluations of individuals."""
+    rows = [evaluations.take([row]) for evaluations, row in (individual.evaluation for individual in individuals)]
+    return Evaluations.concatenate(rows) if rows else nothing.original.take([])

@@ -1,0 +1,107 @@
+"""SPEA2 (Zitzler, Laumanns, Thiele 2001): strength, density and truncation."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.search.base import Problem, Search
+from safevar_sumo.search.evolution import Individual, Operators, Size, Variation, first_brood, objectives_of, result_of, simulated
+
+
+class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Elitist search by strength and density; an archive, thinned where it is densest, begets the next population.
+
+    The variables are the characteristics' unfiltered values; what is simulated and reported is filtered. The result is the
+    non-dominated part of the last archive. A setting whose simulation failed does not survive.
+
+    Parameters
+    ----------
+    crossover_probability, crossover_index
+        Of simulated binary crossover.
+    mutation_probability, mutation_index
+        Of polynomial mutation; by default the probability 1/n per variable.
+    tournament_size
+        Individuals of a tournament.
+    archive
+        Size of the archive, by default the population's.
+    normalised
+        Whether objectives are divided by their range before distances are measured: metres, fractions and counts
+        have no common unit. The publication leaves them as they are.
+    """
+
+    archive: Size | None = None
+    normalised: bool = True
+
+    def search(self, problem: Problem, rng: np.random.Generator) -> Search:
+        variation, size = Variation(self, problem.characteristics, rng), self.archive or problem.population
+        brood, archive, asked = first_brood(problem, rng), list[Individual](), 0
+        while brood:
+            asked += yield from simulated(brood, problem)
+            good = [individual for individual in brood if not individual.failed]
+            archive = survivors(archive + good, size, normalised=self.normalised)
+            brood = variation.distinct_offspring(archive, min(problem.population, problem.evaluations - asked))
+        return result_of([best for best in archive if best.standing[0] < 1], problem)
+
+
+def survivors(individuals: list[Individual], number: int, *, normalised: bool = False) -> list[Individual]:
+    """Environmental selection; `standing` becomes the fitness, which is below 1 where nothing dominates."""
+    if not individuals:
+        return []
+    objectives = objectives_of(individuals)
+    dominates = domination(objectives)
+    distances = _distances(_unit_range(objectives) if normalised else objectives)
+    fitness = _raw(dominates) + _density(distances)
+    for individual, value in zip(individuals, fitness.tolist(), strict=True):
+        individual.standing = (value,)
+    free = ~dominates.any(axis=0)
+    chosen = _truncated(np.flatnonzero(free), distances, number)
+    rest = np.flatnonzero(~free)
+    chosen += rest[np.argsort(fitness[rest], kind="stable")][:number - len(chosen)].tolist()
+    return [individuals[i] for i in chosen]
+
+
+def domination(objectives: FloatArray) -> BoolArray:
+    """Whether row i dominates row j; shape (M, M)."""
+    mine, theirs = objectives[:, np.newaxis], objectives[np.newaxis]
+    return np.asarray((mine <= theirs).all(axis=2) & (mine < theirs).any(axis=2))
+
+
+def _raw(dominates: BoolArray) -> FloatArray:
+    """Sum of the strengths of what dominates each; the strength is how many one dominates."""
+    strength = np.count_nonzero(dominates, axis=1)
+    return np.asarray(np.where(dominates, strength[:, np.newaxis], 0).sum(axis=0), dtype=float)
+
+
+def _density(distances: FloatArray) -> FloatArray:
+    """1 / (distance to the k-th nearest + 2), k the square root of the number of individuals, counted from 0 as in pymoo."""
+    k = min(int(np.sqrt(len(distances))), len(distances) - 1)
+    return np.asarray(1 / (np.sort(distances, axis=1)[:, k] + 2))
+
+
+def _distances(points: FloatArray) -> FloatArray:
+    """Euclidean distances, infinite to itself; added objective by objective, so that they do not depend on the array's shape."""
+    squares = np.zeros((len(points), len(points)))
+    for column in points.T:
+        squares += (column[:, np.newaxis] - column) ** 2
+    distances = np.sqrt(squares)
+    np.fill_diagonal(distances, np.inf)
+    return distances
+
+
+def _unit_range(objectives: FloatArray) -> FloatArray:
+    """Objectives between 0 and 1."""
+    least = objectives.min(axis=0)
+    width = objectives.max(axis=0) - least
+    return np.asarray((objectives - least) / np.where(width > 0, width, 1.0))
+
+
+def _truncated(places: np.ndarray, distances: FloatArray, number: int) -> list[int]:
+    """Places without those that have the nearest neighbours, removed one by one; ties by the second nearest, and so on."""
+    left: list[int] = places.tolist()
+    while len(left) > number:
+        among = distances[np.ix_(left, left)]
+        nearest = among.min(axis=1)
+        tied = np.flatnonzero(nearest == nearest.min())
+        del left[tied[np.lexsort(np.sort(among[tied], axis=1).T[::-1])[0]]]
+    return left
