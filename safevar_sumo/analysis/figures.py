@@ -12,6 +12,7 @@ import numpy as np
 from safevar_sumo.errors import InputError
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 DPI = 200
@@ -24,17 +25,27 @@ CHANGED, INVOLVED, NECESSARY = "#bbbbbb", "#56b4e9", "#0072b2"
 """Grey and Okabe and Ito's blues: of different lightness, so that they stay apart without colour."""
 
 
-def new_figure(title: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
-    """A figure that no global state knows of, and its axes, shape (rows, columns); `size` in inches."""
+def new_figure(title: str, rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, np.ndarray]:
+    """A figure that no global state knows of, and its axes, shape (rows, columns); `size` in inches, `options` as of `Figure.subplots`."""
     import matplotlib.style
     from matplotlib.figure import Figure
 
     with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT, "axes.labelsize": FONT, "axes.titlesize": FONT,
                                                               "xtick.labelsize": FONT, "ytick.labelsize": FONT}]):
         figure = Figure(figsize=size, layout="constrained")
-        axes = figure.subplots(rows, columns, squeeze=False)
+        axes = figure.subplots(rows, columns, squeeze=False, **options)
     figure.suptitle(plain(title), fontsize=FONT + 2)
     return figure, axes
+
+
+def panels(title: str, number: int, across: int, panel: tuple[float, float], least_width: float, above: float) -> tuple[Figure, list[Axes]]:
+    """A figure with a panel of a size for each of a number of things, at most so many across, and the panels' axes [inches]."""
+    columns = min(across, number)
+    rows = -(-number // columns)
+    figure, axes = new_figure(title, rows, columns, (max(panel[0] * columns, least_width), above + panel[1] * rows))
+    for unused in axes.flat[number:]:
+        unused.set_axis_off()
+    return figure, list(axes.flat[:number])
 
 
 def save(figure: Figure, path: Path, source: str = "out") -> None:

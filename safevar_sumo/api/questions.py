@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.api.results import Results, study_of, study_or_case
 from safevar_sumo.progress import shown
-from safevar_sumo.study import StudyLike
+from safevar_sumo.study import Study, StudyLike
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
     from safevar_sumo.analysis.rules.compute import Rules
     from safevar_sumo.analysis.tolerance.compute import Tolerance
     from safevar_sumo.workers.evaluation import Pool
+
+
+T = TypeVar("T")
 
 
 class Tables(dict[str, "pd.DataFrame"]):
@@ -146,8 +150,7 @@ def explain(source: StudyLike | Results, *, solutions: Sequence[str] = ExplainOp
     from safevar_sumo.analysis.explain.compute import explain_failures
 
     options = ExplainOptions(solutions=tuple(solutions), unsafe=_text(unsafe), top=top, limit=limit)
-    with shown(progress) as tell:
-        return explain_failures(study_or_case(source, as_it_is_now=as_it_is_now), options, pool=pool, jobs=jobs, progress=tell)
+    return _asked(explain_failures, study_or_case(source, as_it_is_now=as_it_is_now), options, pool, jobs, progress)
 
 
 def tolerance(study: StudyLike | Results, *, unsafe: Criterion | None = None, characteristics: Sequence[str] | None = None,
@@ -184,8 +187,7 @@ def tolerance(study: StudyLike | Results, *, unsafe: Criterion | None = None, ch
 
     names = None if characteristics is None else tuple(characteristics)
     options = ToleranceOptions(unsafe=_text(unsafe), characteristics=names, pairs=pairs)
-    with shown(progress) as tell:
-        return find_tolerances(study_of(study, as_it_is_now=as_it_is_now), options, pool=pool, jobs=jobs, progress=tell)
+    return _asked(find_tolerances, study_of(study, as_it_is_now=as_it_is_now), options, pool, jobs, progress)
 
 
 def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, confidence: float = RiskOptions.confidence,
@@ -225,8 +227,7 @@ def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, conf
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
     options = RiskOptions(samples=samples, confidence=confidence, width=width, unsafe=_text(unsafe))
-    with shown(progress) as tell:
-        return estimate_risk(study_of(study, as_it_is_now=as_it_is_now), options, pool=pool, jobs=jobs, progress=tell)
+    return _asked(estimate_risk, study_of(study, as_it_is_now=as_it_is_now), options, pool, jobs, progress)
 
 
 def rules(study: StudyLike | Results, *, samples: int = RulesOptions.samples, unsafe: Criterion | None = None, pool: Pool | None = None,
@@ -259,8 +260,14 @@ def rules(study: StudyLike | Results, *, samples: int = RulesOptions.samples, un
     from safevar_sumo.analysis.rules.compute import find_rules
 
     options = RulesOptions(samples=samples, unsafe=_text(unsafe))
-    with shown(progress) as tell:
-        return find_rules(study_of(study, as_it_is_now=as_it_is_now), options, pool=pool, jobs=jobs, progress=tell)
+    return _asked(find_rules, study_of(study, as_it_is_now=as_it_is_now), options, pool, jobs, progress)
+
+
+def _asked(compute: Callable[..., T], subject: Study | Case, options: Options, pool: Pool | None, jobs: int | None,
+           progress: bool | Progress) -> T:
+    """The result that a question's computation gives, with a bar for `progress=True`."""
+    with shown(progress) as show:
+        return compute(subject, options, pool=pool, jobs=jobs, progress=show)
 
 
 def _text(unsafe: Criterion | None) -> str | None:

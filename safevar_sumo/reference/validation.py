@@ -13,7 +13,8 @@ import numpy.typing as npt
 import scipy
 import tomli_w
 
-from safevar_sumo.analysis.figures import save
+from safevar_sumo.analysis.evaluator import finite_or_none
+from safevar_sumo.analysis.figures import new_figure, raised, save
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -26,9 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BINS = 8
-"""Into so many equally full bins a characteristic's values are put in the picture."""
-
-
+"""Number of equally full bins of a characteristic's values in the picture."""
 FLIP = 2.0
 """An outcome that lies within so many standard deviations of the repeats from the other one may be either."""
 
@@ -93,7 +92,8 @@ def agreement(reference: ReferenceData, here: Evaluations, study: Study, origina
         mean_absolute_error=errors,
         bias={name: _mean(values) for name, values in differences.items()},
         collisions=counts,
-        original={name: {"reference": study.published.get(name), "here": _defined(values[0])} for name, values in original.metrics.items()},
+        original={name: {"reference": study.published.get(name), "here": finite_or_none(values[0])}
+                  for name, values in original.metrics.items()},
         precision=counts["both"] / counts["here"] if counts["here"] else None,
         recall=counts["both"] / counts["reference"] if counts["reference"] else None,
         collision_speed={"reference": _mean(-reference.metrics[SAFETY_DEGREE][collided]), "here": _mean(here.collision_speed[collided])},
@@ -151,10 +151,6 @@ def _mean(values: FloatArray) -> float | None:
     return float(np.mean(values)) if values.size else None
 
 
-def _defined(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
-
-
 def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, reference: ReferenceData, here: Evaluations,
                    repeatability: float | None = None) -> None:
     """Draw here against reference and error against what is predicted here, for every metric; the safety degree's by characteristic.
@@ -166,46 +162,36 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
     InputError
         If the file cannot be written or its ending names no picture format.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    import seaborn as sns
-
-    with sns.axes_style("whitegrid"), plt.rc_context({"font.size": 9}):
-        columns = 4
-        rows = 2 + -(-len(characteristics) // columns)
-        figure, axes = plt.subplots(rows, columns, figsize=(12, 2.4 * rows + 0.8), layout="constrained",
-                                    gridspec_kw={"height_ratios": [1.5] + [1] * (rows - 1)})
-        either = np.zeros(len(here), dtype=bool) if repeatability is None else may_be_either(reference, here, repeatability)
-        for axis, below, metric in zip(axes[0], axes[1], reference.metrics, strict=False):
-            _scatter(axis, metric, reference, here, either)
-            _error_by(below, here.metrics[metric], here.metrics[metric] - reference.metrics[metric])
-            below.set_xlabel(f"here: {_label(metric)}")
-            below.set_ylabel("mean error")
-        error = here.metrics[SAFETY_DEGREE] - reference.metrics[SAFETY_DEGREE]
-        lowest, highest = [], []
-        for i, axis in enumerate(axes[2:].flat):
-            if i >= len(characteristics):
-                axis.set_axis_off()
-                continue
-            low, high = _error_by(axis, here.settings[:, i], error)
-            lowest.append(low)
-            highest.append(high)
-            member = characteristics.members[i]
-            axis.set_xlabel(member.name + ("" if member.unit == "-" else f" [{member.unit}]"))
-        margin = 0.1 * (max(highest) - min(lowest)) + 1e-6
-        for i, axis in enumerate(axes[2:].flat):
-            axis.set_ylim(min(lowest) - margin, max(highest) + margin)
-            if i % columns == 0:
-                axis.set_ylabel("error of SD")
-        figure.suptitle(title.replace("$", r"\$"))
-        save(figure, path, "plot")
-        plt.close(figure)
+    columns = 4
+    rows = 2 + -(-len(characteristics) // columns)
+    figure, axes = new_figure(title, rows, columns, (12, 2.4 * rows + 0.8), gridspec_kw={"height_ratios": [1.5] + [1] * (rows - 1)})
+    either = np.zeros(len(here), dtype=bool) if repeatability is None else may_be_either(reference, here, repeatability)
+    for axis, below, metric in zip(axes[0], axes[1], reference.metrics, strict=False):
+        _scatter(axis, metric, reference, here, either)
+        _error_by(below, here.metrics[metric], here.metrics[metric] - reference.metrics[metric])
+        below.set_xlabel(f"here: {_label(metric)}")
+        below.set_ylabel("mean error")
+    error = here.metrics[SAFETY_DEGREE] - reference.metrics[SAFETY_DEGREE]
+    lowest, highest = [], []
+    for i, axis in enumerate(axes[2:].flat):
+        if i >= len(characteristics):
+            axis.set_axis_off()
+            continue
+        low, high = _error_by(axis, here.settings[:, i], error)
+        lowest.append(low)
+        highest.append(high)
+        member = characteristics.members[i]
+        axis.set_xlabel(member.name + ("" if member.unit == "-" else f" [{member.unit}]"))
+    margin = 0.1 * (max(highest) - min(lowest)) + 1e-6
+    for i, axis in enumerate(axes[2:].flat):
+        axis.set_ylim(min(lowest) - margin, max(highest) + margin)
+        if i % columns == 0:
+            axis.set_ylabel("error of SD")
+    save(figure, path, "plot")
 
 
 def _label(metric: str) -> str:
-    return f"{METRICS[metric].title} [{METRICS[metric].unit.replace('^2', '$^2$')}]"
+    return f"{METRICS[metric].title} [{raised(METRICS[metric].unit)}]"
 
 
 def _scatter(axis: Axes, metric: str, reference: ReferenceData, here: Evaluations, either: BoolArray) -> None:

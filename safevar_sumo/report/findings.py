@@ -30,11 +30,8 @@ OBJECTIVES = ["f_safe", "f_diff", "f_num_diff"]
 
 def explanations(material: ReportInput, jobs: int | None, progress: Progress) -> Failures:
     """The failures that matter, explained; computed once for these results."""
-    def compute() -> Failures:
-        return explain(material.case, material.options["explain"], jobs=jobs,
-                       progress=lambda what, done, total: progress(f"{material.case.name}: {what}", done, total)).to_dict()
-
-    return list(stored(material, "explain", compute))
+    return list(stored(material, "explain", lambda: explain(
+        material.case, material.options["explain"], jobs=jobs, progress=progress).to_dict()))
 
 
 def necessity(explained: Failures, material: ReportInput) -> Markup | None:

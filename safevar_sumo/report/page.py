@@ -156,33 +156,7 @@ PARTS = {"causes": "explain", **{name: name for name in LIMITS}}
 
 def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), jobs: int | None = None, progress: Progress = silent,
                 *, point: str = "", as_it_is_now: bool = False) -> str:
-    """One self-contained page about the results of one or several studies; the same results give the same page.
-
-    Parameters
-    ----------
-    directories
-        Results directories.
-    only
-        Names of `SECTIONS`; all of them by default.
-    jobs
-        Worker processes for what is to be simulated, one for each core by default.
-    progress
-        Is told what is being made, how much of it is done, and of how much.
-    point
-        Name of a point of a matrix, to be asked about alone; the research questions are about whole studies and left out.
-    as_it_is_now
-        Simulate with what is there now where results were computed with something else; the page says so.
-
-    Warns
-    -----
-    UserWarning
-        Of solutions that, simulated again, are not what the results say; with `as_it_is_now` of what has changed.
-
-    Raises
-    ------
-    InputError
-        If a directory holds no results, or there is no such section.
-    """
+    """The page about results in directories; parameters, warnings and errors are those of `safevar_sumo.report`."""
     unknown = [name for name in only if name not in SECTIONS]
     if unknown:
         raise InputError("only", f"there is no section {unknown[0]!r}{did_you_mean(unknown[0], SECTIONS)}", f"some of {','.join(SECTIONS)}")
@@ -209,12 +183,15 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     return page + "\n"
 
 
-def _study(material: ReportInput, wanted: Sequence[str], jobs: int | None, progress: Progress) -> Mapping[str, Any]:
+def _study(material: ReportInput, wanted: Sequence[str], jobs: int | None, show: Progress) -> Mapping[str, Any]:
     """What one study gives to every section that is wanted."""
+    def progress(stage: str, done: int, total: int) -> None:
+        show(f"{material.case.name}: {stage}", done, total)
+
     explained = explanations(material, jobs, progress) if "causes" in wanted and material.system is not None else None
-    limits = {name: make(material, jobs, _named(progress, material)) for name, make in LIMITS.items()
+    limits = {name: make(material, jobs, progress) for name, make in LIMITS.items()
               if name in wanted and material.system is not None}
-    progress(f"{material.case.name}: replays", 0, 1)
+    progress("replays", 0, 1)
     shown = replays(material, explained) if "causes" in wanted else []
     sections: dict[str, Callable[[], Any]] = {
         "tested": lambda: tested(material),
@@ -231,11 +208,6 @@ def _study(material: ReportInput, wanted: Sequence[str], jobs: int | None, progr
             "lacking": material.lacking, "changed": material.changed, "original_fails": material.original_fails,
             "front": front(material, [one["handle"] for one in shown]) if shown else None,
             **limits, **{name: make() for name, make in sections.items() if name in wanted or (name == "necessity" and "causes" in wanted)}}
-
-
-def _named(progress: Progress, material: ReportInput) -> Progress:
-    """Progress that tells of which study it is."""
-    return lambda what, done, total: progress(f"{material.case.name}: {what}", done, total)
 
 
 def _part(name: str) -> Markup:

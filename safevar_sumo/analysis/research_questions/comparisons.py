@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -12,6 +13,8 @@ from numpy.typing import ArrayLike
 from safevar_sumo.analysis.research_questions.case import NSGA2, Case, Unanswerable, values
 from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, indicators
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import MetricFacts
+from safevar_sumo.records import FloatArray
 
 ALPHA = 0.01
 """Below it a p-value is called significant."""
@@ -80,15 +83,26 @@ def rq1(case: Case) -> pd.DataFrame:
     """
     if not case.algorithms:
         raise Unanswerable(case.name, "has no finished run", "results with at least one finished run")
+    rows = rq1_rows(case, lambda algorithm, metric: values(case.solutions_of(algorithm), metric),
+                    lambda sample, original: compare(sample, np.full(0 if np.isnan(original) else len(sample), original)))
+    return pd.DataFrame(rows, columns=RQ1_COLUMNS, dtype=object)
+
+
+Sample = Callable[[str, MetricFacts], FloatArray]
+"""An algorithm's values of a metric, shape (N,)."""
+
+
+def rq1_rows(case: Case, sample_of: Sample, test: Callable[[FloatArray, float], Comparison]) -> list[dict[str, Any]]:
+    """A row for each algorithm and metric: the test of its sample against the original's value, turned as in `rq1`."""
     rows = []
     for algorithm in case.algorithms:
-        solutions = case.solutions_of(algorithm)
         for metric in case.scoring.metrics:
-            sample, original = values(solutions, metric), case.original[metric.name]
-            test = compare(sample, np.full(0 if np.isnan(original) else len(sample), original))
-            rows.append((case.name, algorithm, metric.name, *(turned(test) if metric.more_is_unsafe else test),
-                         float(np.mean(sample)) if sample.size else None, None if np.isnan(original) else original))
-    return pd.DataFrame(rows, columns=RQ1_COLUMNS, dtype=object)
+            sample, original = sample_of(algorithm, metric), case.original[metric.name]
+            result = test(sample, original)
+            rows.append({"setting": case.name, "algorithm": algorithm, "metric": metric.name,
+                         **(turned(result) if metric.more_is_unsafe else result)._asdict(), "runs": len(sample),
+                         "mean": float(np.mean(sample)) if sample.size else None, "original": None if np.isnan(original) else original})
+    return rows
 
 
 def turned(test: Comparison) -> Comparison:
@@ -112,17 +126,24 @@ def rq2(case: Case) -> pd.DataFrame:
     Unanswerable
         If NSGA-II or every other algorithm is missing.
     """
-    own = case.solutions_of(NSGA2)
-    baselines = [name for name in case.algorithms if name != NSGA2]
-    if not baselines:
+    case.solutions_of(NSGA2)  # says if there are none
+    if all(name == NSGA2 for name in case.algorithms):
         raise Unanswerable(case.name, f"has finished runs of {NSGA2} alone", "results of another algorithm to compare with, such as rs")
-    quality = indicators(case) if case.has_runs and len(case.solutions) else None
-    rows: list[tuple[object, ...]] = []
-    for baseline in baselines:
-        for indicator, more_is_better in MORE_IS_BETTER.items():
-            test = compare(*([] if quality is None else quality.loc[quality["algorithm"] == name, indicator] for name in (NSGA2, baseline)))
-            rows.append((case.name, baseline, indicator, *(test if more_is_better else turned(test))))
-        for metric in case.scoring.metrics:
-            test = compare(values(own, metric), values(case.solutions_of(baseline), metric))
-            rows.append((case.name, baseline, metric.name, *(test if metric.more_is_unsafe else turned(test))))
+    rows = rq2_rows(case, lambda algorithm, metric: values(case.solutions_of(algorithm), metric))
     return pd.DataFrame(rows, columns=RQ2_COLUMNS, dtype=object)
+
+
+def rq2_rows(case: Case, sample_of: Sample) -> list[dict[str, Any]]:
+    """Rows for each other algorithm: its runs' indicators, and its samples of the metrics, against NSGA-II's, turned as in `rq2`."""
+    quality = indicators(case) if case.has_runs and len(case.solutions) else None
+    rows = []
+    for baseline in (name for name in case.algorithms if name != NSGA2):
+        pair = (NSGA2, baseline)
+        tests = [(name, not more_is_better, compare(*(
+            [] if quality is None else quality.loc[quality["algorithm"] == one, name] for one in pair)))
+            for name, more_is_better in MORE_IS_BETTER.items()]
+        tests += [(metric.name, not metric.more_is_unsafe, compare(*(sample_of(one, metric) for one in pair)))
+                  for metric in case.scoring.metrics]
+        rows += [{"setting": case.name, "baseline": baseline, "metric": name, **(turned(test) if turn else test)._asdict()}
+                 for name, turn, test in tests]
+    return rows

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from safevar_sumo.analysis.figures import FONT, new_figure, plain, raised, save
+from safevar_sumo.analysis.figures import FONT, new_figure, panels, plain, raised, save
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
 from safevar_sumo.analysis.research_questions.changes import ANY, critical, effects, rq31, rq32
 from safevar_sumo.analysis.research_questions.indicators import WORST, convergence, nondominated, objectives
@@ -46,20 +46,16 @@ def number_of_changes(cases: Sequence[Case]) -> Figure:
     import seaborn as sns
 
     counts = [rq31(case) for case in cases]
-    columns = min(len(cases), PANELS)
-    rows = -(-len(cases) // columns)
     title = "number of changed characteristics"
-    figure, axes = _figure(f"{cases[0].name}: {title}" if len(cases) == 1 else title, rows, columns,
-                           (6.4 if columns == 1 else 3.9 * columns, 0.5 + 3.3 * rows))
-    for axis, case, group in zip(axes.flat, cases, counts, strict=False):
+    title = f"{cases[0].name}: {title}" if len(cases) == 1 else title
+    figure, axes = panels(title, len(cases), PANELS, (3.9, 3.3), least_width=6.4, above=0.5)
+    for axis, case, group in zip(axes, cases, counts, strict=True):
         sns.boxplot(group, x="j", y="count", ax=axis, color="#56b4e9", linecolor="black", linewidth=0.8, fliersize=3)
         axis.set_xlabel("characteristics changed")
         axis.set_ylabel(f"critical solutions per run\n({group['run'].nunique()} runs)")
         axis.set_title(plain(case.name) if len(cases) > 1 else "", fontsize=FONT)
         _whole_numbers(axis.yaxis)
-    for axis in list(axes.flat)[len(cases):]:
-        axis.set_axis_off()
-    return figure
+    return _spaced(figure)
 
 
 def changed_characteristics(case: Case) -> Figure:
@@ -71,7 +67,7 @@ def changed_characteristics(case: Case) -> Figure:
     order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
     grid = shares.pivot(index="characteristic", columns="j", values="percent").astype(float)
     grid = grid.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=plain)
-    figure, ((axis,),) = _figure(f"{case.name}: characteristics changed in critical solutions", 1, 1, (7.6, 1.4 + 0.3 * len(grid)))
+    figure, ((axis,),) = new_figure(f"{case.name}: characteristics changed in critical solutions", 1, 1, (7.6, 1.4 + 0.3 * len(grid)))
     sns.heatmap(grid, ax=axis, cmap="cividis", vmin=0, vmax=100, annot=True, fmt=".0f", annot_kws={"fontsize": 7}, linewidths=0.5,
                 cbar_kws={"label": "critical solutions\nin which it is changed [%]"})
     axis.grid(visible=False)
@@ -81,7 +77,7 @@ def changed_characteristics(case: Case) -> Figure:
     axis.set_xlabel("number of characteristics changed (empty: no such solution)")
     axis.set_ylabel("characteristic, most frequent first")
     axis.tick_params(axis="both", length=0, rotation=0)
-    return figure
+    return _spaced(figure)
 
 
 def sizes_of_changes(case: Case) -> Figure:
@@ -91,10 +87,8 @@ def sizes_of_changes(case: Case) -> Figure:
     total = _some_critical(case)
     changes = effects(case)
     members = case.characteristics.members
-    columns = min(4, len(members))
-    rows = -(-len(members) // columns)
-    figure, axes = _figure(f"{case.name}: changes in critical solutions", rows, columns, (9.0, 1.0 + 1.85 * rows))
-    for axis, member in zip(axes.flat, members, strict=False):
+    figure, axes = panels(f"{case.name}: changes in critical solutions", len(members), 4, (2.25, 1.85), least_width=9.0, above=1.0)
+    for axis, member in zip(axes, members, strict=True):
         change = changes.loc[changes["characteristic"] == member.name, "change"]
         low, high = (float(f"{end - member.original:.9g}") for end in (member.lower, member.upper))
         sides = {INCREASE: change[change > 0], DECREASE: change[change < 0]}
@@ -111,12 +105,10 @@ def sizes_of_changes(case: Case) -> Figure:
         axis.set_ylabel("")
         axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
         _whole_numbers(axis.yaxis, 4)
-    for axis in list(axes.flat)[len(members):]:
-        axis.set_axis_off()
     figure.supylabel(f"how many of {total} critical solutions", fontsize=9)
     figure.supxlabel("orange, right of 0: increases; blue, left of 0: decreases; titles tell how many of each;\n"
                      "each axis spans the characteristic's domain", fontsize=FONT)
-    return figure
+    return _spaced(figure)
 
 
 def pareto_fronts(case: Case) -> Figure:
@@ -141,7 +133,7 @@ def pareto_fronts(case: Case) -> Figure:
     pairs = list(combinations(range(len(goals)), 2))
     rows = next(rows for rows in (5, 2, 1) if len(pairs) % (3 * rows) == 0 or rows == 1)
     columns = len(pairs) // rows
-    figure, axes = _figure(f"{case.name}: non-dominated solutions of each algorithm, all runs together", rows, columns,
+    figure, axes = new_figure(f"{case.name}: non-dominated solutions of each algorithm, all runs together", rows, columns,
                            (max(3.2 * columns, 5), 3.7 * rows))
     original = [_of_original(case, one) for one in goals]
     for axis, (first, second) in zip(axes.flat, pairs, strict=True):
@@ -155,7 +147,7 @@ def pareto_fronts(case: Case) -> Figure:
         axis.set_xlabel(_objective_title(goals[first]))
         axis.set_ylabel(_objective_title(goals[second]))
     _legend_below(figure, axes.flat[0])
-    return figure
+    return _spaced(figure)
 
 
 def _objective_title(objective: Objective) -> str:
@@ -172,7 +164,7 @@ def _of_original(case: Case, objective: Objective) -> float:
 def hypervolume_growth(case: Case) -> Figure:
     """Convergence: the hypervolume of what was found against evaluations, median and range over the runs."""
     growth = convergence(case)
-    figure, ((axis,),) = _figure(f"{case.name}: convergence", 1, 1, (6.4, 4.0))
+    figure, ((axis,),) = new_figure(f"{case.name}: convergence", 1, 1, (6.4, 4.0))
     for i, (algorithm, group) in enumerate(growth.groupby("algorithm", sort=False)):
         over = group.groupby("evaluations")["hypervolume"].agg(["min", "median", "max"])
         colour = COLOURS[i % len(COLOURS)]
@@ -184,7 +176,7 @@ def hypervolume_growth(case: Case) -> Figure:
     axis.set_xlabel("evaluations")
     axis.set_ylabel(f"hypervolume of all found, normalised\n(thick: median, thin: range over runs; reference point {WORST:g})")
     _legend_below(figure, axis)
-    return figure
+    return _spaced(figure)
 
 
 OF_ALL: Mapping[str, Callable[[Sequence[Case]], Figure]] = {"rq3.1-number-of-changes": number_of_changes}
@@ -252,11 +244,10 @@ def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Pa
     return written, lacking
 
 
-def _figure(title: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
-    """A figure with room between its axes, and these, shape (rows, columns)."""
-    figure, axes = new_figure(title, rows, columns, size)
+def _spaced(figure: Figure) -> Figure:
+    """The figure with room between its axes."""
     figure.set_layout_engine("constrained", w_pad=0.1)
-    return figure, axes
+    return figure
 
 
 def _legend_below(figure: Figure, axis: Axes) -> None:

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
 
 import numpy as np
 import pandas as pd
 import scipy
 
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, NSGA2, Case, Unanswerable, values
-from safevar_sumo.analysis.research_questions.comparisons import ALPHA, Comparison, compare, magnitude, rq1, rq2, turned
-from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, indicators, titles_of
+from safevar_sumo.analysis.research_questions.comparisons import ALPHA, Comparison, magnitude, rq1, rq1_rows, rq2, rq2_rows
+from safevar_sumo.analysis.research_questions.indicators import titles_of
 from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import FloatArray
 
@@ -160,39 +160,14 @@ def _corrected(case: Case) -> tuple[pd.DataFrame, pd.DataFrame | None]:
     """Both questions over runs, their p-values corrected as one family; without RQ2 where it cannot be asked."""
     if not case.algorithms:
         raise Unanswerable(case.name, "has no finished run", "results with at least one finished run")
-    first = _rq1_rows(case)
+    means = partial(run_means, case)
+    first = rq1_rows(case, means, signed_rank)
     several = NSGA2 in case.algorithms and len(case.algorithms) > 1
-    second = _rq2_rows(case) if several else []
+    second = rq2_rows(case, means) if several else []
     for row, p in zip([*first, *second], holm([row["p_value"] for row in [*first, *second]]), strict=True):
         row["p_holm"] = p
     return (pd.DataFrame(first, columns=RQ1_COLUMNS, dtype=object),
             pd.DataFrame(second, columns=RQ2_COLUMNS, dtype=object) if several else None)
-
-
-def _rq1_rows(case: Case) -> list[dict[str, Any]]:
-    rows = []
-    for algorithm in case.algorithms:
-        for metric in case.scoring.metrics:
-            means, original = run_means(case, algorithm, metric), case.original[metric.name]
-            test = signed_rank(means, original)
-            rows.append({"setting": case.name, "algorithm": algorithm, "metric": metric.name,
-                         **(turned(test) if metric.more_is_unsafe else test)._asdict(), "runs": len(means),
-                         "mean": float(np.mean(means)) if means.size else None, "original": None if np.isnan(original) else original})
-    return rows
-
-
-def _rq2_rows(case: Case) -> list[dict[str, Any]]:
-    quality = indicators(case) if len(case.solutions) else None
-    rows = []
-    for baseline in (name for name in case.algorithms if name != NSGA2):
-        tests = [(indicator, not more_is_better, compare(*(
-            [] if quality is None else quality.loc[quality["algorithm"] == name, indicator] for name in (NSGA2, baseline))))
-            for indicator, more_is_better in MORE_IS_BETTER.items()]
-        tests += [(metric.name, not metric.more_is_unsafe, compare(run_means(case, NSGA2, metric), run_means(case, baseline, metric)))
-                  for metric in case.scoring.metrics]
-        rows += [{"setting": case.name, "baseline": baseline, "metric": name, **(turned(test) if turn else test)._asdict()}
-                 for name, turn, test in tests]
-    return rows
 
 
 def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:

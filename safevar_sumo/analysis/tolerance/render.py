@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.console import Console
 
-from safevar_sumo.analysis.figures import DEGREE, FONT, NECESSARY, UNSAFE, new_figure, plain, raised
+from safevar_sumo.analysis.figures import DEGREE, FONT, NECESSARY, UNSAFE, panels, plain, raised
 from safevar_sumo.analysis.tolerance.compute import OneAtATimeScan, Tolerance
 from safevar_sumo.analysis.tolerance.joint import Pair
 from safevar_sumo.analysis.words import decimal
@@ -94,18 +94,14 @@ def _print_pairs(console: Console, result: Tolerance) -> None:
 
 def profiles_figure(result: Tolerance) -> Figure:
     """The safety degree over the domain of each characteristic alone; the original marked, what is unsafe shaded."""
-    columns = min(4, len(result.alone))
-    rows = -(-len(result.alone) // columns)
     title = f"{result.study.name}: one characteristic at a time (unsafe: {result.unsafe})"
-    figure, axes = new_figure(title, rows, columns, (max(2.3 * columns, 4.6), 1.0 + 1.75 * rows))
+    figure, axes = panels(title, len(result.alone), 4, (2.3, 1.75), least_width=4.6, above=1.0)
     degrees = np.concatenate([scan.profile[SAFETY_DEGREE].dropna() for scan in result.alone])
     margin = 0.05 * (np.ptp(degrees) if degrees.size else 0.0) or 0.5
-    for axis, scan in zip(axes.flat, result.alone, strict=False):
+    for axis, scan in zip(axes, result.alone, strict=True):
         _profile(axis, scan)
         if degrees.size:
             axis.set_ylim(degrees.min() - margin, degrees.max() + margin)  # the same for all: a steep one is one that matters
-    for axis in list(axes.flat)[len(result.alone):]:
-        axis.set_axis_off()
     figure.supylabel(DEGREE, fontsize=FONT)
     notes = {"dot: the original vehicle": True, "hatched: unsafe": any(scan.unsafe for scan in result.alone),
                "below the dashed line: collisions": bool(degrees.size) and degrees.min() <= 0}
@@ -140,15 +136,11 @@ def pairs_figure(result: Tolerance, most: int = 6) -> Figure:
         raise InputError("pairs", "there is no pair to draw", "at least two characteristics, looked at in pairs")
     worst = sorted(result.pairs, key=lambda pair: (-pair.unsafe_share, np.nanmin(pair.safety_degree)))[:most]
     degrees = np.concatenate([pair.safety_degree.ravel() for pair in worst])
-    columns = min(3, len(worst))
-    rows = -(-len(worst) // columns)
     title = f"{result.study.name}: the worst pairs (unsafe: {result.unsafe})"
-    figure, axes = new_figure(title, rows, columns, (max(3.0 * columns, 4.6), 1.1 + 2.4 * rows))
-    for axis, pair in zip(axes.flat, worst, strict=False):
+    figure, axes = panels(title, len(worst), 3, (3.0, 2.4), least_width=4.6, above=1.1)
+    for axis, pair in zip(axes, worst, strict=True):
         colours = _plane(axis, pair, (float(np.nanmin(degrees)), float(np.nanmax(degrees))))
-    for axis in list(axes.flat)[len(worst):]:
-        axis.set_axis_off()
-    bar = figure.colorbar(colours, ax=axes, shrink=0.9)
+    bar = figure.colorbar(colours, ax=figure.axes, shrink=0.9)
     bar.set_label(DEGREE, fontsize=FONT)
     bar.ax.tick_params(labelsize=FONT)
     figure.supxlabel("dot: the original vehicle; hatched: unsafe;\ncross: the unsafe setting nearest to the original", fontsize=FONT)
