@@ -34,7 +34,7 @@ def new_figure(title: str, rows: int, columns: int, size: tuple[float, float], *
                                                               "xtick.labelsize": FONT, "ytick.labelsize": FONT}]):
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, **options)
-    figure.suptitle(plain(title), fontsize=FONT + 2)
+    figure.suptitle(literal(title), fontsize=FONT + 2)
     return figure, axes
 
 
@@ -66,11 +66,11 @@ def save(figure: Figure, path: Path, source: str = "out") -> None:
                          "a file that ends in .png, .pdf or .svg, in a directory that can be written") from None
 
 
-def plain(name: str) -> str:
+def literal(name: str) -> str:
     """A name in which matplotlib sees no formula."""
     return name.replace("$", r"\$")
 
 
-def raised(unit: str) -> str:
+def as_formula(unit: str) -> str:
     """A unit with its powers raised."""
-    return re.sub(r"\^(-?\d+)", r"$^{\1}$", plain(unit))
+    return re.sub(r"\^(-?\d+)", r"$^{\1}$", literal(unit))

@@ -14,7 +14,7 @@ import scipy
 import tomli_w
 
 from safevar_sumo.analysis.evaluator import finite_or_none
-from safevar_sumo.analysis.figures import new_figure, raised, save
+from safevar_sumo.analysis.figures import as_formula, new_figure, save
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -191,7 +191,7 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
 
 
 def _label(metric: str) -> str:
-    return f"{METRICS[metric].title} [{raised(METRICS[metric].unit)}]"
+    return f"{METRICS[metric].title} [{as_formula(METRICS[metric].unit)}]"
 
 
 def _scatter(axis: Axes, metric: str, reference: ReferenceData, here: Evaluations, either: BoolArray) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison
-from safevar_sumo.replay.scene import SEAM_WIDTH, Body, Scene, scene_of
+from safevar_sumo.replay.scene import SEAM_WIDTH, FlatBody, FlatScene, scene_of
 from safevar_sumo.sumo.film import Lane
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ STRIPE = 0.5
 """Length of a crossing's stripe and of the space between two [m]."""
 
 
-def pictures(scene: Scene, stride: int) -> Iterator[Image]:
+def pictures(scene: FlatScene, stride: int) -> Iterator[Image]:
     """Every `stride`-th sample of a scene, and the last one."""
     canvas = _Canvas(scene)
     for sample in [*range(0, scene.length - 1, stride), scene.length - 1]:
@@ -49,7 +49,7 @@ def pictures(scene: Scene, stride: int) -> Iterator[Image]:
 class _Canvas:
     """Draws the samples of one scene."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: FlatScene) -> None:
         self._scene, self._scale = scene, FINER * WIDTH / scene.view.width
         self._size = (FINER * WIDTH, FINER * PANEL + round(self._scale * scene.view.height / 2 / FINER) * 2 * FINER)
 
@@ -103,7 +103,7 @@ class _Canvas:
         for start, end in pairwise(line):
             draw.polygon(self._pixels(quad(start, end, width), sample), fill=colour)
 
-    def _body(self, draw: ImageDraw, body: Body, sample: int) -> None:
+    def _body(self, draw: ImageDraw, body: FlatBody, sample: int) -> None:
         if body.is_person:
             radius = max(body.length, body.width) / 2 * self._scale
             (x, y), = self._pixels(np.array([[body.x[sample], body.y[sample]]]), sample)
@@ -196,7 +196,7 @@ def check_animation(path: Path) -> None:
         _ffmpeg()
 
 
-def _gif(scene: Scene, path: Path) -> None:
+def _gif(scene: FlatScene, path: Path) -> None:
     """As many pictures as fit into the largest size."""
     stride = max(1, round(SECONDS_PER_PICTURE / scene.step))
     while len(written := _gif_of(scene, stride)) > LARGEST_GIF and stride < scene.length:
@@ -204,7 +204,7 @@ def _gif(scene: Scene, path: Path) -> None:
     path.write_bytes(written)
 
 
-def _gif_of(scene: Scene, stride: int) -> bytes:
+def _gif_of(scene: FlatScene, stride: int) -> bytes:
     from PIL.Image import Dither
 
     frames = list(pictures(scene, stride))
@@ -216,7 +216,7 @@ def _gif_of(scene: Scene, stride: int) -> bytes:
     return buffer.getvalue()
 
 
-def _film(scene: Scene, path: Path) -> None:
+def _film(scene: FlatScene, path: Path) -> None:
     frames = list(pictures(scene, 1))
     frames += frames[-1:] * round(LAST_PICTURE / scene.step)
     width, height = frames[0].size
@@ -242,11 +242,11 @@ def _ffmpeg() -> str:
                          "ffmpeg on the PATH, or pip install 'safevar_sumo[film]'; a .gif or .html needs neither") from None
 
 
-def _page(scene: Scene, path: Path) -> None:
+def _page(scene: FlatScene, path: Path) -> None:
     from safevar_sumo.replay.page import animation_page
 
     path.write_text(animation_page(scene), encoding="utf-8", newline="\n")
 
 
-ANIMATIONS: Mapping[str, Callable[[Scene, Path], None]] = {".gif": _gif, ".mp4": _film, ".html": _page}
+ANIMATIONS: Mapping[str, Callable[[FlatScene, Path], None]] = {".gif": _gif, ".mp4": _film, ".html": _page}
 """How an animation is written, by its file's ending."""

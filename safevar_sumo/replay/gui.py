@@ -10,7 +10,7 @@ import numpy as np
 
 from safevar_sumo.replay.animation import OTHER, PERSON, VEHICLES, quad, stripes
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison
-from safevar_sumo.replay.scene import Scene, scene_of
+from safevar_sumo.replay.scene import FlatScene, scene_of
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.film import Lane
 from safevar_sumo.sumo.window import Colour, Place, Window, open_window
@@ -65,7 +65,7 @@ def show_in_gui(comparison: Comparison, network: str | None = None, *, slower: f
 class _Turn:
     """From a comparison's film to the window: the changed vehicle's road lies below, by the height of what is shown."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: FlatScene) -> None:
         self._below = scene.view.height + SPACE
         track = scene.comparison.film.tracks[VUT]
         heading = np.deg2rad(90 - track.angle[0, 0])
@@ -76,7 +76,7 @@ class _Turn:
         return self._side * self._below * (row == CHANGED)
 
 
-def _furnish(window: Window, scene: Scene, row: int, turn: _Turn) -> None:
+def _furnish(window: Window, scene: FlatScene, row: int, turn: _Turn) -> None:
     """A row's road, where it is not SUMO's own, and everybody who drives or walks there."""
     film = scene.comparison.film
     if row == CHANGED:
@@ -88,7 +88,7 @@ def _furnish(window: Window, scene: Scene, row: int, turn: _Turn) -> None:
         window.add(_id(row, name), track.is_person, track.length, track.width, colour)
 
 
-def _show(window: Window, scene: Scene, sample: int, turn: _Turn) -> None:
+def _show(window: Window, scene: FlatScene, sample: int, turn: _Turn) -> None:
     """One sample: the camera, everybody's place, the legend."""
     comparison, places = scene.comparison, []
     film = comparison.film
@@ -112,7 +112,7 @@ def _show(window: Window, scene: Scene, sample: int, turn: _Turn) -> None:
     window.show(places)
 
 
-def _frame(scene: Scene, sample: int) -> np.ndarray:
+def _frame(scene: FlatScene, sample: int) -> np.ndarray:
     """The corners of what a scene shows, in the film's plane; shape (4, 2)."""
     view, track = scene.view, scene.comparison.film.tracks[VUT]
     heading = np.deg2rad(90 - track.angle[0, 0])

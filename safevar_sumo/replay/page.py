@@ -10,7 +10,7 @@ import numpy as np
 
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL
-from safevar_sumo.replay.scene import SEAM_WIDTH, TEN, Body, Scene
+from safevar_sumo.replay.scene import SEAM_WIDTH, TEN, FlatBody, FlatScene
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -38,14 +38,14 @@ def environment(*folders: Path) -> Environment:
                        lstrip_blocks=True)
 
 
-def animation_page(scene: Scene) -> str:
+def animation_page(scene: FlatScene) -> str:
     """A page that shows one scene, whole in itself."""
     template = environment().get_template("animation.html.j2")
     comparison = scene.comparison
     return template.render(title=comparison.title, changes=comparison.changes, data=player_data(scene), **player_parts())
 
 
-def player_data(scene: Scene) -> dict[str, Any]:
+def player_data(scene: FlatScene) -> dict[str, Any]:
     """The data of the template `player`: the still picture, and under `played` what the script plays. y points down."""
     view, key = scene.view, scene.key_sample
     drives = [_drive(scene, row) for row in scene.comparison.rows]
@@ -64,14 +64,14 @@ def player_data(scene: Scene) -> dict[str, Any]:
         "played": {**shared, "bodies": [_moving(body) for body in bodies]}}
 
 
-def _description(scene: Scene) -> str:
+def _description(scene: FlatScene) -> str:
     """The picture in words."""
     comparison = scene.comparison
     who = " and ".join(f"the {comparison.name(row)} vehicle, which {comparison.verdict(row)}" for row in comparison.rows)
     return f"Seen from above after {scene.key_sample * scene.step:.2f} s: {who}"
 
 
-def _moments(scene: Scene) -> list[dict[str, Any]]:
+def _moments(scene: FlatScene) -> list[dict[str, Any]]:
     """Where one may jump to."""
     jumps = []
     for row, one in enumerate(scene.moments):
@@ -84,7 +84,7 @@ def _moments(scene: Scene) -> list[dict[str, Any]]:
     return sorted(jumps, key=lambda moment: moment["sample"])
 
 
-def _drive(scene: Scene, row: int) -> dict[str, Any]:
+def _drive(scene: FlatScene, row: int) -> dict[str, Any]:
     trace, marks = scene.comparison.film.drives.trace, scene.moments[row]
     shown = slice(0, marks.end + 1)
     return {"name": scene.comparison.name(row), "verdict": scene.comparison.verdict(row), "end": marks.end,
@@ -97,12 +97,12 @@ def _lane(lane: Any) -> dict[str, Any]:
             "points": " ".join(f"{x:.2f},{-y:.2f}" for x, y in lane.line.tolist())}
 
 
-def _moving(body: Body) -> dict[str, Any]:
+def _moving(body: FlatBody) -> dict[str, Any]:
     degrees = -np.rad2deg(np.unwrap(body.heading)) if np.isfinite(body.heading).all() else -np.rad2deg(body.heading)
     return {"drive": body.row if body.is_vut else None, "x": _numbers(body.x), "y": _numbers(-body.y), "heading": _numbers(degrees, 1)}
 
 
-def _still(body: Body, scene: Scene) -> dict[str, Any]:
+def _still(body: FlatBody, scene: FlatScene) -> dict[str, Any]:
     """One body at the key moment."""
     key = scene.key_sample
     x, y, heading = (_list(values[key:key + 1])[0] for values in (body.x, -body.y, -np.rad2deg(body.heading)))

@@ -30,7 +30,7 @@ SAME = 0.05
 """Two copies of an actor whose places differ by less are one [m]."""
 
 
-class Body(NamedTuple):
+class FlatBody(NamedTuple):
     """An actor of one drive: front bumper or person's middle, x to the right and y up [m], heading [rad from x]; shape (T,)."""
 
     name: str
@@ -61,14 +61,14 @@ class View(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class FlatScene:
     """What there is to see of a comparison; `length` samples, `step` seconds apart."""
 
     comparison: Comparison
     step: float
     length: int
     road: tuple[Lane, ...]
-    bodies: tuple[Body, ...]
+    bodies: tuple[FlatBody, ...]
     moments: tuple[Moments, ...]
     view: View
 
@@ -84,7 +84,7 @@ class Scene:
         return list(range(math.ceil(left / TEN) * TEN, math.floor(left + self.view.width) + 1, TEN))
 
 
-def scene_of(comparison: Comparison) -> Scene:
+def scene_of(comparison: Comparison) -> FlatScene:
     """Lay a comparison out as a scene."""
     film = comparison.film
     vut = film.tracks[VUT]
@@ -97,15 +97,15 @@ def scene_of(comparison: Comparison) -> Scene:
                    for name, track in film.tracks.items() for row in comparison.rows
                    if name == VUT or (_shown(film, name, row) and not _seen_already(comparison, name, row)))
     road = tuple(lane._replace(line=(lane.line - start) @ to_scene.T) for lane in film.road)
-    return Scene(comparison=comparison, step=film.drives.trace.step, length=length, road=road, bodies=bodies, moments=all_moments,
+    return FlatScene(comparison=comparison, step=film.drives.trace.step, length=length, road=road, bodies=bodies, moments=all_moments,
                  view=_view(bodies, length))
 
 
-def _body(name: str, track: Track, row: int, end: int, length: int, to_scene: FloatArray, start: FloatArray, turn: float) -> Body:
+def _body(name: str, track: Track, row: int, end: int, length: int, to_scene: FloatArray, start: FloatArray, turn: float) -> FlatBody:
     """An actor as long as its drive lasts; afterwards it stays where it was."""
     until = np.minimum(np.arange(length), end)
     x, y = to_scene @ (np.stack([track.x[until, row], track.y[until, row]]) - start[:, np.newaxis])
-    return Body(name, row, name == VUT, track.is_person, track.length, track.width, x, y,
+    return FlatBody(name, row, name == VUT, track.is_person, track.length, track.width, x, y,
                 np.deg2rad(90 - track.angle[until, row]) - turn)
 
 
@@ -125,7 +125,7 @@ def _seen_already(comparison: Comparison, name: str, row: int) -> bool:
     return _shown(comparison.film, name, CHANGED) and bool(np.all((apart < SAME) | np.isnan(apart)))
 
 
-def _view(bodies: tuple[Body, ...], length: int) -> View:
+def _view(bodies: tuple[FlatBody, ...], length: int) -> View:
     """All of it, or where that is too long, what a camera shows that follows the vehicles."""
     low = min(float(np.nanmin(body.x)) - body.length for body in bodies) - MARGIN / 2
     high = max(float(np.nanmax(body.x)) + (0 if body.is_vut else body.length) for body in bodies) + MARGIN

@@ -34,7 +34,7 @@ def explanations(material: ReportInput, jobs: int | None, progress: Progress) ->
         material.case, material.options["explain"], jobs=jobs, progress=progress).to_dict()))
 
 
-def necessity(explained: Failures, material: ReportInput) -> Markup | None:
+def necessity_chart(explained: Failures, material: ReportInput) -> Markup | None:
     """How often each characteristic is changed in a failure, and how often it is needed."""
     shares: dict[str, dict[str, Any]] = next((one["summary"] for one in explained if "summary" in one), {})
     names = [name for name in shares.get("necessary", {}) if shares["changed"].get(name)]
@@ -128,7 +128,7 @@ def _chosen(material: ReportInput, explained: Failures | None) -> list[str]:
     chosen = [str(chosen_handle(solutions, degree, choice, material.place)) for choice in choices]
     chosen += [handle_of(failure) for failure in explained or [] if failure.get("algorithm") is not None]
     best = best_of([row for row, is_unsafe in zip(material.solutions.values(), unsafe, strict=True) if is_unsafe])
-    chosen += [best[place]["handle"] for place in spread(len(best), REPLAYS)]
+    chosen += [best[place]["handle"] for place in evenly(len(best), REPLAYS)]
     return list(dict.fromkeys(chosen))[:max(REPLAYS, len(choices) + len(explained or []))]
 
 
@@ -142,6 +142,6 @@ def best_of(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return list(by_point.values())
 
 
-def spread(number: int, most: int) -> list[int]:
+def evenly(number: int, most: int) -> list[int]:
     """At most so many places, evenly over all of them."""
     return sorted({round(place) for place in np.linspace(0, number - 1, min(number, most)).tolist()})

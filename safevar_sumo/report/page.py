@@ -24,7 +24,7 @@ from safevar_sumo.analysis.research_questions.layout import Bold, Table, lay_out
 from safevar_sumo.errors import InputError, did_you_mean
 from safevar_sumo.replay.comparison import raised
 from safevar_sumo.replay.page import environment, player_parts
-from safevar_sumo.report.findings import best_of, causes, explanations, necessity, replays, spread
+from safevar_sumo.report.findings import best_of, causes, evenly, explanations, necessity_chart, replays
 from safevar_sumo.report.input import ReportInput, gather
 from safevar_sumo.report.limits import LIMITS
 from safevar_sumo.report.svg import Dot, scatter
@@ -86,7 +86,7 @@ def front(material: ReportInput, shown: Sequence[str]) -> Markup:
     """The solutions that no other one beats, by largest change and safety degree; those that are replayed lead there."""
     rows = [row for row in material.solutions.values() if not np.isnan([row["f_safe"], row["f_diff"]]).any()]
     best = best_of(rows)
-    kept = [best[place] for place in spread(len(best), DOTS)] + [row for row in rows if row["handle"] in shown]
+    kept = [best[place] for place in evenly(len(best), DOTS)] + [row for row in rows if row["handle"] in shown]
     dots = {row["handle"]: _dot(material, row, row["handle"] in shown) for row in kept}
     return scatter(f"{material.case.name}: safety degree over the largest change of the solutions that no other beats",
                    list(dots.values()), "largest change [% of the original]", "safety degree [m, or -m/s]", 0.0, "collision below")
@@ -197,7 +197,7 @@ def _study(material: ReportInput, wanted: Sequence[str], jobs: int | None, show:
         "tested": lambda: tested(material),
         "verdict": lambda: verdict(material, explained, limits.get("tolerance")),
         "causes": lambda: causes(explained or [], material),
-        "necessity": lambda: necessity(explained or [], material),
+        "necessity": lambda: necessity_chart(explained or [], material),
         "trust": lambda: trust(material, explained)}
     otherwise = [one["handle"] for one in shown if one.get("differences")]
     if otherwise:

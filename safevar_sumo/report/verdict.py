@@ -100,7 +100,7 @@ def verdict(material: ReportInput, explained: Failures | None, tolerance: Mappin
     unsafe = case.solutions[unsafe_rows(case.solutions, degree)]
     hits = bool(collided(case.solutions).any())
     result: dict[str, Any] = {"unsafe": len(unsafe), "solutions": len(case.solutions), "rule": _rule(hits, degree), "findings": [],
-                              "original": _original(material), "hits": hits, "figures": [], "agreement": agreement(material)}
+                              "original": _original(material), "hits": hits, "figures": [], "agreement": agreement_with_published(material)}
     if unsafe.empty and case.solutions.empty:
         result["headline"] = "No solution was found: nothing to tell a failure from."
         return result
@@ -230,7 +230,7 @@ def _together(tolerance: Mapping[str, Any] | None) -> dict[str, str]:
             "note": f"from the original to the ends of their domains; none of {samples} vehicles within is unsafe"}
 
 
-def agreement(material: ReportInput) -> dict[str, Any]:
+def agreement_with_published(material: ReportInput) -> dict[str, Any]:
     """How well the study agrees with published data: a sentence, and the rows of a table; none where nothing is known."""
     totals = quoted(material.case.study)
     if not totals:
@@ -285,4 +285,4 @@ def trust(material: ReportInput, explained: Failures | None) -> dict[str, Any]:
                         f"fewer than {BORDERLINE:.0%} of their neighbours are unsafe too.")
     if not rows:
         remarks.append("No published values of the original vehicle are known to hold the study against.")
-    return {"published": rows, "remarks": remarks, "general": NOT_MODELLED, "agreement": agreement(material)["rows"]}
+    return {"published": rows, "remarks": remarks, "general": NOT_MODELLED, "agreement": agreement_with_published(material)["rows"]}

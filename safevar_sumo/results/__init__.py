@@ -3,7 +3,7 @@
 from safevar_sumo.results.files import make_directory, write_whole
 from safevar_sumo.results.imported import UNKNOWN, write_imported
 from safevar_sumo.results.journal import SPARE, Journal, JournalBusy
-from safevar_sumo.results.load import Failure, Results, RunStatus, Status, failure_lines, load, status
+from safevar_sumo.results.load import Failure, RunStatus, Status, StoredResults, failure_lines, load, status
 from safevar_sumo.results.manifest import (
     MANIFEST,
     RESULTS,
@@ -19,7 +19,40 @@ from safevar_sumo.results.solution_id import CHOICES, SolutionId, chosen_handle,
 from safevar_sumo.results.store import ORIGINAL, SOLUTIONS, ResultsDirectory, evaluations_frame, record, solutions_frame
 
 __all__ = [
-    "CHOICES", "MANIFEST", "ORIGINAL", "RESULTS", "SOLUTIONS", "SPARE", "UNKNOWN", "Failure", "Journal", "JournalBusy", "Results",
-    "ResultsDirectory", "RunStatus", "SolutionId", "Status", "begun_and_now", "chosen_handle", "differences_now", "evaluations_frame",
-    "failure_lines", "fixed", "half_of", "handles", "load", "make_directory", "manifest_of", "places_of", "position_of", "read_later",
-    "read_manifest", "record", "solutions_frame", "status", "unsafe_rows", "write_imported", "write_whole"]
+    "CHOICES",
+    "MANIFEST",
+    "ORIGINAL",
+    "RESULTS",
+    "SOLUTIONS",
+    "SPARE",
+    "UNKNOWN",
+    "Failure",
+    "Journal",
+    "JournalBusy",
+    "ResultsDirectory",
+    "RunStatus",
+    "SolutionId",
+    "Status",
+    "StoredResults",
+    "begun_and_now",
+    "chosen_handle",
+    "differences_now",
+    "evaluations_frame",
+    "failure_lines",
+    "fixed",
+    "half_of",
+    "handles",
+    "load",
+    "make_directory",
+    "manifest_of",
+    "places_of",
+    "position_of",
+    "read_later",
+    "read_manifest",
+    "record",
+    "solutions_frame",
+    "status",
+    "unsafe_rows",
+    "write_imported",
+    "write_whole",
+]

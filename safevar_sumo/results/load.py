@@ -39,7 +39,7 @@ def failure_lines(failures: Sequence[Failure]) -> list[str]:
     return [str(first) if not others else f"{first} (and {len(others)} more)" for first, *others in reasons.values()]
 
 
-class Results(NamedTuple):
+class StoredResults(NamedTuple):
     """The contents of a results directory.
 
     Attributes
@@ -139,7 +139,7 @@ def _journals(place: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str
         yield algorithm, run, read_journal(path, study, path.stem) if path.exists() else None
 
 
-def load(directory: str | Path) -> Results:
+def load(directory: str | Path) -> StoredResults:
     """Read a results directory, finished or not: the runs and evaluations that its manifest's study asks for.
 
     Raises
@@ -154,7 +154,7 @@ def load(directory: str | Path) -> Results:
     refuse_edited_table(place / SOLUTIONS, manifest, f"the file as it was, or {again}")
     if "imported" in manifest:
         none = evaluations_frame(search.characteristics, []).assign(evaluation=0)
-        return Results(manifest, none, read_imported(place, search.characteristics))
+        return StoredResults(manifest, none, read_imported(place, search.characteristics))
     everything, solved, positions, failures = [], [], [], []
     for algorithm, run, content in _journals(place, manifest, search.runs):
         if content is None or content.evaluations is None:
@@ -169,7 +169,7 @@ def load(directory: str | Path) -> Results:
             solved.append(((algorithm, run), content.by_position(result.positions)))
     frame = evaluations_frame(search.characteristics, everything)
     frame.insert(2, "evaluation", positions)
-    return Results(manifest, frame, solutions_frame(search.characteristics, solved), tuple(key for key, _ in solved), tuple(failures))
+    return StoredResults(manifest, frame, solutions_frame(search.characteristics, solved), tuple(key for key, _ in solved), tuple(failures))
 
 
 def status(directory: str | Path) -> Status:

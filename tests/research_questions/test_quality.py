@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import mannwhitneyu
 
-from safevar_sumo.analysis.research_questions.comparisons import ASYMPTOTIC, EXACT, Comparison, compare, magnitude
+from safevar_sumo.analysis.research_questions.comparisons import ASYMPTOTIC, EXACT, TwoSampleTest, compare_samples, magnitude
 from safevar_sumo.analysis.research_questions.indicators import (
     Scale,
     convergence,
@@ -112,21 +112,21 @@ SAMPLES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=20)
 @given(x=SAMPLES, y=SAMPLES)
 def test_effect_size_is_the_share_of_pairs_won_and_half_of_those_tied(x: list[float], y: list[float]) -> None:
     won = sum((a > b) + 0.5 * (a == b) for a in x for b in y)
-    assert compare(x, y).effect_size == pytest.approx(won / (len(x) * len(y)))
-    assert compare(y, x).effect_size == pytest.approx(1 - won / (len(x) * len(y)))
-    assert compare(y, x).p_value == pytest.approx(compare(x, y).p_value)
+    assert compare_samples(x, y).effect_size == pytest.approx(won / (len(x) * len(y)))
+    assert compare_samples(y, x).effect_size == pytest.approx(1 - won / (len(x) * len(y)))
+    assert compare_samples(y, x).p_value == pytest.approx(compare_samples(x, y).p_value)
 
 
 @given(x=SAMPLES, y=SAMPLES)
 def test_p_is_never_undefined(x: list[float], y: list[float]) -> None:
-    p = compare(x, y).p_value
+    p = compare_samples(x, y).p_value
     assert p is not None
     assert 0 <= p <= 1
 
 
 @pytest.mark.parametrize("size", [2, 3, 5, 8])
 def test_exact_p_of_separated_samples_is_two_orders_of_all(size: int) -> None:
-    told = compare(np.arange(size), 100 + np.arange(size))
+    told = compare_samples(np.arange(size), 100 + np.arange(size))
     assert told.p_value == pytest.approx(2 / math.comb(2 * size, size))
     assert (told.effect_size, told.magnitude, told.method) == (0, "large", EXACT)
 
@@ -139,33 +139,33 @@ def test_p_with_ties_is_the_corrected_normal_approximation() -> None:
     n = n1 + n2
     sigma = math.sqrt(n1 * n2 / 12 * (n + 1 - np.sum(ties**3 - ties) / (n * (n - 1))))
     expected = math.erfc((abs(u - n1 * n2 / 2) - 0.5) / sigma / math.sqrt(2))
-    assert compare(x, y).p_value == pytest.approx(expected)
-    assert compare(x, y).method == ASYMPTOTIC
+    assert compare_samples(x, y).p_value == pytest.approx(expected)
+    assert compare_samples(x, y).method == ASYMPTOTIC
 
 
 def test_thirty_against_thirty_is_scipys_own_choice() -> None:
     rng = np.random.default_rng(3)
     x, y = rng.normal(size=30), rng.normal(0.5, size=30)
-    assert compare(x, y).p_value == pytest.approx(mannwhitneyu(x, y).pvalue)
+    assert compare_samples(x, y).p_value == pytest.approx(mannwhitneyu(x, y).pvalue)
 
 
 def test_equal_samples_do_not_differ() -> None:
     for x, y in (([1.0] * 30, [1.0] * 30), ([2.0], [2.0]), ([1.0, 2, 3], [1.0, 2, 3])):
-        assert compare(x, y)[:3] == (pytest.approx(1), 0.5, "negligible")
+        assert compare_samples(x, y)[:3] == (pytest.approx(1), 0.5, "negligible")
 
 
 def test_one_value_against_one_says_nothing() -> None:
-    assert compare([1.0], [2.0]) == Comparison(1.0, 0.0, "large", 1, 1, EXACT)
+    assert compare_samples([1.0], [2.0]) == TwoSampleTest(1.0, 0.0, "large", 1, 1, EXACT)
 
 
 def test_an_empty_sample_is_undefined_not_zero() -> None:
-    assert compare([], [1.0, 2]) == Comparison(None, None, None, 0, 2, None)
-    assert compare([1.0], []) == Comparison(None, None, None, 1, 0, None)
+    assert compare_samples([], [1.0, 2]) == TwoSampleTest(None, None, None, 0, 2, None)
+    assert compare_samples([1.0], []) == TwoSampleTest(None, None, None, 1, 0, None)
 
 
 def test_nan_is_refused() -> None:
     with pytest.raises(InputError, match="NaN"):
-        compare([1.0, math.nan], [1.0])
+        compare_samples([1.0, math.nan], [1.0])
 
 
 @pytest.mark.parametrize(("effect", "name"), [

@@ -125,7 +125,7 @@ def _braking(runs: SimulationRuns, column: int, first: int, last: int) -> Brakin
         speed_lost=begins - float(speed[down]), deceleration=energy / way)
 
 
-def compare(original: Course, changed: Course, place: str = "") -> BrakingComparison:
+def compare_braking(original: Course, changed: Course, place: str = "") -> BrakingComparison:
     """Compare a changed vehicle's run with the original's at the same place."""
     one, other = original.braking, _as_the_original_would(changed, original)
     if one is None or other is None:

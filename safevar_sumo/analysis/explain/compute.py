@@ -10,7 +10,7 @@ import numpy as np
 from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent, spread
 from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare, course
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, course
 from safevar_sumo.analysis.explain.causes import MinimalCause, affordable, boundaries, minimal_causes, necessary
 from safevar_sumo.analysis.explain.necessity import distinct_causes, key_of, necessity, robustness, smallest_robust
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
@@ -124,7 +124,7 @@ def where(system: System, original: FloatArray, settings: FloatArray, unsafe: Un
     for row, (failing, at) in enumerate(zip(names, worst.tolist(), strict=True), 1):
         one = at_points[at]
         first, other = (course(one.drives, column, float(one.evaluations.f_safe[column])) for column in (0, row))
-        places.append(Where(compare(first, other, one.point.name), failing))
+        places.append(Where(compare_braking(first, other, one.point.name), failing))
     return places, at_points[0].drives.trace.step
 
 

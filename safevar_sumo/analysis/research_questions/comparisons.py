@@ -27,7 +27,7 @@ MAGNITUDES = ((0.714, "large"), (0.638, "medium"), (0.556, "small"))
 NOTABLE = ("medium", "large")
 
 
-class Comparison(NamedTuple):
+class TwoSampleTest(NamedTuple):
     """Two samples X and Y compared; None where one of them is empty.
 
     `effect_size` is Vargha-Delaney's A12 = P(X > Y) + 0.5 P(X = Y), `n1` and `n2` the samples' sizes.
@@ -41,7 +41,7 @@ class Comparison(NamedTuple):
     method: str | None
 
 
-def compare(x: ArrayLike, y: ArrayLike) -> Comparison:
+def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
     """Compare two samples by U test and effect size.
 
     Raises
@@ -53,12 +53,12 @@ def compare(x: ArrayLike, y: ArrayLike) -> Comparison:
     if np.isnan(one).any() or np.isnan(other).any():
         raise InputError("Mann-Whitney U", "a value is NaN", "samples without undefined values")
     if not one.size or not other.size:
-        return Comparison(None, None, None, one.size, other.size, None)
+        return TwoSampleTest(None, None, None, one.size, other.size, None)
     both = np.concatenate([one, other])
     exact = min(one.size, other.size) <= EXACT_UP_TO and np.unique(both).size == both.size
     test = scipy.stats.mannwhitneyu(one, other, alternative="two-sided", method="exact" if exact else "asymptotic")
     a12 = float(test.statistic) / (one.size * other.size)
-    return Comparison(float(test.pvalue), a12, magnitude(a12), one.size, other.size, EXACT if exact else ASYMPTOTIC)
+    return TwoSampleTest(float(test.pvalue), a12, magnitude(a12), one.size, other.size, EXACT if exact else ASYMPTOTIC)
 
 
 def magnitude(effect_size: float) -> str:
@@ -84,7 +84,7 @@ def rq1(case: Case) -> pd.DataFrame:
     if not case.algorithms:
         raise Unanswerable(case.name, "has no finished run", "results with at least one finished run")
     rows = rq1_rows(case, lambda algorithm, metric: values(case.solutions_of(algorithm), metric),
-                    lambda sample, original: compare(sample, np.full(0 if np.isnan(original) else len(sample), original)))
+                    lambda sample, original: compare_samples(sample, np.full(0 if np.isnan(original) else len(sample), original)))
     return pd.DataFrame(rows, columns=RQ1_COLUMNS, dtype=object)
 
 
@@ -92,7 +92,7 @@ Sample = Callable[[str, MetricFacts], FloatArray]
 """An algorithm's values of a metric, shape (N,)."""
 
 
-def rq1_rows(case: Case, sample_of: Sample, test: Callable[[FloatArray, float], Comparison]) -> list[dict[str, Any]]:
+def rq1_rows(case: Case, sample_of: Sample, test: Callable[[FloatArray, float], TwoSampleTest]) -> list[dict[str, Any]]:
     """A row for each algorithm and metric: the test of its sample against the original's value, turned as in `rq1`."""
     rows = []
     for algorithm in case.algorithms:
@@ -105,7 +105,7 @@ def rq1_rows(case: Case, sample_of: Sample, test: Callable[[FloatArray, float], 
     return rows
 
 
-def turned(test: Comparison) -> Comparison:
+def turned(test: TwoSampleTest) -> TwoSampleTest:
     """The same comparison with the effect size of the other sample, A21 = 1 - A12."""
     effect = None if test.effect_size is None else 1 - test.effect_size
     return test if effect is None else test._replace(effect_size=effect, magnitude=magnitude(effect))
@@ -139,10 +139,10 @@ def rq2_rows(case: Case, sample_of: Sample) -> list[dict[str, Any]]:
     rows = []
     for baseline in (name for name in case.algorithms if name != NSGA2):
         pair = (NSGA2, baseline)
-        tests = [(name, not more_is_better, compare(*(
+        tests = [(name, not more_is_better, compare_samples(*(
             [] if quality is None else quality.loc[quality["algorithm"] == one, name] for one in pair)))
             for name, more_is_better in MORE_IS_BETTER.items()]
-        tests += [(metric.name, not metric.more_is_unsafe, compare(*(sample_of(one, metric) for one in pair)))
+        tests += [(metric.name, not metric.more_is_unsafe, compare_samples(*(sample_of(one, metric) for one in pair)))
                   for metric in case.scoring.metrics]
         rows += [{"setting": case.name, "baseline": baseline, "metric": name, **(turned(test) if turn else test)._asdict()}
                  for name, turn, test in tests]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from safevar_sumo.analysis.figures import FONT, new_figure, panels, plain, raised, save
+from safevar_sumo.analysis.figures import FONT, as_formula, literal, new_figure, panels, save
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
 from safevar_sumo.analysis.research_questions.changes import ANY, critical, effects, rq31, rq32
 from safevar_sumo.analysis.research_questions.indicators import WORST, convergence, nondominated, objectives
@@ -53,7 +53,7 @@ def number_of_changes(cases: Sequence[Case]) -> Figure:
         sns.boxplot(group, x="j", y="count", ax=axis, color="#56b4e9", linecolor="black", linewidth=0.8, fliersize=3)
         axis.set_xlabel("characteristics changed")
         axis.set_ylabel(f"critical solutions per run\n({group['run'].nunique()} runs)")
-        axis.set_title(plain(case.name) if len(cases) > 1 else "", fontsize=FONT)
+        axis.set_title(literal(case.name) if len(cases) > 1 else "", fontsize=FONT)
         _whole_numbers(axis.yaxis)
     return _spaced(figure)
 
@@ -66,7 +66,7 @@ def changed_characteristics(case: Case) -> Figure:
     shares = rq32(case)
     order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
     grid = shares.pivot(index="characteristic", columns="j", values="percent").astype(float)
-    grid = grid.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=plain)
+    grid = grid.loc[order, list(dict.fromkeys(shares["j"]))].rename(index=literal)
     figure, ((axis,),) = new_figure(f"{case.name}: characteristics changed in critical solutions", 1, 1, (7.6, 1.4 + 0.3 * len(grid)))
     sns.heatmap(grid, ax=axis, cmap="cividis", vmin=0, vmax=100, annot=True, fmt=".0f", annot_kws={"fontsize": 7}, linewidths=0.5,
                 cbar_kws={"label": "critical solutions\nin which it is changed [%]"})
@@ -100,8 +100,8 @@ def sizes_of_changes(case: Case) -> Figure:
         axis.axvline(0, color="black", linewidth=0.8)
         axis.set_xlim(low, high)
         size = min(FONT, FONT * LONG_NAME / len(member.name))
-        axis.set_title(f"{plain(member.name)}\n+{len(sides[INCREASE])}, -{len(sides[DECREASE])}", fontsize=size)
-        axis.set_xlabel(f"change [{raised(member.unit)}]", fontsize=FONT)
+        axis.set_title(f"{literal(member.name)}\n+{len(sides[INCREASE])}, -{len(sides[DECREASE])}", fontsize=size)
+        axis.set_xlabel(f"change [{as_formula(member.unit)}]", fontsize=FONT)
         axis.set_ylabel("")
         axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
         _whole_numbers(axis.yaxis, 4)
@@ -151,7 +151,7 @@ def pareto_fronts(case: Case) -> Figure:
 
 
 def _objective_title(objective: Objective) -> str:
-    return OBJECTIVE_TITLES.get(objective.name) or f"{plain(objective.title)} [{raised(objective.unit)}]"
+    return OBJECTIVE_TITLES.get(objective.name) or f"{literal(objective.title)} [{as_formula(objective.unit)}]"
 
 
 def _of_original(case: Case, objective: Objective) -> float:
@@ -270,7 +270,7 @@ def _whole_numbers(axis: object, steps: int = 6) -> None:
 
 
 def _title(algorithm: str) -> str:
-    return plain(ALGORITHM_TITLES.get(algorithm, algorithm))
+    return literal(ALGORITHM_TITLES.get(algorithm, algorithm))
 
 
 def _file_name(name: str) -> str:

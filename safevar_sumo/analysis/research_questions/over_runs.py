@@ -15,7 +15,7 @@ import pandas as pd
 import scipy
 
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, NSGA2, Case, Unanswerable, values
-from safevar_sumo.analysis.research_questions.comparisons import ALPHA, Comparison, magnitude, rq1, rq1_rows, rq2, rq2_rows
+from safevar_sumo.analysis.research_questions.comparisons import ALPHA, TwoSampleTest, magnitude, rq1, rq1_rows, rq2, rq2_rows
 from safevar_sumo.analysis.research_questions.indicators import titles_of
 from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import FloatArray
@@ -70,21 +70,21 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return corrected
 
 
-def signed_rank(sample: FloatArray, value: float) -> Comparison:
+def signed_rank(sample: FloatArray, value: float) -> TwoSampleTest:
     """A sample of independent values against one value, shape (N,): Wilcoxon's test and the share of greater values (A12).
 
     Values equal to `value` are dropped from the test (Wilcoxon's own way) and count half in the effect size.
     """
     if not sample.size or np.isnan(value):
-        return Comparison(None, None, None, len(sample), 0, None)
+        return TwoSampleTest(None, None, None, len(sample), 0, None)
     difference = sample - value
     sizes = np.abs(difference[difference != 0])
     effect = float(np.mean(difference > 0) + np.mean(difference == 0) / 2)
     if not sizes.size:
-        return Comparison(1.0, effect, magnitude(effect), len(sample), 1, EXACT_SIGNED)
+        return TwoSampleTest(1.0, effect, magnitude(effect), len(sample), 1, EXACT_SIGNED)
     exact = np.unique(sizes).size == len(sample) <= EXACT_UP_TO
     test = scipy.stats.wilcoxon(difference, alternative="two-sided", correction=not exact, method="exact" if exact else "approx")
-    return Comparison(float(test.pvalue), effect, magnitude(effect), len(sample), 1, EXACT_SIGNED if exact else ASYMPTOTIC_SIGNED)
+    return TwoSampleTest(float(test.pvalue), effect, magnitude(effect), len(sample), 1, EXACT_SIGNED if exact else ASYMPTOTIC_SIGNED)
 
 
 def fewest_runs(question: str) -> int:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.console import Console
 
-from safevar_sumo.analysis.figures import CHANGED, FONT, NECESSARY, new_figure, plain
+from safevar_sumo.analysis.figures import CHANGED, FONT, NECESSARY, literal, new_figure
 from safevar_sumo.analysis.risk.compute import Risk
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study
@@ -79,8 +79,8 @@ def sensitivity_figure(result: Risk) -> Figure:
             width = (rows[f"{column}_upper"] - rows[column]).clip(lower=0)
             axis.barh(np.arange(len(names)) + shift, rows[column], height=0.36, color=colour, xerr=width, label=label,
                       error_kw={"elinewidth": 0.8, "ecolor": "black"})
-        axis.set_yticks(np.arange(len(names)), [plain(name) for name in names])
-        axis.set_title(plain(what), fontsize=FONT)
+        axis.set_yticks(np.arange(len(names)), [literal(name) for name in names])
+        axis.set_title(literal(what), fontsize=FONT)
         axis.set_xlabel("share of the variance [-]")
         axis.set_xlim(0, 1)
         if rows["total"].isna().all():

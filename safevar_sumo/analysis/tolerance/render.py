@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.console import Console
 
-from safevar_sumo.analysis.figures import DEGREE, FONT, NECESSARY, UNSAFE, panels, plain, raised
+from safevar_sumo.analysis.figures import DEGREE, FONT, NECESSARY, UNSAFE, as_formula, literal, panels
 from safevar_sumo.analysis.tolerance.compute import OneAtATimeScan, Tolerance
 from safevar_sumo.analysis.tolerance.joint import Pair
 from safevar_sumo.analysis.words import decimal
@@ -119,8 +119,8 @@ def _profile(axis: Axes, scan: OneAtATimeScan) -> None:
     if profile[SAFETY_DEGREE].min() <= 0:
         axis.axhline(0, color="black", linewidth=0.8, linestyle="--")
     axis.set_xlim(member.lower, member.upper)
-    axis.set_title(plain(member.name), fontsize=FONT)
-    axis.set_xlabel(f"[{raised(member.unit)}]")
+    axis.set_title(literal(member.name), fontsize=FONT)
+    axis.set_xlabel(f"[{as_formula(member.unit)}]")
     axis.locator_params(axis="x", nbins=4)
 
 
@@ -157,8 +157,8 @@ def _plane(axis: Axes, pair: Pair, limits: tuple[float, float]) -> QuadMesh:
     axis.plot(first.original, second.original, marker="o", color="white", markeredgecolor="black", markersize=5)
     if pair.nearest is not None:
         axis.plot(*pair.nearest, marker="X", color=UNSAFE, markeredgecolor="white", markersize=7)
-    axis.set_xlabel(f"{plain(first.name)} [{raised(first.unit)}]")
-    axis.set_ylabel(f"{plain(second.name)} [{raised(second.unit)}]")
+    axis.set_xlabel(f"{literal(first.name)} [{as_formula(first.unit)}]")
+    axis.set_ylabel(f"{literal(second.name)} [{as_formula(second.unit)}]")
     axis.set_xlim(first.lower, first.upper)
     axis.set_ylim(second.lower, second.upper)
     axis.grid(visible=False)
