@@ -19,7 +19,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.reference import Agreement, keep_totals, quoted, validation
 from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, conclusions, grade, paired, tables_beside
 from safevar_sumo.reference.validation import rank_correlation
-from safevar_sumo.report.verdict import agreement
+from safevar_sumo.report.verdict import agreement_with_published
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import simulate
 from safevar_sumo.sumo.batch import score
@@ -126,7 +126,7 @@ MADE_UP = Agreement(
 
 def page_of(study: Any) -> dict[str, Any]:
     material: Any = SimpleNamespace(case=SimpleNamespace(study=study))
-    return agreement(material)
+    return agreement_with_published(material)
 
 
 @pytest.fixture
