@@ -49,7 +49,7 @@ def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
     study
         The study as it is run.
     identity
-        What its results depend on beside its file, by `LAYERS`; see `safevar_sumo.workers.identity_of`.
+        What its results depend on beside its file, by `LAYERS`; see `safevar_sumo.workers.identity.identity_of`.
     """
     return {
         "format": FORMAT, "study": tables_of(study), "seed": study.search.seed, "resolved": fixed(study), **identity,

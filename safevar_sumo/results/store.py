@@ -54,7 +54,7 @@ class ResultsDirectory:
     study
         The study as it is run.
     identity
-        What its results depend on beside its file; see `safevar_sumo.workers.identity_of`.
+        What its results depend on beside its file; see `safevar_sumo.workers.identity.identity_of`.
     scoring
         Metrics and objectives.
 
