@@ -13,12 +13,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from safevar_sumo.analysis.criterion import Criterion, Unsafe
     from safevar_sumo.analysis.evaluator import Progress
+    from safevar_sumo.analysis.explain import explain
     from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation
+    from safevar_sumo.analysis.risk import risk
     from safevar_sumo.analysis.risk.compute import Risk
+    from safevar_sumo.analysis.rules import rules
     from safevar_sumo.analysis.rules.compute import Rule, Rules
+    from safevar_sumo.analysis.subject import Results, load
+    from safevar_sumo.analysis.tolerance import tolerance
     from safevar_sumo.analysis.tolerance.compute import Tolerance
-    from safevar_sumo.api.questions import Figures, Tables, explain, figures, risk, rules, tables, tolerance
-    from safevar_sumo.api.results import Results, load
+    from safevar_sumo.api.research_questions import Figures, Tables, figures, tables
     from safevar_sumo.api.running import run
     from safevar_sumo.api.simulation import Simulation, evaluate, simulate
     from safevar_sumo.campaign import Observer
@@ -38,8 +42,11 @@ if TYPE_CHECKING:
 
 _ROOMS = {
     "study": ("load_study", "study_names", "Study", "StudyLike", "Weather"),
-    "api": ("simulate", "Simulation", "evaluate", "run", "load", "Results", "tables", "Tables", "figures", "Figures", "explain",
-            "tolerance", "risk", "rules"),
+    "api": ("simulate", "Simulation", "evaluate", "run", "load", "Results", "tables", "Tables", "figures", "Figures"),
+    "analysis.explain": ("explain",),
+    "analysis.tolerance": ("tolerance",),
+    "analysis.risk": ("risk",),
+    "analysis.rules": ("rules",),
     "analysis.criterion": ("Criterion", "Unsafe"),
     "analysis.evaluator": ("Progress",),
     "analysis.explain.result": ("Cause", "Explained", "Explanation"),

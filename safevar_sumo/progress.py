@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
@@ -17,25 +16,12 @@ from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study
 from safevar_sumo.terminal import SECONDS_BETWEEN_LINES, print_text, stages
 
-if TYPE_CHECKING:
-    from safevar_sumo.analysis.evaluator import Progress as StageProgress
-
 SETTLED = 5.0
 """Seconds of work after which a throughput is told: batches that end together make the first ones meaningless."""
 BAR = 10
 """Letters that a bar takes."""
 LEAST_ROOM = 26
 """Letters beside the bar, below which there is none."""
-
-
-@contextmanager
-def shown(progress: bool | StageProgress) -> Iterator[StageProgress]:
-    """What to call with a stage, how much of it is done and how much there is: a bar for True, or the function that is given."""
-    if progress is True:
-        with stages(Console(stderr=True)) as bar:
-            yield bar
-    else:
-        yield progress or (lambda stage, done, total: None)
 
 
 class CampaignProgress:

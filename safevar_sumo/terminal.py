@@ -75,10 +75,12 @@ def print_names(console: Console, title: str, rows: Iterable[tuple[str, ...]], h
 
 
 SECONDS_BETWEEN_LINES = 30.0
+StageProgress = Callable[[str, int, int], None]
+"""Called with the stage, how much of it is done, and how much there is."""
 
 
 @contextmanager
-def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
+def stages(console: Console) -> Iterator[StageProgress]:
     """A bar on a terminal, a line now and then elsewhere; yields what to call with the stage, what is done and how much there is."""
     columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=20), MofNCompleteColumn(), TimeRemainingColumn())
     spoke = time.monotonic()
@@ -95,3 +97,13 @@ def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
                 print_text(console, f"{stage}: {number} of {total}")
 
         yield done
+
+
+@contextmanager
+def shown(progress: bool | StageProgress) -> Iterator[StageProgress]:
+    """What to call with a stage, how much of it is done and how much there is: a bar for True, or the function that is given."""
+    if progress is True:
+        with stages(Console(stderr=True)) as bar:
+            yield bar
+    else:
+        yield progress or (lambda stage, done, total: None)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from safevar_sumo.api.results import Results, load
+from safevar_sumo.analysis.subject import Results, load
 from safevar_sumo.api.simulation import assembled
 from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, read_by_algorithms, run_campaign
 from safevar_sumo.errors import InputError, SafevarError, one_of

@@ -15,7 +15,6 @@ from safevar_sumo.ads import Ads
 from safevar_sumo.analysis.words import ENDS
 from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.metrics import Scoring, time_to_collision
-from safevar_sumo.progress import shown
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns
 from safevar_sumo.results import evaluations_frame, record
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study
@@ -23,6 +22,7 @@ from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import simulate as drive
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.terminal import shown
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:

@@ -133,7 +133,7 @@ def results_or_study(place: str, point: str | None = None) -> Study | Case:
     InputError
         If it is neither, or has no such point.
     """
-    from safevar_sumo.api.results import study_or_case
+    from safevar_sumo.analysis.subject import study_or_case
 
     with warnings.catch_warnings(record=True) as changed:
         warnings.simplefilter("always", UserWarning)

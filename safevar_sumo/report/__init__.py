@@ -8,10 +8,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from safevar_sumo.api.results import Results
-from safevar_sumo.progress import shown
+from safevar_sumo.analysis.subject import Results
 from safevar_sumo.report.page import SECTIONS, make_report
 from safevar_sumo.results import write_whole
+from safevar_sumo.terminal import shown
 
 if TYPE_CHECKING:
     from safevar_sumo.analysis.evaluator import Progress

@@ -20,8 +20,8 @@ from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
+from safevar_sumo.analysis.subject import changes_since
 from safevar_sumo.analysis.tolerance import ToleranceOptions
-from safevar_sumo.api.results import changes_since
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.plugins import digest_of
 from safevar_sumo.records import Evaluations, FloatArray

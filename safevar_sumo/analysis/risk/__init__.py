@@ -1,14 +1,22 @@
 """How likely is an unsafe outcome when vehicles vary as a study says, and which characteristic decides?
 
-The options stand here, where the help of a command reads them without loading the computation.
+The options and the function of the library stand here: the help of a command reads them without loading the computation.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, option, unsafe_option
+from safevar_sumo.analysis.subject import Results, answered, criterion_text, study_of
+from safevar_sumo.study import StudyLike
+
+if TYPE_CHECKING:
+    from safevar_sumo.analysis.criterion import Criterion
+    from safevar_sumo.analysis.evaluator import Progress
+    from safevar_sumo.analysis.risk.compute import Risk
+    from safevar_sumo.workers.evaluation import Pool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,3 +29,43 @@ class RiskOptions(Options):
     width: float | None = option(
         None, "Stop as soon as the interval of the probability is no wider.", kind=float, low=0, high=1, is_open=(True, False))
     unsafe: str | None = unsafe_option()
+
+
+def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, confidence: float = RiskOptions.confidence,
+         width: float | None = RiskOptions.width, unsafe: Criterion | None = None, pool: Pool | None = None, jobs: int | None = None,
+         progress: bool | Progress = False, as_it_is_now: bool = False) -> Risk:
+    """Estimate how likely an unsafe outcome is when vehicles vary as the study says, and which characteristic decides.
+
+    Parameters
+    ----------
+    study
+        A study, or results or their directory, whose study is asked about.
+    samples
+        Vehicles to draw at the most.
+    confidence
+        Of the intervals, between 0 and 1.
+    width
+        Stop as soon as the interval of the probability is no wider.
+    unsafe
+        "collision", or a number X for a safety degree below X [m, or minus a collision's speed in m/s]; by default a collision if
+        any of many settings all over the domain is one, else half of the original's safety degree.
+    pool
+        Where to simulate, if not in worker processes of its own.
+    jobs
+        Worker processes, by default one for each core.
+    progress
+        True for a bar on the terminal, or a function called with the stage, how many settings are done, and how many there are.
+    as_it_is_now
+        Simulate with what is there now if results were computed with something else, and warn; by default that is refused.
+
+    Raises
+    ------
+    InputError
+        If something that is asked for is not there or cannot be used, or has changed since the results were computed.
+    SimulationError
+        If no vehicle can be simulated.
+    """
+    from safevar_sumo.analysis.risk.compute import estimate_risk
+
+    options = RiskOptions(samples=samples, confidence=confidence, width=width, unsafe=criterion_text(unsafe))
+    return answered(estimate_risk, study_of(study, as_it_is_now=as_it_is_now), options, pool, jobs, progress)

@@ -1,23 +1,28 @@
-"""Results of a study, read back."""
+"""What a question is asked of: a study, or the results of one, read back."""
 
 from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
+from safevar_sumo.analysis.options import Options
 from safevar_sumo.errors import InputError, did_you_mean, one_of
 from safevar_sumo.results import MANIFEST, begun_and_now, differences_now, manifest_of, read_later, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
+from safevar_sumo.terminal import shown
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from safevar_sumo.analysis.criterion import Criterion
+    from safevar_sumo.analysis.evaluator import Progress
     from safevar_sumo.analysis.research_questions.case import Case
+    from safevar_sumo.workers.evaluation import Pool
 
 MOST = 3
 """Changes that are named in one line."""
@@ -149,3 +154,20 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
         raise InputError(directory / MANIFEST, f"{'; '.join(changed[:MOST])}{more}: what is simulated now is not what these results hold",
                          "what was there then; or --as-it-is-now (as_it_is_now=True), which simulates with what is there now and says so")
     return [f"{difference}; simulated as it is now" for difference in changed]
+
+
+T = TypeVar("T")
+
+
+def answered(compute: Callable[..., T], subject: Study | Case, options: Options, pool: Pool | None, jobs: int | None,
+             progress: bool | Progress) -> T:
+    """The result of a question's computation, with a bar on the terminal for `progress=True`."""
+    with shown(progress) as show:
+        return compute(subject, options, pool=pool, jobs=jobs, progress=show)
+
+
+def criterion_text(unsafe: Criterion | None) -> str | None:
+    """A criterion as options hold it and a command takes it."""
+    from safevar_sumo.analysis.criterion import Unsafe
+
+    return None if unsafe is None else str(Unsafe.parse(unsafe))

@@ -1,0 +1,96 @@
+"""The research questions answered, and their pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from safevar_sumo.analysis.subject import Results
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from safevar_sumo.analysis.research_questions.answer import Answer
+    from safevar_sumo.analysis.research_questions.case import Case
+
+
+class Tables(dict[str, "pd.DataFrame"]):
+    """Answers by name, each a tidy frame over all results; a notebook shows them in the paper's layout."""
+
+    def __init__(self, answers: list[Answer]) -> None:
+        super().__init__({answer.name: answer.frame for answer in answers})
+        self.answers = answers
+
+    @property
+    def notes(self) -> dict[str, tuple[str, ...]]:
+        """By name, notes on what is missing or left out, and why."""
+        return {answer.name: answer.notes for answer in self.answers}
+
+    def _repr_markdown_(self) -> str:
+        from safevar_sumo.analysis.research_questions.tables import markdown
+
+        return markdown(self.answers)
+
+
+class Figures(dict[str, "Figure"]):
+    """Figures by name; `lacking` says why some could not be drawn."""
+
+    lacking: tuple[str, ...] = ()
+
+
+def tables(*results: Results | str | Path, question: str | None = None) -> Tables:
+    """Answer the research questions.
+
+    Parameters
+    ----------
+    results
+        Results, or their directories: one for each case that stands in the tables.
+    question
+        This question alone, such as "rq1".
+
+    Returns
+    -------
+    Tables
+        Frames by name; their columns are those of the functions in `safevar_sumo.analysis`.
+
+    Raises
+    ------
+    InputError
+        If there is no such question, or no results hold what it asks for.
+    """
+    from safevar_sumo.analysis.research_questions.answer import answer
+
+    return Tables(answer(_cases(results), question))
+
+
+def figures(*results: Results | str | Path) -> Figures:
+    """Draw every figure that the results hold.
+
+    Parameters
+    ----------
+    results
+        Results, or their directories.
+
+    Returns
+    -------
+    Figures
+        By name, such as "pareto-fronts"; with several results, with the case's name in front: "rain-pareto-fronts".
+
+    Raises
+    ------
+    InputError
+        If none can be drawn.
+    """
+    from safevar_sumo.analysis.research_questions.figures import draw
+
+    drawn, lacking = draw(_cases(results))
+    result = Figures(drawn)
+    result.lacking = tuple(lacking)
+    return result
+
+
+def _cases(results: tuple[Results | str | Path, ...]) -> list[Case]:
+    from safevar_sumo.analysis.research_questions.case import load_cases
+
+    return load_cases([item.directory if isinstance(item, Results) else item for item in results])
