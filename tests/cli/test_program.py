@@ -154,7 +154,7 @@ def test_names_stay_whole_and_the_rest_goes_on_in_the_next_line(width: int) -> N
 
 def test_every_name_of_the_list_can_be_read_and_typed() -> None:
     told = CliRunner(env={"COLUMNS": "80"}).invoke(commands, ["list"]).stdout
-    assert "┃ name            ┃ friction ┃ sight ┃ delay, s ┃ pause, s ┃ light ┃ road ┃" in told
+    assert "┃ name            ┃ friction ┃ sight ┃ delay, s ┃ light ┃ road ┃" in told
     assert "…" not in told
     for name in study_names():
         study = load_study(name)
