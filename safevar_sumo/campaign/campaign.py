@@ -23,7 +23,7 @@ from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.matrix import LARGEST_WORLD
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
-from safevar_sumo.workers.isolation import check_isolation
+from safevar_sumo.workers.isolation import check_code
 from safevar_sumo.workers.local import first_of, result_of
 from safevar_sumo.workers.retrying import RetryingPool
 
@@ -117,7 +117,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
                 except JournalBusy:
                     campaign.busy.append(key)
                     continue
-                runs.add(run := Run(key, verification.search(key), journal, observer, study.search.evaluations, retry=retry_failed))
+                runs.add(run := Run(key, begun(key), journal, observer, study.search.evaluations, retry=retry_failed))
                 go_on(run)
             batcher.send()
             for future in first_of([*batcher.under_way, *verification.under_way]):
@@ -158,7 +158,8 @@ def _original(study: Study, work: bytes, characteristics: CharacteristicSet, res
         if journal.content.evaluations is not None:
             return journal.content.evaluations
         evaluations = simulated()
-        check_isolation(study, characteristics, lambda settings: pool.submit(work, settings))
+        for remark in check_code(study, results.inputs, pool):
+            observer.warned(remark)
         journal.append([0], evaluations)
         return evaluations
     finally:

@@ -41,24 +41,8 @@ class Verification:
         self._study, self._pool, self._begun, self._observer = study, pool, begun, observer
         self._alone = packed(study, results.inputs, engine=engine, afresh=True) if foreign_names(study) else None
         self._in_sumo = packed(study, results.inputs, engine=Engine.LIBSUMO) if engine is Engine.RECORDED else None
-        self._begun_twice: set[str] = set()
         self._asked: set[Run] = set()
         self.under_way: dict[Future[Evaluations], tuple[Run, Evaluations, Refusal]] = {}
-
-    def search(self, key: RunKey) -> Search:
-        """The search of a run.
-
-        Raises
-        ------
-        ForeignError
-            If it is the first of an algorithm from outside, and asks for other settings at once when it is begun again.
-        """
-        name = self._from_outside(key)
-        if name and name not in self._begun_twice:
-            self._begun_twice.add(name)
-            if not np.array_equal(next(self._begun(key)), next(self._begun(key))):
-                raise self._unrepeatable(name, key)
-        return self._begun(key)
 
     def ask(self, run: Run) -> bool:
         """Have settings of a run simulated once more; whether there are any to verify.

@@ -151,11 +151,13 @@ class GuardedVehicle:
         if not isinstance(units, Mapping) or not all(isinstance(word, str) for pair in units.items() for word in pair):
             raise guard.wrong("__init__", "UNITS", units, "a mapping from names of characteristics to their units")
         self.UNITS = dict(units)
+        self.takes_slope = accepts(vehicle.prepare, 4)
+        self.can_start_moving = hasattr(vehicle, "at_speed")
 
     def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
                 wet: bool | BoolArray = False) -> _Prepared:
         n, method = len(next(iter(characteristics.values()))), self._vehicle.prepare
-        if slope is not LEVEL and not accepts(method, 4):
+        if slope is not LEVEL and not self.takes_slope:
             problem = f"{self._guard.name} has no slope in prepare(characteristics, road_friction, step, slope), and the road has a grade"
             raise ForeignError(self._guard.source, problem, "a vehicle with it, or scenarios with grade 0")
         arguments: tuple[Any, ...] = (read_only_copy(characteristics), road_friction, step)
@@ -178,7 +180,7 @@ class GuardedVehicle:
         return state
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> _State:
-        if not hasattr(self._vehicle, "at_speed"):
+        if not self.can_start_moving:
             problem = f"{self._guard.name} has no method at_speed(prepared, speed), and the traffic puts it onto the road in motion"
             raise ForeignError(self._guard.source, problem, "a vehicle with it, or traffic that departs with speed 0")
         state = self._guard.call("at_speed", self._vehicle.at_speed, prepared.theirs, read_only_copy(speed))

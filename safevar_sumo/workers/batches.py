@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -16,7 +17,7 @@ from safevar_sumo.sumo import Engine, assemble, reason_for_sumo, settings_per_ba
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.identity import Inputs, networks_of
-from safevar_sumo.workers.isolation import check_isolation, refuse_unlike_sumo
+from safevar_sumo.workers.isolation import check_code, refuse_unlike_sumo
 from safevar_sumo.workers.local import first_of, result_of
 from safevar_sumo.workers.retrying import RetryingPool
 
@@ -28,8 +29,6 @@ VERIFIED = 50
 """Settings of a study that are driven in SUMO, too, over as many calls as it takes."""
 _verified: dict[bytes, int] = {}
 """How many settings of a packed study were driven in SUMO, too, with the same results."""
-_isolated: set[bytes] = set()
-"""Packed studies whose models have been seen to keep settings apart."""
 _read: dict[tuple[bytes, str], Files] = {}
 """Files that models have read in this process, by packed study and working directory."""
 
@@ -43,13 +42,12 @@ def batches_of(study: Study) -> tuple[int, bool]:
 def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[[int], None] = lambda number: None) -> Evaluations:
     """Evaluate many filtered settings, shape (M, n), row by row; equal rows are simulated once.
 
-    Models that are not ours are first seen to keep settings apart (`check_isolation`), and a sample of what is driven in a recorded
+    Code from outside is first checked (`check_code`), and a sample of what is driven in a recorded
     scene is driven in SUMO too. `done` is called with the number of settings of every batch that is finished.
     """
     persistent, work = RetryingPool(pool, study), packed(study, inputs := inputs_of(study, pool))
-    if work not in _isolated:
-        check_isolation(study, CharacteristicSet.of(study.vehicle.characteristics), lambda rows: persistent.submit(work, rows))
-        _isolated.add(work)
+    for remark in check_code(study, inputs, persistent):
+        warnings.warn(remark, stacklevel=2)
     unique, row_of = np.unique(settings, axis=0, return_inverse=True)
     most, recorded = batches_of(study)
     size = min(most, max(math.ceil(len(unique) / (SHARES * pool.workers)), LEAST_BATCH))

@@ -10,7 +10,9 @@ from typing import Any, Protocol
 
 import msgspec
 
+from safevar_sumo.conformance import refuse_defects
 from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins import Files, changes, digests, forget_foreign, noted_reading
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, foreign_packages
@@ -43,21 +45,27 @@ class Pool(Protocol):
 
 
 class _Work(msgspec.Struct, frozen=True):
-    """A study as it travels to a worker, the digests of the files that it is to be computed with, and how."""
+    """A study as it travels to a worker, the digests of the files that it is to be computed with, and how.
+
+    With `check` the code from outside that it names is checked instead.
+    """
 
     study: Study
     inputs: Inputs
     engine: Engine
     afresh: bool
+    check: bool
 
 
 class _How(msgspec.Struct, frozen=True):
     """What of that is to be known before models are loaded."""
 
     afresh: bool
+    check: bool
 
 
-def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Engine = Engine.RECORDED, afresh: bool = False) -> bytes:
+def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Engine = Engine.RECORDED, afresh: bool = False,
+           check: bool = False) -> bytes:
     """A study as it travels to a worker.
 
     Parameters
@@ -69,10 +77,13 @@ def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Eng
         Who moves the vehicles.
     afresh
         By models that are loaded anew, with nothing in their modules and classes that earlier batches left there.
+    check
+        A batch checks the code from outside; its `reasons` are remarks on that.
     """
     if inputs is None:
         inputs = {"network": networks_of(assemble(study))}
-    return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED if layer in inputs}, engine, afresh))
+    return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED if layer in inputs}, engine, afresh,
+                                        check))
 
 
 def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
@@ -83,7 +94,11 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
     InputError
         If the study's files are not those that the campaign began with.
     """
-    if msgspec.msgpack.decode(work, type=_How).afresh:
+    how = msgspec.msgpack.decode(work, type=_How)
+    if how.check:
+        remarks = refuse_defects(msgspec.msgpack.decode(work, type=_Work).study)
+        return replace(Evaluations.none(settings.shape[1], METRICS), reasons={remark.encode(): remark for remark in remarks})
+    if how.afresh:
         forget_foreign()
         assembled = _assembled.__wrapped__
     else:

@@ -1,53 +1,58 @@
-"""Checks that models from outside keep settings apart, and that a recorded scene gives the results of SUMO."""
+"""Checks of code from outside, that it keeps settings apart, and that a recorded scene gives the results of SUMO."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import Future
-from typing import Protocol
+import hashlib
+import json
+from contextlib import suppress
+from importlib.metadata import version
 
 import numpy as np
-import numpy.typing as npt
+import platformdirs
 
 from safevar_sumo.errors import ForeignError, InputError
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray
-from safevar_sumo.study import Study, foreign_names
+from safevar_sumo.records import BoolArray, Evaluations
+from safevar_sumo.results import RESULTS
+from safevar_sumo.study import Study, foreign_names, tables_of
 from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.workers.evaluation import packed
+from safevar_sumo.workers.identity import Inputs
 from safevar_sumo.workers.local import result_of
+from safevar_sumo.workers.retrying import RetryingPool
 
 LEGAL = ("what happens to vehicle i depends on vehicle i alone: nothing kept in a class, a module or the model itself from one call or "
          "setting to another, no mean or sum over the batch, nothing random")
 
 ROUNDING = 1e-9
 """Largest difference between a metric in a recorded scene and in SUMO."""
+_passed: set[str] = set()
+"""Identities of studies and their code that have passed in this process, should the cache not be writable."""
 
 
-class Submit(Protocol):
-    """Computes a batch of settings."""
+def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> list[str]:
+    """Check the code from outside that a study names, in a worker; what has passed with the same files is not checked again.
 
-    def __call__(self, settings: FloatArray) -> Future[Evaluations]: ...
-
-
-def check_isolation(study: Study, characteristics: CharacteristicSet, submit: Submit) -> None:
-    """Simulate the same settings together, again, in another order and alone; refuse models whose results differ.
+    Returns remarks that do not make results wrong.
 
     Raises
     ------
     ForeignError
-        Naming the models, the first result that differs, and what to do.
+        Naming the first finding that makes results wrong, with file, line and advice.
     """
-    if not foreign_names(study):
-        return
-    settings = _far_apart(characteristics)
-    order = np.arange(len(settings))
-    ways: dict[str, Sequence[npt.NDArray[np.intp]]] = {
-        "together": [order], "together again": [order], "in another order": [order[::-1]], "alone": list(order[:, np.newaxis])}
-    running = {way: [(rows, submit(settings[rows])) for rows in batches] for way, batches in ways.items()}
-    results = {way: {int(row): result_of(future).take([i]) for rows, future in batches for i, row in enumerate(rows)}
-               for way, batches in running.items()}
-    for way, by_row in results.items():
-        for row, result in by_row.items():
-            refuse_difference(study, {"together": results["together"][row], way: result})
+    if not (foreign_names(study) or any(":" in name for name in study.search.algorithms)):
+        return []
+    identity = json.dumps([tables_of(study), inputs, RESULTS, version("safevar_sumo")], sort_keys=True, default=str)
+    name = hashlib.sha256(identity.encode()).hexdigest()
+    passed = platformdirs.user_cache_path("safevar_sumo") / "checks" / name
+    if name in _passed or passed.exists():
+        return []
+    original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
+    remarks = list(result_of(pool.submit(packed(study, inputs, check=True), original, must_succeed=True)).reasons.values())
+    _passed.add(name)
+    with suppress(OSError):  # it is checked again then
+        passed.parent.mkdir(parents=True, exist_ok=True)
+        passed.touch()
+    return remarks
 
 
 def refuse_difference(study: Study, ways: dict[str, Evaluations], again: str = "") -> None:
@@ -56,7 +61,7 @@ def refuse_difference(study: Study, ways: dict[str, Evaluations], again: str = "
     Raises
     ------
     ForeignError
-        As `check_isolation`.
+        Naming the models, the first result that differs, and what to do.
     """
     (here, first), (there, second) = next(iter(ways.items())), list(ways.items())[-1]
     difference = _difference(first, second)
@@ -92,13 +97,6 @@ def _alike(one: Evaluations, other: Evaluations, most: float) -> BoolArray:
     for here, there in ((one.collision_speed, other.collision_speed), *((one.metrics[name], other.metrics[name]) for name in one.metrics)):
         alike &= np.isclose(here, there, rtol=0, atol=most, equal_nan=True)
     return np.asarray(alike)
-
-
-def _far_apart(characteristics: CharacteristicSet) -> FloatArray:
-    """The original setting and corners of the domains, filtered; shape (5, n)."""
-    lower, upper, number = characteristics.lower, characteristics.upper, np.arange(len(characteristics))
-    corners = [characteristics.original, lower, upper, np.where(number % 2, lower, upper), np.where(number % 2, upper, lower)]
-    return characteristics.filter(np.array(corners))
 
 
 def _difference(one: Evaluations, other: Evaluations, tolerance: float = 0.0) -> tuple[str, object, object] | None:

@@ -28,6 +28,7 @@ ATTEMPTS = 2
 """Attempts for a whole batch, and for a single setting: another process may have killed the worker."""
 PARTS = 8
 """Parts into which a failing batch is split: one fatal setting among 200 costs five time limits."""
+AGAIN = "; again by: "
 FAILURES_IN_A_ROW = 20
 """Number of failing settings in a row that count as a fault of the study."""
 
@@ -183,8 +184,10 @@ class RetryingPool:
         return ForeignError(f"study {self._study.name!r}", problem)
 
     def _with_command(self, error: ForeignError, setting: FloatArray) -> ForeignError:
-        """The error with a command that reproduces it."""
-        return ForeignError(error.source, f"{error.problem}; again by: {reproducing(self._study, setting[0])}", error.legal)
+        """The error with a command that reproduces it, unless it names one."""
+        if AGAIN in error.problem:
+            return error
+        return ForeignError(error.source, f"{error.problem}{AGAIN}{reproducing(self._study, setting[0])}", error.legal)
 
 
 def reproducing(study: Study, setting: FloatArray) -> str:

@@ -1,0 +1,266 @@
+"""What a check finds, and the line of an author's file where it comes from."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import os
+import re
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.plugins import Member
+
+ADVICE: Mapping[str, str] = {
+    "contract": "return what the base class documents: see `safevar_sumo/{room}` and the tutorials",
+    "units": "give the study's table and UNITS the same names and units",
+    "determinism": "draw nothing at random (an algorithm: from `rng` alone) and ask no clock",
+    "state": "keep what a vehicle remembers in the memory that is handed on, or in the instance of that vehicle: nothing in a class, a "
+             "module or a model from one run to the next",
+    "batch": "compute element i of a result from element i of the arguments alone: no mean, sum or maximum over the vehicles, no place in "
+             "the batch",
+    "inputs": "work on a copy: `values = values.copy()`, or make a new array",
+    "finite": "guard divisions and roots where the domain ends: `np.maximum(value, smallest)`; infinite gaps mean that nobody is in sight",
+    "reaction": "see that the quantity that should decide is read at all, with its sign and unit",
+    "speed": "compute all vehicles at once with arrays; load files in `__init__`",
+    "picklable": "give functions a name at the top of the module; open files, sockets and locks in `start`, not in `__init__`",
+}
+"""How to mend what a check finds."""
+REFUSED = ("contract", "units", "determinism", "state", "batch", "inputs", "finite")
+"""Checks without which results are wrong: a study does not begin. Of the others it warns."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """A check that is not passed: where, what was expected, what came, and how to mend it."""
+
+    check: str
+    file: str
+    line: int
+    expected: str
+    got: str
+    advice: str
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}: {self.check}: {self.got}"
+
+
+@dataclass(kw_only=True)
+class Report:
+    """The findings on a subject; `key` is how a study names it, `remarks` are on what was assumed, `speed` is in words."""
+
+    subject: str
+    kind: str
+    key: str = ""
+    findings: list[Finding] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    speed: str = ""
+    seconds: float = 0.0
+
+    @property
+    def passed(self) -> bool:
+        return not self.findings
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON of `check`."""
+        return {"subject": self.subject, "kind": self.kind, "passed": self.passed, "findings": [asdict(one) for one in self.findings],
+                "seconds": round(self.seconds, 3)}
+
+
+class TakesTooLong(BaseException):
+    """Raised inside an author's code that does not come back; no `except Exception` swallows it."""
+
+
+def crowd() -> float:
+    """How many processes want each core, at least 1: by so much everything takes longer."""
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 1.0
+    return max(1.0, load / (os.cpu_count() or 1))
+
+
+@contextmanager
+def time_limit(seconds: float) -> Iterator[None]:
+    """Raise `TakesTooLong` in what takes longer, on a free machine; without effect outside the main thread and on Windows."""
+    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
+        yield
+        return
+
+    def ring(*_: object) -> None:
+        raise TakesTooLong
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, seconds * crowd())
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+class Source:
+    """An author's code: where it stands, and what returned last.
+
+    Parameters
+    ----------
+    member
+        How the subject was found; of a metric or objective its function counts.
+    """
+
+    def __init__(self, member: Member) -> None:
+        self._what = getattr(member.what, "function", member.what)
+        self.file = self._file()
+        self._folder = str(Path(self.file).parent)
+        self._last: tuple[str, int] | None = None
+        self._mine: dict[CodeType, bool] = {}
+
+    def _file(self) -> str:
+        try:
+            return inspect.getsourcefile(self._what) or inspect.getfile(self._what)
+        except TypeError:
+            return str(getattr(sys.modules.get(getattr(self._what, "__module__", "")), "__file__", "") or "")
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """Within, remember the last line of the author's that returned."""
+        before = sys.getprofile()
+        sys.setprofile(self._note)
+        try:
+            yield
+        finally:
+            sys.setprofile(before)
+
+    def _note(self, frame: FrameType, event: str, _: Any) -> None:
+        if event != "return":
+            return
+        code = frame.f_code
+        mine = self._mine.get(code)
+        if mine is None:
+            mine = self._mine[code] = code.co_filename.startswith(self._folder) and "site-packages" not in code.co_filename
+        if mine:
+            self._last = code.co_filename, frame.f_lineno
+
+    def of_error(self, error: BaseException) -> tuple[str, int]:
+        """Innermost line of the author's that an exception passed through; else of what returned last."""
+        one: BaseException | None = error
+        while one is not None:
+            frame, found = one.__traceback__, None
+            while frame is not None:
+                if frame.tb_frame.f_code.co_filename.startswith(self._folder) and "site-packages" not in frame.tb_frame.f_code.co_filename:
+                    found = frame.tb_frame.f_code.co_filename, frame.tb_lineno
+                frame = frame.tb_next
+            if found is not None and not isinstance(one, InputError):
+                return found
+            one = one.__cause__ or one.__context__
+        return self._last or self.definition()
+
+    @property
+    def last(self) -> tuple[str, int]:
+        return self._last or self.definition()
+
+    def definition(self, *methods: str) -> tuple[str, int]:
+        """Line of the first of these methods that there is, else of the subject itself."""
+        for name in methods:
+            function = inspect.unwrap(getattr(self._what, name, None) or object)
+            code = getattr(function, "__code__", None)
+            if code is not None:
+                return code.co_filename, code.co_firstlineno
+        try:
+            return self.file, max(inspect.getsourcelines(self._what)[1], 1)
+        except (OSError, TypeError):
+            return self.file, 1
+
+    def line_of_text(self, pattern: str) -> tuple[str, int] | None:
+        """The first line of the file that holds a pattern."""
+        text = _text(self.file).splitlines()
+        return next(((self.file, number) for number, line in enumerate(text, 1) if re.search(pattern, line)), None)
+
+    def suspect(self, check: str) -> tuple[str, int] | None:
+        """The line of the file that looks like the cause of a difference; None where nothing does."""
+        try:
+            tree = ast.parse(_text(self.file))
+        except (SyntaxError, ValueError):
+            return None
+        lines = sorted({*SUSPECTS[check](tree)})
+        return (self.file, lines[0]) if lines else None
+
+
+@lru_cache(maxsize=64)
+def _text(file: str) -> str:
+    try:
+        return Path(file).read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
+
+
+RANDOM = re.compile(r"(^|\.)(random|randint|uniform|gauss|normal|choice|shuffle|urandom|uuid\d|token_\w+|time|time_ns|perf_counter|"
+                    r"perf_counter_ns|monotonic|monotonic_ns|process_time|now|today|utcnow|getpid|default_rng|id)$")
+OVER_VEHICLES = ("mean", "sum", "max", "min", "std", "var", "median", "average", "any", "all", "cumsum", "sort", "argsort", "argmax",
+                 "argmin", "linspace", "arange", "percentile", "quantile", "ptp", "prod", "dot", "norm", "accumulate", "roll", "unique")
+MUTATORS = ("append", "add", "update", "setdefault", "extend", "insert", "pop", "remove", "clear", "popleft", "appendleft")
+
+
+def _functions(tree: ast.AST) -> Iterator[ast.FunctionDef]:
+    yield from (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+
+
+def _random_lines(tree: ast.AST) -> Iterator[int]:
+    """Calls of random numbers and clocks; `rng.something` is what an algorithm is given."""
+    for function in _functions(tree):
+        for node in ast.walk(function):
+            if isinstance(node, ast.Call):
+                name = ast.unparse(node.func)
+                if RANDOM.search(name) and not name.startswith(("rng.", "problem.", "self.rng.")):
+                    yield node.lineno
+
+
+def _batch_lines(tree: ast.AST) -> Iterator[int]:
+    """Reductions over vehicles, and what depends on how many there are."""
+    for function in _functions(tree):
+        for node in ast.walk(function) if function.name != "__init__" else ():
+            if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in OVER_VEHICLES:
+                yield node.lineno
+
+
+def _state_lines(tree: ast.AST) -> Iterator[int]:
+    """Assignments to classes and modules, and to models outside of what begins a run."""
+    classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    owners = {one.name for one in classes} | {"cls", "type(self)", "self.__class__"}
+    shared = {target.id for body in (getattr(tree, "body", []), *(one.body for one in classes)) for node in body
+              if isinstance(node, ast.Assign | ast.AnnAssign)
+              for target in (node.targets if isinstance(node, ast.Assign) else [node.target]) if isinstance(target, ast.Name)}
+    scalar = {id(one) for one in classes if any("ScalarAds" in ast.unparse(base) for base in one.bases)}
+    for function in _functions(tree):
+        yielded = set(name for node in ast.walk(function) if isinstance(node, ast.Global | ast.Nonlocal) for name in node.names)
+        for default in [*function.args.defaults, *filter(None, function.args.kw_defaults)]:
+            if isinstance(default, ast.List | ast.Dict | ast.Set):
+                yield function.lineno
+        own = next((one for one in classes if function in one.body), None)
+        begins = function.name in ("__init__", "__post_init__", "start") or (own is not None and (id(own) in scalar or any(
+            isinstance(node, ast.FunctionDef) and node.name == "step" for node in own.body)))
+        for node in ast.walk(function):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AugAssign) else []
+            for target in targets:
+                base: ast.expr = target.value if isinstance(target, ast.Attribute | ast.Subscript) else target
+                text = ast.unparse(base)
+                if text in owners or (isinstance(target, ast.Name) and target.id in yielded) \
+                        or (isinstance(target, ast.Subscript) and text.rpartition(".")[2] in shared) \
+                        or (isinstance(target, ast.Attribute) and text == "self" and not begins):
+                    yield target.lineno
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in MUTATORS:
+                held = ast.unparse(node.func.value)
+                if held.rpartition(".")[2] in shared or (held.startswith("self.") and not begins) or held in owners:
+                    yield node.lineno
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("next", "setattr") and node.args \
+                    and ast.unparse(node.args[0]) in shared | owners:
+                yield node.lineno
+
+
+SUSPECTS = {"determinism": _random_lines, "batch": _batch_lines, "state": _state_lines}

@@ -1,0 +1,244 @@
+"""The checks of a subject, one after the other."""
+
+from __future__ import annotations
+
+import pickle
+import shlex
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from safevar_sumo.ads import ScalarAds
+from safevar_sumo.conformance.finding import ADVICE, REFUSED, Finding, Report, Source, TakesTooLong, time_limit
+from safevar_sumo.conformance.probes import PROBES, Outputs, Probe, Rows, StudyProbe, loaded_again, timed
+from safevar_sumo.conformance.subject import Subject, subject_of, subjects_of, violation
+from safevar_sumo.errors import ForeignError, InputError
+from safevar_sumo.plugins import guard_process_state
+from safevar_sumo.study import Study, load_study, study_names
+
+LONGEST = 6.0
+"""Time that a run of a probe may take before the subject counts as hung [s]."""
+SLOWEST = 1e-3
+"""Time per vehicle and step above which a subject is slow [s]: a run of 1,000 simulations then takes minutes."""
+ALONE = 2
+"""Vehicles that are tried alone."""
+ROOMS = {"ads": "ads/base.py", "vehicle": "vehicles/base.py", "scenario": "scenarios/base.py", "metric": "metrics/base.py",
+         "objective": "vehicles/characteristics.py", "algorithm": "search/base.py", "traci": "sumo/traci_controller.py"}
+
+
+def check(name: str, study: str | None = None) -> Report:
+    """Check a subject, or everything that a study names.
+
+    Parameters
+    ----------
+    name
+        `package.module:Name`, the name of something shipped, or a study's name or path.
+    study
+        A study to try a subject in.
+
+    Raises
+    ------
+    InputError
+        If it cannot be loaded.
+    """
+    start = time.perf_counter()
+    if ":" not in name and (name in study_names() or name.endswith(".toml")):
+        report = Report(subject=name, kind="study")
+        for one in checks_of(load_study(name)):
+            report.findings += one.findings
+            report.remarks += [f"{one.kind} {one.subject}: {remark}" for remark in (*one.remarks, one.speed) if remark]
+    else:
+        report = checked(subject_of(name, study))
+    report.seconds = time.perf_counter() - start
+    return report
+
+
+def checks_of(study: Study, *, foreign: bool = False) -> Iterator[Report]:
+    """Check everything that a study names, or what of it is `foreign`; simulate the study once, for one of them. Raises as `checked`."""
+    subjects = [subject for subject in subjects_of(study) if not (foreign and subject.is_ours)]
+    order = ("traci", "scenario", "ads", "vehicle")
+    models = sorted((one for one in subjects if one.kind in order), key=lambda one: (one.is_ours, order.index(one.kind)))
+    for subject in subjects:
+        yield checked(subject, simulated=subject in models[:1])
+
+
+def refuse_defects(study: Study) -> list[str]:
+    """Check the code from outside that a study names; returns the findings that do not make results wrong.
+
+    Raises
+    ------
+    ForeignError
+        Naming the first finding that makes results wrong, with file, line and advice.
+    """
+    remarks = []
+    for report in checks_of(study, foreign=True):
+        for finding in report.findings:
+            place = f"{finding.file}:{finding.line}"
+            problem = f"{report.key} {finding.got}{'' if place in finding.got else f' ({place})'}"
+            if finding.check in REFUSED:
+                again = f"python -m safevar_sumo check {shlex.quote(study.origin.called or study.name)}"
+                raise ForeignError(f"study {study.name!r}", f"{problem}; again by: {again}", f"{finding.expected}; {finding.advice}")
+            remarks.append(f"{problem}; expected: {finding.expected}")
+    return remarks
+
+
+def checked(subject: Subject, *, simulated: bool = True) -> Report:
+    """Check one subject; `simulated`: also in simulations of its study.
+
+    Raises
+    ------
+    InputError
+        If it cannot be tried: its parameters are not those that it takes, or its study cannot be put together.
+    """
+    report = Report(subject=subject.name, kind=subject.kind, key=subject.key, remarks=list(subject.remarks))
+    start, suite = time.perf_counter(), _Suite(subject, simulated)
+    with guard_process_state("check", [subject.name]):
+        report.findings += suite.findings()
+    report.speed, report.seconds = suite.speed, time.perf_counter() - start
+    return report
+
+
+class _Suite:
+    def __init__(self, subject: Subject, simulated: bool) -> None:
+        self._subject, self._source = subject, Source(subject.member)
+        self._probes = [probe for probe in PROBES[subject.kind] if simulated or probe is not StudyProbe]
+        self.speed, self._seconds = "", 0.0
+
+    def findings(self) -> Iterator[Finding]:
+        """What is wrong with the subject; nothing further is tried on what fails."""
+        got, expected = violation(self._subject)
+        if got:
+            yield self._finding("contract", got, expected, self._source.definition(*_named(got)))
+            return
+        number = 0
+        for probe_type in self._probes:
+            for finding in self._probed(probe_type):
+                number += 1
+                yield finding
+            if number:
+                break
+        yield from self._picklable()
+
+    def _probed(self, probe_type: type[Probe]) -> Iterator[Finding]:
+        try:
+            with np.errstate(all="ignore"):
+                probe = probe_type(self._subject)
+                with self._source.watched(), time_limit(LONGEST):
+                    model = probe.fresh()
+                    outputs = probe.run(model, np.arange(probe.number))
+                found = list(self._differences(probe, model, outputs))
+                if not found:
+                    with self._source.watched(), time_limit(LONGEST):
+                        found = [self._finding("reaction", one.got, one.expected, self._source.definition(*one.methods))
+                                 for one in probe.reactions(model, outputs)]
+                    found += self._slow(probe, model)
+            yield from found
+        except ForeignError as error:
+            yield self._of_error(error)
+        except TakesTooLong as error:
+            place = self._source.of_error(error)
+            yield self._finding("speed", f"does not come back within {LONGEST:g} s", "microseconds per vehicle and step", place)
+        except InputError as error:
+            if self._subject.kind == "vehicle" and "vehicle.characteristics" in error.problem:
+                yield self._finding("units", error.problem, error.legal, self._source.line_of_text(r"\bUNITS\b") or self._source.last)
+            elif self._subject.kind == "vehicle" and error.source == "vehicle":
+                yield self._finding("finite", error.problem, error.legal, self._source.last)
+            elif self._subject.kind in ("metric", "objective") and error.source == "check":
+                yield self._finding("contract", error.problem, error.legal, self._source.definition())
+            else:
+                raise
+
+    def _differences(self, probe: Probe, model: Any, outputs: Outputs) -> Iterator[Finding]:
+        """The first way of grouping vehicles in which results are others than all together."""
+        rows = np.arange(probe.number)
+        place = _difference(outputs, probe.run(probe.fresh(), rows), rows)
+        if place:
+            yield self._differing("determinism", probe, f"{place} when the same is done once more", "the same, to the bit")
+            return
+        again: dict[str, Outputs] = {}
+        self._seconds = timed(lambda: again.update(outputs=probe.again(model, rows)))
+        place = _difference(outputs, again["outputs"], rows)
+        if place:
+            yield self._differing("state", probe, f"{place} in a second run", "the same as in the first run, to the bit")
+            return
+        if probe.number == 1:
+            return
+        ways: dict[str, list[Rows]] = {"in another order": [rows[::-1]], "in two halves": np.array_split(rows, 2),
+                                       "alone": [rows[i:i + 1] for i in np.linspace(0, len(rows) - 1, ALONE).astype(int)]}
+        for way, groups in ways.items():
+            for group in groups:
+                place = _difference({name: values[..., group] for name, values in outputs.items()}, probe.run(model, group), group)
+                if place:
+                    check = "batch" if self._source.suspect("batch") or not self._source.suspect("state") else "state"
+                    yield self._differing(check, probe, f"{place} {way}", "the same as all together, to the bit")
+                    return
+
+    def _differing(self, check: str, probe: Probe, got: str, expected: str) -> Finding:
+        place = self._source.suspect(check) or self._source.definition(*probe.methods)
+        return self._finding(check, got, expected, place)
+
+    def _slow(self, probe: Probe, model: Any) -> Iterator[Finding]:
+        seconds, sentence = probe.cost(model, self._seconds)
+        self.speed = self.speed or sentence
+        slowest = SLOWEST * (10 if self._subject.kind == "traci" else 1)  # SUMO's own time counts there
+        if seconds > slowest:
+            yield self._finding("speed", sentence, f"below {slowest * 1e6:g} microseconds per vehicle and step",
+                                self._source.definition(*probe.methods))
+
+    def _picklable(self) -> Iterator[Finding]:
+        """What travels to worker processes; a class by its name, an instance by what it holds, a record with its function."""
+        what = loaded_again(self._subject)
+        travels: Any = what
+        if isinstance(what, type) and self._subject.kind != "traci":
+            try:
+                travels = what(**self._subject.parameters)
+            except Exception:
+                travels = what  # an instance is made by what the study gives, which the probes have tried
+        if getattr(travels, "function", None) is not None and self._subject.kind in ("metric", "objective"):
+            travels = travels.function
+        try:
+            pickle.dumps(travels)
+        except Exception as error:
+            holds = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+            place = self._source.definition("__init__") if isinstance(what, type) else self._source.definition()
+            yield self._finding("picklable", holds, "what pickle can send to a worker process", place)
+
+    def _of_error(self, error: ForeignError) -> Finding:
+        """The finding for an error that a guard raised."""
+        text = error.problem.removeprefix(f"{self._subject.key} ")
+        no_number = any(f"= {value} from" in text for value in ("nan", "inf", "-inf")) if "returned" in text else any(
+            name in text for name in ("ZeroDivisionError", "OverflowError", "FloatingPointError", "math domain"))
+        check = "inputs" if "read-only" in text else "finite" if no_number else "contract"
+        expected = error.legal or "no exception"
+        if check == "inputs":
+            expected = "arguments that stay as they are"
+        return self._finding(check, text, expected, self._source.of_error(error))
+
+    def _finding(self, check: str, got: str, expected: str, place: tuple[str, int]) -> Finding:
+        advice = ADVICE[check].format(room=ROOMS[self._subject.kind])
+        if check == "contract" and self._subject.kind == "ads" and isinstance(self._subject.member.what, type) \
+                and not issubclass(self._subject.member.what, ScalarAds):
+            advice += "; an ADS for one vehicle derives from safevar_sumo.ads.ScalarAds"
+        return Finding(check=check, file=place[0], line=place[1], expected=expected, got=got, advice=advice)
+
+
+def _named(problem: str) -> tuple[str, ...]:
+    """The method that a violation of the contract names."""
+    words = problem.replace("(", " ").split()
+    return tuple(words[i + 1] for i, word in enumerate(words[:-1]) if word in ("method", "has"))
+
+
+def _difference(one: Outputs, other: Outputs, rows: Rows) -> str:
+    """The first result that differs, of which vehicle, and both values; "" if all are equal to the bit."""
+    for name, values in one.items():
+        again = other[name]
+        if values.shape != again.shape:
+            return f"{name} has shape {again.shape}, not {values.shape},"
+        same = values == again if values.dtype.kind == "U" else (values == again) | (np.isnan(values) & np.isnan(again))
+        if not same.all():
+            place = tuple(np.argwhere(~same)[0])
+            return f"{name} of vehicle {rows[place[-1]]} is {again[place]} instead of {values[place]}"
+    return ""
+
