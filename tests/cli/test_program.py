@@ -51,7 +51,7 @@ def test_every_command_is_listed_and_every_listed_one_is_there() -> None:
 def test_every_command_and_each_of_its_options_has_a_whole_sentence_of_help(command: str) -> None:
     found = commands.get_command(None, command)  # type: ignore[arg-type]
     assert found is not None
-    assert str(found.help).endswith(".")
+    assert str(found.help).strip().endswith(".")
     told = CliRunner().invoke(commands, [command, "--help"])
     assert told.exit_code == 0
     for option in found.params:
