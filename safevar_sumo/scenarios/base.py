@@ -27,7 +27,7 @@ BEND = 0.05
 """Largest deviation of a straight lane's middle line from the straight [m]."""
 Coordinates = tuple[float, float]
 Actors = Mapping[str, Mapping[str, str] | None]
-"""Changes to a network's traffic file: attributes to set, or None to leave it out, by the XPath of an element below its root."""
+"""Changes to a network's traffic or lanes: attributes to set, or None to leave it out, by the XPath of an element below the file's root."""
 
 
 class Lane(NamedTuple):
@@ -122,7 +122,8 @@ class Scenario(Protocol):
 
     Optional: `reactive_actors = False` says that no actor reacts to the vehicle under test, so that SUMO can play the scene once for all
     vehicles; `grade`, the rise of the road [%] (SUMO's plane is then that road, and gravity acts in the vehicles); `pre_crash`, its type
-    in NHTSA's typology; `actors(roads) -> Actors`, changes to the network's traffic; `remarks() -> list[str]` on its parameters for the
+    in NHTSA's typology; `lanes(roads) -> Actors` and `actors(roads) -> Actors`, changes to the network as it is built and to its traffic on
+    the changed one; `remarks() -> list[str]` on its parameters for the
     user; `test_speed` [m/s]: a robot holds the vehicle at that speed until the ADS brakes, a run that leaves the tolerance before that
     is an invalid test, and only contacts at the vehicle's front are collisions.
     """
@@ -175,6 +176,8 @@ class PreCrash(StrEnum):
 
     PEDESTRIAN_AFTER_MANOEUVRE = "pedestrian crash with prior vehicle manoeuvre"
     PEDESTRIAN = "pedestrian crash without prior vehicle manoeuvre"
+    CYCLIST = "pedalcyclist crash without prior vehicle manoeuvre"
+    STRAIGHT_PATHS = "straight crossing paths at non-signalised junctions"
     LEAD_STOPPED = "lead vehicle stopped"
     LEAD_SLOWER = "lead vehicle moving at lower constant speed"
     LEAD_DECELERATING = "lead vehicle decelerating"
@@ -220,11 +223,18 @@ class GuardedScenario:
 
     def actors(self, roads: Roads) -> Actors:
         """Its changes to the network's traffic; none without such a method."""
-        changes = self._guard.call("actors", getattr(self._scenario, "actors", lambda roads: {}), roads)
+        return self._changes("actors", "the traffic file", roads)
+
+    def _changes(self, method: str, file: str, roads: Roads) -> Actors:
+        changes = self._guard.call(method, getattr(self._scenario, method, lambda roads: {}), roads)
         if not isinstance(changes, Mapping):
-            raise self._guard.wrong("actors", "changes", changes, "a mapping from XPaths of the traffic file to attributes")
+            raise self._guard.wrong(method, "changes", changes, f"a mapping from XPaths of {file} to attributes")
         return {str(path): change if change is None else {str(name): str(value) for name, value in change.items()}
                 for path, change in changes.items()}
+
+    def lanes(self, roads: Roads) -> Actors:
+        """Its changes to the network's lanes; none without such a method."""
+        return self._changes("lanes", "the network", roads)
 
     def remarks(self) -> list[str]:
         """Remarks on its parameters for the user."""

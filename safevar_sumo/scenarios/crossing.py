@@ -1,114 +1,166 @@
-"""Euro NCAP's pedestrians who cross the way, CPFA, CPNA and CPNCO."""
+"""Euro NCAP's targets that cross the way: pedestrians, cyclists, and a car or a motorcyclist at a junction."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, NamedTuple
+import math
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from msgspec import Meta, Struct
+from msgspec.structs import force_setattr
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import VUT, Actors, Grade, PreCrash, Roads, Scene, World
-from safevar_sumo.scenarios.euro_ncap import BODIES, KMH, VUT_LENGTH, VUT_WIDTH, Range, Walk, beside, lateral_of
-from safevar_sumo.scenarios.frame import SKEW, Frame
+from safevar_sumo.scenarios.crossing_target import NETWORK_ON_FOOT, OnFoot, OnWheels
+from safevar_sumo.scenarios.euro_ncap import (
+    APPROACH,
+    BODIES,
+    FROM_LEFT,
+    FROM_RIGHT,
+    JUNCTION,
+    KMH,
+    VUT_LENGTH,
+    VUT_WIDTH,
+    Body,
+    Direction,
+    Heading,
+    ImpactLocation,
+    Range,
+    Walk,
+    beside,
+    lateral_of,
+)
+from safevar_sumo.scenarios.frame import Frame
 
-PEDESTRIAN = "pedestrian"
-APPROACH, CROSSING, KERB = "approach_0", ":crossing_c0_0", "kerb_0"
-WAYS = {"near": ("footpath", "footpath_on"), "far": ("footpath_on", "footpath")}
-"""Edges that a pedestrian walks on, by the side that it comes from (of a road with right-hand traffic)."""
+KERB = "kerb_0"
 PARKED_GAP = 1.0
-"""From the vehicle's side to the parked cars, from the nearer one's front to the child's path, and between the two [m]."""
+"""From the vehicle's side to the parked cars, from the nearer one's front to the target's path, and between the two [m]."""
 PARKED_LENGTH = {"parked_small": 4.25, "parked_large": 4.5}
 """The middle of what the protocol allows, 4.1 to 4.4 and 4.3 to 4.7 m."""
 PARKED_WIDTH = 1.8
-WALKS_ON = 5.0
-"""How far past the middle of the lane it walks before it stands [m]."""
+TIME_TO_IMPACT = 6.0
+"""Time from the start to the impact, unless the target needs longer [s]."""
+ROUNDED_TO = 0.5
+"""A longer time is a multiple of this [s]."""
 Metres = Annotated[float, Meta(ge=0, le=100)]
+LOCATIONS = (50.0, 25.0, 75.0, 10.0, 90.0)
 
 
 class _Test(NamedTuple):
-    """A row of the protocol's table: km/h, m, m, and the range of the tests."""
+    """A row of the protocol's table: km/h, m, m, and the range of the tests; who has no `lateral_start` is as fast from the start on."""
 
     side: str
     target: str
     target_speed: float
-    lateral_start: float
+    lateral_start: float | None
     acceleration_distance: float
     hidden: bool
     range: Range
 
 
 TESTS = {
-    "CPFA": _Test("far", "adult", 8.0, 6.0, 1.5, False, Range(10, 60, (50, 10, 25, 75, 90))),
-    "CPNA": _Test("near", "adult", 5.0, 4.0, 1.0, False, Range(10, 60, (25, 50, 75, 10, 90))),
-    "CPNCO": _Test("near", "child", 5.0, 4.0, 1.0, True, Range(10, 60, (50, 10, 25, 75, 90))),
+    "CPFA": _Test("far", "adult", 8.0, 6.0, 1.5, False, Range(10, 60, LOCATIONS)),
+    "CPNA": _Test("near", "adult", 5.0, 4.0, 1.0, False, Range(10, 60, LOCATIONS)),
+    "CPNCO": _Test("near", "child", 5.0, 4.0, 1.0, True, Range(10, 60, LOCATIONS)),
+    "CBNA": _Test("near", "cyclist", 15.0, None, 0.0, False, Range(10, 60, LOCATIONS)),
+    "CBFA": _Test("far", "cyclist", 20.0, None, 0.0, False, Range(10, 60, LOCATIONS)),
+    "CBNAO": _Test("near", "cyclist", 10.0, None, 0.0, True, Range(10, 60, LOCATIONS)),
+    "CCCscp": _Test("near", "car", 40.0, None, 0.0, False, Range(20, 80, (50.0,))),
+    "CMCscp": _Test("near", "motorcyclist", 40.0, None, 0.0, False, Range(20, 80, (50.0,))),
 }
+PRE_CRASH = {"adult": PreCrash.PEDESTRIAN, "child": PreCrash.PEDESTRIAN, "cyclist": PreCrash.CYCLIST,
+             "motorcyclist": PreCrash.STRAIGHT_PATHS, "car": PreCrash.STRAIGHT_PATHS}
 
 
 class _Memory(NamedTuple):
-    """The lane, the path's place along it [m], where the pedestrian is due and was; step number; speed that it was last given."""
+    """The lane; the target's place along it at the impact [m], its walk, how it is moved, where it was; step number; speed last given."""
 
     frame: Frame
     path: float
     walk: Walk
-    start: float
+    mover: OnFoot | OnWheels
     place: FloatArray
     sample: int
     given: float
 
 
 class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A pedestrian crosses before a vehicle that is on its way, timed to be hit where it is meant to be if nobody brakes.
+    """Somebody crosses before a vehicle that is on its way, timed to be hit where it is meant to be if nobody brakes.
 
     Parameters
     ----------
     test
-        Row of the protocol that gives what is not given here: CPFA, CPNA or CPNCO.
+        Row of the protocol that gives what is not given here: CPFA, CPNA, CPNCO (pedestrians), CBFA, CBNA, CBNAO (cyclists), CCCscp or
+        CMCscp (a car or a motorcyclist at a junction).
     speed
         The vehicle's at the start [km/h].
     impact_location
-        Where on the vehicle's front the pedestrian would be hit, from the side that it comes from [% of the width].
+        Where on the vehicle's front the target's middle would be hit, from the side that it comes from [% of the width]; below 0 or
+        above 100 it passes behind or before the vehicle's corner.
     target, target_speed
-        `adult` or `child`; its speed once it walks [km/h].
+        `adult`, `child`, `cyclist`, `motorcyclist` or `car`; its speed once it moves [km/h].
     side
         That it comes from: `near` or `far`.
     lateral_start, acceleration_distance
-        From the middle of the lane to where it stands at first, and the way within which it reaches its speed [m].
+        From the middle of the lane to where it stands at first, and the way within which it reaches its speed [m]. Cyclists, motorcyclists
+        and cars are as fast from the start on, unless this says where they stand.
+    start_share
+        Share of its usual distance to the impact at which it starts [-].
+    heading
+        Turn of its way around the point of the impact, counterclockwise seen from above [degrees].
     hidden
         Whether two parked cars stand between it and the vehicle.
     sensor_setback
         How far behind the front bumper, in its middle, the sensors look from [m].
     time_to_impact, time_after
-        Time from the start to the impact, and on from there to the end of the run [s].
+        Time from the start to the impact, by default 6 s or as long as the target needs, and on from there to the end of the run [s].
     vut_length, vut_width
         The vehicle under test [m].
     grade
         By how much the road rises over the way, negative where it falls [%].
+    network
+        By default `crossing` for a pedestrian who crosses at right angles from the usual start, `junction` for everybody else.
 
     Notes
     -----
-    `lateral` is that of the pedestrian's middle, `gap` that of the side of its body that faces the vehicle.
+    `lateral` is that of the target's middle, `gap` that of the corner or side of its body that is nearest along the way.
+
+    Where the protocol leaves a choice this is Euro NCAP's calculator's (euroncap-rating-2026 5.4.9): conditions of its robustness
+    layers by `target_speed`, `start_share` and `heading`. What it leaves open is chosen: whatever a layer changes, the target still
+    arrives at the impact location; a faster one starts from where the usual one stands, or is as far away as its speed takes it. With a
+    smaller `start_share` one who stands sets off later, and the run of one who does not begins when it is there. At a junction the
+    middle of the target meets the middle of the front, and it comes from the near side, of which the calculator says one at random.
     """
 
-    test: Literal["CPFA", "CPNA", "CPNCO"] = "CPFA"
+    test: Literal["CPFA", "CPNA", "CPNCO", "CBNA", "CBFA", "CBNAO", "CCCscp", "CMCscp"] = "CPFA"
     speed: Annotated[float, Meta(gt=0, le=250)] = 40.0
-    impact_location: Annotated[float, Meta(ge=0, le=100)] = 50.0
-    target: Literal["adult", "child"] | None = None
-    target_speed: Annotated[float, Meta(gt=0, le=18)] | None = None
+    impact_location: ImpactLocation = 50.0
+    target: Literal["adult", "child", "cyclist", "motorcyclist", "car"] | None = None
+    target_speed: Annotated[float, Meta(gt=0, le=150)] | None = None
     side: Literal["near", "far"] | None = None
     lateral_start: Annotated[float, Meta(gt=0, le=12)] | None = None
     acceleration_distance: Metres | None = None
+    start_share: Annotated[float, Meta(gt=0, le=1)] = 1.0
+    heading: Heading = 0.0
     hidden: bool | None = None
     sensor_setback: Metres = 0.0
-    time_to_impact: Annotated[float, Meta(gt=0, le=60)] = 6.0
+    time_to_impact: Annotated[float, Meta(gt=0, le=60)] | None = None
     time_after: Annotated[float, Meta(gt=0, le=60)] = 4.0
     vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
     vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
     grade: Grade = 0.0
-    network: str = "crossing"
+    network: str = ""
     reactive_actors = False
-    pre_crash = PreCrash.PEDESTRIAN
+
+    def __post_init__(self) -> None:
+        if not self.network:
+            force_setattr(self, "network", NETWORK_ON_FOOT if self._on_foot else JUNCTION)
+
+    @property
+    def pre_crash(self) -> PreCrash:
+        """NHTSA's type."""
+        return PRE_CRASH[self._of("target")]
 
     @property
     def test_speed(self) -> float:
@@ -118,38 +170,27 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     @property
     def duration(self) -> float:
         """Length of a run [s]."""
-        return self.time_to_impact + self.time_after
+        return self._time + self.time_after
 
     def remarks(self) -> list[str]:
         """Remarks on parameters outside the protocol."""
         return TESTS[self.test].range.remarks(self.test, self.speed, self.impact_location, self.grade)
 
+    def lanes(self, roads: Roads) -> Actors:
+        """The direction of the lane across."""
+        return self._mover.lanes(Frame.of(roads.lane(APPROACH)), roads)
+
     def actors(self, roads: Roads) -> Actors:
-        """The vehicle `time_to_impact` before the pedestrian's path, the pedestrian beside it, and the parked cars or none."""
-        frame, walks_on = Frame.of(roads.lane(APPROACH)), WAYS[self._of("side")]
-        path, _ = frame.place_of(roads.lane(CROSSING).start)
-        for lane in (CROSSING, *(f"{edge}_0" for edge in walks_on)):
-            enters, leaves = (frame.place_of(point)[0] for point in roads.lane(lane))
-            if abs(leaves - enters) > SKEW:
-                raise InputError("scenario.parameters.network", f"lane {lane!r} leads {abs(leaves - enters):.2f} m along the road",
-                                 "a way across at right angles")
-        body = BODIES[self._of("target")]
-        front = path - body.width / 2 - self.speed * KMH * self.time_to_impact
+        """The vehicle before the target's path, the target beside it, and the parked cars or none."""
+        frame, mover, walk = Frame.of(roads.lane(APPROACH)), self._mover, self._walk
+        path = mover.path(frame, roads, self._sideways)
+        front = path - self._reach.length / 2 - self.speed * KMH * self._time
         if front - self.vut_length < 0:
-            raise InputError("scenario.parameters", f"{self.speed:g} km/h for {self.time_to_impact:g} s begin before the road does")
-        self._walk()
-        begins, ends = (self._sign * frame.place_of(point)[1] for point in roads.lane(f"{walks_on[0]}_0"))
-        stands = body.length / 2 - self._of("lateral_start")
-        if not min(begins, ends) <= stands <= max(begins, ends):
-            nearest, farthest = body.length / 2 - max(begins, ends), body.length / 2 - min(begins, ends)
-            raise InputError("scenario.parameters", f"lateral_start = {self._of('lateral_start'):g} m is not on the footpath",
-                             f"a number in [{nearest:.2f}, {farthest:.2f}] m")
+            raise InputError("scenario.parameters", f"{self.speed:g} km/h for {self._time:g} s begin before the road does")
         changes = {
             "vType[@id='vut']": {"length": repr(self.vut_length), "width": repr(self.vut_width)},
             "vehicle[@id='vut']": {"departPos": repr(front), "departSpeed": repr(self.speed * KMH)},
-            "person[@id='pedestrian']": {"type": self._of("target"), "departPos": repr(abs(stands - begins))},
-            "person[@id='pedestrian']/walk": {
-                "edges": " ".join(walks_on), "speed": repr(self._of("target_speed") * KMH), "arrivalPos": "-1" if self._sign > 0 else "1"},
+            **mover.actors(frame, roads, self._sideways, self._way, walk),
         }
         return {**changes, **self._parked(frame, path, roads)}
 
@@ -166,36 +207,56 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return changes
 
     def begin(self, world: World) -> _Memory:
-        frame = Frame.of(world.lane(APPROACH))
-        lateral = self._lateral(frame, world)
-        world.walk(PEDESTRIAN, 0.0)
-        path, _ = frame.place_of(world.lane(CROSSING).start)
-        return _Memory(frame, path - BODIES[self._of("target")].width / 2, self._walk(), lateral[0], lateral, 0, 0.0)
+        frame, mover, walk = Frame.of(world.lane(APPROACH)), self._mover, self._walk
+        lateral = self._sign * mover.middle(frame, world)[1]
+        path, given = mover.path(frame, world, self._sideways), mover.begin(world, walk)
+        return _Memory(frame, path, walk, mover, lateral, 0, given)
 
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
         front = memory.frame.along(world.vehicle_positions(VUT))
-        lateral = self._lateral(memory.frame, world)
-        across = self._of("lateral_start") + WALKS_ON
-        now, then = (min(memory.walk.travelled(sample * step), across) for sample in (memory.sample, memory.sample + 1))
-        pace = (then - now) / step
+        along, left = memory.mover.middle(memory.frame, world)
+        lateral, time = self._sign * left, memory.sample * step
+        pace = memory.mover.pace(memory.walk, memory.sample, step)
         if pace != memory.given:
-            world.walk(PEDESTRIAN, pace)
+            memory.mover.go(world, pace)
         lateral_speed = (lateral - memory.place) / step
-        gap = memory.path - front
-        body = BODIES[self._of("target")]
-        left = (lateral > 0) & (beside(lateral, (self.vut_width + body.length) / 2) > 0)
-        passed = gap < -body.width - self.vut_length
-        scene = Scene(gap, lateral, lateral_speed, left | passed, visible=self._visible(gap, lateral))
+        ahead = 0.0 if along is None else along - memory.path
+        gap = memory.path - self._reach.length / 2 + ahead - front
+        gone = (lateral > 0) & (beside(lateral, (self.vut_width + self._reach.width) / 2) > 0)
+        passed = gap < -self._reach.length - self.vut_length
+        scene = Scene(gap, lateral, lateral_speed, gone | passed, visible=self._visible(gap, lateral, ahead))
+        if self._direction.along:
+            scene = scene._replace(obstacle_speed=np.full_like(gap, self._direction.along * memory.walk.pace(time)))
         return scene, memory._replace(place=lateral, sample=memory.sample + 1, given=pace)
 
     def encounter(self, trace: Trace) -> Encounter:
-        """Between the vehicle's front and the pedestrian's body, along the way and across it; TTC by how fast that shrinks."""
-        body = BODIES[self._of("target")]
-        ahead, across = np.maximum(trace.gap, 0.0), beside(trace.lateral, (self.vut_width + body.length) / 2)
+        """Between the vehicle's front and the target's body, along the way and across it; TTC by how fast that shrinks."""
+        ahead, across = np.maximum(trace.gap, 0.0), beside(trace.lateral, (self.vut_width + self._reach.width) / 2)
         distance = np.sqrt(ahead * ahead + across * across)
-        nearing = trace.speed * ahead - np.sign(trace.lateral) * trace.lateral_speed * across
+        nearing = (trace.speed - trace.obstacle_speed) * ahead - np.sign(trace.lateral) * trace.lateral_speed * across
         return Encounter(separation=distance, distance=distance, closing_speed=nearing / np.maximum(distance, 1e-9),
-                         in_conflict=trace.gap > -body.width - self.vut_length)
+                         in_conflict=trace.gap > -self._reach.length - self.vut_length)
+
+    @property
+    def _on_foot(self) -> bool:
+        """Whether it is a pedestrian who crosses at right angles from where footpaths are, a person to SUMO."""
+        return self._of("target") in ("adult", "child") and self.heading == 0 and self.start_share == 1
+
+    @property
+    def _mover(self) -> OnFoot | OnWheels:
+        target = self._of("target")
+        if self._on_foot:
+            return OnFoot(target, self._sign, -self._of("lateral_start"))
+        return OnWheels(target, self._direction)
+
+    @property
+    def _direction(self) -> Direction:
+        return (FROM_RIGHT if self._of("side") == "near" else FROM_LEFT).turned(self.heading)
+
+    @property
+    def _reach(self) -> Body:
+        """What its body takes up along the way and across it [m]."""
+        return self._direction.reach(BODIES[self._of("target")])
 
     @property
     def _sign(self) -> float:
@@ -203,27 +264,62 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return 1.0 if self._of("side") == "near" else -1.0
 
     @property
+    def _location(self) -> float:
+        """The `lateral` of the impact location [m]."""
+        return lateral_of(self.impact_location, self.vut_width)
+
+    @property
+    def _sideways(self) -> float:
+        """How far to the left of the lane's middle the impact is [m]."""
+        return self._sign * self._location
+
+    @property
     def _kerb_side(self) -> float:
         """Where the sides of parked cars are that face the lane, to its left [m]."""
         return -self.vut_width / 2 - PARKED_GAP
 
-    def _of(self, name: str):  # type: ignore[no-untyped-def]
+    @property
+    def _way(self) -> float:
+        """From where it starts to the impact [m]."""
+        if self._starts_at_speed:
+            return self._target_speed * self._time
+        return (self._of("lateral_start") + self._location) * self.start_share  # type: ignore[no-any-return]
+
+    @property
+    def _time(self) -> float:
+        """From the start to the impact [s]."""
+        if self._starts_at_speed:
+            return (self.time_to_impact or TIME_TO_IMPACT) * self.start_share
+        if self.time_to_impact is not None:
+            return self.time_to_impact
+        needed = (self._way + self._of("acceleration_distance")) / self._target_speed
+        return max(TIME_TO_IMPACT, math.ceil(needed / ROUNDED_TO) * ROUNDED_TO)
+
+    @property
+    def _walk(self) -> Walk:
+        if self._starts_at_speed:
+            return Walk(0.0, self._target_speed, 0.0)
+        return Walk.reaching(self._way, self._time, self._target_speed, self._of("acceleration_distance"))
+
+    @property
+    def _starts_at_speed(self) -> bool:
+        """Whether it does not stand first."""
+        return self._of("lateral_start") is None
+
+    @property
+    def _target_speed(self) -> float:
+        """Once it moves [m/s]."""
+        return self._of("target_speed") * KMH  # type: ignore[no-any-return]
+
+    def _of(self, name: str) -> Any:
         """A parameter, or what the protocol has for it."""
         given = getattr(self, name)
         return getattr(TESTS[self.test], name) if given is None else given
 
-    def _walk(self) -> Walk:
-        way = self._of("lateral_start") + lateral_of(self.impact_location, self.vut_width)
-        return Walk.reaching(way, self.time_to_impact, self._of("target_speed") * KMH, self._of("acceleration_distance"))
-
-    def _lateral(self, frame: Frame, world: World) -> FloatArray:
-        """Of the pedestrian's middle; SUMO tells the place of its front."""
-        return self._sign * frame.left(world.person_positions(PEDESTRIAN)) - BODIES[self._of("target")].length / 2
-
-    def _visible(self, gap: FloatArray, lateral: FloatArray) -> BoolArray:
-        """Where the line from the sensors to the pedestrian's middle passes the front corner of the nearer parked car."""
+    def _visible(self, gap: FloatArray, lateral: FloatArray, ahead: FloatArray | float) -> BoolArray:
+        """Where the line from the sensors to the target's middle passes the front corner of the nearer parked car."""
         if not self._of("hidden"):
             return np.ones(gap.shape, dtype=bool)
-        away = gap + BODIES[self._of("target")].width / 2 + self.sensor_setback
-        corner = away - PARKED_GAP
+        away = gap + self._reach.length / 2 + self.sensor_setback
+        corner = away - ahead - PARKED_GAP
         return np.asarray((corner <= 0) | (-lateral * corner < -self._kerb_side * away))

@@ -1,19 +1,19 @@
-"""What the scenarios of Euro NCAP's frontal crash avoidance tests share: targets, and somebody ahead (protocol CA-FC, v1.1, October 2025).
+"""What the scenarios of Euro NCAP's frontal crash avoidance tests share: targets, ranges and directions (protocol CA-FC, v1.2, July 2026).
 
 Speeds are in km/h and impact locations in per cent of the vehicle's width, as in the protocol.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import BoolArray, Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import VUT, Actors, Grade, Scene, World
+from safevar_sumo.records import FloatArray
+from safevar_sumo.scenarios.base import Actors, Coordinates
 from safevar_sumo.scenarios.frame import Frame
 
 KMH = 1 / 3.6
@@ -22,14 +22,73 @@ VUT_LENGTH, VUT_WIDTH = 4.9016, 2.1284
 """The bounding box of CARLA's vehicle.lincoln.mkz2017 [m]."""
 
 
+ImpactLocation = Annotated[float, Meta(ge=-50, le=150)]
+"""Place on or beside the vehicle's front [% of its width]."""
+Heading = Annotated[float, Meta(ge=-30, le=30)]
+"""Turn of a target's way, counterclockwise seen from above [degrees]."""
+
+
 class Body(NamedTuple):
-    """A pedestrian: length in the direction that it walks, width across [m]."""
+    """A target: length in the direction that it moves, width across [m]."""
 
     length: float
     width: float
 
 
-BODIES = {"adult": Body(0.6, 0.5), "child": Body(0.711, 0.298)}
+BODIES = {"adult": Body(0.6, 0.5), "child": Body(0.711, 0.298), "cyclist": Body(1.9, 0.5), "motorcyclist": Body(2.1, 0.8),
+          "car": Body(4.023, 1.712)}
+"""Bounding boxes of Euro NCAP's targets; those on two wheels with their riders."""
+SHAPES = {"adult": "pedestrian", "child": "pedestrian", "cyclist": "bicycle", "motorcyclist": "motorcycle", "car": "evehicle"}
+"""How sumo-gui draws them; of none of these SUMO cuts corners off."""
+
+
+FASTEST_TARGET = "70"
+"""Highest speed of a target [m/s]."""
+
+
+class Direction(NamedTuple):
+    """Where a target is headed: a unit vector along the vehicle's lane and to its left."""
+
+    along: float
+    left: float
+
+    def turned(self, heading: float) -> Direction:
+        """The direction after a turn [degrees, counterclockwise]; rounded, as the last bits of sine and cosine are the machine's own."""
+        cosine, sine = (round(part(math.radians(heading)), 12) for part in (math.cos, math.sin))
+        return Direction(self.along * cosine - self.left * sine, self.left * cosine + self.along * sine)
+
+    def reach(self, body: Body) -> Body:
+        """What a body takes up along the lane and across it [m]."""
+        along, left = abs(self.along), abs(self.left)
+        return Body(body.length * along + body.width * left, body.length * left + body.width * along)
+
+
+FORTH, FROM_RIGHT, FROM_LEFT = Direction(1.0, 0.0), Direction(0.0, 1.0), Direction(0.0, -1.0)
+TARGET = "target"
+"""Id of the target in every network where it is a vehicle."""
+JUNCTION = "junction"
+"""The network in which a target has a lane of its own, whatever its direction."""
+APPROACH = "approach_0"
+"""The vehicle's lane before it."""
+ACROSS, INSIDE, ACROSS_ON = "across_0", ":junction_0_0", "across_on_0"
+"""The target's lanes: before the junction, on it, and beyond."""
+
+
+def lanes_across(frame: Frame, entry: Coordinates, exit_: Coordinates, direction: Direction, length: float = 300.0) -> Actors:
+    """The target's lanes, straight in a direction: on the junction from one place to another, and `length` before and after that [m].
+
+    Places are those along the vehicle's lane and to its left [m].
+    """
+    begin, end = ((x + sign * length * direction.along, y + sign * length * direction.left) for (x, y), sign in ((entry, -1), (exit_, 1)))
+    return {f"edge/lane[@id='{lane}']": {"shape": " ".join(",".join(map(repr, frame.point(*place))) for place in places),
+                                         "length": repr(math.dist(*places))}
+            for lane, places in ((ACROSS, (begin, entry)), (INSIDE, (entry, exit_)), (ACROSS_ON, (exit_, end)))}
+
+
+def target_type(target: str) -> dict[str, str]:
+    """Attributes of the target's type in the traffic."""
+    body = BODIES[target]
+    return {"id": target, "length": repr(body.length), "width": repr(body.width), "guiShape": SHAPES[target], "maxSpeed": FASTEST_TARGET}
 
 
 class Range(NamedTuple):
@@ -79,6 +138,8 @@ class Walk(NamedTuple):
 
     def pace(self, time: float) -> float:
         """Speed [m/s] at a time [s]."""
+        if time < self.begin:
+            return 0.0
         since = max(time - self.begin, 0.0)
         if not self.run_up or since >= 2 * self.run_up / self.speed:
             return self.speed
@@ -93,89 +154,3 @@ def lateral_of(location: float, width: float) -> float:
 def beside(distance: FloatArray, half_widths: float) -> FloatArray:
     """Gap between two bodies whose middles are `distance` apart; 0 where they overlap [m]."""
     return np.maximum(np.abs(distance) - half_widths, 0.0)
-
-
-TARGET, ROAD = "target", "road_0"
-START = 50.0
-"""Place of the vehicle's front bumper on the lane at the start [m]."""
-CLOSED_IN = 0.5
-"""Closing speed [m/s] after which a vehicle that is no longer faster has avoided the target."""
-
-
-class AheadMemory(NamedTuple):
-    """The lane; step number; speed that the target was last given [m/s]; whether the vehicle has closed in; lateral offset [m]."""
-
-    frame: Frame
-    sample: int
-    given: float
-    closed_in: BoolArray
-    lateral: FloatArray
-
-
-class Ahead(NamedTuple):
-    """A target of a body at a gap [m] and lateral offset [m, to the right], with a speed over time [m/s at s]."""
-
-    body: Body
-    gap: float
-    offset: float
-    speed: Callable[[float], float]
-
-    def actors(self, kind: str, vut: Body, speed: float) -> Actors:
-        """The vehicle at `speed` [m/s], and the target, of the traffic's type `kind`, in front of it."""
-        if self.gap <= 0:
-            raise InputError("scenario.parameters", f"the target begins {-self.gap:.2f} m inside the vehicle", "a target ahead")
-        return {
-            "vType[@id='vut']": {"length": repr(vut.length), "width": repr(vut.width)},
-            "vehicle[@id='vut']": {"departPos": repr(START), "departSpeed": repr(speed)},
-            "vehicle[@id='target']": {
-                "type": kind, "departPos": repr(START + self.gap + self.body.length), "departPosLat": repr(-self.offset),
-                "departSpeed": repr(self.speed(0.0))},
-        }
-
-    def begin(self, world: World) -> AheadMemory:
-        nothing = np.zeros(len(world.vehicle_positions(VUT)))
-        world.drive(TARGET, self.speed(0.0))
-        return AheadMemory(Frame.of(world.lane(ROAD)), 0, self.speed(0.0), nothing > 0, nothing + self.offset)
-
-    def observe(self, world: World, step: float, memory: AheadMemory, speed: FloatArray) -> tuple[Scene, AheadMemory]:
-        """The scene at the vehicles' speed, shape (N,) [m/s]; gives the target its next speed."""
-        frame, nothing = memory.frame, np.zeros_like(speed)
-        gap = frame.along(world.vehicle_positions(TARGET)) - self.body.length - frame.along(world.vehicle_positions(VUT))
-        now, then = self.speed(memory.sample * step), self.speed((memory.sample + 1) * step)
-        if then != memory.given:
-            world.drive(TARGET, then)
-        closed_in = memory.closed_in | (speed - now > CLOSED_IN)
-        scene = Scene(gap, memory.lateral, nothing, closed_in & (speed <= now), obstacle_speed=nothing + now)
-        return scene, memory._replace(sample=memory.sample + 1, given=then, closed_in=closed_in)
-
-
-class BehindSomebody(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of a scenario with somebody ahead.
-
-    Parameters
-    ----------
-    vut_length, vut_width
-        The vehicle under test [m].
-    grade
-        By how much the road rises over the way, negative where it falls [%].
-    """
-
-    vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
-    vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
-    grade: Grade = 0.0
-    reactive_actors = False
-
-    def begin(self, world: World) -> AheadMemory:
-        return self._ahead.begin(world)
-
-    def observe(self, world: World, step: float, memory: AheadMemory) -> tuple[Scene, AheadMemory]:
-        return self._ahead.observe(world, step, memory, world.speeds())
-
-    def encounter(self, trace: Trace) -> Encounter:
-        """Distances from bumper to body; TTC is that gap over the difference of speeds."""
-        return Encounter(separation=trace.gap, distance=trace.gap, closing_speed=trace.speed - trace.obstacle_speed,
-                         in_conflict=trace.gap > 0)
-
-    @property
-    def _ahead(self) -> Ahead:
-        raise NotImplementedError

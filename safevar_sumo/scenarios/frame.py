@@ -55,3 +55,8 @@ class Frame(NamedTuple):
         (x, y), (forth_x, forth_y) = self.origin, self.direction
         right, up = point[0] - x, point[1] - y
         return right * forth_x + up * forth_y, up * forth_x - right * forth_y
+
+    def point(self, along: float, left: float) -> Coordinates:
+        """The point that is so far along the lane and to its left [m]."""
+        (x, y), (forth_x, forth_y) = self.origin, self.direction
+        return x + along * forth_x - left * forth_y, y + along * forth_y + left * forth_x

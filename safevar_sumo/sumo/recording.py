@@ -33,6 +33,8 @@ POSITION_EPS = 0.1
 """Least length of a lane's shape (SUMO, utils/common/StdDefs.h) [m]."""
 NUMERICAL_EPS = 0.001
 """SUMO, utils/common/StdDefs.h [m]."""
+PARALLEL = 1 - 1e-9
+"""Cosine of the angle between two vehicles from which on they are in one direction."""
 
 
 class UnrecordableError(Exception):
@@ -357,12 +359,12 @@ def _body(track: Track, sample: int) -> Body:
 def _overlaps(front: FloatArray, of_open: BoolArray, recording: Recording, other: Body, is_person: bool) -> Any:
     """Rows of vehicles whose rectangles overlap another: no side of either parts them.
 
-    Two vehicles overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
+    Two vehicles in one direction overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
     """
     own, along = recording.along, other.along
     across, other_across = _left(own), _left(along)
     cosine, sine = abs(along @ own), abs(other_across @ own)
-    least = 0.0 if is_person else NUMERICAL_EPS
+    least = 0.0 if is_person or cosine < PARALLEL else NUMERICAL_EPS
     axes = (
         (own, recording.length + other.length * cosine + other.width * sine),
         (across, recording.width + other.length * sine + other.width * cosine),

@@ -1,10 +1,9 @@
-"""A scenario's network with the traffic that its parameters make: a folder like those of `sumo_nets/`, kept in the user's cache."""
+"""A scenario's network with the lanes and traffic that its parameters make: a folder like those of `sumo_nets/`, in the user's cache."""
 
 from __future__ import annotations
 
 import hashlib
 import os
-import shutil
 import tempfile
 import xml.etree.ElementTree as ElementTree
 from functools import cached_property, lru_cache
@@ -16,21 +15,24 @@ from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.scenarios import Lane, Scenario
 from safevar_sumo.scenarios.base import Actors, lane_through
 from safevar_sumo.sumo.copies import parsed
-from safevar_sumo.sumo.network import built_network
+from safevar_sumo.sumo.network import ROADS, built_network
 from safevar_sumo.sumo.sources import OPTIONS, TRAFFIC, Sources, options_of, sources_of
 
 
 def staged(scenario: Scenario) -> str:
-    """The folder of the scenario's network, with its traffic as the scenario's parameters have it.
+    """The folder of the scenario's network, with its lanes and its traffic as the scenario's parameters have them.
 
     Raises
     ------
     InputError
         If the parameters are impossible, or what they change is not in the traffic file.
     """
-    actors = getattr(scenario, "actors", None)
-    changes = actors(_BuiltRoads(scenario.network)) if actors is not None else {}
-    return str(_network_with(sources_of(scenario.network), changes)) if changes else scenario.network
+    network = scenario.network
+    lanes, actors = (getattr(scenario, name, None) for name in ("lanes", "actors"))
+    if lanes is not None and (changes := lanes(_BuiltRoads(network))):
+        network = str(_with_lanes(sources_of(network), built_network(network), changes))
+    changes = actors(_BuiltRoads(network)) if actors is not None else {}
+    return str(_with_traffic(sources_of(network), changes)) if changes else network
 
 
 class _BuiltRoads:
@@ -59,37 +61,50 @@ def _shapes(network: Path, content: bytes) -> dict[str, Lane]:
     return shapes
 
 
-def _network_with(sources: Sources, actors: Actors) -> Path:
+def _with_lanes(sources: Sources, built: Path, changes: Actors) -> Path:
+    """A copy of a network as it was built, with changes to its lanes."""
+    files = {ROADS: ElementTree.tostring(_changed(built, changes)), **_files(sources, TRAFFIC, OPTIONS)}
+    return _kept(sources.place.name, tuple(files.items()))
+
+
+def _with_traffic(sources: Sources, changes: Actors) -> Path:
     """A copy of a network with changes to its traffic."""
-    place = sources.place
-    root = parsed(place / TRAFFIC)
-    for path, attributes in actors.items():
+    files = _files(sources, *sources.files) | {TRAFFIC: ElementTree.tostring(_changed(sources.place / TRAFFIC, changes))}
+    return _kept(sources.place.name, tuple(files.items())) / sources.built
+
+
+def _files(sources: Sources, *names: str) -> dict[str, bytes]:
+    """The contents of some of a network's files, and of what sumo-gui shows."""
+    shown = options_of(sources.place / OPTIONS).get("gui-settings-file", "")
+    return {name: (sources.place / name).read_bytes() for name in (*names, shown) if (sources.place / name).is_file()}
+
+
+def _changed(file: Path, changes: Actors) -> ElementTree.Element:
+    root = parsed(file)
+    for path, attributes in changes.items():
         found = root.findall(path)
         if not found:
-            raise InputError(place / TRAFFIC, f"has no {path}")
+            raise InputError(file, f"has no {path}")
         for element in found:
             if attributes is None:
                 root.remove(element)
             else:
                 element.attrib.update(attributes)
-    return _kept(sources, ElementTree.tostring(root), sources.contents(*sources.files)) / sources.built
+    return root
 
 
 @lru_cache(maxsize=1000)
-def _kept(sources: Sources, traffic: bytes, contents: tuple[bytes, ...]) -> Path:
-    place = sources.place
-    digest = hashlib.sha256(repr((sources.files, traffic, contents)).encode()).hexdigest()
-    target = platformdirs.user_cache_path("safevar_sumo") / "staged" / digest[:16] / (place.name or "network")
+def _kept(name: str, files: tuple[tuple[str, bytes], ...]) -> Path:
+    digest = hashlib.sha256(repr(files).encode()).hexdigest()
+    target = platformdirs.user_cache_path("safevar_sumo") / "staged" / digest[:16] / (name or "network")
     if not target.is_dir():
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=target.parent) as folder:
                 copy = Path(folder) / target.name
                 copy.mkdir()
-                for name in (*sources.files, options_of(place / OPTIONS).get("gui-settings-file", "")):
-                    if (place / name).is_file():
-                        shutil.copy2(place / name, copy / name)
-                (copy / TRAFFIC).write_bytes(traffic)
+                for file, content in files:
+                    (copy / file).write_bytes(content)
                 os.replace(copy, target)
         except OSError as error:
             if not target.is_dir():

@@ -135,11 +135,19 @@ class SumoWorld:
             time.sleep(self._pause)
 
     def collisions(self, open_: BoolArray) -> dict[int, float]:
-        """Copies of open runs whose vehicle under test collides in this step, and its speed [m/s]."""
-        reported = [one for one in self._api.simulation.getCollisions()
-                    if one.collider in self._copy_of and open_[self._copy_of[one.collider]]]
-        self._struck = {self._copy_of[one.collider]: one.victim for one in reported}
-        return {self._copy_of[one.collider]: one.colliderSpeed for one in reported}
+        """Copies of open runs whose vehicle under test collides in this step, and its speed [m/s].
+
+        Of two vehicles on a junction SUMO calls the collider who would have to yield (`MSLane::detectCollisions`): either may be ours.
+        """
+        self._struck, found = {}, dict[int, float]()
+        for one in self._api.simulation.getCollisions():
+            pairs = [(one.collider, one.colliderSpeed, one.victim)]
+            if one.type == "junction":
+                pairs.append((one.victim, one.victimSpeed, one.collider))
+            for name, speed, other in pairs:
+                if (copy := self._copy_of.get(name)) is not None and open_[copy]:
+                    found[copy], self._struck[copy] = speed, other
+        return found
 
     def bodies(self, copy: int) -> tuple[Body, Body]:
         """A vehicle under test that collides in this step, and whom it collides with."""
