@@ -188,7 +188,8 @@ for _array in (*NO_CONTACT, UNDEFINED):
 class SimulationRuns:
     """N simulations as they went; `outcome` holds values of `Outcome`, `collision_speed` is NaN without one [m/s].
 
-    `test_speed_error` is the worst deviation from a test's speed before the system acted, NaN where there is none to hold [m/s].
+    `test_speed_error` is the worst deviation from a test's speed before the system acted, NaN where there is none to hold [m/s];
+    `warning_ttc` the time to collision at which the system first warned its driver, NaN where it never did [s].
     """
 
     trace: Trace
@@ -197,6 +198,7 @@ class SimulationRuns:
     collision_speed: FloatArray
     contact: Contact = NO_CONTACT
     test_speed_error: FloatArray = field(default_factory=lambda: UNDEFINED)
+    warning_ttc: FloatArray = field(default_factory=lambda: UNDEFINED)
 
     def of(self, vehicles: slice) -> SimulationRuns:
         """The runs of some of the vehicles."""
@@ -206,14 +208,26 @@ class SimulationRuns:
         return SimulationRuns(
             trace=self.trace.of(vehicles), encounter=Encounter._make(values[:, vehicles] for values in self.encounter),
             outcome=self.outcome[vehicles], collision_speed=self.collision_speed[vehicles],
-            contact=Contact._make(map(some, self.contact)), test_speed_error=some(self.test_speed_error))
+            contact=Contact._make(map(some, self.contact)), test_speed_error=some(self.test_speed_error),
+            warning_ttc=some(self.warning_ttc))
 
     @property
     def relative_speed(self) -> FloatArray:
-        """Speed of a collision relative to the obstacle along the vehicle's way [m/s], shape (N,); NaN without one."""
-        last = len(self.trace.time) - 1 - np.argmax(self.trace.active[::-1], axis=0)
-        theirs = np.broadcast_to(self.trace.obstacle_speed, self.trace.speed.shape)[last, np.arange(len(last))]
-        return np.asarray(self.collision_speed - theirs)
+        """Speed of a collision relative to the obstacle along the vehicle's way [m/s], shape (N,); NaN without one.
+
+        A gap d that closes within a step from speed v at the relative acceleration a is gone at sqrt(v^2 + 2 a d); the collision is noted
+        at the end of the step. Where no gap closes it is the speed that was noted.
+        """
+        trace, columns = self.trace, np.arange(len(self.collision_speed))
+        last = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
+        theirs = np.broadcast_to(trace.obstacle_speed, trace.speed.shape)
+        (before, after), (gap, gone) = (([values[np.maximum(last - 1, 0), columns], values[last, columns]])
+                                        for values in (trace.speed - theirs, trace.gap))
+        closes = (gap > 0) & np.isfinite(gap) & (gone <= 0) & (before > 0)
+        squared = before * before + 2 * (after - before) / trace.step * np.where(closes, gap, 0.0)
+        at_contact = np.minimum(np.maximum(np.sqrt(np.maximum(squared, 0.0)), np.minimum(before, after)), np.maximum(before, after))
+        noted = self.collision_speed - theirs[last, columns]
+        return np.asarray(np.where(closes & ~np.isnan(self.collision_speed), at_contact, noted))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.ads.base import NotNegative, Positive
-from safevar_sumo.ads.driver import Trim, in_the_way, pedals, trim
+from safevar_sumo.ads.driver import Trim, in_the_way, pedals, time_to_reach, trim
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 LEAST_DECELERATION = 0.5
@@ -17,7 +17,7 @@ LEAST_DECELERATION = 0.5
 
 class _Memory(NamedTuple):
     """The original vehicle; time between calls [s]; initial speed and the pedals that hold it; stage 0 to 2; whether it has ever braked;
-    the obstacle's speed at the last call [m/s].
+    the obstacle's speed at the last call [m/s]; whether it warns.
     """
 
     nominal: Nominal
@@ -26,6 +26,7 @@ class _Memory(NamedTuple):
     stage: FloatArray
     intervened: BoolArray
     obstacle_speed: FloatArray
+    warns: BoolArray
 
 
 class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -33,6 +34,9 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     distance = v rt + max(v_rel^2 / (2 b), v^2 / (2 b) - u^2 / (2 b_u)) + margin, with b_u the deceleration of the obstacle.
     After braking it never accelerates again.
+
+    It warns its driver while gap / closing speed of an obstacle in its way is below `warning_time`, and while it brakes. Warnings change
+    nothing of how it drives: who is warned here does nothing.
 
     Parameters
     ----------
@@ -50,6 +54,9 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Half the width of the corridor that it watches [m].
     reach
         Its sensors' range in clear weather [m].
+    warning_time
+        Time to collision at which it warns [s]; 0 for warnings from braking alone. The default is chosen: Euro NCAP judges a warning by
+        1.7 s, and 0.3 s are for sensors that are late.
 
     Notes
     -----
@@ -66,26 +73,33 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     partial_time: NotNegative = 0.15
     corridor: Positive = 1.4
     reach: Positive = 100.0
+    warning_time: NotNegative = 2.0
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         nothing = np.zeros(n)
-        return _Memory(nominal, step, None, nothing, nothing > 0, nothing)
+        return _Memory(nominal, step, None, nothing, nothing > 0, nothing, nothing > 0)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         nominal = memory.nominal
         speed, pedal = memory.cruise or (self._speed_to_hold(seen), trim(nominal, seen))
-        stage = self._stage(seen, memory)
+        threat = in_the_way(seen, self.corridor, self.reach) & (seen.closing_speed > 0)
+        stage = self._stage(seen, memory, threat)
         intervened = memory.intervened | (stage > 0)
         cruising = pedals(nominal, seen.speed, self.cruise_gain * (speed - seen.speed), pedal)
         command = Command(
             np.where(intervened, 0.0, cruising.throttle),
             np.where(stage == 2, 1.0, np.where(stage == 1, self.partial_share, np.where(intervened, 0.0, cruising.brake))))
-        return command, _Memory(nominal, memory.step, (speed, pedal), stage, intervened, _obstacle_speed(seen))
+        warns = (threat & (time_to_reach(seen) < self.warning_time)) | (stage > 0)
+        return command, _Memory(nominal, memory.step, (speed, pedal), stage, intervened, _obstacle_speed(seen), warns)
+
+    def warns(self, memory: _Memory) -> BoolArray:
+        """Whether the drivers are warned now."""
+        return memory.warns
 
     def _speed_to_hold(self, seen: Observation) -> FloatArray:
         return seen.speed if self.cruise_speed is None else np.full_like(seen.speed, self.cruise_speed)
 
-    def _stage(self, seen: Observation, memory: _Memory) -> FloatArray:
+    def _stage(self, seen: Observation, memory: _Memory, threat: BoolArray) -> FloatArray:
         """The stage; once begun, it lasts until the obstacle has left the way."""
         speed, obstacle_speed = seen.speed, _obstacle_speed(seen)
         deceleration = self.braking_share * memory.nominal.decel
@@ -94,7 +108,6 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         closing = np.maximum(seen.closing_speed, 0.0)
         braking = np.maximum(closing * closing / (2 * deceleration), np.where(theirs > LEAST_DECELERATION, both, 0.0))
         full = speed * self.response_time + braking + self.margin
-        threat = in_the_way(seen, self.corridor, self.reach) & (closing > 0)
         wanted = np.where(threat & (seen.gap < full), 2.0, np.where(threat & (seen.gap < full + speed * self.partial_time), 1.0, 0.0))
         stays = np.isfinite(seen.gap) & (seen.gap > 0) & (closing > 0) & (
             (np.abs(seen.lateral) <= self.corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0))

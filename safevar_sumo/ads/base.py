@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.plugins import Contract, Guard, read_only_copy
-from safevar_sumo.records import Command, FloatArray, Nominal, Observation
+from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 Positive = Annotated[float, Meta(gt=0, le=1e3)]
 """A driver's parameter above 0, in SI units."""
@@ -28,6 +28,8 @@ class Ads(Protocol):
 
     It sees an `Observation` and knows the original vehicle (`Nominal`), never the setting.
     Element i of a command depends on element i of the observations alone, to the bit.
+
+    A class with a method `warns(memory) -> BoolArray` warns its drivers, shape (N,), where that is true after `drive`.
     """
 
     def start(self, n: int, nominal: Nominal, step: float) -> Any:
@@ -45,6 +47,8 @@ class ScalarAds(ABC):
 
     nominal: Nominal
     step: float
+    warns = False
+    """Whether it warns its driver; `drive` may set it."""
 
     def start(self, nominal: Nominal, step: float) -> None:
         """Called once before the run, with the original vehicle and the time between two calls of `drive` [s]."""
@@ -64,8 +68,15 @@ class GuardedAds:
 
     def __init__(self, ads: Ads, guard: Guard) -> None:
         self._ads, self._guard = ads, guard
+        if hasattr(ads, "warns"):
+            self.warns = self._warns
+
+    def _warns(self, memory: Any) -> BoolArray:
+        ads: Any = self._ads
+        return self._guard.truths("warns", "warnings", self._guard.call("warns", ads.warns, memory), (self._vehicles,))
 
     def start(self, n: int, nominal: Nominal, step: float) -> Any:
+        self._vehicles = n
         return self._guard.call("start", self._ads.start, n, read_only_copy(nominal), step)
 
     def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
@@ -93,6 +104,9 @@ class PerVehicle:
     def drive(self, seen: Observation, memory: list[ScalarAds]) -> tuple[Command, list[ScalarAds]]:
         pedals = [self._pedals(self._guard.call("drive", driver.drive, one)) for driver, one in zip(memory, _each(seen), strict=True)]
         return Command(*np.array(pedals, dtype=float).reshape(len(memory), 2).T.copy()), memory
+
+    def warns(self, memory: list[ScalarAds]) -> BoolArray:
+        return np.array([bool(driver.warns) for driver in memory], dtype=bool)
 
     def _pedals(self, command: Any) -> tuple[float, float]:
         if type(command) is tuple and len(command) == 2:

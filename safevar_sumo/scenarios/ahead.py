@@ -41,9 +41,13 @@ BEYOND = 0.5
 
 
 class AheadMemory(NamedTuple):
-    """The lane; step number; speed that the target was last given [m/s]; whether the vehicle has closed in; lateral offset [m]."""
+    """The lane; the target, and how far behind its front the vehicle reaches it [m]; step number; speed that the target was last given
+    [m/s]; whether the vehicle has closed in; lateral offset [m].
+    """
 
     frame: Frame
+    ahead: Ahead
+    depth: float
     sample: int
     given: float
     closed_in: BoolArray
@@ -105,12 +109,12 @@ class Ahead(NamedTuple):
         nothing = np.zeros(len(world.vehicle_positions(VUT)))
         world.drive(TARGET, self.speed(0.0))
         frame = Frame.of(world.lane(APPROACH if self._askew else ROAD))
-        return AheadMemory(frame, 0, self.speed(0.0), nothing > 0, nothing + self.offset)
+        return AheadMemory(frame, self, self._depth, 0, self.speed(0.0), nothing > 0, nothing + self.offset)
 
     def observe(self, world: World, step: float, memory: AheadMemory, speed: FloatArray) -> tuple[Scene, AheadMemory]:
         """The scene at the vehicles' speed, shape (N,) [m/s]; gives the target its next speed."""
         frame, nothing = memory.frame, np.zeros_like(speed)
-        gap = frame.along(world.vehicle_positions(TARGET)) - self._depth - frame.along(world.vehicle_positions(VUT))
+        gap = frame.along(world.vehicle_positions(TARGET)) - memory.depth - frame.along(world.vehicle_positions(VUT))
         now, then = self.speed(memory.sample * step), self.speed((memory.sample + 1) * step)
         if then != memory.given:
             world.drive(TARGET, then)
@@ -184,7 +188,7 @@ class BehindSomebody(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return self._ahead.begin(world)
 
     def observe(self, world: World, step: float, memory: AheadMemory) -> tuple[Scene, AheadMemory]:
-        return self._ahead.observe(world, step, memory, world.speeds())
+        return memory.ahead.observe(world, step, memory, world.speeds())
 
     def encounter(self, trace: Trace) -> Encounter:
         """Distances from bumper to body; TTC is that gap over the difference of speeds."""

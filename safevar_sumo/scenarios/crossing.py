@@ -73,13 +73,22 @@ PRE_CRASH = {"adult": PreCrash.PEDESTRIAN, "child": PreCrash.PEDESTRIAN, "cyclis
              "motorcyclist": PreCrash.STRAIGHT_PATHS, "car": PreCrash.STRAIGHT_PATHS}
 
 
-class _Memory(NamedTuple):
-    """The lane; the target's place along it at the impact [m], its walk, how it is moved, where it was; step number; speed last given."""
+class _Course(NamedTuple):
+    """What stays as it is in a run: the lane, the target's place along it at the impact [m], its walk, how it moves, what it takes up."""
 
     frame: Frame
     path: float
     walk: Walk
     mover: OnFoot | OnWheels
+    reach: Body
+    direction: Direction
+    hidden: bool
+
+
+class _Memory(NamedTuple):
+    """The course; where the target was; step number; speed that it was last given."""
+
+    course: _Course
     place: FloatArray
     sample: int
     given: float
@@ -208,26 +217,29 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def begin(self, world: World) -> _Memory:
         frame, mover, walk = Frame.of(world.lane(APPROACH)), self._mover, self._walk
-        lateral = self._sign * mover.middle(frame, world)[1]
-        path, given = mover.path(frame, world, self._sideways), mover.begin(world, walk)
-        return _Memory(frame, path, walk, mover, lateral, 0, given)
+        path = mover.path(frame, world, self._sideways)
+        course = _Course(frame, path, walk, mover, self._reach, self._direction, self._of("hidden"))
+        return _Memory(course, self._sign * mover.middle(frame, world)[1], 0, mover.begin(world, walk))
 
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
-        front = memory.frame.along(world.vehicle_positions(VUT))
-        along, left = memory.mover.middle(memory.frame, world)
-        lateral, time = self._sign * left, memory.sample * step
-        pace = memory.mover.pace(memory.walk, memory.sample, step)
+        frame, path, walk, mover, reach, direction, hidden = memory.course
+        front = frame.along(world.vehicle_positions(VUT))
+        along, left = mover.middle(frame, world)
+        lateral = left if direction.left > 0 else -left
+        pace = mover.pace(walk, memory.sample, step)
         if pace != memory.given:
-            memory.mover.go(world, pace)
+            mover.go(world, pace)
         lateral_speed = (lateral - memory.place) / step
-        ahead = 0.0 if along is None else along - memory.path
-        gap = memory.path - self._reach.length / 2 + ahead - front
-        gone = (lateral > 0) & (beside(lateral, (self.vut_width + self._reach.width) / 2) > 0)
-        passed = gap < -self._reach.length - self.vut_length
-        scene = Scene(gap, lateral, lateral_speed, gone | passed, visible=self._visible(gap, lateral, ahead))
-        if self._direction.along:
-            scene = scene._replace(obstacle_speed=np.full_like(gap, self._direction.along * memory.walk.pace(time)))
-        return scene, memory._replace(place=lateral, sample=memory.sample + 1, given=pace)
+        ahead = 0.0 if along is None else along - path
+        gap = path - reach.length / 2 + ahead - front
+        gone = lateral > (self.vut_width + reach.width) / 2
+        passed = gap < -reach.length - self.vut_length
+        scene = Scene(gap, lateral, lateral_speed, gone | passed)
+        if hidden:
+            scene = scene._replace(visible=self._visible(gap, lateral, ahead, reach))
+        if direction.along:
+            scene = scene._replace(obstacle_speed=np.full_like(gap, direction.along * walk.pace(memory.sample * step)))
+        return scene, _Memory(memory.course, lateral, memory.sample + 1, pace)
 
     def encounter(self, trace: Trace) -> Encounter:
         """Between the vehicle's front and the target's body, along the way and across it; TTC by how fast that shrinks."""
@@ -289,15 +301,17 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def _time(self) -> float:
         """From the start to the impact [s]."""
         if self._starts_at_speed:
-            return (self.time_to_impact or TIME_TO_IMPACT) * self.start_share
+            return float(self.time_to_impact or TIME_TO_IMPACT) * self.start_share
         if self.time_to_impact is not None:
             return self.time_to_impact
         needed = (self._way + self._of("acceleration_distance")) / self._target_speed
-        return max(TIME_TO_IMPACT, math.ceil(needed / ROUNDED_TO) * ROUNDED_TO)
+        return float(max(TIME_TO_IMPACT, math.ceil(needed / ROUNDED_TO) * ROUNDED_TO))
 
     @property
     def _walk(self) -> Walk:
         if self._starts_at_speed:
+            if self.acceleration_distance is not None:
+                raise InputError("scenario.parameters", "acceleration_distance: the target does not stand first", "lateral_start too")
             return Walk(0.0, self._target_speed, 0.0)
         return Walk.reaching(self._way, self._time, self._target_speed, self._of("acceleration_distance"))
 
@@ -316,10 +330,8 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         given = getattr(self, name)
         return getattr(TESTS[self.test], name) if given is None else given
 
-    def _visible(self, gap: FloatArray, lateral: FloatArray, ahead: FloatArray | float) -> BoolArray:
+    def _visible(self, gap: FloatArray, lateral: FloatArray, ahead: FloatArray | float, reach: Body) -> BoolArray:
         """Where the line from the sensors to the target's middle passes the front corner of the nearer parked car."""
-        if not self._of("hidden"):
-            return np.ones(gap.shape, dtype=bool)
-        away = gap + self._reach.length / 2 + self.sensor_setback
+        away = gap + reach.length / 2 + self.sensor_setback
         corner = away - ahead - PARKED_GAP
         return np.asarray((corner <= 0) | (-lateral * corner < -self._kerb_side * away))

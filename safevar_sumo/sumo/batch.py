@@ -12,6 +12,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import guard_process_state
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Evaluations, FloatArray, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios import VUT, Lane, Point
+from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.scenarios.frame import Frame
 from safevar_sumo.sumo.contact import Contacts
 from safevar_sumo.sumo.driving_robot import DrivingRobot
@@ -109,7 +110,7 @@ def _driven(system: System, settings: FloatArray, world: Any, watch: Watcher | N
     parts = Parts(system.points, world, n)
     log = _Log(n, int(parts.last.max()) + 1, way)
     verdict, robot = _Verdict(n), DrivingRobot(system.points, vehicle, prepared, state, step)
-    contacts = Contacts(n, robot.tested)
+    contacts, warnings = Contacts(n, robot.tested), _Warnings(system.ads, n)
     for sample in range(log.length):
         if watch is not None:
             watch(world)
@@ -119,6 +120,7 @@ def _driven(system: System, settings: FloatArray, world: Any, watch: Watcher | N
         seen = parts.seen(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
         seen, state = vehicle.sense(prepared, state, seen)
         command, driver = system.ads.drive(seen, driver)
+        warnings.take(driver, speed, scene, verdict.open)
         command, state = robot.drive(command, state, verdict.open)
         log.write(sample, place=world.vehicle_positions(VUT), speed=speed, gap=scene.gap, lateral=scene.lateral,
                   lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active,
@@ -134,7 +136,7 @@ def _driven(system: System, settings: FloatArray, world: Any, watch: Watcher | N
     return SimulationRuns(
         trace=trace, encounter=parts.encounter(trace), outcome=np.where(robot.invalid, Outcome.INVALID_TEST, verdict.outcome()),
         collision_speed=np.where(robot.invalid, np.nan, verdict.collision_speed), contact=contacts.contact(),
-        test_speed_error=robot.error)
+        test_speed_error=robot.error, warning_ttc=warnings.time_to_collision)
 
 
 def _refuse_no_number(speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet) -> None:
@@ -173,6 +175,23 @@ def _sensors(system: System, prepared: Any, n: int) -> Sensors:
     delay = np.repeat([weather.recognition_delay for weather in weathers], n // len(weathers))
     visibility = np.repeat([weather.visibility for weather in weathers], n // len(weathers))
     return Sensors(own.latency + delay, own.reach * visibility, own.scale)
+
+
+class _Warnings:
+    """The times to collision at which N drivers are first warned [s], NaN where they are not; an ADS without `warns` never does."""
+
+    def __init__(self, ads: Any, n: int) -> None:
+        self._warns = getattr(ads, "warns", None)
+        self.time_to_collision = np.full(n, np.nan)
+
+    def take(self, memory: Any, speed: FloatArray, scene: Scene, open_: BoolArray) -> None:
+        """Take in one sample: what counts is where the obstacle is, not where sensors have it."""
+        if self._warns is None:
+            return
+        closing = speed - scene.obstacle_speed
+        first = self._warns(memory) & open_ & np.isnan(self.time_to_collision) & (closing > 0)
+        if first.any():
+            self.time_to_collision = np.where(first, scene.gap / closing, self.time_to_collision)
 
 
 class _Log:

@@ -13,6 +13,7 @@ from safevar_sumo.records import FloatArray, SimulationRuns
 from safevar_sumo.sumo.copies import copy_and_name
 from safevar_sumo.sumo.matrix import at_worst, simulate
 from safevar_sumo.sumo.network import built_network
+from safevar_sumo.sumo.staging import staged
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.world import SumoWorld
 
@@ -72,7 +73,7 @@ def film(system: System, settings: FloatArray) -> Film:
     """
     camera, system = _Camera(len(settings)), at_worst(system, settings)
     drives = simulate(system, settings, watch=camera.take)
-    return Film(drives=drives, tracks=camera.tracks(), road=road_of(system.scenario.network))
+    return Film(drives=drives, tracks=camera.tracks(), road=road_of(staged(system.scenario)))
 
 
 class _Camera:

@@ -42,12 +42,14 @@ class AtPoint(NamedTuple):
 
 def point_record(found: AtPoint, row: int = 0) -> dict[str, Any]:
     """One setting at one point as plain values: where that is, how it ended, speeds of the impact [m/s], the worst deviation from the
-    test's speed before the system acted [km/h], who was touched where [%]; undefined is None.
+    test's speed before the system acted [km/h], the time to collision at the first warning [s], who was touched where [%]; None if
+    undefined.
     """
     evaluations, relative = found.evaluations, found.drives.relative_speed
     numbers = {"impact_speed": evaluations.collision_speed[row], "relative_impact_speed": relative[row],
                SAFETY_DEGREE: evaluations.f_safe[row],
-               "test_speed_error": np.broadcast_to(found.drives.test_speed_error, relative.shape)[row] / KMH}
+               "test_speed_error": np.broadcast_to(found.drives.test_speed_error, relative.shape)[row] / KMH,
+               "warning_ttc": np.broadcast_to(found.drives.warning_ttc, relative.shape)[row]}
     side, place = (np.broadcast_to(values, relative.shape)[row] for values in found.drives.contact)
     return {"point": found.point.name, **dict(found.point.place), "outcome": str(evaluations.outcome[row]),
             **{name: None if np.isnan(value) else float(value) for name, value in numbers.items()},
@@ -237,4 +239,4 @@ def _picked(drives: Sequence[SimulationRuns], number: npt.NDArray[np.intp]) -> S
         trace=replace(trace, active=active), encounter=Encounter._make(picked(list(values)) for values in encounters),
         outcome=of_each([one.outcome for one in drives]), collision_speed=of_each([one.collision_speed for one in drives]),
         contact=Contact._make(of_each(list(values)) for values in zip(*(one.contact for one in drives), strict=True)),
-        test_speed_error=of_each([one.test_speed_error for one in drives]))
+        test_speed_error=of_each([one.test_speed_error for one in drives]), warning_ttc=of_each([one.warning_ttc for one in drives]))

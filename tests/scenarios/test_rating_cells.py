@@ -1,0 +1,226 @@
+"""Cells of Euro NCAP's rating and their robustness layers: when and where who does not brake meets the target, and how fast."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import Outcome
+from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point
+from safevar_sumo.sumo import Engine
+from safevar_sumo.sumo.matrix import at_every_point
+from tests.scenarios.holding import CARLA, NATIVE, Hold, at_contact, driven
+
+KMH = 1 / 3.6
+CAR, NARROW = (125, 100, 75, 50, 25, 0, -25), (90, 75, 50, 25, 10)
+NEAR, FAR = 1, -1
+
+
+class Cell(NamedTuple):
+    """A scenario, and what the closed form has: arrival [s] and relative speed [m/s]."""
+
+    scenario: Any
+    arrival: float
+    relative: float
+
+
+class Row(NamedTuple):
+    """A crossing test of the protocol: where it starts from, or None, and its run-up [m]; headings of its layer; speed layers [km/h]."""
+
+    side: int
+    speed: float
+    start: float | None
+    run_up: float
+    headings: tuple[float, ...]
+    faster_or_slower: tuple[float, float]
+
+
+CROSSING = {
+    "CPNA": Row(NEAR, 5, 4, 1, (-10, 20), (3, -2)), "CPFA": Row(FAR, 8, 6, 1.5, (-10, 20), (3, -2)),
+    "CPNCO": Row(NEAR, 5, 4, 1, (20,), (3, -2)), "CBNA": Row(NEAR, 15, None, 0, (20,), (5, -3)),
+    "CBFA": Row(FAR, 20, None, 0, (-20,), (5, -3)), "CBNAO": Row(NEAR, 10, None, 0, (-10, 20), (5, -3)),
+}
+
+
+def crossing(test: str, speed: float, location: float) -> Iterator[Cell]:
+    """A cell and its layers: the protocol's target is there after 6 s, or as soon as it can be."""
+    row = CROSSING[test]
+    width = Crossing().vut_width
+    layers: list[dict[str, float]] = [{}, {"start_share": 0.75}, *({"heading": float(turn)} for turn in row.headings),
+                                      *({"target_speed": row.speed + more} for more in row.faster_or_slower)]
+    for layer in layers:
+        share, pace = layer.get("start_share", 1.0), layer.get("target_speed", row.speed) * KMH
+        arrival = 6.0 * share
+        if row.start is not None:
+            way = (row.start + (location / 100 - 0.5) * width) * share
+            arrival = max(6.0, math.ceil((way + row.run_up) / pace * 2) / 2)
+        forward = -row.side * math.sin(math.radians(layer.get("heading", 0.0))) * pace
+        yield Cell(Crossing(test=test, speed=speed, impact_location=location, **layer), arrival, speed * KMH - forward)
+
+
+def junction(test: str, speed: float, target_speed: float) -> Iterator[Cell]:
+    for more in (0, 5, -5):
+        yield Cell(Crossing(test=test, speed=speed, target_speed=target_speed + more), 6.0, speed * KMH)
+
+
+def behind(test: str, speed: float, location: float, target_speed: float) -> Iterator[Cell]:
+    """A cell and its layers of somebody who stands, or is slower; gap of 5 s."""
+    turns = (0.0, -10.0, 20.0) if target_speed == 0 else (0.0,)
+    closing = (speed - target_speed) * KMH
+    for turn in turns:
+        scenario = CarToCar(test=test, speed=speed, target_speed=target_speed, impact_location=location, heading=turn)
+        yield Cell(scenario, 5 * speed * KMH / closing, closing)
+
+
+def behind_braking(test: str, speed: float, location: float) -> Iterator[Cell]:
+    """Headway of 1 s; from 3 s on the target brakes at 4 m/s^2 down to 2 km/h: gap = closing^2 / (2 b), then steady."""
+    for headway, deceleration in ((1, 4), (1.5, 4), (0.5, 4), (1, 6), (1, 2)):
+        gap, slowed = headway * speed * KMH, (speed - 2) * KMH
+        closing = min(math.sqrt(2 * deceleration * gap), slowed)
+        since = closing / deceleration + max(gap - closing**2 / (2 * deceleration), 0) / closing
+        scenario = CarToCar(test=test, speed=speed, impact_location=location, headway=headway, target_deceleration=deceleration)
+        yield Cell(scenario, 3 + since, closing)
+
+
+def along(test: str, speed: float, location: float, target_speed: float) -> Iterator[Cell]:
+    yield Cell(Along(test=test, speed=speed, impact_location=location, target_speed=target_speed), 6.0, (speed - target_speed) * KMH)
+
+
+def all_cells() -> Iterator[Cell]:
+    for test in CROSSING:
+        for speed in range(10, 61, 10):
+            for location in NARROW:
+                yield from crossing(test, speed, location)
+    for test in ("CCCscp", "CMCscp"):
+        for speed in range(20, 81, 10):
+            for target_speed in range(20, 81, 10):
+                yield from junction(test, speed, target_speed)
+    for test, locations in (("CC", CAR), ("CM", NARROW)):
+        for location in locations:
+            for speed in range(10, 81, 10):
+                yield from behind(f"{test}Rs", speed, location, 0)
+            for speed in range(30, 131, 10):
+                yield from behind_braking(f"{test}Rb", speed, location)
+    for location in CAR:
+        for speed in range(30, 131, 10):
+            yield from behind("CCRm", speed, location, 20 + max(speed - 80, 0))
+    for test, slowest, first, then in (("CPLA", 10, 5, 5), ("CBLA", 20, 15, 20)):
+        for location in (75, 50, 25, 10):
+            for speed in range(slowest, 61, 10):
+                yield from along(test, speed, location, first)
+            for speed in range(50, 81, 10):
+                yield from along(test, speed, location, then)
+
+
+def at_the_edges() -> Iterator[Cell]:
+    """One cell of every test and all its layers, at the ends of the ranges."""
+    for k, test in enumerate(CROSSING):
+        yield from crossing(test, (10, 60)[k % 2], (10, 90)[k // 2 % 2])
+    yield from junction("CCCscp", 20, 80)
+    yield from junction("CMCscp", 80, 30)
+    yield from behind("CCRs", 80, 125, 0)
+    yield from behind("CCRs", 10, -25, 0)
+    yield from behind("CMRs", 50, 10, 0)
+    yield from behind("CCRm", 130, 100, 70)
+    yield from behind_braking("CMRb", 50, 90)
+    yield from behind_braking("CCRb", 130, -25)
+    yield from along("CBLA", 80, 10, 20)
+
+
+def check(cells: list[Cell]) -> None:
+    points = tuple(Point(cell.scenario, WEATHERS["clear"], str(k)) for k, cell in enumerate(cells))
+    system = replace(CARLA, ads=Hold(), matrix=points)
+    for cell, found in zip(cells, at_every_point(system, system.characteristics.original[np.newaxis]), strict=True):
+        run, scenario = found.drives, cell.scenario
+        assert run.outcome[0] == Outcome.COLLISION, scenario
+        assert set(run.contact.side) == {"front"}, scenario
+        late = at_contact(run, run.trace.time) - cell.arrival
+        assert abs(late) * scenario.speed * KMH < 0.05, (late, scenario)
+        lateral = at_contact(run, run.trace.lateral[:, 0])
+        assert abs(lateral - (scenario.impact_location / 100 - 0.5) * scenario.vut_width) < 0.02 * scenario.vut_width, scenario
+        assert run.contact.place == pytest.approx(min(max(scenario.impact_location, 0), 100), abs=2), scenario
+        assert run.relative_speed[0] == pytest.approx(cell.relative, abs=0.1 * KMH), scenario
+
+
+def test_cells_at_the_edges_and_their_layers_are_where_the_closed_forms_have_them() -> None:
+    check([*at_the_edges()])
+
+
+@pytest.mark.slow
+def test_all_cells_and_layers_are_where_the_closed_forms_have_them() -> None:
+    check([*all_cells()])
+
+
+@pytest.mark.parametrize("scenario", [
+    Crossing(test="CBNAO", impact_location=90, heading=-10), Crossing(test="CBFA", speed=60, impact_location=10, heading=-20),
+    Crossing(test="CPNCO", start_share=0.75), Crossing(test="CMCscp", speed=20, target_speed=80, impact_location=10),
+    CarToCar(test="CCRs", impact_location=125, heading=20), CarToCar(test="CMRs", impact_location=10, heading=-10),
+    CarToCar(test="CMRb", speed=90, impact_location=90), Along(test="CBLA", speed=80, target_speed=20),
+], ids=lambda scenario: scenario.test)
+def test_further_targets_are_hit_in_a_recorded_scene_as_in_sumo_to_the_last_bit(scenario: Any) -> None:
+    """One who never brakes, and who brakes at any time up to the impact: fronts that hit, corners, targets that have passed."""
+    n, arrival = 30, scenario.duration - scenario.time_after
+    brakes_at = np.append(np.random.default_rng(4).uniform(arrival - 3, arrival + 0.3, n - 1), 99.0)
+    system = replace(CARLA, ads=Hold(brakes_at), matrix=(Point(scenario, WEATHERS["clear"]),))
+    settings = np.repeat(system.characteristics.original[np.newaxis], n, axis=0)
+    (here,), (there,) = (at_every_point(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO))
+    assert here.drives.outcome.tolist() == there.drives.outcome.tolist()
+    assert set(here.drives.outcome) > {Outcome.COLLISION}
+    for name in ("collision_speed", "relative_speed", "warning_ttc"):
+        np.testing.assert_array_equal(getattr(here.drives, name), getattr(there.drives, name), err_msg=name)
+    for ours, theirs in zip(here.drives.contact, there.drives.contact, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direction() -> None:
+    """Straight line from the front's middle to the cyclist's: it passes the corner 1 m beside the vehicle, 1 m before the impact."""
+    for heading in (0.0, -10.0, 20.0):
+        scenario = Crossing(test="CBNAO", heading=heading)
+        trace = driven(scenario).trace
+        turned = math.radians(heading)
+        reach = (1.9 * abs(math.sin(turned)) + 0.5 * math.cos(turned)) / 2
+        before = np.maximum(6.0 - trace.time, 0.0)
+        x = trace.gap[:, 0] + reach
+        corner = 40 * KMH * before + reach - 1.0
+        y = 10 * KMH * before * math.cos(turned)
+        hidden = (corner > 0) & (y * corner / x > scenario.vut_width / 2 + 1.0)
+        recorder = _Seen()
+        driven(scenario, recorder)
+        seen = np.array(recorder.gaps)
+        assert np.isinf(seen).tolist() == hidden[:len(seen)].tolist()
+        assert 0.5 < before[np.argmin(hidden)] < 3.0
+
+
+class _Seen(Hold):
+    """Does nothing, and keeps the gaps that it sees."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gaps: list[float] = []
+
+    def drive(self, seen: Any, memory: Any) -> Any:
+        self.gaps.append(seen.gap[0])
+        return super().drive(seen, memory)
+
+
+@pytest.mark.parametrize(("kind", "parameters", "told"), [
+    (CarToCar, {"test": "CCRm", "heading": 10}, "a target that moves"),
+    (Crossing, {"test": "CBFA", "target_speed": 90, "time_to_impact": 13}, "has no lane"),
+    (Crossing, {"test": "CBNA", "acceleration_distance": 1.0}, "lateral_start"),
+])
+def test_impossible_targets_are_refused(kind: type, parameters: dict[str, Any], told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        driven(kind(**parameters), system=NATIVE)
+
+
+def test_a_speed_outside_the_protocol_is_allowed_with_a_word() -> None:
+    assert Crossing(test="CMCscp", speed=90).remarks() == ["CMCscp: speed = 90 km/h is outside the protocol's 20 to 80 km/h"]
+    assert CarToCar(test="CMRs", speed=10, impact_location=125).remarks() == [
+        "CMRs: impact_location = 125 % is none of the protocol's 50, 10, 25, 75, 90 %"]
+    assert not Along(test="CBLA", speed=80, target_speed=20).remarks()
