@@ -21,11 +21,15 @@ from safevar_sumo.records import Evaluations
 from safevar_sumo.reference import (
     Agreement,
     Calibration,
+    Effect,
     ReferenceData,
+    Subject,
     agreement,
     calibrate,
+    calibrate_together,
     calibration_comment,
     cost_line,
+    effects_of,
     evaluations_of,
     fitted_as,
     keep_totals,
@@ -34,9 +38,11 @@ from safevar_sumo.reference import (
     plot_agreement,
     read_reference,
 )
+from safevar_sumo.reference.effects import LEAST as LEAST_EFFECT
+from safevar_sumo.reference.effects import SHARE as EFFECT_SHARE
 from safevar_sumo.reference.replication import Nearness, nearness, paired, replication
 from safevar_sumo.results import write_imported, write_whole
-from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, load_study, write_study
+from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, load_study, study_names, write_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, stages
 from safevar_sumo.vehicles import CharacteristicSet
@@ -52,7 +58,9 @@ from safevar_sumo.workers.local import available_cores, local_pool
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option("--totals", type=click.Path(path_type=Path), metavar="FILE.toml",
               help="Keep rank correlations, errors and counts of collisions there too: no row of the data.")
-def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, as_json: bool, totals: Path | None) -> None:
+@click.option("--effects", "with_effects", is_flag=True, help="How strongly each characteristic acts there and here, by linear regression.")
+def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, as_json: bool, totals: Path | None,
+             with_effects: bool) -> None:
     """Compare STUDY with settings and metrics in the published package's CSV format."""
     chosen = load_study(study)
     tell_remarks(chosen)
@@ -75,56 +83,109 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
                        chosen.repeatability.get(SAFETY_DEGREE))
     if totals is not None:
         keep_totals(totals, chosen, reference.name, result)
+    effects = effects_of(data, here, system.characteristics) if with_effects else []
     if as_json:
-        click.echo(json.dumps(result.to_dict(), indent=2, allow_nan=False))
+        told = {one.name: {"reference": one.reference, "here": one.here, "agrees": one.agrees} for one in effects}
+        click.echo(json.dumps({**result.to_dict(), **({"effects": told} if with_effects else {})}, indent=2, allow_nan=False))
     else:
         print_agreement(Console(), chosen, result)
+        if with_effects:
+            print_effects(Console(), effects)
 
 
 @commands.command(name="calibrate")
 @click.argument("study", shell_complete=complete_study)
-@click.argument("references", type=click.Path(path_type=Path), nargs=-1, metavar="[REFERENCE.csv]...")
-@click.option("--trials", type=click.IntRange(min=1), help="How many sets of parameters are tried.  [default: the study's]")
-@click.option("--seed", type=click.IntRange(min=0, max=2**31), help="Seed of the search.  [default: the study's]")
-@click.option("--from-scratch", is_flag=True, help="Start from random places alone, as if the study's values were not known.")
+@click.argument("others", nargs=-1, metavar="[STUDY]... [[STUDY=]REFERENCE.csv]...")
+@click.option("--trials", type=click.IntRange(min=1), help="How many sets of parameters are tried.  [default: the first study's]")
+@click.option("--seed", type=click.IntRange(min=0, max=2**31), help="Seed of the search.  [default: the first study's]")
+@click.option("--starts", type=click.IntRange(min=0, max=1000), help="Random places to start from, too.  [default: the first study's]")
+@click.option("--from-scratch", is_flag=True, help="Start from random places alone, as if the studies' values were not known.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
-@click.option("--out", type=click.Path(path_type=Path), metavar="FILE.toml", help="Study file to write.  [default: STUDY-calibrated.toml]")
-def calibrate_command(study: str, references: tuple[Path, ...], trials: int | None, seed: int | None, from_scratch: bool,
-                      jobs: int | None, out: Path | None) -> None:
-    """Fit what STUDY declares under [calibration] to the published values and to rows of reference files, as [fit] says."""
-    given = load_study(study)
-    asked = {name: value for name, value in (("trials", trials), ("seed", seed)) if value is not None}
-    chosen = msgspec.structs.replace(given, fit=msgspec.structs.replace(given.fit, **asked))
-    system = assemble(chosen, study)
-    target = out or Path(f"{chosen.name}-calibrated.toml")
-    for source in (Path(study), *references):
-        if target.exists() and source.exists() and target.samefile(source):
-            raise InputError("--out", f"{target} is what the calibration starts from", "another file")
-    check_writable(target)
-    if len({path.name for path in references}) < len(references):
+@click.option("--out", type=click.Path(path_type=Path), metavar="FILE.toml",
+              help="Study file to write; of several studies, the directory of their files.  [default: STUDY-calibrated.toml]")
+def calibrate_command(study: str, others: tuple[str, ...], trials: int | None, seed: int | None, starts: int | None,
+                      from_scratch: bool, jobs: int | None, out: Path | None) -> None:
+    """Fit what STUDY declares under [calibration] to the published values and to rows of reference files, as [fit] says.
+
+    Several studies are fitted together: they share the parameters that they give one value, unless [calibration] says that it is their
+    own. A file belongs to the study that is named before it, STUDY=FILE.csv, or that its name begins with.
+    """
+    names = [study, *(one for one in others if _is_study(one))]
+    files = [one for one in others if not _is_study(one)]
+    asked = {name: value for name, value in (("trials", trials), ("seed", seed), ("starts", starts)) if value is not None}
+    given = [load_study(name) for name in names]
+    chosen = [msgspec.structs.replace(one, fit=msgspec.structs.replace(one.fit, **asked)) for one in given]
+    systems = [assemble(one, name) for one, name in zip(chosen, names, strict=True)]
+    if len({one.name for one in chosen}) < len(chosen):
+        raise InputError("STUDY", f"two studies are called {chosen[0].name!r}", "studies of different names")
+    targets = _targets(chosen, out)
+    owners = [_owner(file, chosen) for file in files]
+    for source in (*map(Path, names), *(path for _, path in owners)):
+        for target in targets:
+            if target.exists() and source.exists() and target.samefile(source):
+                raise InputError("--out", f"{target} is what the calibration starts from", "another file")
+    for target in targets:
+        check_writable(target)
+    if len({path.name for _, path in owners}) < len(owners):
         raise InputError("REFERENCE.csv", "two files have one name", "files of different names")
-    data = {path.name: _read(path, system.characteristics) for path in references}
-    tried, lowest, best = 0, np.inf, chosen
+    data = [{path.name: _read(path, system.characteristics) for owner, path in owners if owner == k} for k, system in enumerate(systems)]
+    tried, lowest, best = 0, np.inf, tuple(chosen)
+    count = chosen[0].fit.trials
     try:
-        with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
+        with (local_pool(jobs or available_cores(), max(one.search.time_limit for one in chosen)) as pool,
               stages(Console(stderr=True)) as show):
-            show("trials", 0, chosen.fit.trials)
+            show("trials", 0, count)
 
-            def one_done(cost: float, so_far: Study) -> None:
+            def one_done(cost: float, so_far: Study | tuple[Study, ...]) -> None:
                 nonlocal tried, lowest, best
-                tried, lowest, best = tried + 1, cost, so_far
-                show(f"trials, lowest cost {cost:.4f}", tried, chosen.fit.trials)
+                tried, lowest, best = tried + 1, cost, so_far if isinstance(so_far, tuple) else (so_far,)
+                show(f"trials, lowest cost {cost:.4f}", tried, count)
 
-            calibration = calibrate(chosen, data, pool, one_done, from_scratch=from_scratch)
+            if len(chosen) == 1:
+                calibrations = [calibrate(chosen[0], data[0], pool, one_done, from_scratch=from_scratch)]
+            else:
+                subjects = [Subject(one, references) for one, references in zip(chosen, data, strict=True)]
+                calibrations = calibrate_together(subjects, pool, one_done, from_scratch=from_scratch)
     except KeyboardInterrupt:
         if tried:
-            account = f"Best of {tried} of {chosen.fit.trials} trials, then interrupted (seed {chosen.fit.seed}). Cost {lowest:.4f}."
-            write_study(target, fitted_as(chosen, best), account)
-            click.echo(f"interrupted: the best of {tried} trials is in {target}", err=True)
+            account = f"Best of {tried} of {count} trials, then interrupted (seed {chosen[0].fit.seed}). Cost {lowest:.4f}."
+            for one, found, target in zip(chosen, best, targets, strict=True):
+                write_study(target, fitted_as(one, found), account)
+            click.echo(f"interrupted: the best of {tried} trials is in {', '.join(map(str, targets))}", err=True)
         raise
-    print_calibration(Console(), chosen, calibration)
-    write_study(target, fitted_as(chosen, calibration.study), calibration_comment(calibration, chosen, data, from_scratch=from_scratch))
-    Console().print(f"Study file: {target}", soft_wrap=True)
+    for one, calibration, references, target in zip(chosen, calibrations, data, targets, strict=True):
+        print_calibration(Console(), one, calibration)
+        write_study(target, fitted_as(one, calibration.study), calibration_comment(calibration, one, references, from_scratch=from_scratch))
+        Console().print(f"Study file: {target}", soft_wrap=True)
+
+
+def _is_study(given: str) -> bool:
+    """Whether a word names a study rather than a reference file."""
+    return given in study_names() or given.endswith(".toml")
+
+
+def _targets(studies: Sequence[Study], out: Path | None) -> list[Path]:
+    """The files that are written, one for each study."""
+    if len(studies) == 1:
+        return [out or Path(f"{studies[0].name}-calibrated.toml")]
+    if out is not None and not out.is_dir():
+        raise InputError("--out", f"{out} is no directory", "a directory that exists, for the files of several studies")
+    return [(out or Path()) / f"{study.name}-calibrated.toml" for study in studies]
+
+
+def _owner(given: str, studies: Sequence[Study]) -> tuple[int, Path]:
+    """Number of the study that a reference file belongs to, and its path."""
+    names = [study.name for study in studies]
+    name, _, place = given.partition("=")
+    if place and name in names and not Path(given).exists():
+        return names.index(name), Path(place)
+    path = Path(given)
+    if len(names) == 1:
+        return 0, path
+    fitting = [own for own in names if path.name.startswith(own)]
+    if not fitting:
+        raise InputError("REFERENCE.csv", f"{given} may belong to each of {', '.join(names)}", "STUDY=FILE.csv, or a name that begins so")
+    return names.index(max(fitting, key=len)), path
 
 
 @commands.command(name="import")
@@ -259,6 +320,18 @@ def print_agreement(console: Console, study: Study, result: Agreement) -> None:
     console.print(f"Mean error by the safety degree here: {bins}.", markup=False)
 
 
+def print_effects(console: Console, effects: Sequence[Effect]) -> None:
+    """Effects there and here, and whether they agree."""
+    title = f"Linear effects on the safety degree over a domain, m (agree: within {EFFECT_SHARE:.0%} or {LEAST_EFFECT:g} m)"
+    table = WholeTable("characteristic", title=title, title_justify="left")
+    for head in ("there", "here", "agree"):
+        table.add_column(head, justify="right")
+    for one in effects:
+        told = "-" if one.agrees is None else "yes" if one.agrees else "no"
+        table.add_row(one.name, *("-" if value is None else f"{value:+.2f}" for value in (one.reference, one.here)), told)
+    console.print(table)
+
+
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
@@ -267,8 +340,9 @@ def print_calibration(console: Console, study: Study, result: Calibration) -> No
     """Fitted values, and how well they agree with both halves of the data."""
     table = WholeTable("parameter", "unit", right=("fitted", "lower", "upper"), title=study.title)
     for name, value in result.values.items():
-        row = study.calibration[name]
-        table.add_row(name, row.unit, *(f"{number:.5g}" for number in (value, row.lower, row.upper)))
+        row = result.bounds[name]
+        shared = f" (shared with {', '.join(result.together)})" if name in result.shared else ""
+        table.add_row(name + shared, row.unit, *(f"{number:.5g}" for number in (value, row.lower, row.upper)))
     console.print(table)
     for name in result.used:
         both = WholeTable("", right=("Spearman's rho", "mean abs. error", "bias"), title=f"{name}: rows used / held back")
@@ -279,6 +353,6 @@ def print_calibration(console: Console, study: Study, result: Calibration) -> No
                 " / ".join("-" if number is None else f"{number:.3f}" for number in (getattr(half, what)[metric] for half in halves))
                 for what in ("spearman", "mean_absolute_error", "bias")))
         console.print(both)
-    for name in on_a_bound(result.values, study.calibration):
+    for name in on_a_bound(result.values, result.bounds):
         console.print(f"{name} stands on its bound: a wider one may fit better.", markup=False)
     console.print(cost_line(result))

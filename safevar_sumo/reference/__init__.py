@@ -1,10 +1,21 @@
 """Work with reference data: read it, hold a study against it, fit a study to it, take it over as results."""
 
-from safevar_sumo.reference.calibration import Calibration, calibrate, calibration_comment, cost_line, fitted_as, on_a_bound
-from safevar_sumo.reference.fit import with_values
+from safevar_sumo.reference.calibration import (
+    Calibration,
+    Subject,
+    calibrate,
+    calibrate_together,
+    calibration_comment,
+    cost_line,
+    fitted_as,
+    on_a_bound,
+)
+from safevar_sumo.reference.effects import Effect, effects_of
+from safevar_sumo.reference.parameters import with_values
 from safevar_sumo.reference.rows import ReferenceData, evaluations_of, original_metrics, package_filter, read_reference
 from safevar_sumo.reference.validation import Agreement, Totals, agreement, keep_totals, plot_agreement, quoted
 
-__all__ = ["Agreement", "Calibration", "ReferenceData", "Totals", "agreement", "calibrate", "calibration_comment", "cost_line",
-           "evaluations_of", "fitted_as", "keep_totals", "on_a_bound", "original_metrics", "package_filter", "plot_agreement", "quoted",
-           "read_reference", "with_values"]
+__all__ = [
+    "Agreement", "Calibration", "Effect", "ReferenceData", "Subject", "Totals", "agreement", "calibrate", "calibrate_together",
+    "calibration_comment", "cost_line", "effects_of", "evaluations_of", "fitted_as", "keep_totals", "on_a_bound", "original_metrics",
+    "package_filter", "plot_agreement", "quoted", "read_reference", "with_values"]

@@ -1,7 +1,8 @@
-"""How the values of a calibrated study were found, in words for the head of its file."""
+"""The fit of studies to published data, one or several together, and in words for the head of a study file how its values were found."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import NamedTuple
@@ -12,10 +13,11 @@ import numpy as np
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.reference.fit import LARGEST, Search, check_bound, original_cost, reference_cost, value_of, with_values
+from safevar_sumo.reference.fit import LARGEST, Search, Together, original_cost, reference_cost
+from safevar_sumo.reference.parameters import Free, free_parameters, value_of, with_values
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.reference.validation import Agreement, agreement
-from safevar_sumo.study import SAFETY_DEGREE, FreeParameter, Study
+from safevar_sumo.study import SAFETY_DEGREE, FitTable, FreeParameter, Study
 from safevar_sumo.sumo import Engine, settings_per_batch
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
@@ -29,18 +31,21 @@ EDGE = 0.01
 
 
 def calibration_comment(result: Calibration, study: Study, references: Mapping[str, ReferenceData], *, from_scratch: bool) -> str:
-    """Data with fingerprints, search, cost, agreement on both parts, and what stands on its bound."""
-    fit = study.fit
+    """Data with fingerprints, search, cost, agreement on both parts, what is shared, and what stands on its bound."""
+    fit = result.search
     start = "random places alone" if from_scratch else f"its own values and {fit.starts} random places" if fit.starts else "its own values"
     parts = [
         f"  {name}: rho of the safety degree {_rho(result.used[name])} on the rows used, {_rho(result.held_back[name])} on those held back"
         for name in result.used]
-    others = f" and to all but each {_ordinal(fit.hold_out)} row of" if references else "."
+    others = f" and to all but each {_ordinal(study.fit.hold_out)} row of" if references else "."
+    together = f" together with {' and '.join(map(repr, result.together))}" if result.together else ""
+    own = [name for name in result.values if name not in result.shared]
     return "\n".join([
-        f"Study {study.name!r}, calibrated by CMA-ES ({fit.trials} trials, seed {fit.seed}, from {start})",
+        f"Study {study.name!r}, calibrated{together} by CMA-ES ({fit.trials} trials, seed {fit.seed}, from {start})",
         f"to the original vehicle's published values{others}", *(_data_line(name, data) for name, data in references.items()),
+        *([f"Its own are {', '.join(own) or 'none'}; the other parameters are shared."] if result.together else []),
         f"{cost_line(result)}.", *parts,
-        *(f"{name} stands on its bound." for name in on_a_bound(result.values, study.calibration))])
+        *(f"{name} stands on its bound." for name in on_a_bound(result.values, result.bounds))])
 
 
 def cost_line(calibration: Calibration) -> str:
@@ -73,10 +78,19 @@ NEAR, WIDE = 0.05, 0.3
 """Standard deviation of the first trials around known values, and around a random place, as a share of a parameter's bounds."""
 
 
-class Calibration(NamedTuple):
-    """Found values by parameter, the study with them, its cost, and both parts of every reference by its name.
+class Subject(NamedTuple):
+    """A study and the data that it is fitted to, by name."""
 
-    `reached` is the lowest cost that each search came to, the last one from the study's own values unless these were forgotten.
+    study: Study
+    references: Mapping[str, ReferenceData]
+
+
+class Calibration(NamedTuple):
+    """Found values by parameter with their bounds, the study with them, their cost, and both parts of every reference by its name.
+
+    `reached` is the lowest cost that each search came to, the last one from the studies' own values unless these were forgotten.
+    `together` are the studies that were fitted with this one, `shared` the parameters that it has in common with one of them,
+    `search` is the table [fit] whose trials, seed and starts counted.
     """
 
     values: dict[str, float]
@@ -85,111 +99,132 @@ class Calibration(NamedTuple):
     reached: list[float]
     used: dict[str, Agreement]
     held_back: dict[str, Agreement]
+    bounds: dict[str, FreeParameter]
+    search: FitTable
+    together: tuple[str, ...] = ()
+    shared: frozenset[str] = frozenset()
 
 
 def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
               done: Callable[[float, Study], None] = lambda cost, best: None, *, from_scratch: bool = False) -> Calibration:
-    """Fit by CMA-ES (Hansen 2016), as the study's table [fit] says.
+    """Fit one study; see `calibrate_together`."""
+    return calibrate_together([Subject(study, references)], pool, lambda cost, best: done(cost, best[0]), from_scratch=from_scratch)[0]
+
+
+def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[float, Together], None] = lambda cost, best: None, *,
+                       from_scratch: bool = False) -> list[Calibration]:
+    """Fit by CMA-ES (Hansen 2016), as the studies' tables [fit] say; trials, seed, starts and population are the first one's.
 
     Parameters
     ----------
-    references
-        Data by name; may be empty, then only the original vehicle's values count.
+    subjects
+        Studies with their data, which may be none: then only the original vehicle's values count.
     done
-        Is called after every trial with the lowest cost so far, and the study that has it.
+        Is called after every trial with the lowest cost so far, and the studies that have it.
     from_scratch
-        Forget the study's own values of what is free: only the random places count.
+        Forget the studies' own values of what is free: only the random places count.
 
     Raises
     ------
     InputError
-        If the study declares nothing to fit, or something that cannot be, or has nothing to fit it to.
+        If a study declares nothing to fit, or something that cannot be, or has nothing to fit it to.
     SimulationError
-        If the study cannot be simulated with its own values.
+        If the studies cannot be simulated with their own values.
     """
-    fit, first = study.fit, _checked(study, references, from_scratch)
-    used, held_back = {}, {}
-    for name, data in references.items():
-        rows = np.arange(len(data.settings)) % fit.hold_out == fit.hold_out - 1
-        used[name], held_back[name] = data.take(~rows), data.take(rows)
-    trial = _Trial(study, used, pool)
+    studies = tuple(subject.study for subject in subjects)
+    if not any(study.calibration for study in studies):
+        raise InputError(f"study {studies[0].name!r}", "has no table [calibration]", "the free parameters with bounds, unit and meaning")
+    for subject in subjects:
+        _check(subject)
+    fit, free = studies[0].fit, free_parameters(studies)
+    if from_scratch and not fit.starts:
+        raise InputError(f"study {studies[0].name!r}", "fit.starts = 0", "at least 1 for a fit from scratch")
+    used, held_back = [], []
+    for study, references in subjects:
+        rows = {name: np.arange(len(data.settings)) % study.fit.hold_out == study.fit.hold_out - 1 for name, data in references.items()}
+        used.append({name: data.take(~rows[name]) for name, data in references.items()})
+        held_back.append({name: data.take(rows[name]) for name, data in references.items()})
+    trial = _Trial(free, [_Fitted(study, data, pool) for study, data in zip(studies, used, strict=True)])
     search = Search(trial, fit.population, fit.trials, done)
-    if not from_scratch and search.tried([study])[0] >= LARGEST:
-        raise SimulationError(f"study {study.name!r} cannot be simulated with its own values")
+    if not from_scratch and search.tried([studies])[0] >= LARGEST:
+        names = " and ".join(f"study {study.name!r}" for study in studies)
+        raise SimulationError(f"{names} cannot be simulated with {'its' if len(studies) == 1 else 'their'} own values")
     rng = np.random.default_rng(fit.seed)
-    searches = [search.begun(rng.random(len(first)), WIDE, int(rng.integers(1, 2**31))) for _ in range(fit.starts)]
+    searches = [search.begun(rng.random(len(free)), WIDE, int(rng.integers(1, 2**31))) for _ in range(fit.starts)]
     if not from_scratch:
-        searches.append(search.begun(trial.shares(study), NEAR, fit.seed + 1))
+        searches.append(search.begun(trial.shares(studies), NEAR, fit.seed + 1))
     search.race(searches)
     assert search.best is not None, "there is a trial at least"
-    values = {name: value_of(search.best, name) for name in study.calibration}
-    best = with_values(study, values)
-    return Calibration(values, best, search.cost, [one.lowest for one in searches if one.lowest < np.inf],
-                       _told(best, used, pool), _told(best, held_back, pool))
+    reached, results = [one.lowest for one in searches if one.lowest < np.inf], []
+    for k, best in enumerate(search.best):
+        mine = [one for one in free if k in one.studies]
+        results.append(Calibration(
+            {one.key: value_of(best, one.key) for one in mine}, best, search.cost, reached, _told(best, used[k], pool),
+            _told(best, held_back[k], pool), {one.key: one.bounds for one in mine}, fit,
+            tuple(study.name for study in studies if study is not studies[k]),
+            frozenset(one.key for one in mine if len(one.studies) > 1)))
+    return results
 
 
-def _checked(study: Study, references: Mapping[str, ReferenceData], from_scratch: bool) -> dict[str, float]:
-    """The study's own values, after a look at all that a fit needs."""
-    source = f"study {study.name!r}"
-    if not study.calibration:
-        raise InputError(source, "has no table [calibration]", "the free parameters with bounds, unit and meaning")
-    if not references and not study.published:
+def _check(subject: Subject) -> None:
+    source = f"study {subject.study.name!r}"
+    if not subject.references and not subject.study.published:
         raise InputError(source, "has no table [published] and there is no reference file", "something to fit to")
-    if from_scratch and not study.fit.starts:
-        raise InputError(source, "fit.starts = 0", "at least 1 for a fit from scratch")
-    for name in study.fit.weights:
+    for name in subject.study.fit.weights:
         if name not in METRICS:
             raise InputError(source, f"fit.weights.{name} is no metric", f"some of {', '.join(METRICS)}")
-    first = {name: value_of(study, name) for name in study.calibration}
-    for name, value in first.items():
-        row = study.calibration[name]
-        if not row.lower <= value <= row.upper:
-            raise InputError(source, f"{name} = {value}", f"a value in its bounds, [{row.lower:g}, {row.upper:g}]")
-        for side in ("lower", "upper"):
-            check_bound(study, name, side, getattr(row, side))
-    return first
 
 
 class _Trial:
     """Costs of studies that differ in free parameters."""
 
+    def __init__(self, free: Sequence[Free], fitted: Sequence[_Fitted]) -> None:
+        self._free, self._fitted = free, fitted
+        self._lower, self._upper = np.array([(one.bounds.lower, one.bounds.upper) for one in free]).T
+
+    def at(self, shares: FloatArray) -> Together:
+        """The studies at a place in the unit cube of the bounds."""
+        values = (self._lower + np.asarray(shares) * (self._upper - self._lower)).tolist()
+        return tuple(
+            with_values(one.study, {free.key: value for free, value in zip(self._free, values, strict=True) if k in free.studies})
+            for k, one in enumerate(self._fitted))
+
+    def shares(self, studies: Together) -> FloatArray:
+        """Where studies lie in the unit cube of the bounds."""
+        values = np.array([value_of(studies[free.studies[0]], free.key) for free in self._free])
+        return np.asarray(np.clip((values - self._lower) / (self._upper - self._lower), 0, 1))
+
+    def costs(self, tried: Sequence[Together]) -> list[float]:
+        submitted = [[one.submit(study) for one, study in zip(self._fitted, together, strict=True)] for together in tried]
+        return [float(np.mean([one.cost(parts) for one, parts in zip(self._fitted, of_one, strict=True)])) for of_one in submitted]
+
+
+class _Fitted:
+    """A study that is fitted, and the data that it is fitted to."""
+
     def __init__(self, study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> None:
         self.study, self._references = study, references
         self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-        self._inputs = inputs_of(study, pool)
-        self._lower, self._upper = np.array([(row.lower, row.upper) for row in study.calibration.values()]).T
-        self._pool = RetryingPool(pool, study)
+        self._inputs, self._pool = inputs_of(study, pool), RetryingPool(pool, study)
         settings = [self._characteristics.original[np.newaxis], *(data.settings for data in references.values())]
         self._settings, self._row_of = np.unique(np.concatenate(settings), axis=0, return_inverse=True)
-        self._size = min(settings_per_batch(assemble(study), Engine.RECORDED), len(self._settings))
+        batches = math.ceil(len(self._settings) / settings_per_batch(assemble(study), Engine.RECORDED))
+        self._size = math.ceil(len(self._settings) / batches)
 
-    def at(self, shares: FloatArray) -> Study:
-        """The study at a place in the unit cube of the bounds."""
-        values = self._lower + np.asarray(shares) * (self._upper - self._lower)
-        return with_values(self.study, dict(zip(self.study.calibration, values.tolist(), strict=True)))
-
-    def shares(self, study: Study) -> FloatArray:
-        """Where a study lies in the unit cube of the bounds."""
-        values = np.array([value_of(study, name) for name in self.study.calibration])
-        return np.asarray(np.clip((values - self._lower) / (self._upper - self._lower), 0, 1))
-
-    def costs(self, studies: Sequence[Study]) -> list[float]:
-        submitted = [self._submit(study) for study in studies]
-        return [self._cost(Evaluations.concatenate([result_of(part) for part in parts])) for parts in submitted]
-
-    def _submit(self, study: Study) -> list[Future[Evaluations]]:
+    def submit(self, study: Study) -> list[Future[Evaluations]]:
         work, size = packed(study, self._inputs), self._size
         return [self._pool.submit(work, self._settings[start:start + size]) for start in range(0, len(self._settings), size)]
 
-    def _cost(self, unique: Evaluations) -> float:
+    def cost(self, parts: Sequence[Future[Evaluations]]) -> float:
+        unique = Evaluations.concatenate([result_of(part) for part in parts])
         if not unique.valid.all():
             return LARGEST
-        evaluations, fit = unique.take(self._row_of.ravel()), self.study.fit
-        cost = original_cost(evaluations.take([0]), self.study.published, fit)
+        evaluations = unique.take(self._row_of.ravel())
+        cost = original_cost(evaluations.take([0]), self.study.published, self.study.fit)
         row = 1
         for data in self._references.values():
             here = evaluations.take(np.arange(row, row + len(data.settings)))
-            cost += reference_cost(agreement(data, here, self.study, here), data, fit) / len(self._references)
+            cost += reference_cost(agreement(data, here, self.study, here), data, here, self.study) / len(self._references)
             row += len(data.settings)
         return cost
 

@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
-import msgspec
 import numpy as np
 
-from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.reference.effects import effects_apart
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.reference.validation import Agreement
-from safevar_sumo.scenarios import weather_of
-from safevar_sumo.study import FitTable, Study, invalid
-from safevar_sumo.sumo.system import models_of
+from safevar_sumo.study import SAFETY_DEGREE, FitTable, Study
+from safevar_sumo.vehicles import CharacteristicSet
 
-LARGEST = 1e3
+LARGEST = 1e5
 """Of what a reference can cost; that of a study which cannot be simulated at all."""
 FARTHEST = 10.0
 """Tolerances beyond which the original vehicle's miss costs no more: a value that there is not is so far away."""
@@ -40,51 +38,62 @@ def _huber(miss: float, tolerance: float) -> float:
     return distance * distance if distance <= 1 else 2 * distance - 1
 
 
-def reference_cost(result: Agreement, data: ReferenceData, fit: FitTable) -> float:
-    """Lost rank correlation and absolute error (in standard deviations of the reference), weighted, and collisions."""
-    cost = 0.0
+def reference_cost(result: Agreement, data: ReferenceData, here: Evaluations, study: Study) -> float:
+    """Lost rank correlation and absolute error, weighted by metric, differences of effects, and collisions.
+
+    Errors count in standard deviations of repeats of one setting there; where these are not known, in those of the reference.
+    """
+    fit, cost = study.fit, 0.0
     for name, weight in fit.weights.items():
         values = data.metrics[name][~np.isnan(data.metrics[name])]
         if not values.size or np.ptp(values) == 0:
             continue
         rho, error = result.spearman[name], result.mean_absolute_error[name]
-        cost += weight * (fit.rank * (1 - (rho or 0.0)) + (np.inf if error is None else error) / float(np.std(values)))
+        unit = study.repeatability.get(name) or float(np.std(values))
+        cost += weight * (fit.rank * (1 - (rho or 0.0)) + (np.inf if error is None else error) / unit)
+        if name == SAFETY_DEGREE and fit.effects:
+            apart = effects_apart(data, here, CharacteristicSet.of(study.vehicle.characteristics))
+            cost += fit.effects * float(np.mean(np.abs(apart))) / unit
     collisions = result.collisions
     missed = collisions["reference"] + collisions["here"] - 2 * collisions["both"]
     return min(cost, LARGEST) + fit.collisions * missed / max(result.rows, 1)
 
 
+Together = tuple[Study, ...]
+"""Studies that are fitted together."""
+
+
 class Trial(Protocol):
-    """What is tried: studies by their place in the unit cube of the bounds, and what they cost."""
+    """What is tried: studies that are fitted together, by their place in the unit cube of the bounds, and what they cost."""
 
-    def at(self, shares: FloatArray) -> Study: ...
+    def at(self, shares: FloatArray) -> Together: ...
 
-    def costs(self, studies: Sequence[Study]) -> list[float]: ...
+    def costs(self, tried: Sequence[Together]) -> list[float]: ...
 
 
 class Search:
-    """Keeps the best study of all that are tried, and count of the trials that are left.
+    """Keeps the best of all that are tried, and count of the trials that are left.
 
     Parameters
     ----------
     population
         Trials in a generation.
     done
-        Is called after every trial with the lowest cost so far, and the study that has it.
+        Is called after every trial with the lowest cost so far, and the studies that have it.
     """
 
-    def __init__(self, trial: Trial, population: int, trials: int, done: Callable[[float, Study], None]) -> None:
-        self.best: Study | None = None
+    def __init__(self, trial: Trial, population: int, trials: int, done: Callable[[float, Together], None]) -> None:
+        self.best: Together | None = None
         self.cost, self.left = np.inf, trials
         self.trial, self.population, self._done = trial, population, done
 
-    def tried(self, studies: Sequence[Study]) -> list[float]:
+    def tried(self, studies: Sequence[Together]) -> list[float]:
         """What studies cost."""
         costs = self.trial.costs(studies)
         self.left -= len(costs)
-        for study, cost in zip(studies, costs, strict=True):
+        for together, cost in zip(studies, costs, strict=True):
             if self.best is None or cost < self.cost:
-                self.best, self.cost = study, cost
+                self.best, self.cost = together, cost
             self._done(self.cost, self.best)
         return costs
 
@@ -127,68 +136,3 @@ class OneSearch:
             self.lowest = min(self.lowest, min(costs))
             if len(costs) == len(shares):
                 self._strategy.tell(shares, costs)
-
-
-FITTED = ("vehicle.parameters.", "ads.parameters.", "weather.")
-
-
-def check_bound(study: Study, name: str, side: str, bound: float) -> None:
-    """A search goes as far as its bounds: the models must take them."""
-    try:
-        models_of(with_values(study, {name: bound}), name)
-    except InputError as error:
-        legal = error.legal or error.problem
-        raise InputError(f"study {study.name!r}", f"calibration.{name!r}.{side} = {bound:g}", legal) from None
-
-
-def with_values(study: Study, values: Mapping[str, float]) -> Study:
-    """A study with other values of some parameters, named by their keys in the study file.
-
-    Raises
-    ------
-    InputError
-        If there is no such parameter, or it does not take the value.
-    """
-    raw = _raw(study)
-    for name, value in values.items():
-        table, key = _place(study, raw, name)
-        table[key] = value
-    try:
-        return msgspec.convert(raw, Study)
-    except msgspec.ValidationError as error:
-        raise invalid(f"study {study.name!r}", raw, error) from None
-
-
-def _raw(study: Study) -> Any:
-    """The study as tables; a weather that is given by its name as the table behind it."""
-    return msgspec.to_builtins(msgspec.structs.replace(study, weather=weather_of(study.weather, f"study {study.name!r}")))
-
-
-def _place(study: Study, raw: Any, name: str) -> tuple[Any, Any]:
-    """The table or list that a parameter stands in, and its key or index there."""
-    refused = InputError(f"study {study.name!r}", f"calibration.{name!r} is no parameter of the study",
-                         f"a number that is given under {', '.join(prefix.rstrip('.') for prefix in FITTED)}")
-    if not name.startswith(FITTED):
-        raise refused
-    *path, last = name.split(".")
-    table = raw
-    try:
-        for key in path:
-            table = table[_key(table, key)]
-        place = _key(table, last)
-        if not isinstance(table[place], int | float):
-            raise refused
-    except (KeyError, IndexError, ValueError, TypeError):
-        raise refused from None
-    return table, place
-
-
-def _key(table: Any, name: str) -> int | str:
-    """A list's places are told in one way only: two names of one parameter would be fitted against each other."""
-    return int(name) if isinstance(table, list) and name == str(int(name)) else name
-
-
-def value_of(study: Study, name: str) -> float:
-    """What a parameter is in the study."""
-    table, key = _place(study, _raw(study), name)
-    return float(table[key])

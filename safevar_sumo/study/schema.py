@@ -145,12 +145,16 @@ class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A parameter to calibrate: its bounds in `unit`, and its meaning."""
+    """A parameter to calibrate: its bounds in `unit`, and its meaning.
+
+    Studies that are fitted together share it as far as they give it one value, unless it is a study's `own`.
+    """
 
     lower: float
     upper: float
     unit: str
     meaning: str
+    own: bool = False
 
 
 class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -169,8 +173,10 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How free parameters are found: what counts for how much, which rows are used, and from where the search starts.
 
     The loss is `original` * mean_m(w_m h(miss / (`tolerance` * published))) of the original vehicle, h being x^2 to 1 and 2 x - 1 beyond,
-    + mean over the files of sum_m(w_m (`rank` (1 - rho) + mean |error| / standard deviation)) + `collisions` * share of rows that
-    collide on one side alone, w_m being `weights` by metric. Of every `hold_out` rows one is used for nothing but to be reported.
+    + mean over the files of sum_m(w_m (`rank` (1 - rho) + mean |error| / unit)) + `effects` * mean_c |difference of the safety degree's
+    linear effects over the domain of characteristic c| / unit + `collisions` * share of rows that collide on one side alone. w_m are
+    `weights` by metric; a unit is the study's repeatability or, where it is not known, the standard deviation of the data. Studies that
+    are fitted together have the mean of their losses. Of every `hold_out` rows one is used for nothing but to be reported.
     `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own values and from
     `starts` random places in the bounds, of which the worse half gives up after every round. `seed` is the seed of all that.
     """
@@ -184,6 +190,7 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     original: Weight = 1.0
     rank: Weight = 5.0
     collisions: Weight = 10.0
+    effects: Weight = 0.0
     weights: dict[str, Weight] = msgspec.field(
         default_factory=lambda: {SAFETY_DEGREE: 1.0, "tet": 0.3, "tit": 0.3, "ave_dece": 0.5})
 

@@ -128,3 +128,37 @@ def test_an_interrupted_calibration_leaves_the_best_so_far(in_tmp: Path, monkeyp
     CliRunner().invoke(commands, ["calibrate", "sun", "--trials", "9", "--out", "best.toml"])
     assert "Best of 2 of 9 trials" in Path("best.toml").read_text()
     assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
+
+
+def test_several_studies_are_fitted_together(data: Path, in_tmp: Path) -> None:
+    free = '[calibration]\n"ads.parameters.brake_gap" = { lower = 7, upper = 12, unit = "m", meaning = "gap" }\n'
+    Path("mine.toml").write_text(f'extends = "sun"\nname = "mine"\n{free}')
+    Path("late.toml").write_text(f'extends = "sun"\nname = "late"\n[ads.parameters]\nhesitation = 0.1\n{free}')
+    Path("late_rows.csv").write_bytes(data.read_bytes())
+    words = ("calibrate", "mine.toml", "late.toml", f"mine={data}", "late_rows.csv", "--trials", "15")
+    refused(*words, "--out", "nowhere", told=("--out", "nowhere"))
+    Path("fitted").mkdir()
+    run(*words, "--out", "fitted")
+    found = [tomllib.loads(Path(f"fitted/{name}-calibrated.toml").read_text()) for name in ("mine", "late")]
+    assert found[0]["ads"]["parameters"]["brake_gap"] == found[1]["ads"]["parameters"]["brake_gap"]
+    assert "hesitation" not in found[0]["ads"]["parameters"]
+    heads = [Path(f"fitted/{name}-calibrated.toml").read_text().split("\n\n")[0] for name in ("mine", "late")]
+    assert "together with 'late'" in heads[0]
+    assert "late_rows.csv, SHA-256" in heads[1]
+    assert "late_rows.csv" not in heads[0]
+    Path("rows.csv").write_bytes(data.read_bytes())
+    refused("calibrate", "mine.toml", "late.toml", "rows.csv", "--trials", "1", told=("rows.csv", "mine, late", "STUDY=FILE.csv"))
+
+
+def test_validate_tells_effects_when_asked(in_tmp: Path) -> None:
+    system = assemble(load_study("sun"))
+    characteristics = system.characteristics
+    settings = np.random.default_rng(5).uniform(characteristics.lower, characteristics.upper, (160, 12))
+    frame = pd.DataFrame(settings, columns=list(characteristics.names)).assign(
+        SaftyDegree=evaluate(system, settings).f_safe + 0.3 * settings[:, 0] / 2800, TIT=0.0, TET=0.0)
+    frame.to_csv("rows.csv", index=False)
+    told = json.loads(run("validate", "sun", "rows.csv", "--json", "--effects").stdout)["effects"]
+    assert list(told) == list(characteristics.names)
+    assert told["mass"]["agrees"] is True
+    assert told["max_rpm"]["reference"] - told["max_rpm"]["here"] == pytest.approx(0.3, abs=0.02)
+    assert "max_rpm" in run("validate", "sun", "rows.csv", "--effects").stdout

@@ -11,8 +11,10 @@ import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.reference import ReferenceData, calibrate, with_values
-from safevar_sumo.reference.fit import Search, original_cost
+from safevar_sumo.reference import ReferenceData, Subject, agreement, calibrate, calibrate_together, with_values
+from safevar_sumo.reference.effects import linear_effects
+from safevar_sumo.reference.fit import Search, original_cost, reference_cost
+from safevar_sumo.reference.parameters import free_parameters
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
@@ -58,6 +60,63 @@ def test_a_fit_is_refused_that_could_not_mean_anything(data: ReferenceData) -> N
         calibrate(mine(1.0), {"mine": data}, Here(), from_scratch=True)
     with pytest.raises(InputError, match=r"fit\.weights\.speed is no metric"):
         calibrate(mine(1.0, weights={"speed": 1.0}), {"mine": data}, Here())
+
+
+HESITATION = "ads.parameters.hesitation"
+
+
+def test_studies_that_are_fitted_together_share_what_is_not_their_own(data: ReferenceData) -> None:
+    """Both find the gap that the rows of both were made with, and the one that hesitates how late it does."""
+    truth = load_study("sun").ads.parameters["brake_gap"]
+    own = FreeParameter(lower=0.0, upper=0.3, unit="s", meaning="pause", own=True)
+    sun, late = mine(0.95, trials=49), with_hesitation(mine(0.95), 0.15)
+    late = msgspec.structs.replace(late, name="late", calibration={HESITATION: own})
+    settings = data.settings
+    there = dict(evaluate(assemble(with_hesitation(load_study("sun"), 0.2)), settings).metrics)
+    subjects = [Subject(sun, {"mine": data}), Subject(late, {"theirs": ReferenceData(settings, there, 0)})]
+    dry, wet = calibrate_together(subjects, Here())
+    assert dry.values[GAP] == wet.values[GAP] == pytest.approx(truth, rel=0.05)
+    assert wet.values[HESITATION] == pytest.approx(0.2, abs=0.04)
+    assert set(dry.values) == {GAP}
+    assert (dry.shared, wet.shared) == ({GAP}, {GAP})
+    assert dry.cost == wet.cost
+
+
+def with_hesitation(study: Study, hesitation: float) -> Study:
+    ads = msgspec.structs.replace(study.ads, parameters={**study.ads.parameters, "hesitation": hesitation})
+    return msgspec.structs.replace(study, ads=ads)
+
+
+def test_what_another_study_gives_another_value_is_not_shared() -> None:
+    near, far = mine(0.8), mine(1.2)
+    assert [free.studies for free in free_parameters([near, near])] == [(0, 1)]
+    assert [free.studies for free in free_parameters([near, far])] == [(0,), (1,)]
+    assert [free.studies for free in free_parameters([near, load_study("lgsvl")]) if free.key == GAP] == [(0,)]
+
+
+def test_errors_count_in_repeats_and_effects_in_the_safety_degrees(data: ReferenceData) -> None:
+    """All of the loss is sum(w error / repeatability): a repeatability of 2 halves what one of 1 makes of it."""
+    only = FitTable(original=0.0, rank=0.0, collisions=0.0, weights={"safety_degree": 1.0})
+    def loss(unit: float, **fit: float) -> float:
+        study = msgspec.structs.replace(mine(0.8), repeatability={"safety_degree": unit}, fit=msgspec.structs.replace(only, **fit))
+        here = evaluate(assemble(study), data.settings)
+        return reference_cost(agreement(data, here, study, here), data, here, study)
+
+    error = np.abs(evaluate(assemble(mine(0.8)), data.settings).f_safe - data.metrics["safety_degree"]).mean()
+    assert loss(1.0) == pytest.approx(error)
+    assert loss(2.0) == pytest.approx(error / 2)
+
+
+def test_a_linear_response_has_the_effects_that_it_was_made_with() -> None:
+    characteristics = assemble(load_study("sun")).characteristics
+    width, rng = characteristics.upper - characteristics.lower, np.random.default_rng(1)
+    settings = rng.uniform(characteristics.lower, characteristics.upper, (200, 12))
+    settings[:, 3] = characteristics.original[3]
+    slopes = np.arange(12) - 5.0
+    found = linear_effects(settings, 1.0 + ((settings - characteristics.original) / width) @ slopes, characteristics)
+    assert np.delete(found, 3) == pytest.approx(np.delete(slopes, 3))
+    assert np.isnan(found[3]), "it does not vary"
+    assert np.isnan(linear_effects(settings[:20], np.ones(20), characteristics)).all(), "too few rows"
 
 
 PUBLISHED = {"safety_degree": 2.0, "tet": 1.0}
