@@ -5,16 +5,18 @@
 Time outside the simulation is what is left of all processor time when that of the same batches, computed by one process
 with nothing else to do, is taken away: search, journal and hand-over. Workers start, and load the network, before the
 clock does. The floor is bare libsumo for one population. What two workers bring is told by the clock: only an idle
-machine tells the truth.
+machine tells the truth. `ceiling` is what two processes bring on this machine that only compute the same batches, and
+`two_workers_of_ceiling` the share of it that two workers reach.
 """
 
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import statistics
 import tempfile
 from collections.abc import Iterator
-from concurrent.futures import Future
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -36,6 +38,7 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.cluster import cluster_pool
 from safevar_sumo.workers.evaluation import Pool, evaluate_batch, packed
+from safevar_sumo.workers.identity import identity_of
 from safevar_sumo.workers.local import local_pool
 
 
@@ -99,8 +102,9 @@ def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
             future.result()
         recording = Recording(pool)
         before = processors()
-        clock = clock_seconds(lambda: run_campaign(study, all_runs(study), ResultsDirectory(Path(folder), study), recording, Silent(),
-                                                   LARGEST_BATCH, engine=Engine.RECORDED))
+        results = ResultsDirectory(Path(folder), study, identity_of(study, assemble(study)))
+        clock = clock_seconds(lambda: run_campaign(study, all_runs(study), results, recording, Silent(), LARGEST_BATCH,
+                                                   engine=Engine.RECORDED))
         return Cost(clock, processors() - before, recording.batches)
 
 
@@ -108,14 +112,31 @@ def simulation(study: Study, batches: list[FloatArray]) -> float:
     """Processor seconds of the same batches in one process that has nothing else to do."""
     work = packed(study)
     evaluate_batch(work, max(batches, key=len))
-    return processor_seconds(lambda: [evaluate_batch(work, settings) for settings in batches])
+    return processor_seconds(lambda: compute(work, batches))
+
+
+def compute(work: bytes, batches: list[FloatArray]) -> None:
+    for settings in batches:
+        evaluate_batch(work, settings)
+
+
+def ceiling(study: Study, batches: list[FloatArray]) -> float:
+    """How much faster two processes are than one that only compute the same batches."""
+    work = packed(study)
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as processes:
+        def together(n: int) -> None:
+            for future in [processes.submit(compute, work, batches) for _ in range(n)]:
+                future.result()
+
+        together(2)
+        return 2 * clock_seconds(lambda: together(1)) / clock_seconds(lambda: together(2))
 
 
 def floor(study: Study) -> float:
     """Processor seconds that bare libsumo takes to load and step the network for one setting of a population."""
     system, n = assemble(study), study.search.population
     steps = len(simulate(system, drawn(study, n)).trace.time)
-    network = staged(system.points[0].scenario)
+    network = staged(system.points[0].scenario).folder
     return float(np.median([bare(network, n, steps)[0] for _ in range(9)])) / n
 
 
@@ -135,8 +156,10 @@ def turn(study: Study) -> dict[str, float]:
     alone, bare_each = simulation(study, one.batches), floor(study)
     two = campaign(study, local_pool(2, study.search.time_limit))
     cluster = campaign(study, two_dask_workers(study))
+    most = ceiling(study, one.batches)
     return {"campaign": one.processor / one.simulated / bare_each, "outside_simulation": 1 - alone / one.processor,
-            "two_workers": one.clock / two.clock, "cluster": two.clock / cluster.clock}
+            "two_workers": one.clock / two.clock, "ceiling": most, "two_workers_of_ceiling": one.clock / two.clock / most,
+            "cluster": two.clock / cluster.clock}
 
 
 def records_of(study: Study, turns: int) -> Iterator[Record]:

@@ -3,7 +3,7 @@
     python benchmarks/evaluation.py [STUDY...] [--json]
 
 The floor is bare libsumo that loads and steps the same network as many steps with nobody at the wheel; an evaluation
-finds its network loaded, as all but every 200th of a worker does. The TraCI socket is what one would write otherwise: one
+finds its scene recorded, as all but the first of a worker does. The TraCI socket is what one would write otherwise: one
 `sumo` process, reloaded for every setting, the same controller; who starts a process for each waits a second more, as
 traci tries again only then. What is compared takes turns, and where one process does the work its processor time
 counts: so a machine that others use too disturbs them little.
@@ -121,7 +121,7 @@ def through_socket(system: System, settings: FloatArray, command: list[str]) -> 
 def records_of(study: str, populations: tuple[int, ...] = POPULATIONS) -> Iterator[Record]:
     """Measure a study's evaluations."""
     system = assemble(load_study(study))
-    network = staged(system.points[0].scenario)
+    network = staged(system.points[0].scenario).folder
     for n in populations:
         settings = settings_of(system, n)
         steps = len(simulate(system, settings).trace.time)
@@ -147,7 +147,7 @@ def beside_others(study: str, system: System, settings: FloatArray) -> Iterator[
     n, few = len(settings), settings[:SOCKET_SETTINGS]
     scalar = replace(system, ads=PerVehicle(Coasting, Guard("benchmark", "ads")))
     evaluate(system, settings)
-    command = sumo_command(Engine.TRACI, copied_network(staged(system.points[0].scenario), 1))
+    command = sumo_command(Engine.TRACI, copied_network(staged(system.points[0].scenario).folder, 1))
     with socket_to(command):
         through_socket(system, few[:1], command)
         together, alone, coasting, socket = medians_in_turn(

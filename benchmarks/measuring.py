@@ -19,6 +19,8 @@ MEANINGS = {
     "scalar_ads": "an evaluation with a ScalarAds that does next to nothing takes so many times one with the study's own ADS",
     "campaign": "an evaluation of a campaign takes so many times a core's time of bare libsumo",
     "two_workers": "two workers are so many times as fast as one",
+    "ceiling": "two processes that only compute are so many times as fast as one",
+    "two_workers_of_ceiling": "share of that ceiling that two workers reach",
     "outside_simulation": "share of all processor time that is not simulation",
     "cluster": "a Dask cluster of two workers is so many times as fast as two processes",
     "growth_time": "the last evaluations take so many times what the first took",

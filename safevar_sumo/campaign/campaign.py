@@ -120,10 +120,11 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
                 runs.add(run := Run(key, begun(key), journal, observer, study.search.evaluations, retry=retry_failed))
                 go_on(run)
             batcher.send()
+            verification.send()
             for future in first_of([*batcher.under_way, *verification.under_way]):
                 if future in verification.under_way:
-                    if ended := verification.take(future):
-                        finish(ended)
+                    for run in verification.take(future):
+                        finish(run)
                     continue
                 shares = list(batcher.take(future))
                 for (run, _), is_whole in zip(shares, journalling.map(_take, shares), strict=True):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future
-from functools import partial
 
 import numpy as np
 
+from safevar_sumo.campaign.batcher import Batcher
 from safevar_sumo.campaign.keys import RunKey, run_generator
 from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.errors import ForeignError
@@ -17,32 +17,36 @@ from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.search import Search
 from safevar_sumo.study import Study, foreign_names
 from safevar_sumo.sumo import Engine
+from safevar_sumo.sumo.matrix import LARGEST_WORLD
 from safevar_sumo.workers.evaluation import packed
 from safevar_sumo.workers.isolation import refuse_difference, refuse_unlike_sumo
 from safevar_sumo.workers.retrying import RetryingPool, reproducing
 
-Refusal = Callable[[Evaluations, Evaluations], None]
-"""Refuses two evaluations of settings that differ."""
 LEGAL = ("what a run asks for depends on its problem, its evaluations and `rng` alone: nothing kept in a class or a module between runs, "
          "no clock, no random numbers of its own")
 
 
 class Verification:
-    """Runs that have ended, and settings of theirs under way: in SUMO, or alone and with other people's models loaded afresh.
-
-    Attributes
-    ----------
-    under_way
-        By what computes it, a run and what it holds of a setting.
-    """
+    """Runs that have ended, and settings of theirs under way: alone and with other people's models loaded afresh, then in SUMO."""
 
     def __init__(self, study: Study, results: ResultsDirectory, pool: RetryingPool, begun: Callable[[RunKey], Search],
                  engine: Engine, observer: Observer) -> None:
         self._study, self._pool, self._begun, self._observer = study, pool, begun, observer
-        self._alone = packed(study, results.inputs, engine=engine, afresh=True) if foreign_names(study) else None
-        self._in_sumo = packed(study, results.inputs, engine=Engine.LIBSUMO) if engine is Engine.RECORDED else None
-        self._asked: set[Run] = set()
-        self.under_way: dict[Future[Evaluations], tuple[Run, Evaluations, Refusal]] = {}
+        self._alone = packed(study, results.inputs, engine=engine, afresh=True) if foreign_names(study) else b""
+        self._is_recorded = engine is Engine.RECORDED
+        self._in_sumo = Batcher(pool, packed(study, results.inputs, engine=Engine.LIBSUMO), LARGEST_WORLD)
+        self._leaks: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}
+        self._unverified: dict[Run, tuple[Evaluations, int]] = {}
+        """What runs hold of settings that are driven in SUMO, and how many of them have not come back."""
+
+    @property
+    def under_way(self) -> list[Future[Evaluations]]:
+        """What is being computed."""
+        return [*self._leaks, *self._in_sumo.under_way]
+
+    def send(self) -> None:
+        """Have SUMO drive what pays now."""
+        self._in_sumo.send()
 
     def ask(self, run: Run) -> bool:
         """Have settings of a run simulated once more; whether there are any to verify.
@@ -54,36 +58,35 @@ class Verification:
         """
         self._refuse_unrepeatable(run)
         rng = run_generator(self._study, run.key._replace(algorithm=f"recheck {run.key.algorithm}"))
-        for known in [] if self._alone is None else run.samples(rng):
-            self._submit(self._alone, run, known, partial(self._refuse_leak, run.key))
-        return self._is_under_way(run) or self._ask_sumo(run)
+        for known in run.samples(rng) if self._alone else ():
+            self._leaks[self._pool.submit(self._alone, known.settings)] = run, known
+        return self._is_alone(run) or self._ask_sumo(run)
 
     def _ask_sumo(self, run: Run) -> bool:
         """Have settings of a run driven in SUMO, once nothing leaks between them; whether there are any."""
         rng = run_generator(self._study, run.key._replace(algorithm=f"verify {run.key.algorithm}"))
-        known = None if self._in_sumo is None or run in self._asked else run.solutions_and_others(rng)
-        self._asked.add(run)
+        known = run.solutions_and_others(rng) if self._is_recorded else None
         if not known:
             return False
-        self._submit(self._in_sumo, run, known, partial(self._refuse_unlike_sumo, run.key))
+        self._unverified[run] = known, len(known)
+        self._in_sumo.ask(run, known.settings)
         return True
 
-    def _submit(self, work: bytes | None, run: Run, known: Evaluations, refuse: Refusal) -> None:
-        assert work is not None
-        self.under_way[self._pool.submit(work, known.settings)] = run, known, refuse
+    def _is_alone(self, run: Run) -> bool:
+        return any(run is other for other, _ in self._leaks.values())
 
-    def _is_under_way(self, run: Run) -> bool:
-        return any(run is other for other, *_ in self.under_way.values())
-
-    def _refuse_unlike_sumo(self, key: RunKey, known: Evaluations, in_sumo: Evaluations) -> None:
-        refuse_unlike_sumo(self._study, known, in_sumo)
+    def _is_verified(self, run: Run, in_sumo: Evaluations) -> bool:
+        """Hold what has come back from SUMO against what a run holds of it; whether that was all."""
+        known, left = self._unverified.pop(run)
+        rows = {row.tobytes(): i for i, row in enumerate(known.settings)}
+        refuse_unlike_sumo(self._study, known.take([rows[row.tobytes()] for row in in_sumo.settings]), in_sumo)
         failed = np.flatnonzero(in_sumo.failed).tolist()
         if failed:
-            self._observer.warned(f"run {key}: {len(failed)} of {len(known)} settings could not be verified in SUMO: "
+            self._observer.warned(f"run {run.key}: {len(failed)} of {len(known)} settings could not be verified in SUMO: "
                                   f"{in_sumo.reason(failed[0])}")
-
-    def _refuse_leak(self, key: RunKey, known: Evaluations, alone: Evaluations) -> None:
-        refuse_difference(self._study, {f"in run {key}": known, "alone": alone}, reproducing(self._study, known.settings[0]))
+        if left > len(in_sumo):
+            self._unverified[run] = known, left - len(in_sumo)
+        return run not in self._unverified
 
     def _refuse_unrepeatable(self, run: Run) -> None:
         name = self._from_outside(run.key)
@@ -101,17 +104,17 @@ class Verification:
         problem = f"search.algorithms: {name!r} asks for other settings when run {key.run} is repeated alone"
         return ForeignError(f"study {self._study.name!r}", problem, LEGAL)
 
-    def take(self, done: Future[Evaluations]) -> Run | None:
-        """The run of settings, if those were its last ones.
+    def take(self, done: Future[Evaluations]) -> list[Run]:
+        """The runs of settings of which those were the last ones.
 
         Raises
         ------
         InputError
             If a setting's result is another one alone, or in SUMO.
         """
-        run, known, refuse = self.under_way.pop(done)
-        refuse(known, done.result())
-        if self._is_under_way(run) or self._ask_sumo(run):
-            return None
-        self._asked.discard(run)
-        return run
+        if done in self._in_sumo.under_way:
+            return [run for run, in_sumo in self._in_sumo.take(done) if self._is_verified(run, in_sumo)]
+        run, known = self._leaks.pop(done)
+        reproduction = reproducing(self._study, known.settings[0])
+        refuse_difference(self._study, {f"in run {run.key}": known, "alone": done.result()}, reproduction)
+        return [] if self._is_alone(run) or self._ask_sumo(run) else [run]

@@ -16,9 +16,11 @@ from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.scenarios.frame import Frame
 from safevar_sumo.sumo.contact import Contacts
 from safevar_sumo.sumo.driving_robot import DrivingRobot
-from safevar_sumo.sumo.engine import Engine, world_on
+from safevar_sumo.sumo.engine import Engine, open_world
+from safevar_sumo.sumo.network import copied_network
 from safevar_sumo.sumo.perception import Parts
-from safevar_sumo.sumo.recording import RecordedWorld, reason_for_copies, recording_of
+from safevar_sumo.sumo.recorded_world import RecordedWorld
+from safevar_sumo.sumo.recording import Recording, recorded_scenes
 from safevar_sumo.sumo.staging import staged
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
@@ -49,13 +51,15 @@ def reason_for_sumo(system: System) -> str:
     """Why a system's vehicles are driven in SUMO, each in a copy of the network; "" where they drive in a recorded scene."""
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
-    reasons = (reason_for_copies(point.scenario, step_options(system)) for point in system.points)
-    return next((reason for reason in reasons if reason), "")
+    scenes = recorded_scenes([point.scenario for point in system.points], step_options(system))
+    return next((scene for scene in scenes if isinstance(scene, str)), "")
 
 
 def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = (),
               watch: Watcher | None = None) -> SimulationRuns:
-    """Drive every setting, shape (N, n), at every one of the points, which share a network; `watch` is shown SUMO at every sample.
+    """Drive every setting, shape (N, n), at every one of the points; `watch` is shown SUMO at every sample.
+
+    The points share a network and are recorded; in SUMO there is one.
 
     The drives at the first point come first, then those at the second, and so on.
 
@@ -66,15 +70,16 @@ def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECO
     InputError
         If a user's ADS fails.
     """
-    options = (*step_options(system), *options)
+    scenarios, options = [point.scenario for point in system.points], (*step_options(system), *options)
     if engine is Engine.RECORDED:
         if watch is None and not reason_for_sumo(system):
-            scenes = [recording_of(point.scenario, options) for point in system.points]
-            return drive(system, np.tile(settings, (len(system.points), 1)), RecordedWorld(scenes, len(settings)))
+            scenes = recorded_scenes(scenarios, options)
+            recorded = RecordedWorld([scene for scene in scenes if isinstance(scene, Recording)], len(settings))
+            return drive(system, np.tile(settings, (len(system.points), 1)), recorded)
         engine = Engine.LIBSUMO
-    first, *others = [staged(point.scenario) for point in system.points]
-    with world_on(first, len(settings), engine, options, others) as world:
-        return drive(system, np.tile(settings, (len(system.points), 1)), world, watch)
+    (scenario,) = scenarios
+    with open_world(copied_network(staged(scenario).folder, len(settings)), len(settings), engine, options) as world:
+        return drive(system, settings, world, watch)
 
 
 def step_options(system: System) -> tuple[str, ...]:

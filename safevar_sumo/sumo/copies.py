@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 
@@ -74,12 +74,11 @@ def write_roads(root: ElementTree.Element, n: int, file: Path) -> None:
     _write(root, parts, file)
 
 
-def write_demand(originals: Sequence[ElementTree.Element], n: int, file: Path, wanted: Callable[[ElementTree.Element], bool]) -> None:
-    """N copies of what is wanted of each traffic, in the order of departure: SUMO leaves out whoever comes too late in the file."""
-    found = [(begin, copy, _text(child, DEMAND)) for copy, original in enumerate(original for original in originals for _ in range(n))
-             for child, begin in _departures(original) if wanted(child)]
-    found.sort(key=lambda one: one[0])
-    _write(originals[0], [text.replace(_COPY, str(copy)) for _, copy, text in found], file)
+def write_demand(original: ElementTree.Element, n: int, file: Path) -> None:
+    """N copies of a traffic, in the order of departure: SUMO leaves out whoever comes too late in the file."""
+    texts = [(begin, _text(child, DEMAND)) for child, begin in _departures(original)]
+    copies = sorted(((begin, copy, text) for copy in range(n) for begin, text in texts), key=lambda one: one[0])
+    _write(original, [text.replace(_COPY, str(copy)) for _, copy, text in copies], file)
 
 
 def check_roads(root: ElementTree.Element, file: Path) -> None:

@@ -16,9 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
-from safevar_sumo.sumo.network import CopiedNetwork, copied_network, empty_fingerprint, empty_network, round_up
-from safevar_sumo.sumo.reusable import ReusableSumo
-from safevar_sumo.sumo.traffic import Traffic, common_checks, repeatable_traffic
+from safevar_sumo.sumo.network import CopiedNetwork
 from safevar_sumo.sumo.world import SumoWorld
 
 CONNECTION_ATTEMPTS = 15
@@ -37,73 +35,22 @@ class Engine(StrEnum):
 
 
 @contextmanager
-def world_on(folder: str, n: int, engine: Engine = Engine.LIBSUMO, options: Sequence[str] = (),
-             others: Sequence[str] = ()) -> Iterator[SumoWorld]:
-    """Copies of a network before their first step, `n` and another `n` for each of `others`, which differ in the traffic alone.
-
-    In the SUMO that stays open where that serves, else in a fresh one.
+def open_world(files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, options: Sequence[str] = ()) -> Iterator[SumoWorld]:
+    """Start SUMO on `n` copies of a network with their traffic, and close it whatever happens.
 
     Raises
     ------
     SimulationError
         With SUMO's own words, if it cannot load or loses a step.
     """
-    folders = (folder, *others)
-    traffic = [repeatable_traffic(one, options) if engine is Engine.LIBSUMO else None for one in folders]
-    expected = [one for one in traffic if one is not None]
-    checks = common_checks(expected)
-    if len(expected) == len(folders) and checks is not None:
-        with _standing_world(folder, [one for one in expected for _ in range(n)], (*options, "--insertion-checks", checks)) as world:
-            yield world
-    else:
-        with open_world(copied_network(folder, n, *others), n * len(folders), engine, options) as world:
-            yield world
-
-
-@contextmanager
-def open_world(files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, options: Sequence[str] = ()) -> Iterator[SumoWorld]:
-    """Start SUMO on `n` copies of a network with their traffic, and close it whatever happens; raises as `world_on`."""
     api = engine_api(engine)
     try:
         start_engine(api, engine, [*sumo_command(engine, files), *options])
         yield SumoWorld(api, n, watched=engine is Engine.GUI)
     except (api.TraCIException, api.FatalTraCIError) as error:
-        raise _failure(error) from None
+        raise SimulationError(f"SUMO failed: {str(error).strip() or 'it closed the connection'}") from None
     finally:
         stop_engine(api)
-
-
-_standing: ReusableSumo | None = None
-"""The libsumo of this process, if it is open."""
-
-
-@contextmanager
-def _standing_world(folder: str, traffic: Sequence[Traffic], options: Sequence[str]) -> Iterator[SumoWorld]:
-    """Worlds in the SUMO of this process, which stays open unless one fails."""
-    global _standing
-    api, n, wanted = engine_api(Engine.LIBSUMO), len(traffic), (empty_fingerprint(folder), *options)
-    try:
-        if _standing is None or not _standing.serves(wanted, n):
-            copies = round_up(n)
-            start_engine(api, Engine.LIBSUMO, [*sumo_command(Engine.LIBSUMO, empty_network(folder, copies)), *options])
-            _standing = ReusableSumo(api, wanted, copies)
-        _standing.expect(traffic)
-        yield SumoWorld(api, n, standing=_standing)
-    except BaseException as error:
-        _standing = None
-        stop_engine(api)
-        if isinstance(error, (api.TraCIException, api.FatalTraCIError)):
-            raise _failure(error) from None
-        raise
-
-
-def standing_network() -> str | None:
-    """What the network is like that this process has open: its `empty_fingerprint`."""
-    return None if _standing is None else _standing.network
-
-
-def _failure(error: Exception) -> SimulationError:
-    return SimulationError(f"SUMO failed: {str(error).strip() or 'it closed the connection'}")
 
 
 def engine_api(engine: Engine) -> Any:
@@ -127,9 +74,7 @@ def sumo_command(engine: Engine, files: CopiedNetwork) -> list[str]:
 
 def start_engine(api: Any, engine: Engine, command: list[str]) -> None:
     """Start an engine's program with this command line."""
-    global _standing
     if engine is Engine.LIBSUMO:
-        _standing = None  # libsumo exists once in a process
         try:
             api.start(command)
         except (api.TraCIException, api.FatalTraCIError) as error:

@@ -73,7 +73,7 @@ def film(system: System, settings: FloatArray) -> Film:
     """
     camera, system = _Camera(len(settings)), at_worst(system, settings)
     drives = simulate(system, settings, watch=camera.take)
-    return Film(drives=drives, tracks=camera.tracks(), road=road_of(staged(system.scenario)))
+    return Film(drives=drives, tracks=camera.tracks(), road=road_of(staged(system.scenario).folder))
 
 
 class _Camera:

@@ -17,9 +17,9 @@ from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.batch import Watcher, drive_all, reason_for_sumo, score
-from safevar_sumo.sumo.engine import Engine, standing_network
-from safevar_sumo.sumo.network import empty_fingerprint, lanes_of
-from safevar_sumo.sumo.staging import staged
+from safevar_sumo.sumo.engine import Engine
+from safevar_sumo.sumo.network import lanes_of
+from safevar_sumo.sumo.staging import all_staged
 from safevar_sumo.sumo.system import System, assemble
 
 LARGEST_WORLD = 200
@@ -136,7 +136,8 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
 def at_every_point(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = ()) -> list[AtPoint]:
     """Settings, shape (N, n), at every point, in the points' order; raises as `simulate`."""
     n, found = len(settings), dict[str, AtPoint]()
-    for points in _together(system.points, max(_most_vehicles(system, engine) // max(n, 1), 1)):
+    recorded = engine is Engine.RECORDED and not reason_for_sumo(system)
+    for points in _together(system.points, LARGEST_BATCH // max(n, 1)) if recorded else ((point,) for point in system.points):
         drives = drive_all(replace(system, matrix=points), settings, engine, options)
         evaluations = score(system, np.tile(settings, (len(points), 1)), drives)
         for k, point in enumerate(points):
@@ -190,15 +191,13 @@ def study_at(study: Study, name: str, source: object) -> Study:
 
 
 def _together(points: Sequence[Point], most: int) -> Iterator[tuple[Point, ...]]:
-    """Points that share a network, as many as one simulation may have; first those on the network that is loaded already."""
+    """Points that share a network, types and routes, as many as one simulation may have."""
     groups: dict[str, list[Point]] = {}
-    for point in points:
-        groups.setdefault(empty_fingerprint(staged(point.scenario)), []).append(point)
-    standing = standing_network()
-    for network in sorted(groups, key=lambda one: one != standing):
-        group = groups[network]
-        for start in range(0, len(group), most):
-            yield tuple(group[start:start + most])
+    for point, network in zip(points, all_staged([point.scenario for point in points]), strict=True):
+        groups.setdefault(network.roads, []).append(point)
+    for group in groups.values():
+        for start in range(0, len(group), max(most, 1)):
+            yield tuple(group[start:start + max(most, 1)])
 
 
 def worst_points(found: Sequence[AtPoint]) -> npt.NDArray[np.intp]:

@@ -25,7 +25,6 @@ from safevar_sumo.sumo.demand import check_demand, unused
 from safevar_sumo.sumo.sources import OPTIONS, TRAFFIC, Sources, check_options, is_shipped, options_of, sources_of
 
 ROADS = "network.net.xml"
-NOBODY = "nobody.rou.xml"
 TRIED = "tried.txt"
 RECIPE = ("--xml-validation", "never")
 """Options of netconvert in every network."""
@@ -39,10 +38,8 @@ class CopiedNetwork(NamedTuple):
     options: Path
 
 
-def copied_network(folder: str, n: int, *others: str) -> CopiedNetwork:
+def copied_network(folder: str, n: int) -> CopiedNetwork:
     """At least `n` copies of a network with traffic in `n` of them; see `sources_of` for what `folder` may be.
-
-    With `others`, which differ from it in the traffic alone, the next `n` copies have the traffic of the next of them.
 
     Raises
     ------
@@ -52,18 +49,10 @@ def copied_network(folder: str, n: int, *others: str) -> CopiedNetwork:
         If netconvert fails otherwise or the cache cannot be written.
     """
     sources = sources_of(folder)
-    places = [sources.place, *(sources_of(one).place for one in others)]
-    size = round_up(n * len(places))
+    size = round_up(n)
     roads = cached(_name(sources, size, sources.roads), ROADS, partial(_copy_roads, sources, size))
-    contents = tuple((place / TRAFFIC).read_bytes() for place in places)
-    traffic = cached(_folder(sources, n, _digest(contents, str(n))), TRAFFIC, partial(_copy_demand, places, n))
+    traffic = cached(_name(sources, n, (TRAFFIC,)), TRAFFIC, partial(_copy_demand, sources, n))
     return CopiedNetwork(roads, traffic, sources.place / OPTIONS)
-
-
-def empty_network(folder: str, n: int) -> CopiedNetwork:
-    """The same copies with the types and routes of the traffic in `n` of them, and nobody there; raises as `copied_network`."""
-    files, sources = copied_network(folder, n), sources_of(folder)
-    return files._replace(traffic=cached(_name(sources, n, (TRAFFIC,)), NOBODY, partial(_copy_nobody, sources.place, n)))
 
 
 def built_network(folder: str) -> Path:
@@ -100,7 +89,7 @@ def network_files(folder: str) -> dict[str, str]:
     return {name: hashlib.sha256(content).hexdigest()[:16] for name, content in zip(sources.files, contents, strict=True)}
 
 
-def empty_fingerprint(folder: str) -> str:
+def roads_fingerprint(folder: str) -> str:
     """Tells networks apart by everything but who is on them: sources, options, types and routes."""
     sources = sources_of(folder)
     nobody = ElementTree.Element("routes")
@@ -127,12 +116,8 @@ def round_up(n: int) -> int:
 
 def _name(sources: Sources, n: int, files: Sequence[str]) -> str:
     """Where in the cache `n` copies are that are made from these files."""
-    return _folder(sources, n, _digest(sources.contents(*files), f"{n} {sources.plain} {sources.options}"))
-
-
-def _folder(sources: Sources, n: int, digest: str) -> str:
-    """SUMO takes a comma for the beginning of another file."""
-    return f"{re.sub(r'[^a-zA-Z0-9_.-]', '_', sources.place.name)}-{n}-{digest}"
+    digest = _digest(sources.contents(*files), f"{n} {sources.plain} {sources.options}")
+    return f"{re.sub(r'[^a-zA-Z0-9_.-]', '_', sources.place.name)}-{n}-{digest}"  # SUMO takes a comma for the beginning of another file
 
 
 @cache
@@ -149,12 +134,8 @@ def _copy_roads(sources: Sources, n: int, into: Path) -> None:
     write_roads(_checked(_built(sources)), n, into / ROADS)
 
 
-def _copy_demand(places: Sequence[Path], n: int, into: Path) -> None:
-    write_demand([parsed(place / TRAFFIC) for place in places], n, into / TRAFFIC, lambda child: True)
-
-
-def _copy_nobody(place: Path, n: int, into: Path) -> None:
-    write_demand([parsed(place / TRAFFIC)], n, into / NOBODY, _is_nobody)
+def _copy_demand(sources: Sources, n: int, into: Path) -> None:
+    write_demand(parsed(sources.place / TRAFFIC), n, into / TRAFFIC)
 
 
 def _is_nobody(child: ElementTree.Element) -> bool:

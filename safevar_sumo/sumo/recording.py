@@ -1,48 +1,41 @@
-"""A scene that SUMO has played once, and the vehicles under test that drive in it without SUMO.
+"""Scenes that SUMO plays once: where nobody reacts to the vehicle under test, everybody else moves alike in every simulation.
 
-Where nobody reacts to the vehicle under test, everybody else moves alike in every simulation. SUMO plays them once, with a vehicle
-under test that stays where it starts; N vehicles then move over its lanes as SUMO's ballistic update moves them and collide where
-bodies overlap. Positions are SUMO's to the last bit: the operations are those of `MSVehicle::updateState`,
-`MSLane::interpolateLanePosToGeometryPos` and `PositionVector::positionAtOffset`, in their order.
+The vehicle under test stays where it starts meanwhile; `recorded_world.py` has vehicles drive in a scene.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any, NamedTuple, cast
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec import msgpack, to_builtins
 
-from safevar_sumo.errors import SimulationError
-from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.scenarios import VUT, GuardedScenario, Lane, Scenario
-from safevar_sumo.scenarios.base import lane_through
+from safevar_sumo.records import FloatArray
+from safevar_sumo.scenarios import VUT, GuardedScenario, Scenario
+from safevar_sumo.sumo.cache import cached
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
-from safevar_sumo.sumo.engine import Engine, world_on
-from safevar_sumo.sumo.network import network_fingerprint
+from safevar_sumo.sumo.engine import Engine, open_world
+from safevar_sumo.sumo.network import copied_network, netconvert_version
 from safevar_sumo.sumo.sources import is_shipped
-from safevar_sumo.sumo.staging import staged
-from safevar_sumo.sumo.world import Body, SumoWorld, begin, direction_of
-from safevar_sumo.vehicles import Sensors, SumoType
+from safevar_sumo.sumo.staging import all_staged
+from safevar_sumo.sumo.world import SumoWorld, begin, direction_of
 
-SCENES = 256
+SCENES = 4000
 """Recorded scenes that a process keeps; one of ten seconds takes some ten kilobytes."""
+KEPT = "scenes.msgpack"
+LEEWAY = 0.01
+"""Added to extents, which sort out who is far away [m]."""
 POSITION_EPS = 0.1
 """Least length of a lane's shape (SUMO, utils/common/StdDefs.h) [m]."""
-NUMERICAL_EPS = 0.001
-"""SUMO, utils/common/StdDefs.h [m]."""
-PARALLEL = 1 - 1e-9
-"""Cosine of the angle between two vehicles from which on they are in one direction."""
 
 
 class UnrecordableError(Exception):
     """A scene cannot be recorded; its text says why."""
-
-
-class UnknownActorError(Exception):
-    """A scenario asks for somebody or a lane that a scene does not have."""
 
 
 class Track(NamedTuple):
@@ -79,7 +72,11 @@ class Way(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """A scene without a vehicle under test that drives: `start` and `speed` are where it departs on its `way` [m, m/s]."""
+    """A scene without a vehicle under test that drives: `start` and `speed` are where it departs on its `way` [m, m/s].
+
+    `extents`, shape (2, T, A), are for each of the A tracks between which places along the way the front of a vehicle is when the two
+    are side by side [m].
+    """
 
     step_length: float
     start: float
@@ -91,35 +88,80 @@ class Recording:
     lanes: dict[str, tuple[tuple[float, float], ...]]
     lane_of: dict[str, str]
     tracks: dict[str, Track]
+    extents: FloatArray
 
 
-def reason_for_copies(scenario: Scenario, options: Sequence[str]) -> str:
-    """Why a scenario is driven in SUMO, each vehicle in a copy of its own; "" if its scene can be recorded."""
-    if getattr(scenario, "reactive_actors", True):
-        return "somebody in the scenario may react to the vehicle under test"
-    if not isinstance(scenario, GuardedScenario) and not is_shipped(scenario.network):  # ours speak for our own networks alone
-        return f"the traffic of the network {scenario.network!r} may react to the vehicle under test"
-    recording = _recorded(cast(Hashable, scenario), network_fingerprint(staged(scenario)), tuple(options))
-    return recording if isinstance(recording, str) else ""
+def recorded_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list[Recording | str]:
+    """The scenes of scenarios with further options of SUMO, or why one is driven in SUMO, each vehicle in a copy of its own.
 
-
-def recording_of(scenario: Scenario, options: Sequence[str]) -> Recording:
-    """The scene of a scenario without a `reason_for_copies`, with further options of SUMO; recorded once in a process.
+    SUMO plays a scene once in a process; those of our own scenarios are kept in the user's cache folder, too.
 
     Raises
     ------
     SimulationError
         If SUMO fails.
     """
-    recording = _recorded(cast(Hashable, scenario), network_fingerprint(staged(scenario)), tuple(options))
-    assert isinstance(recording, Recording)
-    return recording
+    reasons = [_reason_for_copies(scenario) for scenario in scenarios]
+    recordable = [scenario for scenario, reason in zip(scenarios, reasons, strict=True) if not reason]
+    folders = {(scenario, network.fingerprint, tuple(options)): network.folder
+               for scenario, network in zip(recordable, all_staged(recordable), strict=True)}
+    missing = {key: folder for key, folder in folders.items() if key not in _scenes}
+    if missing:
+        for old in [key for key in _scenes if key not in folders][:max(len(_scenes) + len(missing) - SCENES, 0)]:
+            del _scenes[old]
+        _scenes.update(zip(missing, _scenes_of(missing), strict=True))
+    scenes = {key[0]: _scenes[key] for key in folders}
+    return [reason or scenes[scenario] for scenario, reason in zip(scenarios, reasons, strict=True)]
 
 
-@lru_cache(maxsize=SCENES)
-def _recorded(scenario: Any, fingerprint: str, options: tuple[str, ...]) -> Recording | str:
-    """The scene, or why there is none; `fingerprint` stands for the contents of the network's files."""
-    with world_on(staged(scenario), 1, Engine.LIBSUMO, options) as world:
+def _reason_for_copies(scenario: Scenario) -> str:
+    if getattr(scenario, "reactive_actors", True):
+        return "somebody in the scenario may react to the vehicle under test"
+    if not isinstance(scenario, GuardedScenario) and not is_shipped(scenario.network):  # ours speak for our own networks alone
+        return f"the traffic of the network {scenario.network!r} may react to the vehicle under test"
+    return ""
+
+
+_Key = tuple[Scenario, str, tuple[str, ...]]
+"""A scenario, the fingerprint of its network with its traffic, and further options."""
+_scenes: dict[_Key, Recording | str] = {}
+"""Scenes of this process, or why there is none."""
+
+
+def _scenes_of(missing: Mapping[_Key, str]) -> list[Recording | str]:
+    """Scenes by their key and the folder of their network, from the cache or as SUMO plays them."""
+    def play() -> list[Recording | str]:
+        return [_play(scenario, folder, options) for (scenario, _, options), folder in missing.items()]
+
+    if any(isinstance(scenario, GuardedScenario) for scenario, *_ in missing):
+        return play()
+    digest = sha256(_code() + repr([(type(scenario).__name__, to_builtins(scenario), *rest) for scenario, *rest in missing]).encode())
+    def build(folder: Path) -> None:
+        (folder / KEPT).write_bytes(msgpack.encode(play(), enc_hook=_packed_array))
+
+    file = cached(f"scenes-{digest.hexdigest()[:16]}", KEPT, build)
+    return msgpack.decode(file.read_bytes(), type=list[Recording | str], dec_hook=_unpacked_array)
+
+
+@cache
+def _code() -> bytes:
+    """Of what scenes are made beside their scenario: SUMO, and our rooms that play them."""
+    rooms = sorted(file for room in ("sumo", "scenarios") for file in (Path(__file__).parents[1] / room).glob("*.py"))
+    return b"".join([netconvert_version().encode(), *(file.read_bytes() for file in rooms)])
+
+
+def _packed_array(array: Any) -> tuple[tuple[int, ...], bytes]:
+    return array.shape, array.tobytes()
+
+
+def _unpacked_array(kind: Any, packed: Any) -> FloatArray:
+    shape, content = packed
+    return np.frombuffer(content).reshape(shape)
+
+
+def _play(scenario: Any, folder: str, options: tuple[str, ...]) -> Recording | str:
+    """The scene, or why there is none."""
+    with open_world(copied_network(folder, 1), 1, Engine.LIBSUMO, options) as world:
         world.let_depart()
         world.depart()
         try:
@@ -148,10 +190,23 @@ def _played(scenario: Scenario, world: SumoWorld) -> Recording:
         if sample < length - 1:
             _, memory = scenario.observe(world, step, memory)
             world.advance(np.zeros(1))
+    tracks = {name: Track(rows[:, :2].copy(), rows[:, 2].copy(), rows[:, 3].copy(), *sizes[name]) for name, rows in states.items()}
+    own_length = world.vehicle_length(VUT)
+    extents = np.full((2, length, len(tracks)), np.nan)
+    for number, track in enumerate(tracks.values()):
+        extents[:, :, number] = _extent(track, along, own_length)
     return Recording(
-        step_length=step, start=start, speed=speed, length=world.vehicle_length(VUT), width=world.vehicle_width(VUT), way=way,
-        along=along, lanes=lanes, lane_of=lane_of,
-        tracks={name: Track(rows[:, :2].copy(), rows[:, 2], rows[:, 3], *sizes[name]) for name, rows in states.items()})
+        step_length=step, start=start, speed=speed, length=own_length, width=world.vehicle_width(VUT), way=way,
+        along=along, lanes=lanes, lane_of=lane_of, tracks=tracks, extents=extents)
+
+
+def _extent(track: Track, along: FloatArray, own_length: float) -> FloatArray:
+    """Between which places along the way the front of a vehicle is beside somebody at every step, and a little more; shape (2, T) [m]."""
+    angle = np.radians(track.angle)
+    cosine, sine = along @ np.array([np.sin(angle), np.cos(angle)]), along @ np.array([np.cos(angle), -np.sin(angle)])
+    middle = track.position @ along - cosine * (track.length / 2)
+    reach = (np.abs(cosine) * track.length + np.abs(sine) * track.width) / 2 + LEEWAY
+    return np.array([middle - reach, middle + reach + own_length])
 
 
 def _named(ids: Iterable[str]) -> Iterator[tuple[str, str]]:
@@ -193,191 +248,3 @@ def _way_of(api: Any, vut: str) -> tuple[Way, FloatArray]:
     if np.abs(direction - direction[0]).max() > 1e-6 or np.abs(first[1:] - last[:-1]).max(initial=0.0) > 1e-6:
         raise UnrecordableError("the lanes of the vehicle under test are not one straight")
     return Way(first, vector, end, np.maximum(shape_length, POSITION_EPS) / end, shape_length), direction_of(api.vehicle.getAngle(vut))
-
-
-def distance(before: FloatArray, after: FloatArray, step: float) -> FloatArray:
-    """Way in a step from one speed to another at a constant acceleration [m], in SUMO's operations (`MSVehicle::getDeltaPos`)."""
-    acceleration = (after - before) / step
-    return np.asarray((before + 0.5 * (acceleration * step)) * step)
-
-
-class RecordedWorld:
-    """N vehicles in each of several recorded scenes of one network; for a drive what `SumoWorld` is, of shapes (N,) and (N, 2)."""
-
-    lookup_errors = (UnknownActorError,)
-
-    def __init__(self, recordings: Sequence[Recording], n: int, whole: RecordedWorld | None = None, first: int = 0) -> None:
-        self._recordings, self._size, self._whole, self._first = recordings, n, whole, first
-        self.n, self.step_length = n * len(recordings), recordings[0].step_length
-        self._way, self._sample = recordings[0].way, 0
-        self._speeds = np.repeat([one.speed for one in recordings], n)
-        self._lane, self._place = np.zeros(self.n, dtype=np.intp), np.repeat([one.start for one in recordings], n)
-        self._left = np.zeros(self.n, dtype=bool)
-        self._front: FloatArray | None = None
-        self._front_before, self._speeds_before = np.full((self.n, 2), np.inf), self._speeds
-        self._struck: dict[int, Body] = {}
-        self.sensors = Sensors.perfect(self.n)
-
-    def set_types(self, types: SumoType) -> None:
-        """SUMO obeys every speed that it is given: types have no part in how vehicles move."""
-
-    def set_decelerations(self, decel: FloatArray) -> None:
-        """Nor have these."""
-
-    def depart(self) -> None:
-        """Everybody has departed."""
-
-    def leave(self, copies: Sequence[int]) -> None:
-        """Vehicles whose runs are over are told to be where and as fast as they were."""
-        self._left[copies] = True
-
-    def walk(self, person: str, speed: float) -> None:
-        """Everybody else moves as recorded."""
-
-    def drive(self, vehicle: str, speed: float) -> None:
-        """As recorded."""
-
-    def turn_back(self, person: str) -> None:
-        """As recorded."""
-
-    def part(self, first: int, n: int) -> RecordedWorld:
-        """The world of the `n` vehicles from the `first`, in one of the scenes."""
-        return RecordedWorld([self._recordings[first // self._size]], n, self, first)
-
-    def advance(self, speeds: FloatArray) -> None:
-        """One step in which the vehicles reach `speeds` [m/s], at a constant acceleration.
-
-        Raises
-        ------
-        SimulationError
-            If a vehicle leaves its last lane.
-        """
-        self._front_before, self._speeds_before = self.vehicle_positions(VUT), self._speeds
-        way = distance(self._speeds, speeds, self.step_length)
-        if self._left.any():
-            speeds, way = np.where(self._left, self._speeds, speeds), np.where(self._left, 0.0, way)
-        self._place = self._place + way
-        self._speeds, self._front, self._sample = speeds, None, self._sample + 1
-        end = self._way.end
-        while (beyond := self._place > end[self._lane]).any():
-            if (self._lane[beyond] == len(end) - 1).any():
-                raise SimulationError("SUMO failed: a vehicle under test drives beyond the end of its route")
-            self._place = np.where(beyond, self._place - end[self._lane], self._place)
-            self._lane = self._lane + beyond
-
-    def speeds(self) -> FloatArray:
-        return self._speeds if self._whole is None else self._whole.speeds()[self._rows]
-
-    def vehicle_positions(self, actor: str) -> FloatArray:
-        if actor != VUT:
-            return self._recorded(actor)
-        if self._whole is not None:
-            return self._whole.vehicle_positions(VUT)[self._rows]
-        if self._front is None:
-            self._front = self._way.positions(self._lane, self._place)
-        return self._front
-
-    person_positions = vehicle_positions
-
-    def _recorded(self, actor: str) -> FloatArray:
-        """Where one is whom a scene has, for all vehicles in it; there is one scene."""
-        positions = self._track(actor).position
-        position = positions[min(self._now, len(positions) - 1)]  # of a batch in which other scenes last longer
-        if np.isnan(position[0]):
-            raise SimulationError(f"SUMO failed: {actor!r} is not on the road at {self._now * self.step_length:g} s")
-        return np.broadcast_to(position, (self.n, 2))
-
-    def _track(self, actor: str) -> Track:
-        track: Track = self._known(self._recordings[0].tracks, actor)
-        return track
-
-    @staticmethod
-    def _known(table: dict[str, Any], name: str) -> Any:
-        if name not in table:
-            raise UnknownActorError(f"{name!r} is not known")
-        return table[name]
-
-    @property
-    def _rows(self) -> slice:
-        return slice(self._first, self._first + self.n)
-
-    @property
-    def _now(self) -> int:
-        return self._sample if self._whole is None else self._whole._sample
-
-    def vehicle_length(self, actor: str) -> float:
-        return self._recordings[0].length if actor == VUT else self._track(actor).length
-
-    def vehicle_width(self, actor: str) -> float:
-        return self._recordings[0].width if actor == VUT else self._track(actor).width
-
-    def person_width(self, actor: str) -> float:
-        return self._track(actor).width
-
-    def lane(self, lane: str) -> Lane:
-        return lane_through(lane, self._known(self._recordings[0].lanes, lane))
-
-    def lane_start(self, lane: str) -> tuple[float, float]:
-        return self._known(self._recordings[0].lanes, lane)[0]  # type: ignore[no-any-return]
-
-    def lane_of(self, vehicle: str) -> Lane:
-        return self.lane(self._known(self._recordings[0].lane_of, vehicle))
-
-    def collisions(self, open_: BoolArray) -> dict[int, float]:
-        """Vehicles of open runs whose body overlaps another, and their speeds [m/s].
-
-        SUMO looks twice in a step: when persons have moved, while vehicles are where and as fast as they were, and when vehicles have
-        moved too (`MSNet::simulationStep`: `STAGE_EVENTS`, `STAGE_MOVEMENTS`).
-        """
-        self._struck, found = {}, dict[int, float]()
-        for k, recording in enumerate(self._recordings):
-            rows = slice(k * self._size, (k + 1) * self._size)
-            of_open = open_[rows]
-            moved, still = (self.vehicle_positions(VUT), self._speeds), (self._front_before, self._speeds_before)
-            for track in recording.tracks.values():
-                if self._sample < len(track.angle) and not np.isnan(track.angle[self._sample]):
-                    other = _body(track, self._sample)
-                    for fronts, speeds in (still, moved) if track.is_person else (moved,):
-                        for row in (rows.start + _overlaps(fronts[rows], of_open, recording, other, track.is_person)).tolist():
-                            if row not in found:
-                                found[row], self._struck[row] = float(speeds[row]), other
-        return dict(sorted(found.items()))
-
-    def bodies(self, copy: int) -> tuple[Body, Body]:
-        """A vehicle under test that collides in this step, and whom it collides with."""
-        recording = self._recordings[copy // self._size]
-        own = Body.behind(self.vehicle_positions(VUT)[copy], recording.along, recording.length, recording.width,
-                          float(self._speeds[copy]))
-        return own, self._struck[copy]
-
-
-def _body(track: Track, sample: int) -> Body:
-    return Body.behind(track.position[sample], direction_of(float(track.angle[sample])), track.length, track.width,
-                       float(track.speed[sample]))
-
-
-def _overlaps(front: FloatArray, of_open: BoolArray, recording: Recording, other: Body, is_person: bool) -> Any:
-    """Rows of vehicles whose rectangles overlap another: no side of either parts them.
-
-    Two vehicles in one direction overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
-    """
-    own, along = recording.along, other.along
-    across, other_across = _left(own), _left(along)
-    cosine, sine = abs(along @ own), abs(other_across @ own)
-    least = 0.0 if is_person or cosine < PARALLEL else NUMERICAL_EPS
-    axes = (
-        (own, recording.length + other.length * cosine + other.width * sine),
-        (across, recording.width + other.length * sine + other.width * cosine),
-        (along, other.length + recording.length * cosine + recording.width * sine),
-        (other_across, other.width + recording.length * sine + recording.width * cosine))
-    offset = other.middle + own * (recording.length / 2)
-    rows = np.flatnonzero(of_open & (np.abs((offset - front) @ own) < axes[0][1] / 2 - least))
-    if len(rows):
-        to_other = offset - front[rows]
-        apart = [np.abs(to_other @ axis) >= reach / 2 - least for axis, reach in axes[1:]]
-        rows = rows[~np.logical_or.reduce(apart)]
-    return rows
-
-
-def _left(direction: FloatArray) -> FloatArray:
-    return np.array([-direction[1], direction[0]])

@@ -6,33 +6,57 @@ import hashlib
 import os
 import tempfile
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import platformdirs
 
 from safevar_sumo.errors import InputError, SimulationError
-from safevar_sumo.scenarios import Lane, Scenario
+from safevar_sumo.scenarios import GuardedScenario, Lane, Scenario
 from safevar_sumo.scenarios.base import Actors, lane_through
 from safevar_sumo.sumo.copies import parsed
-from safevar_sumo.sumo.network import ROADS, built_network
+from safevar_sumo.sumo.network import ROADS, built_network, network_fingerprint, roads_fingerprint
 from safevar_sumo.sumo.sources import OPTIONS, TRAFFIC, Sources, options_of, sources_of
 
 
-def staged(scenario: Scenario) -> str:
-    """The folder of the scenario's network, with its lanes and its traffic as the scenario's parameters have them.
+class Staged(NamedTuple):
+    """The folder of a network with a scenario's traffic; digests of all that is in it, and of all but who is on the road."""
+
+    folder: str
+    fingerprint: str
+    roads: str
+
+
+def staged(scenario: Scenario) -> Staged:
+    """The scenario's network, with its lanes and its traffic as the scenario's parameters have them.
 
     Raises
     ------
     InputError
         If the parameters are impossible, or what they change is not in the traffic file.
     """
-    network = scenario.network
+    return all_staged([scenario])[0]
+
+
+def all_staged(scenarios: Sequence[Scenario]) -> list[Staged]:
+    """The networks of several scenarios; every network's files are read once. Raises as `staged`."""
+    fingerprints = {name: network_fingerprint(name) for name in {scenario.network for scenario in scenarios}}
+    staging: Any = {True: _staged.__wrapped__, False: _staged}  # what a scenario from outside changes may change
+    return [staging[isinstance(scenario, GuardedScenario)](scenario, fingerprints[scenario.network]) for scenario in scenarios]
+
+
+@lru_cache(maxsize=10_000)
+def _staged(scenario: Any, fingerprint: str) -> Staged:
+    """`fingerprint` stands for the contents of the network's files."""
+    folder = scenario.network
     lanes, actors = (getattr(scenario, name, None) for name in ("lanes", "actors"))
-    if lanes is not None and (changes := lanes(_BuiltRoads(network))):
-        network = str(_with_lanes(sources_of(network), built_network(network), changes))
-    changes = actors(_BuiltRoads(network)) if actors is not None else {}
-    return str(_with_traffic(sources_of(network), changes)) if changes else network
+    if lanes is not None and (changes := lanes(_BuiltRoads(folder))):
+        folder = str(_with_lanes(sources_of(folder), built_network(folder), changes))
+    if actors is not None and (changes := actors(_BuiltRoads(folder))):
+        folder = str(_with_traffic(sources_of(folder), changes))
+    return Staged(folder, fingerprint if folder == scenario.network else network_fingerprint(folder), roads_fingerprint(folder))
 
 
 class _BuiltRoads:

@@ -15,7 +15,6 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import VUT, Lane, Scenario
 from safevar_sumo.scenarios.base import lane_through
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
-from safevar_sumo.sumo.reusable import ReusableSumo
 from safevar_sumo.vehicles import Sensors, SumoType
 
 SURE_BRAKES = 9.0
@@ -46,12 +45,10 @@ class Body(NamedTuple):
 class SumoWorld:
     """N copies of a network under simulation; made by `open_world`. Shapes: (N,) or (N, 2)."""
 
-    def __init__(self, api: Any, n: int, *, first: int = 0, watched: bool = False, standing: ReusableSumo | None = None,
-                 whole: SumoWorld | None = None) -> None:
-        self._api, self.n, self._first, self._standing = api, n, first, standing
+    def __init__(self, api: Any, n: int, *, watched: bool = False) -> None:
+        self._api, self.n = api, n
         self._set_speed, self._get_speed = _direct(api, "vehicle", "setSpeed"), _direct(api, "vehicle", "getSpeed")
         self._vehicle_position, self._person_position = _direct(api, "vehicle", "getPosition"), _direct(api, "person", "getPosition")
-        self._parts, self._whole = list[SumoWorld](), whole
         self._last_speeds, self._last_positions = np.zeros(n), np.zeros((n, 2))
         """Speeds and positions of vehicles under test that have left the road."""
         self._speeds_now: FloatArray | None = None
@@ -72,7 +69,7 @@ class SumoWorld:
     def ids(self, name: str) -> list[str]:
         """The ids of an actor in its copies."""
         if name not in self._ids:
-            self._ids[name] = [copied_id(copy, name) for copy in range(self._first, self._first + self.n)]
+            self._ids[name] = [copied_id(copy, name) for copy in range(self.n)]
         return self._ids[name]
 
     def set_types(self, types: SumoType) -> None:
@@ -108,11 +105,7 @@ class SumoWorld:
         """
         global _present
         _present = self
-        if self._standing is not None:
-            self._standing.enter()
         self._api.simulationStep()
-        if self._standing is not None:
-            self._standing.shift()
         departed = set(self._api.vehicle.getIDList())
         for name in self.ids(VUT):
             if name not in departed:
@@ -128,9 +121,8 @@ class SumoWorld:
             set_speed(names[copy], speed)
         self._told = speeds
         self._api.simulationStep()
-        for world in (self, *self._parts):
-            world._positions.clear()
-            world._speeds_now = None
+        self._positions.clear()
+        self._speeds_now = None
         if self._pause:
             time.sleep(self._pause)
 
@@ -170,8 +162,6 @@ class SumoWorld:
 
     def speeds(self) -> FloatArray:
         """Speeds of the vehicles under test as SUMO has them in this step [m/s]; whoever asks again gets the same array."""
-        if self._whole is not None:
-            return self._whole.speeds()[self._first:self._first + self.n]
         if self._speeds_now is None:
             self._speeds_now = self._last_speeds.copy()
             self._speeds_now[self._rows] = [*map(self._get_speed, self._driving)]
@@ -185,8 +175,6 @@ class SumoWorld:
 
     def _looked_up(self, actor: str, position: Callable[[str], tuple[float, float]]) -> FloatArray:
         """Positions in this step; whoever asks again gets the same array."""
-        if self._whole is not None and actor == VUT:
-            return self._whole.vehicle_positions(VUT)[self._first:self._first + self.n]
         if actor not in self._positions:
             names = self._driving if actor == VUT else self.ids(actor)
             found = np.fromiter(chain.from_iterable(map(position, names)), float, 2 * len(names)).reshape(-1, 2)
@@ -254,12 +242,6 @@ class SumoWorld:
         for name in self.ids(vehicle):
             self._api.vehicle.setSpeedMode(name, OBEY)
             self._api.vehicle.setSpeed(name, speed)
-
-    def part(self, first: int, n: int) -> SumoWorld:
-        """The world of `n` copies alone, from the `first`."""
-        part = SumoWorld(self._api, n, first=first, whole=self)
-        self._parts.append(part)
-        return part
 
     def turn_back(self, person: str) -> None:
         api = self._api.person

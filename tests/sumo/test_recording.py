@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
+import platformdirs
 import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Outcome
+from safevar_sumo.records import Command, Nominal, Observation, Outcome
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo import Engine, at_every_point, reason_for_sumo
-from safevar_sumo.sumo.recording import distance, reason_for_copies
+from safevar_sumo.sumo import Engine, at_every_point, reason_for_sumo, recording
+from safevar_sumo.sumo.recorded_world import distance
+from safevar_sumo.sumo.recording import recorded_scenes
 from safevar_sumo.sumo.system import System, assemble
 
 CLAIM = """
@@ -47,6 +51,16 @@ def assert_same(system: System, number: int, seed: int) -> list[str]:
     return outcomes
 
 
+class FullThrottle:
+    """Drives into whatever is there."""
+
+    def start(self, n: int, nominal: Nominal, step: float) -> None:
+        return None
+
+    def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
+        return Command(np.ones_like(seen.speed), np.zeros_like(seen.speed)), memory
+
+
 def test_vehicles_in_a_recorded_scene_do_what_they_do_in_sumo_to_the_last_bit(any_system: System) -> None:
     assert reason_for_sumo(any_system) == ""
     assert_same(any_system, 60, 5)
@@ -57,6 +71,30 @@ def test_a_step_is_as_long_as_sumos_where_the_order_of_operations_shows() -> Non
     before, after = np.array([0.0, 0.49783446695015615]), np.array([0.4348049848410796, 1.0073508794958133])
     there = np.array([28.196, 28.208445861673756]) + distance(before, after, 0.05)
     assert there.tolist() == [28.206870124621027, 28.246075495334903]
+
+
+@pytest.mark.parametrize("study", ["rain", "sun", "lgsvl", "native"])
+def test_who_drives_into_whatever_is_there_collides_as_in_sumo(study: str) -> None:
+    outcomes = assert_same(replace(assemble(load_study(study)), ads=FullThrottle()), 12, 7)
+    assert Outcome.COLLISION in outcomes
+
+
+def test_a_scene_from_the_cache_is_the_one_that_sumo_played(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A cache of one's own: SUMO plays, the file is read in the next process, and a torn one is made again."""
+    monkeypatch.setattr(platformdirs, "user_cache_path", lambda name: tmp_path)
+    scenario = assemble(load_study("sun")).scenario
+
+    def scene() -> str:
+        recording._scenes.clear()
+        return repr(recorded_scenes([scenario], ()))
+
+    played = scene()
+    (file,) = tmp_path.glob("networks/scenes-*/scenes.msgpack")
+    monkeypatch.setattr(recording, "_play", None)
+    assert scene() == played
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(TypeError):
+        scene()
 
 
 def test_contacts_are_those_that_sumo_finds() -> None:
@@ -77,7 +115,8 @@ def test_points_of_different_length_share_a_batch() -> None:
 
 def test_a_shipped_scenario_on_somebody_elses_network_is_driven_in_sumo() -> None:
     scenario = SCENARIOS["crossing"](network="my_town")
-    assert "my_town" in reason_for_copies(scenario, ())
+    (scene,) = recorded_scenes([scenario], ())
+    assert "my_town" in str(scene)
 
 
 @pytest.fixture

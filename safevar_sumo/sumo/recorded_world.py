@@ -1,0 +1,242 @@
+"""Vehicles that drive in recorded scenes, without SUMO.
+
+N vehicles move over the scene's lanes as SUMO's ballistic update moves them and collide where bodies overlap. Positions are SUMO's to
+the last bit: the operations are those of `MSVehicle::updateState`, `MSLane::interpolateLanePosToGeometryPos` and
+`PositionVector::positionAtOffset`, in their order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from safevar_sumo.errors import SimulationError
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.scenarios import VUT, Lane
+from safevar_sumo.scenarios.base import lane_through
+from safevar_sumo.sumo.recording import Recording, Track
+from safevar_sumo.sumo.world import Body, direction_of
+from safevar_sumo.vehicles import Sensors, SumoType
+
+NUMERICAL_EPS = 0.001
+"""SUMO, utils/common/StdDefs.h [m]."""
+PARALLEL = 1 - 1e-9
+"""Cosine of the angle between two vehicles from which on they are in one direction."""
+
+
+class UnknownActorError(Exception):
+    """A scenario asks for somebody or a lane that a scene does not have."""
+
+
+def distance(before: FloatArray, after: FloatArray, step: float) -> FloatArray:
+    """Way in a step from one speed to another at a constant acceleration [m], in SUMO's operations (`MSVehicle::getDeltaPos`)."""
+    acceleration = (after - before) / step
+    return np.asarray((before + 0.5 * (acceleration * step)) * step)
+
+
+class RecordedWorld:
+    """N vehicles in each of several recorded scenes of one network; for a drive what `SumoWorld` is, of shapes (N,) and (N, 2)."""
+
+    lookup_errors = (UnknownActorError,)
+
+    def __init__(self, recordings: Sequence[Recording], n: int, whole: RecordedWorld | None = None, first: int = 0) -> None:
+        self._recordings, self._size, self._whole, self._first = recordings, n, whole, first
+        self.n, self.step_length = n * len(recordings), recordings[0].step_length
+        self._way, self._sample = recordings[0].way, 0
+        self._speeds = np.repeat([one.speed for one in recordings], n)
+        self._lane, self._place = np.zeros(self.n, dtype=np.intp), np.repeat([one.start for one in recordings], n)
+        self._left = np.zeros(self.n, dtype=bool)
+        self._front: FloatArray | None = None
+        self._struck: dict[int, Body] = {}
+        self.sensors = Sensors.perfect(self.n)
+        if whole is None:
+            self._front_before, self._speeds_before = self.vehicle_positions(VUT), self._speeds
+            self._ahead_before = self._front_before @ recordings[0].along
+            self._extents = _joined_extents(recordings)
+
+    def set_types(self, types: SumoType) -> None:
+        """SUMO obeys every speed that it is given: types have no part in how vehicles move."""
+
+    def set_decelerations(self, decel: FloatArray) -> None:
+        """Nor have these."""
+
+    def depart(self) -> None:
+        """Everybody has departed."""
+
+    def leave(self, copies: Sequence[int]) -> None:
+        """Vehicles whose runs are over are told to be where and as fast as they were."""
+        self._left[copies] = True
+
+    def walk(self, person: str, speed: float) -> None:
+        """Everybody else moves as recorded."""
+
+    def drive(self, vehicle: str, speed: float) -> None:
+        """As recorded."""
+
+    def turn_back(self, person: str) -> None:
+        """As recorded."""
+
+    def part(self, first: int, n: int) -> RecordedWorld:
+        """The world of the `n` vehicles from the `first`, in one of the scenes."""
+        return RecordedWorld([self._recordings[first // self._size]], n, self, first)
+
+    def advance(self, speeds: FloatArray) -> None:
+        """One step in which the vehicles reach `speeds` [m/s], at a constant acceleration.
+
+        Raises
+        ------
+        SimulationError
+            If a vehicle leaves its last lane.
+        """
+        self._front_before, self._speeds_before = self.vehicle_positions(VUT), self._speeds
+        way = distance(self._speeds, speeds, self.step_length)
+        if self._left.any():
+            speeds, way = np.where(self._left, self._speeds, speeds), np.where(self._left, 0.0, way)
+        self._place = self._place + way
+        self._speeds, self._front, self._sample = speeds, None, self._sample + 1
+        end = self._way.end
+        while (beyond := self._place > end[self._lane]).any():
+            if (self._lane[beyond] == len(end) - 1).any():
+                raise SimulationError("SUMO failed: a vehicle under test drives beyond the end of its route")
+            self._place = np.where(beyond, self._place - end[self._lane], self._place)
+            self._lane = self._lane + beyond
+
+    def speeds(self) -> FloatArray:
+        return self._speeds if self._whole is None else self._whole.speeds()[self._rows]
+
+    def vehicle_positions(self, actor: str) -> FloatArray:
+        if actor != VUT:
+            return self._recorded(actor)
+        if self._whole is not None:
+            return self._whole.vehicle_positions(VUT)[self._rows]
+        if self._front is None:
+            self._front = self._way.positions(self._lane, self._place)
+        return self._front
+
+    person_positions = vehicle_positions
+
+    def _recorded(self, actor: str) -> FloatArray:
+        """Where one is whom a scene has, for all vehicles in it; there is one scene."""
+        positions = self._track(actor).position
+        position = positions[min(self._now, len(positions) - 1)]  # of a batch in which other scenes last longer
+        if math.isnan(position[0]):
+            raise SimulationError(f"SUMO failed: {actor!r} is not on the road at {self._now * self.step_length:g} s")
+        found = np.empty((self.n, 2))
+        found[:] = position
+        return found
+
+    def _track(self, actor: str) -> Track:
+        track: Track = self._known(self._recordings[0].tracks, actor)
+        return track
+
+    @staticmethod
+    def _known(table: dict[str, Any], name: str) -> Any:
+        if name not in table:
+            raise UnknownActorError(f"{name!r} is not known")
+        return table[name]
+
+    @property
+    def _rows(self) -> slice:
+        return slice(self._first, self._first + self.n)
+
+    @property
+    def _now(self) -> int:
+        return self._sample if self._whole is None else self._whole._sample
+
+    def vehicle_length(self, actor: str) -> float:
+        return self._recordings[0].length if actor == VUT else self._track(actor).length
+
+    def vehicle_width(self, actor: str) -> float:
+        return self._recordings[0].width if actor == VUT else self._track(actor).width
+
+    def person_width(self, actor: str) -> float:
+        return self._track(actor).width
+
+    def lane(self, lane: str) -> Lane:
+        return lane_through(lane, self._known(self._recordings[0].lanes, lane))
+
+    def lane_start(self, lane: str) -> tuple[float, float]:
+        return self._known(self._recordings[0].lanes, lane)[0]  # type: ignore[no-any-return]
+
+    def lane_of(self, vehicle: str) -> Lane:
+        return self.lane(self._known(self._recordings[0].lane_of, vehicle))
+
+    def collisions(self, open_: BoolArray) -> dict[int, float]:
+        """Vehicles of open runs whose body overlaps another, and their speeds [m/s].
+
+        SUMO looks twice in a step: when persons have moved, while vehicles are where and as fast as they were, and when vehicles have
+        moved too (`MSNet::simulationStep`: `STAGE_EVENTS`, `STAGE_MOVEMENTS`).
+        """
+        self._struck, found = {}, dict[int, float]()
+        moved, still = (self.vehicle_positions(VUT), self._speeds), (self._front_before, self._speeds_before)
+        for k, number in self._near(open_).tolist():
+            recording, rows = self._recordings[k], slice(k * self._size, (k + 1) * self._size)
+            track = [*recording.tracks.values()][number]
+            other = _body(track, self._sample)
+            for fronts, speeds in (still, moved) if track.is_person else (moved,):
+                for row in (rows.start + _overlaps(fronts[rows], open_[rows], recording, other, track.is_person)).tolist():
+                    if row not in found:
+                        found[row], self._struck[row] = float(speeds[row]), other
+        return dict(sorted(found.items()))
+
+    def _near(self, open_: BoolArray) -> Any:
+        """Scenes, and somebody in each by number, beside whom a vehicle of an open run is or was a step ago; shape (M, 2)."""
+        ahead = self.vehicle_positions(VUT) @ self._recordings[0].along
+        foremost = np.where(open_, ahead, -np.inf).reshape(-1, self._size).max(axis=1)
+        rearmost = np.where(open_, self._ahead_before, np.inf).reshape(-1, self._size).min(axis=1)
+        self._ahead_before = ahead
+        if self._sample >= self._extents.shape[1]:
+            return np.empty((0, 2), dtype=np.intp)
+        rears, fronts = self._extents[:, self._sample]
+        return np.argwhere((rears < foremost[:, np.newaxis]) & (fronts > rearmost[:, np.newaxis]))
+
+    def bodies(self, copy: int) -> tuple[Body, Body]:
+        """A vehicle under test that collides in this step, and whom it collides with."""
+        recording = self._recordings[copy // self._size]
+        own = Body.behind(self.vehicle_positions(VUT)[copy], recording.along, recording.length, recording.width,
+                          float(self._speeds[copy]))
+        return own, self._struck[copy]
+
+
+def _joined_extents(recordings: Sequence[Recording]) -> FloatArray:
+    """Those of several scenes, shape (2, T, K, A); NaN where nobody is."""
+    _, length, most = np.max([one.extents.shape for one in recordings], axis=0)
+    joined = np.full((2, length, len(recordings), most), np.nan)
+    for k, one in enumerate(recordings):
+        joined[:, :one.extents.shape[1], k, :one.extents.shape[2]] = one.extents
+    return joined
+
+
+def _body(track: Track, sample: int) -> Body:
+    return Body.behind(track.position[sample], direction_of(float(track.angle[sample])), track.length, track.width,
+                       float(track.speed[sample]))
+
+
+def _overlaps(front: FloatArray, of_open: BoolArray, recording: Recording, other: Body, is_person: bool) -> Any:
+    """Rows of vehicles whose rectangles overlap another: no side of either parts them.
+
+    Two vehicles in one direction overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
+    """
+    own, along = recording.along, other.along
+    across, other_across = _left(own), _left(along)
+    cosine, sine = abs(along @ own), abs(other_across @ own)
+    least = 0.0 if is_person or cosine < PARALLEL else NUMERICAL_EPS
+    axes = (
+        (own, recording.length + other.length * cosine + other.width * sine),
+        (across, recording.width + other.length * sine + other.width * cosine),
+        (along, other.length + recording.length * cosine + recording.width * sine),
+        (other_across, other.width + recording.length * sine + recording.width * cosine))
+    offset = other.middle + own * (recording.length / 2)
+    rows = np.flatnonzero(of_open & (np.abs((offset - front) @ own) < axes[0][1] / 2 - least))
+    if len(rows):
+        to_other = offset - front[rows]
+        apart = [np.abs(to_other @ axis) >= reach / 2 - least for axis, reach in axes[1:]]
+        rows = rows[~np.logical_or.reduce(apart)]
+    return rows
+
+
+def _left(direction: FloatArray) -> FloatArray:
+    return np.array([-direction[1], direction[0]])
