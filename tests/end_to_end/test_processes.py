@@ -72,7 +72,7 @@ def test_two_workers_that_are_killed_leave_the_same_bytes(whole: Path) -> None:
 
 @pytest.mark.parametrize("when", ["mid-run", *(pytest.param(moment, marks=SLOW) for moment in ("loading", 0.0, 0.15, 0.4, "twice"))])
 def test_ctrl_c_ends_everything_with_code_130(when: float | str) -> None:
-    process = started("study", "rain", "--out", "out", "--jobs", "1")
+    process = started("study", "rain", "--out", "out", "--jobs", "1", "--engine", "sumo")
     if when == "loading":
         until(lambda: any("numpy" in one.path for one in psutil.Process(process.pid).memory_maps()), process)
     elif isinstance(when, str):
