@@ -15,8 +15,8 @@ import numpy as np
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison
+from safevar_sumo.replay.film import Lane
 from safevar_sumo.replay.scene import SEAM_WIDTH, FlatBody, FlatScene, scene_of
-from safevar_sumo.sumo.film import Lane
 
 if TYPE_CHECKING:
     from PIL.Image import Image

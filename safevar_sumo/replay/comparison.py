@@ -12,10 +12,10 @@ import numpy as np
 from safevar_sumo.analysis.words import ENDS
 from safevar_sumo.api.simulation import assembled
 from safevar_sumo.records import STANDSTILL, Evaluations, FloatArray, Outcome, SimulationRuns
+from safevar_sumo.replay.film import Film, film
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo.batch import score
-from safevar_sumo.sumo.film import Film, film
 from safevar_sumo.sumo.matrix import at_worst
 from safevar_sumo.sumo.system import System
 from safevar_sumo.vehicles import CharacteristicSet

@@ -10,8 +10,8 @@ import numpy as np
 
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import CHANGED, Comparison, Moments, moments
+from safevar_sumo.replay.film import Film, Lane, Track
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.sumo.film import Film, Lane, Track
 
 SEAM_WIDTH = 0.12
 """Of the line between two lanes, as it is drawn [m]."""

@@ -23,11 +23,11 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.replay.comparison import Comparison, compare_setting, differences, divergence, moments
 from safevar_sumo.replay.figure import draw_comparison
+from safevar_sumo.replay.film import film
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.results import handles
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.batch import score
-from safevar_sumo.sumo.film import film
 from safevar_sumo.sumo.matrix import simulate, study_at
 from safevar_sumo.sumo.system import System, assemble
 
