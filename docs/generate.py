@@ -11,7 +11,7 @@ import msgspec
 from msgspec.inspect import type_info
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.metrics import METRICS, SAFEVAR
+from safevar_sumo.metrics import FURTHER, METRICS, SAFEVAR
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import VEHICLES
@@ -109,7 +109,7 @@ def _bounds(annotation: Any) -> str:
 def metric_columns() -> str:
     """Columns of metrics and objectives in solutions.csv."""
     objectives = [(f"`{one.name}`", one.unit, f"objective: {one.title}") for one in SAFEVAR.objectives]
-    metrics = [(f"`{name}`", metric.unit, metric.description) for name, metric in METRICS.items()]
+    metrics = [(f"`{name}`", metric.unit, metric.description) for name, metric in {**METRICS, **FURTHER}.items()]
     return _table(("column", "unit", "content"), [*objectives, *metrics])
 
 

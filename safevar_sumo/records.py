@@ -33,6 +33,7 @@ class Outcome(StrEnum):
     NEVER_MOVED = "never-moved"
     INVALID_TEST = "invalid-test"
     SIMULATOR_ERROR = "simulator-error"
+    INFEASIBLE = "infeasible"
 
 
 NOTHING: FloatArray = np.zeros(())
@@ -275,8 +276,13 @@ class Evaluations:
 
     @property
     def valid(self) -> BoolArray:
-        """Where the simulation ended in a way that can be scored: neither a simulator's error nor an invalid test."""
-        return np.asarray(~self.failed & (self.outcome != Outcome.INVALID_TEST))
+        """Where the simulation ended in a way that can be scored: no simulator's error, no invalid test, and it was feasible at all."""
+        return np.asarray(~self.failed & (self.outcome != Outcome.INVALID_TEST) & ~self.infeasible)
+
+    @property
+    def infeasible(self) -> BoolArray:
+        """Where a constraint of the study is violated, so that nothing was simulated."""
+        return np.asarray(self.outcome == Outcome.INFEASIBLE)
 
     @property
     def failed(self) -> BoolArray:

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from safevar_sumo.study import Study
 from safevar_sumo.vehicles import Characteristic
 
 
@@ -64,6 +65,14 @@ def print_meanings(console: Console, members: Iterable[Characteristic]) -> None:
             table.add_row(plain(member.name), plain(member.words))
     if table.row_count:
         console.print(table)
+
+
+def print_constraints(console: Console, study: Study) -> None:
+    """What the settings that were looked at satisfy, if the study says so."""
+    rows = study.vehicle.characteristics
+    if study.constraints:
+        listed = "; ".join(f"{one.quantity} {one.legal(rows)}" for one in study.constraints)
+        print_text(console, f"Only settings that satisfy the study's constraints: {listed}.")
 
 
 def print_names(console: Console, title: str, rows: Iterable[tuple[str, ...]], heads: tuple[str, ...]) -> None:

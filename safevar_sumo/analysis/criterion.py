@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.evaluator import Bench, spread
+from safevar_sumo.analysis.evaluator import Bench
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, Evaluations, Outcome
 from safevar_sumo.results import half_of
@@ -87,7 +87,7 @@ def criterion_of(text: str | None, bench: Bench, original: Evaluations | None = 
     if text is not None:
         return Unsafe.parse(text)
     original = bench.original() if original is None else original
-    return Unsafe.usual(bench.evaluate(spread(bench.characteristics, PROBED), "settings over the whole domain"), original)
+    return Unsafe.usual(bench.evaluate(bench.spread(PROBED), "settings over the whole domain"), original)
 
 
 def clopper_pearson(count: int, total: int, confidence: float = CONFIDENCE) -> tuple[float, float]:

@@ -12,16 +12,20 @@ import scipy
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.vehicles import CharacteristicSet, region_of
 from safevar_sumo.workers.batches import evaluate_all
 from safevar_sumo.workers.evaluation import Pool
 from safevar_sumo.workers.local import available_cores, local_pool
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage, how many of its settings are done, and how many there are."""
+
+
+SPREAD = 64
+"""Points of a sequence that are looked at for each feasible one."""
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -38,12 +42,21 @@ class Bench:
     """
 
     def __init__(self, study: Study, pool: Pool, progress: Progress = silent) -> None:
-        self.study, self.characteristics = study, CharacteristicSet.of(study.vehicle.characteristics)
+        self.study, self.region = study, region_of(study)
+        self.characteristics = self.region.characteristics
         self._pool, self.progress = pool, progress
         self.simulated = 0
 
-    def evaluate(self, settings: FloatArray, stage: str, before: int = 0, of: int | None = None) -> Evaluations:
-        """Evaluate settings, shape (M, n); `stage` is what the progress calls them, the part after the first `before` of that many."""
+    def evaluate(self, settings: FloatArray, stage: str, before: int = 0, of: int | None = None, *, anywhere: bool = False) -> Evaluations:
+        """Evaluate settings, shape (M, n); `stage` is what the progress calls them, the part after the first `before` of that many.
+
+        What violates a constraint of the study is not simulated: its outcome is `infeasible`. With `anywhere`, it is.
+        """
+        if self.region and not anywhere:
+            feasible = self.region.feasible(settings)
+            if not feasible.all():
+                parts = [self.evaluate(settings[feasible], stage, before, of), self._infeasible(settings[~feasible])]
+                return Evaluations.concatenate(parts).take(np.argsort(np.argsort(~feasible, kind="stable"), kind="stable"))
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
         done, total = 0, len(np.unique(settings, axis=0))
@@ -58,6 +71,27 @@ class Bench:
         evaluations = evaluate_all(self.study, settings, self._pool, count)
         self.simulated += total
         return evaluations
+
+    def _infeasible(self, settings: FloatArray) -> Evaluations:
+        undefined = np.full(len(settings), np.nan)
+        return Evaluations(
+            settings=settings, outcome=np.full(len(settings), Outcome.INFEASIBLE.value, dtype="U16"), collision_speed=undefined,
+            metrics=dict.fromkeys(METRICS, undefined), f_diff=self.characteristics.largest_change(settings),
+            f_num_diff=self.characteristics.number_changed(settings))
+
+    def spread(self, number: int, seed: int = 0, *, filtered: bool = False) -> FloatArray:
+        """Settings that cover the whole domain evenly, where they are feasible, once they are filtered if they are to be."""
+        if not self.region:
+            return spread(self.characteristics, number, seed)
+        rng, drawn = np.random.default_rng(seed), 0
+
+        def following(some: int) -> FloatArray:
+            """The next points of the sequence, which begins alike however long it is."""
+            nonlocal drawn
+            drawn += some
+            return spread(self.characteristics, drawn, seed)[drawn - some:]
+
+        return self.region.sampled(following, number, rng, filtered=filtered, rejections=SPREAD)
 
     def original(self) -> Evaluations:
         """The original vehicle's evaluation.

@@ -172,7 +172,7 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
     filtered
         Put changes that are smaller than their thresholds back to the original, as every search does.
     beyond
-        Take values outside the domains too.
+        Take values outside the domains, and settings that violate the study's constraints, too.
     gui
         Show the setting in sumo-gui.
 
@@ -185,6 +185,8 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
     """
     chosen, system = assembled(study)
     asked = system.characteristics.setting(changes or {}, "changes", beyond=beyond)
+    if not beyond:
+        system.check_feasible(asked[np.newaxis], "changes", filtered=filtered)
     return beside_the_original(chosen, system, asked, filtered=filtered, gui=gui)
 
 
@@ -237,7 +239,7 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
     filtered
         Put changes that are smaller than their thresholds back to the original, as every search does.
     beyond
-        Take values outside the domains too.
+        Take values outside the domains, and settings that violate the study's constraints, too.
     pool
         Where to simulate, if not in worker processes of its own.
     jobs
@@ -264,6 +266,8 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
     characteristics = system.characteristics
     asked, index = _table(settings, characteristics)
     _check(asked, characteristics, beyond)
+    if not beyond:
+        system.check_feasible(asked, "settings", filtered=filtered)
     rows = characteristics.filter(asked) if filtered else asked
     with shown(progress) as tell:
         evaluations = evaluated(chosen, rows, pool, jobs, tell)
@@ -274,11 +278,11 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
 
 def evaluated(study: Study, rows: FloatArray, pool: Pool | None = None, jobs: int | None = None,
               progress: Progress | None = None) -> Evaluations:
-    """Simulate settings, shape (M, n), in worker processes."""
+    """Simulate settings, shape (M, n), in worker processes, whether they satisfy the study's constraints or not."""
     from safevar_sumo.analysis.evaluator import open_bench, silent
 
     with open_bench(study, pool, jobs, progress or silent) as bench:
-        return bench.evaluate(rows, "settings")
+        return bench.evaluate(rows, "settings", anywhere=True)
 
 
 def _table(settings: Any, characteristics: CharacteristicSet) -> tuple[FloatArray, Any]:

@@ -21,7 +21,7 @@ from safevar_sumo.search import Problem, Search
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.matrix import LARGEST_WORLD
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.vehicles import CharacteristicSet, region_of
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.isolation import check_code
 from safevar_sumo.workers.local import first_of, result_of
@@ -82,7 +82,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
         observer.warned(f"study {study.name!r}: the original vehicle itself collides, no change is needed for that")
     results.begin(original)
     problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,
-                      population=study.search.population, scoring=results.scoring)
+                      population=study.search.population, scoring=results.scoring, region=region_of(study))
     campaign = Campaign(original, {}, [], [], {}, {}, results.scoring)
     waiting, runs = deque(keys), set[Run]()
 

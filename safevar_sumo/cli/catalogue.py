@@ -12,7 +12,7 @@ from rich.console import Console
 
 from safevar_sumo.ads import ADS
 from safevar_sumo.cli.program import commands
-from safevar_sumo.metrics import METRICS
+from safevar_sumo.metrics import FURTHER, METRICS
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study, study_names
@@ -46,7 +46,7 @@ def _catalogue(studies: list[Study]) -> dict[str, Any]:
         "scenarios": [_described(name, cls) for name, cls in SCENARIOS.items()],
         "weathers": [msgspec.to_builtins(weather) for weather in WEATHERS.values()],
         "algorithms": [_described(name, cls) for name, cls in ALGORITHMS.items()],
-        "metrics": [{"name": name, "description": metric.description} for name, metric in METRICS.items()],
+        "metrics": [{"name": name, "description": metric.description} for name, metric in {**METRICS, **FURTHER}.items()],
     }
 
 

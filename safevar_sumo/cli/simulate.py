@@ -45,7 +45,7 @@ FILE = click.Path(path_type=Path)
 @click.option("--set", "changes", multiple=True, metavar="NAME=VALUE", shell_complete=complete_changes,
               help="A characteristic's value in its unit, +10% of the original, or a sweep FROM..TO; may be repeated for others.")
 @click.option("--no-filter", is_flag=True, help="Keep changes that are smaller than the filter's thresholds.")
-@click.option("--beyond", is_flag=True, help="Take values beyond the domains too.")
+@click.option("--beyond", is_flag=True, help="Take values beyond the domains, and settings that violate a constraint, too.")
 @click.option("--trace", type=click.Path(path_type=Path), metavar="FILE.csv", help="Write the simulation step by step.")
 @click.option("--plot", type=FILE, metavar="FILE", help="Draw it beside the original vehicle: png, pdf or svg.")
 @click.option("--animate", type=FILE, metavar="FILE", help="Show both from above, moving: gif, mp4 or html.")
@@ -65,6 +65,8 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
     swept = read_changes(changes, system.characteristics, beyond)
     base = system.characteristics.original if target.setting is None else target.setting
     asked = settings_of(swept, base, system.characteristics)
+    if not beyond and changes:
+        system.check_feasible(asked, "--set", filtered=not no_filter, switch="--beyond")
     _check_outputs(study, trace, showing)
     if any(len(values) > 1 for values in swept.values()):
         if trace is not None or showing.asked:

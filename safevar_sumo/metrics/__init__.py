@@ -1,6 +1,7 @@
-"""Safety metrics of method section 4, by name."""
+"""Safety metrics of method section 4, and those of comfort, by name."""
 
 from safevar_sumo.metrics.base import F_DIFF, F_NUM_DIFF, F_SAFE, Metric, MetricFacts, Objective, Scoring, foreign_metric
+from safevar_sumo.metrics.comfort import BRAKE_HARSHNESS, MAX_JERK, RMS_ACCELERATION
 from safevar_sumo.metrics.deceleration import AVE_DECE
 from safevar_sumo.metrics.safety_degree import SAFETY_DEGREE_METRIC
 from safevar_sumo.metrics.time_to_collision import TET, TIT, time_to_collision
@@ -11,8 +12,17 @@ METRICS = {metric.name: metric for metric in (
     TIT,
     AVE_DECE,
 )}
+FURTHER = {metric.name: metric for metric in (
+    MAX_JERK,
+    RMS_ACCELERATION,
+    BRAKE_HARSHNESS,
+)}
+"""Metrics of the studies that name them."""
+OBJECTIVES = {F_SAFE.name: SAFETY_DEGREE_METRIC, "f_comfort": MAX_JERK}
+"""Metrics by the names that objectives have for them."""
 SAFEVAR = Scoring(metrics=tuple(metric.facts for metric in METRICS.values()), objectives=(F_SAFE, F_DIFF, F_NUM_DIFF))
 """Metrics and objectives of the published study (method sections 3 and 4)."""
 
-__all__ = ["F_DIFF", "F_NUM_DIFF", "F_SAFE", "METRICS", "SAFEVAR", "Metric", "MetricFacts", "Objective", "Scoring", "foreign_metric",
-           "time_to_collision"]
+__all__ = [
+    "FURTHER", "F_DIFF", "F_NUM_DIFF", "F_SAFE", "METRICS", "OBJECTIVES", "SAFEVAR", "Metric", "MetricFacts", "Objective", "Scoring",
+    "foreign_metric", "time_to_collision"]

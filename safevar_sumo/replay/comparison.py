@@ -136,7 +136,7 @@ def compare(study: StudyLike, changes: Mapping[str, float] | None = None, *, fil
     filtered
         Put changes that are smaller than their thresholds back to the original, as every search does.
     beyond
-        Take values outside the domains too.
+        Take values outside the domains, and a setting that violates the study's constraints, too.
 
     Raises
     ------
@@ -147,6 +147,8 @@ def compare(study: StudyLike, changes: Mapping[str, float] | None = None, *, fil
     """
     chosen, system = assembled(study)
     setting = system.characteristics.setting(changes or {}, "changes", beyond=beyond)
+    if not beyond:
+        system.check_feasible(setting[np.newaxis], "changes", filtered=filtered)
     return compare_setting(chosen, system, system.characteristics.filter(setting) if filtered else setting)
 
 

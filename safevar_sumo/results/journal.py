@@ -31,7 +31,7 @@ MAGIC = b"SVJ\n"
 HEAD = struct.Struct("<4sII")
 OUTCOMES = {
     Outcome.STOPPED: 0, Outcome.PASSED: 1, Outcome.COLLISION: 2, Outcome.TIMEOUT: 3, Outcome.NEVER_MOVED: 4, Outcome.SIMULATOR_ERROR: 5,
-    Outcome.INVALID_TEST: 6}
+    Outcome.INVALID_TEST: 6, Outcome.INFEASIBLE: 7}
 """Codes of outcomes in journals; a code never changes its meaning."""
 _OUTCOME_OF = {code: outcome.value for outcome, code in OUTCOMES.items()}
 BESIDE_METRICS = ("collision_speed", "f_diff", "f_num_diff")

@@ -11,8 +11,8 @@ import numpy as np
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.metrics import SAFEVAR, Scoring
 from safevar_sumo.plugins import Contract, Guard, read_only_copy
-from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
 Search = Generator[FloatArray, Evaluations, Evaluations]
 """Yields filtered settings, shape (k, n), is sent their evaluations, and returns the result of the run."""
@@ -22,7 +22,8 @@ Search = Generator[FloatArray, Evaluations, Evaluations]
 class Problem:
     """The characteristics to vary, the original vehicle's evaluation and the budget of evaluations.
 
-    `population` is the number of settings of a generation, for algorithms with generations; `scoring` gives the objectives.
+    `population` is the number of settings of a generation, for algorithms with generations; `scoring` gives the objectives. Where a study
+    has constraints, `region` has its feasible settings: what is asked for must be among them once it is filtered.
     """
 
     characteristics: CharacteristicSet
@@ -30,11 +31,23 @@ class Problem:
     evaluations: int
     population: int = 50
     scoring: Scoring = SAFEVAR
+    region: FeasibleRegion | None = None
 
     def uniform(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Unfiltered settings drawn uniformly in the domains; shape (number, n)."""
+        """Unfiltered settings drawn uniformly in the domains, which are feasible once they are filtered; shape (number, n)."""
         lower, upper = self.characteristics.lower, self.characteristics.upper
-        return rng.uniform(lower, upper, (number, len(lower)))
+        if not self.region:
+            return rng.uniform(lower, upper, (number, len(lower)))
+        return self.region.sampled(lambda some: rng.uniform(lower, upper, (some, len(lower))), number, rng, filtered=True)
+
+    def feasible(self, settings: FloatArray) -> BoolArray:
+        """Which settings, shape (k, n), satisfy the study's constraints once they are filtered; shape (k,)."""
+        filtered = self.characteristics.filter(settings)
+        return self.region.feasible(filtered) if self.region else np.ones(len(filtered), dtype=bool)
+
+    def repaired(self, settings: FloatArray) -> FloatArray:
+        """Settings moved towards the original as far as it takes to be feasible once they are filtered; shape (k, n)."""
+        return self.region.repaired(settings) if self.region else settings
 
 
 class Algorithm(Protocol):
@@ -88,6 +101,9 @@ class GuardedAlgorithm:
             row, column = unfiltered[0]
             raise self._guard.wrong("search", members.names[column], float(settings[row, column]),
                                     "filtered settings: problem.characteristics.filter(settings)")
+        if problem.region and not problem.region.feasible(settings).all():
+            problem.region.check(settings, self._guard.source, otherwise=f", of every setting that {self._guard.name} asks for: "
+                                 "problem.characteristics.filter(problem.repaired(settings))")
         return settings
 
     def _result(self, result: Any, sent: dict[bytes, Evaluations], problem: Problem) -> Evaluations:

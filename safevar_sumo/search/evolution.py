@@ -15,7 +15,6 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search.base import Problem
-from safevar_sumo.vehicles import CharacteristicSet
 
 Probability = Annotated[float, Meta(ge=0, le=1)]
 Index = Annotated[float, Meta(ge=0, le=1000)]
@@ -23,6 +22,8 @@ Size = Annotated[int, Meta(ge=1, le=100_000)]
 TournamentSize = Annotated[int, Meta(ge=2, le=1000)]
 REDRAWS = 10
 """How often a child that there is already is drawn anew, before it is taken all the same."""
+MISSES = 50
+"""How many litters without a feasible child are borne in a row."""
 
 
 @cache
@@ -59,9 +60,11 @@ class Operators(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Variation:
     """Draws offspring; DEAP's own random state is set and restored around every draw."""
 
-    def __init__(self, operators: Operators, characteristics: CharacteristicSet, rng: np.random.Generator) -> None:
+    def __init__(self, operators: Operators, problem: Problem, rng: np.random.Generator) -> None:
+        characteristics, self._problem = problem.characteristics, problem
         self._operators, self._state = operators, random.Random(int(rng.integers(2**63))).getstate()
         self._candidates: list[Individual] = []
+        self._missed = 0
         given = operators.mutation_probability
         self._mutation = 1 / len(characteristics) if given is None else given
         self._lower, self._upper = characteristics.lower.tolist(), characteristics.upper.tolist()
@@ -82,8 +85,8 @@ class Variation:
         children: list[Individual] = []
         with self.randomness():
             while population and len(children) < number:
-                first, second = self._crossed(self.winner(population), self.winner(population))
-                children += [self._mutated(first), self._mutated(second)]
+                pair = self._crossed(self.winner(population), self.winner(population))
+                children += self._feasible([self._mutated(child) for child in pair])
         return children[:number]
 
     def distinct_offspring(self, population: list[Individual], number: int) -> list[Individual]:
@@ -92,8 +95,8 @@ class Variation:
         self._candidates = []
         with self.randomness():
             while population and len(children) < number:
-                for child in self._crossed(*self._winners(population)):
-                    known, drawn = tuple(self._mutated(child)) in there, drawn + 1
+                for child in self._feasible([self._mutated(child) for child in self._crossed(*self._winners(population))]):
+                    known, drawn = tuple(child) in there, drawn + 1
                     if not known or drawn > REDRAWS * number:
                         there.add(tuple(child))
                         children.append(child)
@@ -101,11 +104,30 @@ class Variation:
 
     def child(self, mothers: list[Individual], fathers: list[Individual]) -> Individual:
         """One new individual of the winners of two tournaments, none of their candidates; call it within `randomness`."""
+        feasible: list[Individual] = []
         for _ in range(REDRAWS):
-            child = self._mutated(self._crossed(self.winner(mothers), self.winner(fathers))[0])
+            while not feasible:
+                feasible = self._feasible([self._mutated(self._crossed(self.winner(mothers), self.winner(fathers))[0])])
+            child = feasible.pop()
             if child not in mothers and child not in fathers:
                 break
         return child
+
+    def _feasible(self, children: list[Individual]) -> list[Individual]:
+        """The children that satisfy the study's constraints.
+
+        Constrained domination (Deb 2000) has whatever is feasible dominate whatever is not. The first population is feasible, so no
+        child that is not would survive: others are drawn in its place, and it is not simulated. After `MISSES` such children in a
+        row, the next are moved towards the original as far as it takes.
+        """
+        if not self._problem.region:
+            return children
+        feasible = self._problem.feasible(np.array(children))
+        self._missed = 0 if feasible.any() else self._missed + 1
+        if self._missed > MISSES:
+            self._missed = 0
+            return [Individual(values) for values in self._problem.repaired(np.array(children)).tolist()]
+        return [child for child, is_feasible in zip(children, feasible, strict=True) if is_feasible]
 
     def _winners(self, population: list[Individual]) -> tuple[Individual, Individual]:
         """Of two tournaments, whose candidates are drawn without replacement until the population is used up."""

@@ -64,7 +64,7 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         neighbours = self._neighbours(problem.population)
-        variation, size = Variation(self, problem.characteristics, rng), self.archive or problem.population
+        variation, size = Variation(self, problem, rng), self.archive or problem.population
         cells = first_brood(problem, rng)
         asked = yield from simulated(cells, problem)
         archive = archived([], cells, size)

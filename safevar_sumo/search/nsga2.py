@@ -17,7 +17,7 @@ class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        variation = Variation(self, problem.characteristics, rng)
+        variation = Variation(self, problem, rng)
         brood, population, asked = first_brood(problem, rng), list[Individual](), 0
         while brood:
             asked += yield from simulated(brood, problem)

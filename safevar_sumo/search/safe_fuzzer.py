@@ -13,6 +13,8 @@ from safevar_sumo.search.base import Problem, Search
 
 KEPT = 50
 SAFETY_WEIGHT = 6.0
+REDRAWS = 100
+"""How often a setting that is not feasible is drawn anew."""
 Number = Annotated[int, Meta(ge=1, le=1_000_000)]
 
 
@@ -66,19 +68,30 @@ class _Ranges:
     """Where values are drawn, and how many characteristics change at the most."""
 
     def __init__(self, problem: Problem) -> None:
-        self._characteristics, self._scoring = problem.characteristics, problem.scoring
+        self._problem, self._characteristics, self._scoring = problem, problem.characteristics, problem.scoring
         self._original = problem.scoring.values(problem.original)[0, 0]
         self.lower, self.upper = problem.characteristics.lower.copy(), problem.characteristics.upper.copy()
         self.most_changed = len(problem.characteristics)
 
     def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
         """Filtered settings: each changes k of the characteristics, k uniform in 1..`most_changed`."""
-        settings = np.repeat(self._characteristics.original[np.newaxis], number, axis=0)
-        for setting in settings:
-            changes = rng.choice(len(setting), size=rng.integers(1, self.most_changed, endpoint=True), replace=False)
-            for i in changes:
-                setting[i] = self._value(i, rng)
+        settings = np.stack([self._feasible_setting(rng) for _ in range(number)])
         return self._characteristics.filter(settings)
+
+    def _feasible_setting(self, rng: np.random.Generator) -> FloatArray:
+        """A setting drawn until it is feasible; after `REDRAWS`, moved towards the original as far as that takes."""
+        setting = self._setting(rng)
+        for _ in range(REDRAWS):
+            if self._problem.feasible(setting[np.newaxis])[0]:
+                return setting
+            setting = self._setting(rng)
+        return np.asarray(self._problem.repaired(setting[np.newaxis])[0])
+
+    def _setting(self, rng: np.random.Generator) -> FloatArray:
+        setting = self._characteristics.original.copy()
+        for i in rng.choice(len(setting), size=rng.integers(1, self.most_changed, endpoint=True), replace=False):
+            setting[i] = self._value(i, rng)
+        return setting
 
     def _value(self, i: int, rng: np.random.Generator) -> float:
         """Uniform in the range outside the filter's band; the original where nothing of the range lies outside it."""

@@ -34,7 +34,7 @@ class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     normalised: bool = True
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        variation, size = Variation(self, problem.characteristics, rng), self.archive or problem.population
+        variation, size = Variation(self, problem, rng), self.archive or problem.population
         brood, archive, asked = first_brood(problem, rng), list[Individual](), 0
         while brood:
             asked += yield from simulated(brood, problem)

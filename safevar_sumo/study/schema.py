@@ -12,6 +12,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import refuse_other_than_file, unknown
 from safevar_sumo.shipped import STUDIES
+from safevar_sumo.study.constraints import Constraint
 from safevar_sumo.study.variation import Correlation, Distribution
 
 Positive = Annotated[float, Meta(gt=0, le=1e6)]
@@ -203,7 +204,8 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `published` are the original vehicle's metrics in the published study, by name, as far as there are any;
     `repeatability` are standard deviations of repeats of one setting there;
     `calibration` tells which parameters are free, by their keys in the file, such as `ads.parameters.corridor`, `fit` how they are found;
-    `variation` and `correlations` tell how characteristics vary in the world, by name: uniformly where nothing is said.
+    `variation` and `correlations` tell how characteristics vary in the world, by name: uniformly where nothing is said;
+    `constraints` tell what the characteristics of one vehicle satisfy together.
     """
 
     name: Annotated[str, Meta(pattern=NAME)]
@@ -222,6 +224,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     calibration: dict[str, FreeParameter] = {}
     variation: dict[str, Distribution] = {}
     correlations: list[Correlation] = []
+    constraints: list[Constraint] = []
     origin: Origin = Origin()
 
 
@@ -229,6 +232,8 @@ def tables_of(study: Study) -> dict[str, Any]:
     """A study as plain tables, without its origin."""
     tables: dict[str, Any] = msgspec.to_builtins(study)
     del tables["origin"]
+    if not study.constraints:
+        del tables["constraints"]  # results of studies from before there were any keep their bytes
     return tables
 
 
@@ -275,6 +280,8 @@ def _foreign(study: Study) -> list[tuple[str, str]]:
     tests = [] if study.matrix is None else [test.model for test in study.matrix.tests]
     named = {"vehicle.model": [study.vehicle.model], "ads.model": [study.ads.model], "scenario.model": [study.scenario.model, *tests],
              "metrics.also": study.metrics.also, "search.objectives": study.search.objectives}
+    functions = [one.function for one in study.constraints]
+    named["constraints.function"] = [name for name in functions if name]
     return [(key, name) for key, names in named.items() for name in dict.fromkeys(names) if ":" in name]
 
 

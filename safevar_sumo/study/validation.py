@@ -12,6 +12,7 @@ import msgspec
 from msgspec import Struct
 
 from safevar_sumo.errors import InputError, unknown
+from safevar_sumo.study.constraints import constraint_mistakes
 from safevar_sumo.study.schema import CharacteristicTable, Study
 from safevar_sumo.study.variation import variation_mistakes
 
@@ -142,6 +143,7 @@ def implausible(source: object, study: Study) -> Iterator[InputError]:
     for name, row in rows.items():
         yield from _characteristic(source, f"vehicle.characteristics.{name}", row)
     yield from variation_mistakes(source, rows, study.variation, study.correlations)
+    yield from constraint_mistakes(source, rows, study.constraints)
     for name, free in study.calibration.items():
         if free.lower >= free.upper:
             yield InputError(source, f"calibration.{name!r}: lower = {free.lower} and upper = {free.upper}", "numbers, lower < upper")

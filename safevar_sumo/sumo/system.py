@@ -17,9 +17,10 @@ import numpy as np
 
 from safevar_sumo.ads import ADS, ADS_CONTRACT, REACTIONS, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown
-from safevar_sumo.metrics import F_SAFE, METRICS, Metric, Objective, Scoring, foreign_metric
+from safevar_sumo.metrics import FURTHER, METRICS, Metric, Objective, Scoring, foreign_metric
+from safevar_sumo.metrics import OBJECTIVES as BY_OBJECTIVE
 from safevar_sumo.plugins import Guard, Lookup, Member, OwnModules, check_parameters, guard_process_state, instance_of
-from safevar_sumo.records import Nominal
+from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, WEATHERS, GuardedScenario, Point, Scenario, weather_of
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, foreign_names
 from safevar_sumo.sumo.network import check_network, network_remarks
@@ -32,10 +33,12 @@ from safevar_sumo.vehicles import (
     VEHICLES,
     Change,
     CharacteristicSet,
+    FeasibleRegion,
     GuardedVehicle,
     Vehicle,
     calibration_drive,
     foreign_change,
+    region_of,
 )
 
 TAKEN = ("algorithm", "run", "evaluation", "outcome", "handle", "collision", "collision_speed", "setting", "f_safe", "f_diff", "f_num_diff")
@@ -67,13 +70,16 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     def taken_in(name: str, key: str) -> Metric | Change:
         if name in by_name:
             return by_name[name]
-        member = lookup.find({**METRICS, **CHANGES} if key == OBJECTIVES else METRICS, name, key)
+        own = {**METRICS, **FURTHER, **(CHANGES if key == OBJECTIVES else {})}
+        member = lookup.find(own, name, key)
         if member.guard is None:
+            if name in FURTHER:
+                metrics[name] = member.what
             return member.what  # type: ignore[no-any-return]
         found.append(member)
         foreign = isinstance(member.what, Change) and key == OBJECTIVES
         record = foreign_change(member.what, member.guard) if foreign else foreign_metric(member.what, member.guard)
-        if record.name in (*TAKEN, *metrics, *changes, *study.vehicle.characteristics):
+        if record.name in (*TAKEN, *metrics, *FURTHER, *changes, *study.vehicle.characteristics):
             raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a name of its own")
         if isinstance(record, Change):
             changes[record.name] = record
@@ -84,7 +90,8 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
 
     for name in study.metrics.also:
         taken_in(name, "metrics.also")
-    objectives = [F_SAFE if name == F_SAFE.name else _objective(taken_in(name, OBJECTIVES)) for name in study.search.objectives]
+    names = [BY_OBJECTIVE[name].name if name in BY_OBJECTIVE else name for name in study.search.objectives]
+    objectives = [_objective(taken_in(name, OBJECTIVES)) for name in names]
     _refuse_twice(objectives, lookup.source)
     scoring = Scoring(metrics=tuple(metric.facts for metric in metrics.values()), objectives=tuple(objectives))
     return Measuring(metrics, changes, scoring, tuple(found))
@@ -99,7 +106,7 @@ def _objective(record: Metric | Change) -> Objective:
 def _refuse_twice(objectives: Iterable[Objective], source: str) -> None:
     names = [objective.name for objective in objectives]
     if len(set(names)) < len(names):
-        raise InputError(source, f"search.objectives: one of {', '.join(names)} is named twice", one_of([*METRICS, *CHANGES]))
+        raise InputError(source, f"search.objectives: one of {', '.join(names)} is named twice", one_of([*METRICS, *FURTHER, *CHANGES]))
 
 
 STEP = "a function step(traci, vehicle_id), or a class with that method"
@@ -133,6 +140,7 @@ class System:
     nominal: Nominal
     members: tuple[Member, ...]
     measuring: Measuring
+    region: FeasibleRegion
     step_length: float | None = None
     matrix: tuple[Point, ...] = ()
 
@@ -144,6 +152,10 @@ class System:
     def at(self, point: Point) -> System:
         """The same at one point alone."""
         return replace(self, scenario=point.scenario, weather=point.weather, matrix=())
+
+    def check_feasible(self, settings: FloatArray, source: object, *, filtered: bool, switch: str = "beyond=True") -> None:
+        """Refuse settings, shape (M, n), that violate a constraint of the study; raises as `FeasibleRegion.check`."""
+        self.region.check(self.characteristics.filter(settings) if filtered else settings, source, otherwise=f", or any with {switch}")
 
     @property
     def remarks(self) -> list[str]:
@@ -197,7 +209,8 @@ def _assembled(study: Study, source: str) -> System:
     matrix = _matrix(study, source)
     for network in dict.fromkeys(scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))):
         check_network(network)
-    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    region = region_of(study, source)
+    characteristics = region.characteristics
     nominal = calibration_drive(models.vehicle, characteristics)
     if isinstance(models.ads, TraciController) and isinstance(models.vehicle, GuardedVehicle):
         ends = np.stack([characteristics.original, characteristics.lower, characteristics.upper])
@@ -206,7 +219,8 @@ def _assembled(study: Study, source: str) -> System:
         nominal.tables()  # what is wrong with a vehicle from outside shows here, whoever drives it
     return System(
         characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
-        metrics=study.metrics, nominal=nominal, members=(*models.members, *measuring.members), measuring=measuring,
+        metrics=study.metrics, nominal=nominal, members=(*models.members, *measuring.members, *region.members),
+        measuring=measuring, region=region,
         step_length=study.step_length, matrix=matrix)
 
 

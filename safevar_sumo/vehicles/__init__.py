@@ -18,6 +18,7 @@ from safevar_sumo.vehicles.calibration_drive import calibration_drive
 from safevar_sumo.vehicles.carla import Carla
 from safevar_sumo.vehicles.characteristics import CHANGES, Change, Characteristic, CharacteristicSet, foreign_change
 from safevar_sumo.vehicles.lgsvl import Lgsvl
+from safevar_sumo.vehicles.region import FeasibleRegion, region_of
 from safevar_sumo.vehicles.sensors import Sensors
 from safevar_sumo.vehicles.sumo import SumoVehicle
 from safevar_sumo.vehicles.worn import WornVehicle
@@ -30,5 +31,6 @@ VEHICLES: Mapping[str, type[Any]] = {
 }
 
 __all__ = [
-    "CHANGES", "LEVEL", "VEHICLES", "VEHICLE_CONTRACT", "Carla", "Change", "Characteristic", "CharacteristicSet", "GuardedVehicle",
-    "Sensors", "Slope", "SumoType", "Vehicle", "VehicleState", "at_start", "calibration_drive", "foreign_change", "slope_of"]
+    "CHANGES", "LEVEL", "VEHICLES", "VEHICLE_CONTRACT", "Carla", "Change", "Characteristic", "CharacteristicSet", "FeasibleRegion",
+    "GuardedVehicle", "Sensors", "Slope", "SumoType", "Vehicle", "VehicleState", "at_start", "calibration_drive", "foreign_change",
+    "region_of", "slope_of"]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.analysis.criterion import Unsafe
-from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent, spread
+from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, course
 from safevar_sumo.analysis.explain.causes import MinimalCause, affordable, boundaries, minimal_causes, necessary
@@ -72,7 +72,7 @@ def failures_of(source: Study | Case, bench: Bench, original: Evaluations, named
     if isinstance(source, Study):
         if named:
             raise InputError("solution", f"{source.name!r} is a study and has no solutions", "a results directory")
-        settings = bench.characteristics.filter(spread(bench.characteristics, LOOKED_AT, source.search.seed))
+        settings = bench.characteristics.filter(bench.spread(LOOKED_AT, source.search.seed, filtered=True))
         called: list[SolutionId | None] = [None] * len(settings)
         recorded = None
         rows = None

@@ -17,7 +17,7 @@ from safevar_sumo.analysis.explain.summary import LABELS, Finding, in_short
 from safevar_sumo.analysis.figures import CHANGED, FONT, INVOLVED, NECESSARY, literal, new_figure
 from safevar_sumo.analysis.words import ask, changes, command, decimal, number_of
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import WholeTable, print_meanings, print_text
+from safevar_sumo.terminal import WholeTable, print_constraints, print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ def print_explained(console: Console, place: str, result: Explained, point: str 
     members = CharacteristicSet.of(result.study.vehicle.characteristics)
     print_text(console, result.study.title)
     print_text(console, f"Unsafe: {result.unsafe}. {number_of(result.failures, 'failure')} among {result.looked_at} different settings.")
+    print_constraints(console, result.study)
     if result.otherwise:
         print_text(console, f"note: {number_of(result.otherwise, 'setting')} not as the results say; another version or code?")
     if not result.explanations:

@@ -178,6 +178,11 @@ def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
     Unanswerable
         If the solutions belong to no run.
     """
+    return np.asarray(series_of_means(case, algorithm, metric), dtype=float)
+
+
+def series_of_means(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
+    """The means of `run_means` by run."""
     solutions = case.solutions_of(algorithm)
-    samples = [values(solutions[solutions["run"] == run], metric) for run in case.runs_of(algorithm)]
-    return np.array([float(np.mean(sample)) for sample in samples if sample.size])
+    samples = {run: values(solutions[solutions["run"] == run], metric) for run in case.runs_of(algorithm)}
+    return pd.Series({run: float(np.mean(sample)) for run, sample in samples.items() if sample.size}, dtype=float)

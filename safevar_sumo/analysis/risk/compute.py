@@ -18,6 +18,7 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.study.variation import Correlation, Distribution, Fixed, Lognormal, Normal, Triangular, Uniform
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+from safevar_sumo.vehicles.region import REJECTIONS
 from safevar_sumo.workers.evaluation import Pool
 
 Quantile = Callable[[FloatArray], FloatArray]
@@ -113,7 +114,7 @@ class Risk:
         Vehicles that were drawn, and how many of them were unsafe; those that could not be simulated are `errors`.
     sensitivity, sensitivity_of_unsafe
         Frames of `sensitivities`, of the safety degree and of being unsafe; None where
-        characteristics are correlated, for which they are not defined.
+        characteristics are correlated or bound by constraints, for which they are not defined.
     """
 
     study: Study
@@ -183,19 +184,28 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
         unsafe = criterion_of(options.unsafe, bench)
         chunk = CHUNK if options.width is not None else LARGEST_CHUNK
         while count + errors < options.samples:
-            probabilities = rng.random((min(chunk, options.samples - count - errors), len(bench.characteristics)))
-            evaluations = bench.evaluate(model.settings(probabilities), "vehicles as they vary", count + errors, options.samples)
+            settings = _feasible_vehicles(bench, model, min(chunk, options.samples - count - errors), rng)
+            evaluations = bench.evaluate(settings, "vehicles as they vary", count + errors, options.samples)
             valid = int(np.count_nonzero(evaluations.valid))
-            count, errors = count + valid, errors + len(probabilities) - valid
+            count, errors = count + valid, errors + len(settings) - valid
             failures += int(np.count_nonzero(unsafe.of(evaluations)))
             low, high = clopper_pearson(failures, count, options.confidence) if count else (0.0, 1.0)
             if options.width is not None and high - low <= options.width:
                 break
         if not count:
             raise SimulationError(f"study {study.name!r}: not one of {errors} vehicles could be simulated")
-        of_degree, of_unsafe = (None, None) if model.correlated else sensitivities(bench, model, unsafe, options.confidence)
+        of_degree, of_unsafe = (None, None) if model.correlated or bench.region else sensitivities(bench, model, unsafe, options.confidence)
     return Risk(study=study, unsafe=unsafe, samples=count, failures=failures, errors=errors, confidence=options.confidence,
                 sensitivity=of_degree, sensitivity_of_unsafe=of_unsafe)
+
+
+def _feasible_vehicles(bench: Bench, model: VariationModel, number: int, rng: np.random.Generator) -> FloatArray:
+    """Vehicles as they vary, without those that violate a constraint; shape (number, n)."""
+    settings = bench.region.sampled(lambda some: model.settings(rng.random((some, len(bench.characteristics)))), number)
+    if len(settings) < number:
+        raise InputError(f"study {bench.study.name!r}", f"fewer than 1 in {REJECTIONS} vehicles as they vary satisfy the constraints: "
+                         f"{bench.region}", "a [variation] and [[constraints]] that agree")
+    return settings
 
 
 BASE = 512

@@ -13,7 +13,7 @@ from safevar_sumo.analysis.risk.compute import Risk
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study
 from safevar_sumo.study.variation import Uniform
-from safevar_sumo.terminal import WholeTable, print_meanings, print_text
+from safevar_sumo.terminal import WholeTable, print_constraints, print_meanings, print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ def print_risk(console: Console, result: Risk) -> None:
     if result.of_domain:
         print_text(console, "warning: no probability in the field: the study has no [variation] table that says how real vehicles vary.")
     print_text(console, _variation(result.study))
+    print_constraints(console, result.study)
     if result.sensitivity is None or result.sensitivity_of_unsafe is None:
         return
     table = WholeTable("characteristic", right=("SD: alone", "in all", "unsafe: alone", "in all"),
@@ -65,10 +66,11 @@ def sensitivity_figure(result: Risk) -> Figure:
     Raises
     ------
     InputError
-        If there are none, because characteristics are correlated.
+        If there are none, because characteristics are correlated or bound by constraints.
     """
     if result.sensitivity is None or result.sensitivity_of_unsafe is None:
-        raise InputError("correlations", "there are no sensitivity indices of correlated characteristics", "a study without correlations")
+        raise InputError("correlations", "there are no sensitivity indices of characteristics that are correlated or bound by constraints",
+                         "a study without correlations and constraints")
     names = result.sensitivity.sort_values("total", kind="stable")["characteristic"].to_list()
     title = f"{result.study.name}: what decides ({result.confidence:.0%} intervals)"
     figure, (axes,) = new_figure(title, 1, 2, (7.2, 1.5 + 0.28 * max(len(names), 4)))

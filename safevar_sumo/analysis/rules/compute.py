@@ -17,12 +17,12 @@ import pandas as pd
 from rich.console import Console
 
 from safevar_sumo.analysis.criterion import CONFIDENCE, Unsafe, clopper_pearson, criterion_of
-from safevar_sumo.analysis.evaluator import Bench, Progress, open_bench, silent, spread
+from safevar_sumo.analysis.evaluator import Bench, Progress, open_bench, silent
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.words import joined
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study
-from safevar_sumo.terminal import print_meanings, print_text
+from safevar_sumo.terminal import print_constraints, print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
@@ -145,7 +145,7 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
 
 def _design(bench: Bench, number: int, seed: int) -> Evaluations:
     """Evaluated settings over the whole domain, without those that could not be simulated."""
-    evaluations = bench.evaluate(spread(bench.characteristics, number, seed), "settings over the whole domain")
+    evaluations = bench.evaluate(bench.spread(number, seed), "settings over the whole domain")
     return evaluations.take(evaluations.valid)
 
 
@@ -250,6 +250,7 @@ def print_rules(console: Console, result: Rules) -> None:
     members = CharacteristicSet.of(result.study.vehicle.characteristics)
     print_text(console, result.study.title)
     print_text(console, f"Unsafe: {result.unsafe}; {result.unsafe_share:.2%} of {result.samples} settings all over the domain.")
+    print_constraints(console, result.study)
     if result.remark:
         print_text(console, f"No rule: {result.remark}.")
     elif not result.rules:

@@ -16,7 +16,7 @@ from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, ope
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.joint import Pair, SafeBox, no_box, planes, safe_box
 from safevar_sumo.errors import unknown
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import Characteristic
 from safevar_sumo.workers.evaluation import Pool
@@ -25,7 +25,7 @@ VALUES = 201
 """Values over the domain; the original comes on top."""
 FINER, ROUNDS = 8, 4
 """Into how many parts the place of a change is divided, and how often: to a 4096th of the distance of two values."""
-SAFE, UNSAFE, NOT_SIMULATED = range(3)
+SAFE, UNSAFE, NOT_SIMULATED, INFEASIBLE = range(4)
 Interval = tuple[float, float]
 
 
@@ -76,11 +76,17 @@ class OneAtATimeScan:
         """All intervals that could not be simulated, as `unsafe`."""
         return [_ends(part) for part in self._intervals(NOT_SIMULATED)]
 
+    @property
+    def infeasible(self) -> list[Interval]:
+        """All intervals that violate a constraint of the study, as `unsafe`."""
+        return [_ends(part) for part in self._intervals(INFEASIBLE)]
+
     def to_dict(self) -> dict[str, Any]:
         """The entry of `alone` in `tolerance --json`."""
         return {"characteristic": self.characteristic.name, "unit": self.characteristic.unit, "original": self.characteristic.original,
                 "safe": None if self.safe is None else list(self.safe), "unsafe": [list(interval) for interval in self.unsafe],
-                "not_simulated": [list(interval) for interval in self.not_simulated]}
+                "not_simulated": [list(interval) for interval in self.not_simulated],
+                **({"infeasible": [list(interval) for interval in self.infeasible]} if self.infeasible else {})}
 
 
 def _ends(part: pd.DataFrame) -> Interval:
@@ -111,7 +117,8 @@ def _where_it_changes(profile: pd.DataFrame) -> FloatArray:
 
 
 def _states(profile: pd.DataFrame) -> npt.NDArray[np.int_]:
-    return np.where(profile["valid"], np.where(profile["unsafe"], UNSAFE, SAFE), NOT_SIMULATED)
+    failed = np.where(profile["outcome"] == Outcome.INFEASIBLE, INFEASIBLE, NOT_SIMULATED)
+    return np.where(profile["valid"], np.where(profile["unsafe"], UNSAFE, SAFE), failed)
 
 
 def _evaluated(bench: Bench, columns: Sequence[int], values: Sequence[FloatArray], unsafe: Unsafe) -> list[pd.DataFrame]:

@@ -37,7 +37,7 @@ class Pair:
         Of either, shape (2, SIDE), in its unit.
     safety_degree, unsafe, valid
         On the grid, shape (SIDE, SIDE): the first characteristic down, the second across [m, or -m/s]. What is not valid could not be
-        simulated and is neither safe nor unsafe.
+        simulated, or is `infeasible`, and is neither safe nor unsafe.
     nearest
         The two values of the unsafe setting that is nearest to the original, in widths of the domains, to a 5120th of each; None if the
         grid has none. What is unsafe between safe values of the grid alone is not seen.
@@ -48,6 +48,7 @@ class Pair:
     safety_degree: FloatArray
     unsafe: BoolArray
     valid: BoolArray
+    infeasible: BoolArray
     nearest: tuple[float, float] | None
 
     @property
@@ -59,7 +60,7 @@ class Pair:
     @property
     def not_simulated_share(self) -> float:
         """Share of the plane that could not be simulated, by the same rule."""
-        return float(np.sum(_WEIGHT * ~self.valid) / np.sum(_WEIGHT))
+        return float(np.sum(_WEIGHT * (~self.valid & ~self.infeasible)) / np.sum(_WEIGHT))
 
     def to_dict(self) -> dict[str, Any]:
         """The entry of `pairs` in `tolerance --json`."""
@@ -78,11 +79,12 @@ def planes(bench: Bench, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
         group[:, :, first], group[:, :, second] = axes[first][:, np.newaxis], axes[second]
     evaluations = bench.evaluate(settings.reshape(-1, len(original)), "two characteristics at a time")
     shape = (len(chosen), SIDE, SIDE)
-    degrees, valid = evaluations.f_safe.reshape(shape), evaluations.valid.reshape(shape)
+    degrees, valid, infeasible = (values.reshape(shape) for values in (evaluations.f_safe, evaluations.valid, evaluations.infeasible))
     is_unsafe = unsafe.of(evaluations).reshape(shape)
     nearest = _nearest(bench, chosen, is_unsafe, unsafe)
     return [Pair(characteristics=(members[first], members[second]), values=np.stack([axes[first], axes[second]]), safety_degree=degrees[i],
-                 unsafe=is_unsafe[i], valid=valid[i], nearest=nearest.get(i)) for i, (first, second) in enumerate(chosen)]
+                 unsafe=is_unsafe[i], valid=valid[i], infeasible=infeasible[i], nearest=nearest.get(i))
+            for i, (first, second) in enumerate(chosen)]
 
 
 def _nearest(bench: Bench, chosen: Sequence[tuple[int, int]], is_unsafe: BoolArray, unsafe: Unsafe) -> dict[int, tuple[float, float]]:
@@ -202,15 +204,17 @@ def safe_box(bench: Bench, columns: Sequence[int], unsafe: Unsafe, beyond: Float
             break
         for number in (PROBE, SEARCHED):
             sobol = sobol_points(number, len(columns), bench.study.search.seed + search)
-            hits, _ = _unsafe_within(bench, columns, factor, np.concatenate([sobol, np.round(sobol)]), unsafe)  # and corners
+            points = np.concatenate([sobol, np.round(sobol)])  # and corners
+            hits, _ = _unsafe_of(bench, factor, _in_box(bench, columns, factor, points), unsafe)
             if len(hits):
                 break
         else:
             attempt += 1
             error = (1 - CONFIDENCE) / 2**attempt
             samples = math.ceil(math.log(error) / math.log1p(-UNSAFE_AT_MOST))
-            points = np.random.default_rng((bench.study.search.seed, attempt)).random((samples, len(columns)))
-            hits, failed = _unsafe_within(bench, columns, factor, points, unsafe)
+            settings = _drawn_in_box(bench, columns, factor, samples, np.random.default_rng((bench.study.search.seed, attempt)))
+            samples = len(settings)
+            hits, failed = _unsafe_of(bench, factor, settings, unsafe)
             if not len(hits):
                 share = float(scipy.stats.beta.ppf(1 - error, failed + 1, samples - failed)) if failed < samples else 1.0
                 return SafeBox(factor, CONFIDENCE, samples, failed, attempt, share,
@@ -223,15 +227,25 @@ def safe_box(bench: Bench, columns: Sequence[int], unsafe: Unsafe, beyond: Float
     return no_box(bench, columns, attempt)
 
 
-def _unsafe_within(bench: Bench, columns: Sequence[int], factor: float, points: FloatArray, unsafe: Unsafe) -> tuple[FloatArray, int]:
-    """Unsafe settings, shape (K, n), at points of the unit cube that stands for a box around the original; and how many failed."""
+def _in_box(bench: Bench, columns: Sequence[int], factor: float, points: FloatArray) -> FloatArray:
+    """Settings at points of the unit cube that stands for a box around the original; shape (K, n)."""
     members, which = bench.characteristics, list(columns)
     lower = members.original - factor * (members.original - members.lower)
     upper = members.original + factor * (members.upper - members.original)
     settings = np.tile(members.original, (len(points), 1))
     settings[:, which] = lower[which] + points * (upper - lower)[which]
+    return settings
+
+
+def _drawn_in_box(bench: Bench, columns: Sequence[int], factor: float, number: int, rng: np.random.Generator) -> FloatArray:
+    """Feasible settings drawn uniformly in a box; fewer than `number` where hardly any is feasible."""
+    return bench.region.sampled(lambda some: _in_box(bench, columns, factor, rng.random((some, len(columns)))), number)
+
+
+def _unsafe_of(bench: Bench, factor: float, settings: FloatArray, unsafe: Unsafe) -> tuple[FloatArray, int]:
+    """The unsafe ones of settings, shape (K, n), and how many could not be simulated; what is not feasible is neither."""
     evaluations = bench.evaluate(settings, f"all characteristics within {factor:.0%} of the domain")
-    return settings[unsafe.of(evaluations)], int(np.count_nonzero(~evaluations.valid))
+    return settings[unsafe.of(evaluations)], int(np.count_nonzero(~evaluations.valid & ~evaluations.infeasible))
 
 
 def _reach(bench: Bench, settings: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from safevar_sumo.analysis.tolerance.joint import Pair
 from safevar_sumo.analysis.words import decimal
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import SAFETY_DEGREE
-from safevar_sumo.terminal import WholeTable, print_meanings, print_text
+from safevar_sumo.terminal import WholeTable, print_constraints, print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ def print_tolerance(console: Console, result: Tolerance) -> None:
     original = result.original
     print_text(console, f"Unsafe: {result.unsafe}. The original vehicle: {original.outcome[0]}, SD {decimal(original.f_safe[0])}.")
     print_text(console, result.verdict)
+    print_constraints(console, result.study)
     console.print(_alone(result))
     print_text(console, "* the end of the domain: nothing beyond was looked at.")
     print_meanings(console, [scan.characteristic for scan in result.alone])
@@ -45,21 +46,24 @@ def _together(result: Tolerance) -> str:
     if not box.factor:
         return f"{who}: no box around the original is safe."
     failed = f"; {box.failed} of them could not be simulated and count as unsafe in what follows" if box.failed else ""
+    box_settings = "all settings in the box that satisfy the constraints" if result.study.constraints else "all settings in the box"
     bad = "are unsafe or cannot be simulated" if box.failed else "are unsafe"
     return (f"{who}: each may go {box.factor:.1%} of the way from its original value to either end of its domain. None of {box.samples} "
             f"settings drawn at random in this box is unsafe{failed}. With {box.confidence:.0%} confidence at most "
-            f"{box.unsafe_at_most:.2%} of all settings in the box {bad}.")
+            f"{box.unsafe_at_most:.2%} of {box_settings} {bad}.")
 
 
 def _alone(result: Tolerance) -> WholeTable:
-    failing = any(scan.not_simulated for scan in result.alone)
-    heads = ("original", "safe from", "to", "SD at the ends", "unsafe", *(["could not be simulated"] if failing else []))
+    others = {"could not be simulated": [scan.not_simulated for scan in result.alone],
+              "violates a constraint": [scan.infeasible for scan in result.alone]}
+    others = {head: intervals for head, intervals in others.items() if any(intervals)}
+    heads = ("original", "safe from", "to", "SD at the ends", "unsafe", *others)
     table = WholeTable("characteristic", right=heads, title="Each alone")
-    for scan in result.alone:
+    for i, scan in enumerate(result.alone):
         member = scan.characteristic
         table.add_row(f"{member.name} [{member.unit}]", f"{member.original:g}", *_ends(scan),
                       *(", ".join(f"{low:.5g} to {high:.5g}" for low, high in intervals) or "nowhere"
-                        for intervals in (scan.unsafe, *([scan.not_simulated] if failing else []))))
+                        for intervals in (scan.unsafe, *(column[i] for column in others.values()))))
     return table
 
 

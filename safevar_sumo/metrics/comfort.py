@@ -1,0 +1,107 @@
+"""Comfort of those on board, along the vehicle's way: jerk, weighted acceleration, harsh braking. Only studies that name them have them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.metrics.base import Metric, total
+from safevar_sumo.records import BoolArray, FloatArray, SimulationRuns
+from safevar_sumo.study import MetricsTable
+
+JERK_TIME = 1.0
+"""Time over which jerk is averaged [s], as ISO 15622 (adaptive cruise control) has it, which allows 2.5 m/s^3 above 20 m/s."""
+BRAKING_TIME = 0.5
+"""Time over which a deceleration is averaged [s]: the half second that UN R79 averages accelerations over."""
+HIGH_PASS, TRANSITION, TRANSITION_QUALITY = 0.4, 2.0, 0.63
+"""W_d of ISO 2631-1, annex A: f_1 and f_3 = f_4 [Hz], Q_4 [-]; the high pass is Butterworth's."""
+
+
+class _Biquad(NamedTuple):
+    """A filter of second order, from the latest sample to the oldest; the first coefficient of the output is 1."""
+
+    of_input: tuple[float, float, float]
+    of_output: tuple[float, float]
+
+    @classmethod
+    def bilinear(cls, numerator: tuple[float, float, float], denominator: tuple[float, float, float], step: float) -> _Biquad:
+        """From polynomials in s, the highest power first, by Tustin's rule."""
+        k = 2 / step
+
+        def in_z(polynomial: tuple[float, float, float]) -> tuple[float, float, float]:
+            a, b, c = polynomial
+            return a * k * k + b * k + c, 2 * (c - a * k * k), a * k * k - b * k + c
+
+        first, *rest = in_z(denominator)
+        given = in_z(numerator)
+        return cls((given[0] / first, given[1] / first, given[2] / first), (rest[0] / first, rest[1] / first))
+
+    def apply(self, samples: FloatArray) -> FloatArray:
+        """Filter samples along the first axis, from rest; one operation after the other, so that results do not depend on N."""
+        (b0, b1, b2), (a1, a2) = self
+        result = np.zeros_like(samples)
+        x1 = x2 = y1 = y2 = np.zeros(samples.shape[1:])
+        for i, x in enumerate(samples):
+            result[i] = b0 * x + b1 * x1 + b2 * x2 - a1 * y1 - a2 * y2
+            x1, x2, y1, y2 = x, x1, result[i], y1
+        return result
+
+
+def weighted(acceleration: FloatArray, step: float) -> FloatArray:
+    """Acceleration as W_d of ISO 2631-1 weighs it along the vehicle [m/s^2], shape (T, N).
+
+    Without the low pass at 100 Hz: the samples of a simulation have nothing above half of their rate.
+    """
+    high, transition = 2 * np.pi * HIGH_PASS, 2 * np.pi * TRANSITION
+    passes = _Biquad.bilinear((1.0, 0.0, 0.0), (1.0, float(np.sqrt(2.0)) * high, high * high), step)
+    weighs = _Biquad.bilinear((0.0, transition, transition * transition),
+                              (1.0, transition / TRANSITION_QUALITY, transition * transition), step)
+    return weighs.apply(passes.apply(acceleration))
+
+
+def max_jerk(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """Largest magnitude of the jerk over a second [m/s^3]; shape (N,), NaN on a collision."""
+    gained, counts = _accelerations(runs)
+    steps = _steps(JERK_TIME, runs.trace.step, len(gained) - 1)
+    jerk = np.abs(gained[steps:] - gained[:-steps]) / (steps * runs.trace.step)
+    return _without_collision(runs, np.max(np.where(counts[steps:], jerk, 0.0), axis=0, initial=0.0))
+
+
+def rms_acceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """Root mean square of the weighted acceleration over the run [m/s^2]; shape (N,), NaN on a collision."""
+    gained, counts = _accelerations(runs)
+    squares = np.where(counts, weighted(np.where(counts, gained, 0.0), runs.trace.step), 0.0) ** 2
+    return _without_collision(runs, np.sqrt(total(squares) / np.maximum(np.count_nonzero(counts, axis=0), 1)))
+
+
+def brake_harshness(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """Largest deceleration over half a second [m/s^2]; shape (N,), NaN on a collision."""
+    speed, active = runs.trace.speed, runs.trace.active
+    steps = _steps(BRAKING_TIME, runs.trace.step, len(speed) - 1)
+    lost = (speed[:-steps] - speed[steps:]) / (steps * runs.trace.step)
+    return _without_collision(runs, np.max(np.where(active[steps:], lost, 0.0), axis=0, initial=0.0))
+
+
+def _accelerations(runs: SimulationRuns) -> tuple[FloatArray, BoolArray]:
+    """Gain of speed per time between two samples [m/s^2], shape (T - 1, N), and where both count."""
+    return np.diff(runs.trace.speed, axis=0) / runs.trace.step, runs.trace.active[1:]
+
+
+def _steps(time: float, step: float, most: int) -> int:
+    return max(1, min(round(time / step), most))
+
+
+def _without_collision(runs: SimulationRuns, values: FloatArray) -> FloatArray:
+    return np.where(np.isnan(runs.collision_speed), values, np.nan)
+
+
+MAX_JERK = Metric(
+    name="max_jerk", title="jerk", unit="m/s^3", more_is_unsafe=True, over_collisions=False, function=max_jerk,
+    description="Largest magnitude of the jerk, averaged over a second (ISO 15622); without a collision.")
+RMS_ACCELERATION = Metric(
+    name="rms_acceleration", title="RMS a_w", unit="m/s^2", more_is_unsafe=True, over_collisions=False, function=rms_acceleration,
+    description="Root mean square of the acceleration along the vehicle, weighted with W_d of ISO 2631-1; without a collision.")
+BRAKE_HARSHNESS = Metric(
+    name="brake_harshness", title="harshness", unit="m/s^2", more_is_unsafe=True, over_collisions=False, function=brake_harshness,
+    description="Largest deceleration, averaged over half a second; without a collision.")

@@ -1,0 +1,239 @@
+"""The feasible region of a study: settings whose characteristics satisfy its constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.plugins import Guard, Lookup, Member
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import Constraint, Study
+from safevar_sumo.vehicles.characteristics import CharacteristicSet
+
+SLACK = 1e-9
+"""By how much of its range over the domains a quantity may miss its bounds: rounding."""
+STEPS_BACK = 64
+"""Places on the way to the original that are tried for a setting that is not feasible."""
+REJECTIONS = 1000
+"""Settings that are drawn at the most for each feasible one."""
+PROBES = 512
+"""Settings that look for a feasible change, beside vertices and ends of the domains."""
+Draw = Callable[[int], FloatArray]
+"""Draws so many settings."""
+
+
+class _Bounds(NamedTuple):
+    """A constraint that can be computed: `quantity` takes settings, shape (N, n); `range` is the quantity's over the domains."""
+
+    constraint: Constraint
+    legal: str
+    suffix: str
+    quantity: Callable[[FloatArray], FloatArray]
+    at_least: float
+    at_most: float
+    range: float
+
+    def excess(self, settings: FloatArray) -> FloatArray:
+        """By how much of its range each setting misses the bounds, shape (N,)."""
+        values = self.quantity(settings)
+        return np.asarray(np.maximum(np.maximum(self.at_least - values, values - self.at_most), 0.0) / self.range)
+
+    def __str__(self) -> str:
+        return f"{self.constraint.quantity} {self.legal}"
+
+
+@dataclass(frozen=True)
+class FeasibleRegion:
+    """Settings that satisfy all constraints of a study; without constraints, all of them.
+
+    `vertices` are settings at the ends of the linear constraints' polytope, shape (V, n); without linear constraints there are none.
+    """
+
+    characteristics: CharacteristicSet
+    bounds: tuple[_Bounds, ...]
+    vertices: FloatArray
+    members: tuple[Member, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.bounds)
+
+    def __str__(self) -> str:
+        return "; ".join(map(str, self.bounds))
+
+    def violation(self, settings: FloatArray) -> FloatArray:
+        """Sum over the constraints of by how much settings miss them, in ranges of their quantities; 0 if feasible; shape (N,)."""
+        excess = np.zeros(len(settings))
+        for one in self.bounds:
+            excess = excess + one.excess(settings)
+        return np.where(excess <= SLACK, 0.0, excess)
+
+    def feasible(self, settings: FloatArray) -> BoolArray:
+        """Which settings satisfy all constraints; shape (N,)."""
+        return np.asarray(self.violation(settings) == 0)
+
+    def check(self, settings: FloatArray, source: object, *, otherwise: str = "") -> None:
+        """Refuse settings, shape (N, n), that are not feasible.
+
+        Raises
+        ------
+        InputError
+            Naming the constraint that the first such one violates, and its values.
+        """
+        for setting in settings[~self.feasible(settings)][:1]:
+            for one in self.bounds:
+                if one.excess(setting[np.newaxis])[0] > SLACK / len(self.bounds):
+                    quantity = f"{one.constraint.quantity} = {one.quantity(setting[np.newaxis])[0]:g}{one.suffix}"
+                    raise InputError(source, f"violates a constraint: {quantity} ({self._values(one, setting)})", one.legal + otherwise)
+
+    def _values(self, one: _Bounds, setting: FloatArray) -> str:
+        return ", ".join(f"{member.name} = {value:g}{member.suffix}" for member, value in zip(self.characteristics, setting, strict=True)
+                         if member.name in one.constraint.sum or (one.constraint.function and value != member.original)) or "the original"
+
+    def repaired(self, settings: FloatArray, *, filtered: bool = True) -> FloatArray:
+        """Settings moved towards the original as far as it takes to be feasible, once filtered if they are to be; shape (N, n)."""
+        result = settings.copy()
+        wrong = np.flatnonzero(~self._accepted(settings, filtered))
+        for share in np.arange(STEPS_BACK - 1, -1, -1) / STEPS_BACK:
+            if not len(wrong):
+                break
+            original = self.characteristics.original
+            result[wrong] = original + share * (settings[wrong] - original)
+            wrong = wrong[~self._accepted(result[wrong], filtered)]
+        return result
+
+    def sampled(self, draw: Draw, number: int, rng: np.random.Generator | None = None, *, filtered: bool = False,
+                rejections: int = REJECTIONS) -> FloatArray:
+        """The first `number` feasible settings that are drawn, shape (number, n).
+
+        Where fewer than one in `rejections` is, mixtures of the region's vertices by `rng` follow; without it there are fewer settings.
+        """
+        found, drawn = [np.zeros((0, len(self.characteristics)))], 0
+        while (lacking := number - sum(map(len, found))) and drawn < rejections * number:
+            settings = draw(max(lacking, min(drawn, 10_000)))
+            drawn += len(settings)
+            found.append(settings[self._accepted(settings, filtered)][:lacking])
+        if lacking and rng is not None:
+            corners = np.concatenate([self.vertices, self.characteristics.original[np.newaxis]])
+            mixtures = rng.dirichlet(np.full(len(corners), 0.5), lacking) @ corners
+            mixtures = np.clip(mixtures, self.characteristics.lower, self.characteristics.upper)
+            found.append(self.repaired(mixtures, filtered=filtered))
+        return np.concatenate(found)
+
+    def _accepted(self, settings: FloatArray, filtered: bool) -> BoolArray:
+        return self.feasible(self.characteristics.filter(settings) if filtered else settings)
+
+
+def region_of(study: Study, source: str = "") -> FeasibleRegion:
+    """The feasible region of a study.
+
+    Raises
+    ------
+    InputError
+        If a function cannot be loaded, the original vehicle is not feasible, or no change is.
+    """
+    source = source or f"study {study.name!r}"
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    if not study.constraints:
+        return FeasibleRegion(characteristics, (), np.zeros((0, len(characteristics))))
+    lookup, members = Lookup(source, study.origin.places), list[Member]()
+    bounds = tuple(_bounds(one, study, characteristics, lookup, f"constraints[{number}]", members)
+                   for number, one in enumerate(study.constraints))
+    linear = [(tuple(one.sum.get(name, 0.0) for name in characteristics.names), some.at_least, some.at_most)
+              for one, some in zip(study.constraints, bounds, strict=True) if one.sum]
+    ends = tuple(characteristics.lower.tolist()), tuple(characteristics.upper.tolist())
+    for one, some in zip(study.constraints, bounds, strict=True):
+        if one.sum:
+            _refuse_unreachable(source, some, characteristics)
+    vertices = _vertices(tuple(linear), *ends) if linear else np.zeros((0, len(characteristics)))
+    if vertices is None:
+        raise InputError(source, f"constraints: no setting in the domains satisfies all of them: {'; '.join(map(str, bounds))}",
+                         "constraints that leave a region, with the original in it")
+    region = FeasibleRegion(characteristics, bounds, vertices, tuple(members))
+    region.check(characteristics.original[np.newaxis], f"{source}: the original vehicle",
+                 otherwise="; the original vehicle must satisfy every constraint")
+    if not _leaves_a_change(region):
+        raise InputError(source, f"constraints leave the original vehicle alone, no change that the filter keeps: {region}",
+                         "constraints that leave a region around it")
+    return region
+
+
+def _bounds(one: Constraint, study: Study, characteristics: CharacteristicSet, lookup: Lookup, key: str, members: list[Member]) -> _Bounds:
+    least, most = -np.inf if one.at_least is None else one.at_least, np.inf if one.at_most is None else one.at_most
+    legal, unit = one.legal(study.vehicle.characteristics), one.unit_of(study.vehicle.characteristics)
+    suffix = "" if unit == "-" else f" {unit}"
+    if one.sum:
+        weights = [(characteristics.names.index(name), weight) for name, weight in one.sum.items()]
+        width = sum(abs(weight) * (characteristics.upper - characteristics.lower)[column] for column, weight in weights)
+        return _Bounds(one, legal, suffix, lambda settings: _weighted(settings, weights), least, most, float(width))
+    member = lookup.find({}, one.function, f"{key}.function")
+    guard = member.guard or Guard(lookup.source, f"{key}.function = {one.function!r}")
+    if not callable(member.what):
+        raise InputError(lookup.source, f"{guard.name} is of type {type(member.what).__name__}", "a function of a mapping of arrays")
+    members.append(member)
+
+    def quantity(settings: FloatArray) -> FloatArray:
+        columns = {name: column.copy() for name, column in zip(characteristics.names, settings.T, strict=True)}
+        return guard.numbers("its call", "values", guard.call("its call", member.what, columns), (len(settings),))
+
+    ends = quantity(np.stack([characteristics.original, characteristics.lower, characteristics.upper]))
+    return _Bounds(one, legal, suffix, quantity, least, most, float(np.ptp(ends)) or max(1.0, abs(float(ends[0]))))
+
+
+def _weighted(settings: FloatArray, weights: Sequence[tuple[int, float]]) -> FloatArray:
+    """A weighted sum, one term after the other: it does not depend on how many settings there are."""
+    total = np.zeros(len(settings))
+    for column, weight in weights:
+        total = total + weight * settings[:, column]
+    return total
+
+
+def _refuse_unreachable(source: str, one: _Bounds, characteristics: CharacteristicSet) -> None:
+    ends = np.array([[getattr(characteristics, side)[characteristics.names.index(name)] * weight for side in ("lower", "upper")]
+                     for name, weight in one.constraint.sum.items()])
+    least, most = (float(side(ends, axis=1).sum()) for side in (np.min, np.max))
+    if most < one.at_least or least > one.at_most:
+        raise InputError(source, f"constraints: {one.constraint.quantity} is between {least:g} and {most:g} in the domains", one.legal)
+
+
+@lru_cache(maxsize=16)
+def _vertices(linear: tuple[Any, ...], lower: tuple[float, ...], upper: tuple[float, ...]) -> FloatArray | None:
+    """Settings that satisfy the linear constraints, one at the least and one at the greatest value of every characteristic; or None."""
+    from scipy.optimize import linprog  # takes half a second to load
+
+    rows = [(sign * np.array(weights), sign * bound) for weights, least, most in linear for sign, bound in ((-1, least), (1, most))
+            if np.isfinite(bound)]
+    found = []
+    for column in range(len(lower)):
+        for sign in (1.0, -1.0):
+            answer = linprog(sign * np.eye(len(lower))[column], A_ub=np.array([row for row, _ in rows]),
+                             b_ub=np.array([bound for _, bound in rows]), bounds=list(zip(lower, upper, strict=True)), method="highs")
+            if not answer.success:
+                return None
+            found.append(np.clip(answer.x, lower, upper))
+    return np.array(found)
+
+
+def _leaves_a_change(region: FeasibleRegion) -> bool:
+    """Whether a setting is feasible that differs from the original once it is filtered."""
+    characteristics = region.characteristics
+    for settings in _candidates(region):
+        filtered = characteristics.filter(settings)
+        if (characteristics.changed(filtered).any(axis=1) & region.feasible(filtered)).any():
+            return True
+    return False
+
+
+def _candidates(region: FeasibleRegion) -> Iterator[FloatArray]:
+    characteristics, original = region.characteristics, region.characteristics.original
+    size = len(characteristics)
+    yield np.concatenate([region.vertices, *(np.where(np.eye(size, dtype=bool), end, original)
+                                             for end in (characteristics.lower, characteristics.upper))])
+    rng = np.random.default_rng(0)
+    probes = rng.uniform(characteristics.lower, characteristics.upper, (PROBES, size))
+    some = np.where(rng.random((PROBES, size)) < 2 / size, probes, original)
+    yield region.repaired(np.concatenate([probes, some]))

@@ -1,0 +1,196 @@
+"""Constraints among characteristics: what every command reports satisfies them, and what cannot be satisfied is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import safevar_sumo as sv
+from safevar_sumo.errors import InputError
+from safevar_sumo.search import ALGORITHMS, Problem
+from safevar_sumo.study import Study, load_study, tables_of
+from safevar_sumo.vehicles import CharacteristicSet, region_of
+from tests.in_process import run
+from tests.search.problems import SUN, sphere
+
+ROUND = """
+def spread(values):
+    return ((values["tireFric"] - 3.5) / 2.9) ** 2 + ((values["mass"] - 2404) / 660) ** 2
+"""
+BOUND = """
+extends = "smoke"
+[search]
+algorithms = ["mocell", "nsga2", "rs", "safe_fuzzer", "spea2"]
+runs = 1
+evaluations = 60
+population = 10
+[[constraints]]
+sum = { mass = 1, maxBrakeTorque = -1 }
+unit = "kg"
+at_least = 700
+at_most = 1100
+[[constraints]]
+sum = { tireFric = 1, radius = -0.5 }
+unit = "-"
+at_least = -16.4
+[[constraints]]
+function = "round_region:spread"
+at_most = 0.7
+"""
+
+
+def is_feasible(values: Mapping[str, float]) -> bool:
+    """The region of `BOUND`, written once more; what is not there is the original's."""
+    by = {**dict(zip(SUN.names, SUN.original.tolist(), strict=True)), **values}
+    return (700 - 1e-6 <= by["mass"] - by["maxBrakeTorque"] <= 1100 + 1e-6 and by["tireFric"] - 0.5 * by["radius"] >= -16.4 - 1e-6
+            and ((by["tireFric"] - 3.5) / 2.9) ** 2 + ((by["mass"] - 2404) / 660) ** 2 <= 0.7 + 1e-6)
+
+
+def settings_in(answer: Any) -> Iterator[dict[str, float]]:
+    """Every mapping of an answer whose keys are characteristics."""
+    if isinstance(answer, dict):
+        if answer and set(answer) <= set(SUN.names) and all(isinstance(value, float) for value in answer.values()):
+            yield answer
+        for value in answer.values():
+            yield from settings_in(value)
+    elif isinstance(answer, list):
+        for value in answer:
+            yield from settings_in(value)
+
+
+@pytest.fixture
+def bound(in_tmp: Path) -> Path:
+    Path("round_region.py").write_text(ROUND)
+    Path("bound.toml").write_text(BOUND)
+    return in_tmp
+
+
+@pytest.mark.slow
+def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
+    """The region is given in closed form; without constraints a fifth of the domain lies in it."""
+    run("study", "bound.toml", "--quiet", "--out", "out")
+    frame = sv.load("out").evaluations
+    assert set(frame["algorithm"]) == set(ALGORITHMS)
+    assert len(frame) > 200
+    assert all(is_feasible(row) for row in frame[list(SUN.names)].to_dict("records"))
+    below = ("--unsafe", "below=2.5")
+    explained = json.loads(run("explain", "out", *below, "--top", "4", "--json").stdout)
+    tolerance = json.loads(run("tolerance", "bound.toml", *below, "--pairs", "--json", "--characteristics",
+                               "tireFric,mass,maxBrakeTorque").stdout)
+    boundaries = [cause["boundary"] for one in explained[:-1] for cause in one["minimal_causes"]]
+    nearest = [pair["nearest"] for pair in tolerance["pairs"] if pair["nearest"]]
+    alone = [{scan["characteristic"]: value} for scan in tolerance["alone"] for ends in [scan["safe"], *scan["unsafe"]] for value in ends]
+    assert boundaries
+    assert nearest
+    assert len(alone) >= 6
+    reported = [*settings_in([one for one in explained if "summary" not in one]), *nearest, *alone]
+    assert [values for values in reported if not is_feasible(values)] == []
+    assert any(scan["infeasible"] for scan in tolerance["alone"] if scan["characteristic"] == "mass")
+    for question in ("explain out --unsafe below=2.5", "tolerance bound.toml --unsafe below=2.5 --characteristics mass",
+                     "risk bound.toml --samples 200 --unsafe below=2.5", "rules bound.toml --samples 200 --unsafe below=2.5"):
+        assert "satisfy the study's constraints: mass - maxBrakeTorque at least 700 kg" in run(*question.split()).stdout, question
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.data())
+def test_searches_and_designs_stay_in_any_linear_region_around_the_original(data: st.DataObject) -> None:
+    names = data.draw(st.lists(st.sampled_from(SUN.names), min_size=1, max_size=4, unique=True))
+    widths, units = (SUN.upper - SUN.lower).tolist(), {member.unit for member in SUN if member.name in names}
+    weights = {name: data.draw(st.sampled_from([-2.0, -1.0, 0.5, 1.0])) / widths[SUN.names.index(name)] for name in names}
+    middle = sum(weight * float(SUN.original[SUN.names.index(name)]) for name, weight in weights.items())
+    room = data.draw(st.tuples(st.floats(0.1, 1), st.floats(0.1, 1)))
+    unit = units.pop() if len(units) == 1 else "-"
+    study = load_study("smoke", constraints=[{"sum": weights, "unit": unit, "at_least": middle - room[0], "at_most": middle + room[1]}])
+    region = region_of(study)
+    problem = Problem(characteristics=SUN, original=sphere(SUN, SUN.original[np.newaxis]), evaluations=60, population=12, region=region)
+    for name, algorithm in ALGORITHMS.items():
+        search = algorithm().search(problem, np.random.default_rng(data.draw(st.integers(0, 9))))
+        asked, total = next(search), 0
+        while True:
+            value = sum(weight * asked[:, SUN.names.index(name)] for name, weight in weights.items())
+            assert np.all((value >= middle - room[0] - 1e-6) & (value <= middle + room[1] + 1e-6)), name
+            assert np.array_equal(SUN.filter(asked), asked)
+            total += len(asked)
+            try:
+                asked = search.send(sphere(SUN, asked))
+            except StopIteration:
+                break
+        assert total == 60
+
+
+def constrained(*constraints: Mapping[str, Any]) -> Study:
+    return load_study("smoke", constraints=list(constraints))
+
+
+MASS = {"sum": {"mass": 1.0}}
+
+
+@pytest.mark.parametrize(("constraints", "problem"), [
+    ([{**MASS, "at_least": 2500.0}], "the original vehicle: violates a constraint: mass = 2404 kg (mass = 2404 kg)"),
+    ([{"sum": {"mass": 1.0, "maxBrakeTorque": -1.0}, "unit": "kg", "at_most": 900.0}],
+     "mass - maxBrakeTorque = 904 kg (mass = 2404 kg, maxBrakeTorque = 1500 N m)\nexpected: at most 900 kg"),
+    ([{**MASS, "at_least": 3000.0}], "mass is between 2040 and 2700 in the domains\nexpected: at least 3000 kg"),
+    ([{**MASS, "at_least": 2404.0}, {"sum": {"mass": 2.0, "tireFric": 1.0}, "unit": "kg", "at_most": 4800.0}],
+     "no setting in the domains satisfies all of them: mass at least 2404 kg; 2 mass + tireFric at most 4800 kg"),
+    ([{"sum": {name: 1.0}, "at_least": float(value), "at_most": float(value)} for name, value in zip(SUN.names, SUN.original, strict=True)],
+     "leave the original vehicle alone"),
+    ([{"sum": {"mas": 1.0}, "at_least": 1.0}], "constraints[0].sum.mas: there is no such characteristic; did you mean 'mass'?"),
+    ([{**MASS, "at_least": 1.0, "unit": "t"}], "constraints[0].unit = 't'\nexpected: 'kg', the unit of mass, or '-'"),
+    ([{"sum": {"mass": 1.0, "radius": 1.0}, "at_least": 1.0}], "constraints[0].sum adds mass [kg], radius [cm]"),
+    ([{**MASS}], "neither at_least nor at_most"), ([{**MASS, "at_least": 2.0, "at_most": 1.0}], "at_least = 2 and at_most = 1"),
+    ([{"at_least": 2.0}], "neither sum nor function"), ([{**MASS, "function": "a:b", "at_most": 2.0}], "both sum and function"),
+    ([{"function": "no_such_module:f", "at_most": 2.0}], "constraints[0].function = 'no_such_module:f'"),
+])
+def test_constraints_that_cannot_be_used_are_refused(constraints: list[dict[str, Any]], problem: str) -> None:
+    with pytest.raises(InputError) as refused:
+        region_of(constrained(*constraints))
+    assert problem in str(refused.value)
+
+
+def test_an_infeasible_original_ends_the_command_with_two_lines(in_tmp: Path) -> None:
+    Path("heavy.toml").write_text('extends = "smoke"\n[[constraints]]\nsum = { mass = 1 }\nat_least = 2500\n')
+    told = run("study", "heavy.toml", expect=2)
+    assert len(told.stderr.splitlines()) == 2
+    assert "mass = 2404 kg" in told.stderr
+
+
+def test_an_equation_leaves_what_satisfies_it() -> None:
+    """Nothing drawn uniformly does: mixtures of the region's vertices do."""
+    study = constrained({"sum": {"mass": 1.0, "maxBrakeTorque": -2.0}, "unit": "kg", "at_least": -596.0, "at_most": -596.0})
+    rng = np.random.default_rng(1)
+    region = region_of(study)
+    drawn = region.sampled(lambda some: rng.uniform(SUN.lower, SUN.upper, (some, len(SUN))), 40, rng, filtered=True, rejections=2)
+    filtered = SUN.filter(drawn)
+    mass, torque = (filtered[:, SUN.names.index(name)] for name in ("mass", "maxBrakeTorque"))
+    assert np.abs(mass - 2 * torque + 596).max() < 1e-5
+    assert np.count_nonzero(mass != 2404) > 10
+
+
+def test_an_unfeasible_setting_is_simulated_only_where_that_is_asked_for(bound: Path) -> None:
+    with pytest.raises(InputError, match="violates a constraint: mass - maxBrakeTorque = 540 kg"):
+        sv.simulate("bound.toml", {"mass": 2040})
+    assert sv.simulate("bound.toml", {"mass": 2040}, beyond=True).outcome
+    with pytest.raises(InputError, match="violates a constraint"):
+        sv.evaluate("bound.toml", pd.DataFrame({"mass": [2404, 2040]}), jobs=1)
+    assert "or any with --beyond" in run("simulate", "bound.toml", "--set", "mass=2040", expect=2).stderr
+
+
+@pytest.mark.parametrize("name", ["rain_realistic", "wear_realistic"])
+def test_shipped_constraints_say_why_and_leave_a_good_part_of_the_domain(name: str) -> None:
+    study = load_study(name)
+    members = CharacteristicSet.of(study.vehicle.characteristics)
+    share = np.mean(region_of(study).feasible(np.random.default_rng(1).uniform(members.lower, members.upper, (20_000, len(members)))))
+    assert 0.002 < share < 0.9
+    assert all(len(one.meaning) > 40 for one in study.constraints)
+
+
+def test_a_study_without_constraints_is_written_as_ever() -> None:
+    assert "constraints" not in tables_of(load_study("rain"))
