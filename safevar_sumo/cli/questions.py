@@ -112,13 +112,15 @@ def risk(place: str, point: str | None, jobs: int | None, as_json: bool, plot: P
     from safevar_sumo.analysis.risk.compute import estimate_risk
     from safevar_sumo.analysis.risk.render import print_risk, sensitivity_figure
 
-    study = study_at_point(place, point)
+    options, study = RiskOptions(**given), study_at_point(place, point)
     if plot is not None:
         check_output(plot, "--plot", PICTURES)
         if study.correlations:
             raise InputError("--plot", "sensitivity indices of correlated characteristics are not defined", "a study without correlations")
-    result = _answer(estimate_risk, study, RiskOptions(**given), jobs)
-    if result.sensitivity is None:
+        if options.is_for_rare:
+            raise InputError("--plot", "a method for rare failures leaves out what decides, which the figure shows", "--method auto")
+    result = _answer(estimate_risk, study, options, jobs)
+    if study.correlations:
         click.echo("note: characteristics are correlated, for which sensitivity indices are not defined: there are none", err=True)
     if result.errors:
         click.echo(f"warning: {result.errors} vehicles could not be simulated and are left out", err=True)

@@ -8,7 +8,7 @@ from typing import Any
 from markupsafe import Markup
 
 from safevar_sumo.analysis.evaluator import Progress
-from safevar_sumo.analysis.risk.compute import estimate_risk
+from safevar_sumo.analysis.risk.compute import FLEET, estimate_risk, fleet_probability
 from safevar_sumo.analysis.rules.compute import find_rules, rule_in_words
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import number_of
@@ -37,7 +37,9 @@ def risk(material: ReportInput, jobs: int | None, progress: Progress) -> Section
 
     result = stored(material, "risk", compute)
     study = material.case.study
-    return {**result, "of_domain": not study.variation, "correlated": bool(study.correlations),
+    fleet = {} if not study.variation else {
+        "fleet": {"vehicles": FLEET, "probability": fleet_probability(result["probability"], FLEET)}}
+    return {**result, **fleet, "of_domain": not study.variation, "correlated": bool(study.correlations),
             "chart": _sensitivity(material, result["sensitivity"])}
 
 

@@ -27,6 +27,8 @@ LEAST_BATCH = 100
 """A smaller one costs as much."""
 VERIFIED = 50
 """Settings of a study that are driven in SUMO, too, over as many calls as it takes."""
+_batches: dict[bytes, tuple[int, bool]] = {}
+"""What `batches_of` says of a packed study."""
 _verified: dict[bytes, int] = {}
 """How many settings of a packed study were driven in SUMO, too, with the same results."""
 _read: dict[tuple[bytes, str], Files] = {}
@@ -49,7 +51,9 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     for remark in check_code(study, inputs, persistent):
         warnings.warn(remark, stacklevel=2)
     unique, row_of = np.unique(settings, axis=0, return_inverse=True)
-    most, recorded = batches_of(study)
+    if work not in _batches:
+        _batches[work] = batches_of(study)
+    most, recorded = _batches[work]
     size = min(most, max(math.ceil(len(unique) / (SHARES * pool.workers)), LEAST_BATCH))
     starts = range(0, len(unique), size)
     futures = {persistent.submit(work, unique[start:start + size]): start for start in starts}

@@ -80,7 +80,8 @@ def test_the_promised_record_and_the_same_again() -> None:
     first, again = (json.dumps(of(box, samples=500).to_dict(), allow_nan=False) for _ in range(2))
     assert first == again
     record = json.loads(first)
-    assert list(record) == ["study", "unsafe", "samples", "failures", "probability", "interval", "confidence", "sensitivity"]
+    assert list(record) == ["study", "unsafe", "samples", "failures", "probability", "interval", "confidence", "sensitivity", "method",
+                            "simulations", "coefficient_of_variation", "design_point", "remark"]
     assert list(record["sensitivity"][0]) == ["characteristic", "first_order", "total", "first_order_interval", "total_interval"]
 
 

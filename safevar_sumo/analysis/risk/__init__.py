@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, option, unsafe_option
 from safevar_sumo.analysis.subject import Results, answered, criterion_text, study_of
+from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
@@ -18,22 +19,43 @@ if TYPE_CHECKING:
     from safevar_sumo.analysis.risk.compute import Risk
     from safevar_sumo.workers.evaluation import Pool
 
+METHODS = ("auto", "monte_carlo", "subset_simulation", "cross_entropy")
+"""How a probability may be estimated."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RiskOptions(Options):
     """How a risk is estimated."""
 
     question: ClassVar[str] = "risk"
-    samples: int = option(10_000, "Maximum number of vehicles to sample.", kind=int, low=1, high=100_000_000, metavar="N")
+    samples: int = option(10_000, "Maximum number of vehicles that plain Monte Carlo samples.", kind=int, low=1, high=100_000_000,
+                          metavar="N")
     confidence: float = option(0.95, "Confidence of the intervals.", kind=float, low=0, high=1, is_open=(True, True))
     width: float | None = option(
         None, "Stop as soon as the interval of the probability is no wider.", kind=float, low=0, high=1, is_open=(True, False))
     unsafe: str | None = unsafe_option()
+    method: str = option("auto", "How: monte_carlo, subset_simulation, cross_entropy, or auto, which draws 1,000 vehicles and takes "
+                                 "subset_simulation for a probability below 0.01 if OpenTURNS is installed.",
+                         metavar="METHOD", kind=str)
+    rare: bool = option(False, "For rare failures, 1e-3 to 1e-8: as auto, but it needs OpenTURNS and leaves out what decides.", kind=bool)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.method not in METHODS:
+            raise unknown("method", repr(self.method), self.method, METHODS)
+        if self.rare and self.method == "monte_carlo":
+            raise InputError("rare", "with method = 'monte_carlo'", "one of the two")
+
+    @property
+    def is_for_rare(self) -> bool:
+        """Whether a method for rare failures is asked for, not merely allowed."""
+        return self.rare or self.method in ("subset_simulation", "cross_entropy")
 
 
 def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, confidence: float = RiskOptions.confidence,
-         width: float | None = RiskOptions.width, unsafe: Criterion | None = None, pool: Pool | None = None, jobs: int | None = None,
-         progress: bool | Progress = False, as_it_is_now: bool = False) -> Risk:
+         width: float | None = RiskOptions.width, unsafe: Criterion | None = None, method: str = RiskOptions.method,
+         rare: bool = RiskOptions.rare, pool: Pool | None = None, jobs: int | None = None, progress: bool | Progress = False,
+         as_it_is_now: bool = False) -> Risk:
     """Estimate how likely an unsafe outcome is when vehicles vary as the study says, and which characteristic decides.
 
     Parameters
@@ -41,7 +63,7 @@ def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, conf
     study
         A study, or results or their directory, whose study is asked about.
     samples
-        Vehicles to draw at the most.
+        Vehicles that plain Monte Carlo draws at the most.
     confidence
         Of the intervals, between 0 and 1.
     width
@@ -49,6 +71,11 @@ def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, conf
     unsafe
         "collision", or a number X for a safety degree below X [m, or minus a collision's speed in m/s]; by default a collision if
         any of many settings all over the domain is one, else half of the original's safety degree.
+    method
+        "monte_carlo", "subset_simulation", "cross_entropy", or "auto": subset simulation for a probability below 0.01, if OpenTURNS is
+        installed.
+    rare
+        For rare failures, 1e-3 to 1e-8: as "auto", but it needs OpenTURNS and leaves out which characteristic decides.
     pool
         Where to simulate, if not in worker processes of its own.
     jobs
@@ -67,5 +94,5 @@ def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, conf
     """
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
-    options = RiskOptions(samples=samples, confidence=confidence, width=width, unsafe=criterion_text(unsafe))
+    options = RiskOptions(samples=samples, confidence=confidence, width=width, unsafe=criterion_text(unsafe), method=method, rare=rare)
     return answered(estimate_risk, study_of(study, as_it_is_now=as_it_is_now), options, pool, jobs, progress)

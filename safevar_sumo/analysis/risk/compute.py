@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import scipy
 from safevar_sumo.analysis.criterion import Unsafe, clopper_pearson, criterion_of
 from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent
 from safevar_sumo.analysis.risk import RiskOptions
+from safevar_sumo.analysis.risk.rare import PILOT, RARE_BELOW, Estimate, PlateauError, Response, estimate_rare, is_plateau, openturns
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import SAFETY_DEGREE, Study
@@ -52,7 +54,14 @@ class VariationModel:
     def settings(self, probabilities: FloatArray) -> FloatArray:
         """Settings at points of the unit cube, shape (N, n): independent there, correlated as the study says in the result."""
         if self._factor is not None:
-            probabilities = scipy.stats.norm.cdf(scipy.stats.norm.ppf(probabilities) @ self._factor.T)
+            return self.of_normal(scipy.stats.norm.ppf(probabilities))
+        return self._of(probabilities)
+
+    def of_normal(self, points: FloatArray) -> FloatArray:
+        """Settings at points of standard normal space, shape (N, n), correlated as the study says."""
+        return self._of(scipy.stats.norm.cdf(points if self._factor is None else points @ self._factor.T))
+
+    def _of(self, probabilities: FloatArray) -> FloatArray:
         columns = [quantile(column) for quantile, column in zip(self._quantiles, probabilities.T, strict=True)]
         return np.clip(np.stack(columns, axis=1), self._members.lower, self._members.upper)
 
@@ -98,6 +107,15 @@ def _given(value: float | None, default: float) -> float:
     return default if value is None else value
 
 
+FLEET = 1000
+"""Vehicles of the fleet that examples speak of."""
+
+
+def fleet_probability(probability: float, vehicles: int) -> float:
+    """Probability that at least one of independent vehicles is unsafe, 1 - (1 - p)^N."""
+    return float(-np.expm1(vehicles * np.log1p(-probability))) if probability < 1 else 1.0
+
+
 CHUNK = 1000
 """Samples between two checks of the interval's width."""
 LARGEST_CHUNK = 50_000
@@ -106,12 +124,22 @@ LARGEST_CHUNK = 50_000
 
 @dataclass(frozen=True, kw_only=True)
 class Risk:
-    """Probability of an unsafe outcome, with Clopper and Pearson's interval, and Sobol indices.
+    """Probability of an unsafe outcome, with its interval (Clopper and Pearson's of plain Monte Carlo), and Sobol indices.
 
     Attributes
     ----------
     samples, failures
         Vehicles that were drawn, and how many of them were unsafe; those that could not be simulated are `errors`.
+    method
+        "monte_carlo", "subset_simulation" or "cross_entropy".
+    simulations
+        What the estimate took, without what decides.
+    coefficient_of_variation
+        Standard error over the probability; NaN without a failure.
+    design_point
+        The most probable failure by characteristic, of rare ones.
+    remark
+        What the estimate may have missed, or why it is by that method; "" if there is nothing to say.
     sensitivity, sensitivity_of_unsafe
         Frames of `sensitivities`, of the safety degree and of being unsafe; None where
         characteristics are correlated or bound by constraints, for which they are not defined.
@@ -125,19 +153,22 @@ class Risk:
     confidence: float
     sensitivity: pd.DataFrame | None
     sensitivity_of_unsafe: pd.DataFrame | None
-
-    @property
-    def probability(self) -> float:
-        return self.failures / self.samples
+    probability: float
+    interval: tuple[float, float]
+    method: str
+    simulations: int
+    coefficient_of_variation: float
+    design_point: dict[str, float] | None
+    remark: str
 
     @property
     def of_domain(self) -> bool:
         """Whether it is a share of the domain, no probability in the field: the study does not say how vehicles vary."""
         return not self.study.variation
 
-    @property
-    def interval(self) -> tuple[float, float]:
-        return clopper_pearson(self.failures, self.samples, self.confidence)
+    def of_fleet(self, vehicles: int) -> float:
+        """Probability that at least one of so many vehicles is unsafe, if they vary independently of each other."""
+        return fleet_probability(self.probability, vehicles)
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of `risk`."""
@@ -149,7 +180,10 @@ class Risk:
                 "characteristic": row["characteristic"],
                 **{name: finite_or_none(row[name]) for name in ("first_order", "total")},
                 **{f"{name}_interval": [finite_or_none(row[f"{name}_{end}"]) for end in ("lower", "upper")]
-                   for name in ("first_order", "total")}} for row in rows]}
+                   for name in ("first_order", "total")}} for row in rows],
+            "method": self.method, "simulations": self.simulations,
+            "coefficient_of_variation": finite_or_none(self.coefficient_of_variation),
+            "design_point": self.design_point, "remark": self.remark}
 
     def to_frame(self) -> pd.DataFrame:
         """Sensitivity of the safety degree and of being unsafe, one row per output and characteristic; empty if correlated.
@@ -178,25 +212,102 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
         If no vehicle can be simulated.
     """
     model = VariationModel(study)
-    rng = np.random.default_rng(study.search.seed)
-    count = failures = errors = 0
     with open_bench(study, pool, jobs, progress) as bench:
         unsafe = criterion_of(options.unsafe, bench)
-        chunk = CHUNK if options.width is not None else LARGEST_CHUNK
-        while count + errors < options.samples:
-            settings = _feasible_vehicles(bench, model, min(chunk, options.samples - count - errors), rng)
-            evaluations = bench.evaluate(settings, "vehicles as they vary", count + errors, options.samples)
-            valid = int(np.count_nonzero(evaluations.valid))
-            count, errors = count + valid, errors + len(settings) - valid
-            failures += int(np.count_nonzero(unsafe.of(evaluations)))
-            low, high = clopper_pearson(failures, count, options.confidence) if count else (0.0, 1.0)
-            if options.width is not None and high - low <= options.width:
-                break
-        if not count:
-            raise SimulationError(f"study {study.name!r}: not one of {errors} vehicles could be simulated")
-        of_degree, of_unsafe = (None, None) if model.correlated or bench.region else sensitivities(bench, model, unsafe, options.confidence)
-    return Risk(study=study, unsafe=unsafe, samples=count, failures=failures, errors=errors, confidence=options.confidence,
-                sensitivity=of_degree, sensitivity_of_unsafe=of_unsafe)
+        beginning = bench.simulated
+        response = Response(bench, model.of_normal, unsafe)
+        counts = _sampled(bench, model, unsafe, options, response)
+        if isinstance(counts, Estimate):
+            estimate, method = counts, _method(options)
+        else:
+            estimate, method = counts.estimate(options.confidence), "monte_carlo"
+        left_out = model.correlated or bool(bench.region) or options.is_for_rare
+        of_degree, of_unsafe = (None, None) if left_out else sensitivities(bench, model, unsafe, options.confidence)
+    point = None if estimate.design_point is None else model.of_normal(estimate.design_point[np.newaxis])[0]
+    return Risk(
+        study=study, unsafe=unsafe, samples=estimate.simulations - estimate.errors, failures=estimate.failures, errors=estimate.errors,
+        confidence=options.confidence, sensitivity=of_degree, sensitivity_of_unsafe=of_unsafe, probability=estimate.probability,
+        interval=estimate.interval, method=method, simulations=beginning + estimate.simulations,
+        coefficient_of_variation=estimate.variation, remark=estimate.remark,
+        design_point=None if point is None else dict(zip(bench.characteristics.names, point.tolist(), strict=True)))
+
+
+@dataclass(kw_only=True)
+class _Counts:
+    """What plain Monte Carlo has drawn."""
+
+    count: int = 0
+    failures: int = 0
+    errors: int = 0
+    remark: str = ""
+
+    def estimate(self, confidence: float) -> Estimate:
+        share = self.failures / self.count
+        variation = float(np.sqrt((1 - share) / self.failures)) if self.failures else float("nan")
+        return Estimate(probability=share, variation=variation, interval=clopper_pearson(self.failures, self.count, confidence),
+                        failures=self.failures, errors=self.errors, simulations=self.count + self.errors, design_point=None,
+                        remark=self.remark)
+
+
+def _method(options: RiskOptions) -> str:
+    return options.method if options.method == "cross_entropy" else "subset_simulation"
+
+
+def _sampled(bench: Bench, model: VariationModel, unsafe: Unsafe, options: RiskOptions, response: Response) -> Estimate | _Counts:
+    """Draw vehicles plainly; where few of the first are unsafe, go on by a method for rare failures."""
+    found, rng = _Counts(), np.random.default_rng(bench.study.search.seed)
+    chooses = _may_be_rare(options) and not bench.region
+    if options.is_for_rare and bench.region:
+        found.remark = "the study has constraints, within which only plain Monte Carlo draws"
+    if options.is_for_rare:
+        openturns()  # whoever asks for it learns at once that it is missing
+    most = max(options.samples, PILOT) if options.is_for_rare else options.samples
+    while found.count + found.errors < most:
+        chunk = PILOT if chooses else CHUNK if options.width is not None else LARGEST_CHUNK
+        drawn = found.count + found.errors
+        number = min(chunk, most - drawn)
+        probabilities = rng.random((number, len(bench.characteristics))) if chooses else None
+        settings = _feasible_vehicles(bench, model, number, rng) if probabilities is None else model.settings(probabilities)
+        evaluations = bench.evaluate(settings, "vehicles as they vary", drawn, most)
+        valid = int(np.count_nonzero(evaluations.valid))
+        found.count, found.errors = found.count + valid, found.errors + number - valid
+        found.failures += int(np.count_nonzero(unsafe.of(evaluations)))
+        if probabilities is not None:
+            chooses = False
+            values = response.take(scipy.stats.norm.ppf(probabilities), evaluations)
+            if valid and found.failures < RARE_BELOW * valid:
+                estimate = _rare(response, values, options, found, bench.study.search.seed)
+                if estimate is not None:
+                    return estimate
+            elif options.is_for_rare:
+                found.remark = f"more than {RARE_BELOW:g} of {valid} vehicles are unsafe: plain Monte Carlo"
+        low, high = clopper_pearson(found.failures, found.count, options.confidence) if found.count else (0.0, 1.0)
+        if options.width is not None and high - low <= options.width:
+            break
+    if not found.count:
+        raise SimulationError(f"study {bench.study.name!r}: not one of {found.errors} vehicles could be simulated")
+    return found
+
+
+def _may_be_rare(options: RiskOptions) -> bool:
+    return options.is_for_rare or (options.method == "auto" and options.width is None and options.samples >= 2 * PILOT)
+
+
+def _rare(response: Response, values: FloatArray, options: RiskOptions, found: _Counts, seed: int) -> Estimate | None:
+    """The estimate by a method for rare failures; None where plain Monte Carlo goes on, with the reason as a remark."""
+    if is_plateau(values):
+        found.remark = ("the response is a plateau: most vehicles nearest to failing have the same safety degree, which leads no method "
+                        "for rare failures to them; plain Monte Carlo")
+        return None
+    if not options.is_for_rare and find_spec("openturns") is None:
+        found.remark = ("fewer than 0.01 of the first vehicles are unsafe; pip install 'safevar_sumo[rare]' for a method that needs fewer "
+                        "vehicles for rare failures")
+        return None
+    try:
+        return estimate_rare(response, _method(options), options.confidence, seed)
+    except PlateauError:
+        found.remark = "the response is a plateau on the way to failures: no method for rare failures gets across; plain Monte Carlo"
+        return None
 
 
 def _feasible_vehicles(bench: Bench, model: VariationModel, number: int, rng: np.random.Generator) -> FloatArray:

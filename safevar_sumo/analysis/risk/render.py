@@ -9,7 +9,8 @@ import numpy as np
 from rich.console import Console
 
 from safevar_sumo.analysis.figures import CHANGED, FONT, NECESSARY, literal, new_figure
-from safevar_sumo.analysis.risk.compute import Risk
+from safevar_sumo.analysis.risk.compute import FLEET, Risk
+from safevar_sumo.analysis.risk.rare import RARE_BELOW
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study
 from safevar_sumo.study.variation import Uniform
@@ -24,9 +25,19 @@ def print_risk(console: Console, result: Risk) -> None:
     """The probability with its interval, how vehicles vary, and what decides."""
     low, high = result.interval
     print_text(console, result.study.title)
-    print_text(console, f"Unsafe: {result.unsafe}. {result.failures} of {result.samples} vehicles.")
+    drawn = "" if result.method == "monte_carlo" else f", drawn by {result.method.replace('_', ' ')}"
+    print_text(console, f"Unsafe: {result.unsafe}. {result.failures} of {result.samples} vehicles{drawn}.")
     name = "Share of the domain that is unsafe:" if result.of_domain else "Probability"
     print_text(console, f"{name} {result.probability:.4g}, with {result.confidence:.0%} confidence from {low:.4g} to {high:.4g}.")
+    if result.remark:
+        print_text(console, f"note: {result.remark}.")
+    if result.design_point is not None:
+        values = ", ".join(f"{one.name} = {one.text(result.design_point[one.name])}{one.suffix}"
+                           for one in CharacteristicSet.of(result.study.vehicle.characteristics))
+        print_text(console, f"The most probable failure: {values}.")
+    if not result.of_domain and 0 < result.probability < RARE_BELOW:
+        print_text(console, f"Of {FLEET:,} vehicles that vary independently at least one is unsafe with probability "
+                            f"{result.of_fleet(FLEET):.2g}.")
     if result.of_domain:
         print_text(console, "warning: no probability in the field: the study has no [variation] table that says how real vehicles vary.")
     print_text(console, _variation(result.study))

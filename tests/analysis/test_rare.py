@@ -1,0 +1,105 @@
+"""Rare failures against analytic probabilities of limit states in standard normal space."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import pytest
+import scipy
+
+from safevar_sumo import risk
+from safevar_sumo.analysis.risk.compute import Risk
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import FloatArray
+from tests.analysis.known_regions import Plant, made_up_study
+
+Limit = Callable[[FloatArray], FloatArray]
+
+
+def of_normal(settings: FloatArray) -> FloatArray:
+    """Standard normal variables of characteristics that are uniform from 0 to 10."""
+    return np.asarray(scipy.stats.norm.ppf(np.clip(settings / 10, 1e-16, 1 - 1e-16)))
+
+
+def linear(beta: float) -> Limit:
+    return lambda u: beta - u.sum(axis=1) / math.sqrt(u.shape[1])
+
+
+def curved(radius: float) -> Limit:
+    """Failures are outside a sphere: a sum of n squares has a chi squared distribution."""
+    return lambda u: radius - np.linalg.norm(u, axis=1)
+
+
+def islands(beta: float) -> Limit:
+    return lambda u: beta - np.abs(u[:, 0])
+
+
+def rare(limit: Limit, n: int, seed: int = 1, **options: object) -> Risk:
+    study = made_up_study(n)
+    study = msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, seed=seed))
+    plant = Plant(study, lambda settings: limit(of_normal(settings)) < 0, lambda settings: limit(of_normal(settings)))
+    return risk(study, unsafe="collision", pool=plant, **{"rare": True, **options})  # type: ignore[arg-type]
+
+
+def beta_of(probability: float) -> float:
+    return float(-scipy.stats.norm.ppf(probability))
+
+
+def radius_of(probability: float, n: int) -> float:
+    return float(math.sqrt(scipy.stats.chi2.isf(probability, n)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("method", "shape", "n", "probability"), [
+    ("subset_simulation", "linear", 3, 1e-4), ("subset_simulation", "linear", 8, 1e-6), ("subset_simulation", "curved", 2, 1e-4),
+    ("subset_simulation", "curved", 4, 1e-6), ("cross_entropy", "linear", 8, 1e-6)])
+def test_analytic_probabilities_over_twenty_seeds(method: str, shape: str, n: int, probability: float) -> None:
+    limit = linear(beta_of(probability)) if shape == "linear" else curved(radius_of(probability, n))
+    found = [rare(limit, n, seed, method=method) for seed in range(20)]
+    assert {one.method for one in found} == {method}
+    assert np.mean([one.probability for one in found]) == pytest.approx(probability, rel=0.1)
+    assert sum(one.interval[0] <= probability <= one.interval[1] for one in found) >= 18
+
+
+def test_a_rare_failure_its_interval_and_its_most_probable_point() -> None:
+    """The design point of a plane at the distance beta has components beta / sqrt(n)."""
+    found = rare(linear(beta_of(1e-5)), 3)
+    assert found.method == "subset_simulation"
+    assert found.interval[0] <= 1e-5 <= found.interval[1]
+    assert found.remark == ""
+    assert found.design_point is not None
+    point = of_normal(np.array([list(found.design_point.values())]))[0]
+    assert np.linalg.norm(point) == pytest.approx(beta_of(1e-5), rel=0.05)
+    assert point == pytest.approx(beta_of(1e-5) / math.sqrt(3), rel=0.25)
+    record = found.to_dict()
+    assert json.loads(json.dumps(record, allow_nan=False)) == record
+    assert set(record) >= {"method", "simulations", "coefficient_of_variation", "design_point", "remark"}
+    assert found.of_fleet(1000) == pytest.approx(1 - (1 - found.probability) ** 1000)
+    assert rare(linear(beta_of(1e-5)), 3).to_dict() == record
+
+
+def test_two_islands_are_told() -> None:
+    found = rare(islands(beta_of(5e-5)), 2)
+    assert found.interval[0] <= 1e-4 <= found.interval[1]
+    assert "2 islands" in found.remark
+
+
+def test_a_plateau_and_a_frequent_failure_are_left_to_monte_carlo() -> None:
+    plateau = rare(lambda u: np.where(u[:, 0] > beta_of(1e-3), -1.0, 2.0), 2)
+    assert plateau.method == "monte_carlo"
+    assert "plateau" in plateau.remark
+    frequent = rare(linear(beta_of(0.05)), 2)
+    assert frequent.method == "monte_carlo"
+    assert frequent.samples == 10_000
+    assert "plain Monte Carlo" in frequent.remark
+
+
+def test_auto_chooses_and_monte_carlo_stays_where_it_is_asked_for() -> None:
+    assert rare(linear(beta_of(1e-4)), 2, rare=False).method == "subset_simulation"
+    assert rare(linear(beta_of(1e-4)), 2, rare=False, method="monte_carlo").method == "monte_carlo"
+    with pytest.raises(InputError, match="method"):
+        rare(linear(3.0), 2, method="subset")
