@@ -17,6 +17,7 @@ from safevar_sumo.results import UNKNOWN
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.matrix import at_worst
+from safevar_sumo.sumo.staging import staged
 from safevar_sumo.sumo.system import System
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -66,7 +67,8 @@ ORIGINAL, CHANGED = 0, 1
 class Comparison:
     """Runs of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is changed).
 
-    `title` is the study's, `network` the scenario's; `evaluations` and `film` have one row for each vehicle.
+    `title` is the study's, `network` the scenario's, with the lanes that its parameters make; `evaluations` and `film` have one row for
+    each vehicle.
     """
 
     title: str
@@ -166,7 +168,7 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     where = [f" ({point.name})" for point in system.matrix if (point.scenario, point.weather) == (there.scenario, there.weather)]
     recording = film(there, settings)
     return Comparison(title=study.title + "".join(where[:1]), characteristics=system.characteristics,
-                      ttc_threshold=system.metrics.ttc_threshold, network=there.scenario.network,
+                      ttc_threshold=system.metrics.ttc_threshold, network=staged(there.scenario).folder,
                       evaluations=score(there, settings, recording.drives),
                       film=replace(recording, drives=_up_to_impacts(recording.drives)))
 

@@ -233,8 +233,8 @@ class GuardedScenario:
                 for path, change in changes.items()}
 
     def lanes(self, roads: Roads) -> Actors:
-        """Its changes to the network's lanes; none without such a method."""
-        return self._changes("lanes", "the network", roads)
+        """Its changes to the network's lanes; none without such a method: a parameter may have that name."""
+        return {} if not callable(getattr(self._scenario, "lanes", None)) else self._changes("lanes", "the network", roads)
 
     def remarks(self) -> list[str]:
         """Remarks on its parameters for the user."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,8 +14,10 @@ import pytest
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point
+from safevar_sumo.study import load_study
 from safevar_sumo.sumo import Engine
-from safevar_sumo.sumo.matrix import at_every_point
+from safevar_sumo.sumo.matrix import at_every_point, simulate
+from safevar_sumo.sumo.system import assemble
 from tests.scenarios.holding import CARLA, NATIVE, Hold, at_contact, driven
 
 KMH = 1 / 3.6
@@ -153,8 +156,9 @@ def test_cells_at_the_edges_and_their_layers_are_where_the_closed_forms_have_the
 
 
 @pytest.mark.slow
-def test_all_cells_and_layers_are_where_the_closed_forms_have_them() -> None:
-    check([*all_cells()])
+def test_cells_and_layers_of_all_tests_are_where_the_closed_forms_have_them() -> None:
+    """Every seventh of some 2,400 cells: all rows, locations and layers come up."""
+    check([*all_cells()][::7])
 
 
 @pytest.mark.parametrize("scenario", [
@@ -176,6 +180,21 @@ def test_further_targets_are_hit_in_a_recorded_scene_as_in_sumo_to_the_last_bit(
         np.testing.assert_array_equal(getattr(here.drives, name), getattr(there.drives, name), err_msg=name)
     for ours, theirs in zip(here.drives.contact, there.drives.contact, strict=True):
         np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_scenario_of_ones_own_may_turn_lanes_and_may_call_a_parameter_lanes(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(in_tmp)
+    Path("mine_at_an_angle.py").write_text(
+        "from safevar_sumo.scenarios import Crossing, LeadVehicleStopped\n\n\n"
+        "class Mine(Crossing, frozen=True, kw_only=True):\n    pass\n\n\n"
+        "class Lanes(LeadVehicleStopped, frozen=True, kw_only=True):\n    lanes: int = 2\n")
+    turned = {"test": "CBNA", "heading": 20}
+    studies = [load_study("euro_ncap_pedestrian", title="", matrix=None, scenario={"model": model, "parameters": turned})
+               for model in ("mine_at_an_angle:Mine", "crossing")]
+    mine, ours = (simulate(system, system.characteristics.original[np.newaxis], Engine.LIBSUMO) for system in map(assemble, studies))
+    np.testing.assert_array_equal(mine.trace.gap, ours.trace.gap)
+    lanes = assemble(load_study("native", title="", published={}, scenario={"model": "mine_at_an_angle:Lanes"}))
+    assert simulate(lanes, lanes.characteristics.original[np.newaxis]).outcome[0] == Outcome.STOPPED
 
 
 def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direction() -> None:
