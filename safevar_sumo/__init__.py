@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from safevar_sumo.analysis.evaluator import Progress
     from safevar_sumo.analysis.explain import explain
     from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation
+    from safevar_sumo.analysis.rating import rating
+    from safevar_sumo.analysis.rating.compute import Rating
     from safevar_sumo.analysis.risk import risk
     from safevar_sumo.analysis.risk.compute import Risk
     from safevar_sumo.analysis.rules import rules
@@ -47,6 +49,8 @@ _ROOMS = {
     "analysis.tolerance": ("tolerance",),
     "analysis.risk": ("risk",),
     "analysis.rules": ("rules",),
+    "analysis.rating": ("rating",),
+    "analysis.rating.compute": ("Rating",),
     "analysis.criterion": ("Criterion", "Unsafe"),
     "analysis.evaluator": ("Progress",),
     "analysis.explain.result": ("Cause", "Explained", "Explanation"),
@@ -69,10 +73,10 @@ _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = [
     "Cause", "Comparison", "Criterion", "Explained", "Explanation", "Figures", "InputError", "Observer", "Outcome", "Pool", "Progress",
-    "Results", "Risk", "Rule", "Rules", "SafevarError", "Simulation", "SimulationError", "Status", "Study", "StudyLike", "Tables",
-    "Tolerance", "Unsafe", "Weather", "__version__", "animate", "compare", "draw_comparison", "evaluate", "explain", "figures", "load",
-    "load_study", "make_report", "report", "risk", "rules", "run", "show_in_gui", "simulate", "status", "study_names", "tables",
-    "tolerance",
+    "Rating", "Results", "Risk", "Rule", "Rules", "SafevarError", "Simulation", "SimulationError", "Status", "Study", "StudyLike",
+    "Tables", "Tolerance", "Unsafe", "Weather", "__version__", "animate", "compare", "draw_comparison", "evaluate", "explain", "figures",
+    "load", "load_study", "make_report", "rating", "report", "risk", "rules", "run", "show_in_gui", "simulate", "status", "study_names",
+    "tables", "tolerance",
 ]
 
 if not TYPE_CHECKING:  # a type checker is to know the names above, and no others

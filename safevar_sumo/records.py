@@ -231,6 +231,21 @@ class SimulationRuns:
         return np.asarray(np.where(closes & ~np.isnan(self.collision_speed), at_contact, noted))
 
 
+class CellResults(NamedTuple):
+    """What M vehicles did in every cell of a rating, shape (M, cells).
+
+    `impact` is the relative speed of the collision [km/h] and `warning` the true time to collision at the warning [s], NaN without one;
+    `valid` is false where the test could not be driven.
+    """
+
+    impact: FloatArray
+    warning: FloatArray
+    valid: BoolArray
+
+    def of(self, vehicles: Sequence[int] | npt.NDArray[np.intp] | BoolArray) -> CellResults:
+        return CellResults._make(values[vehicles] for values in self)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Evaluations:
     """M evaluated settings: what was simulated, how it ended, metrics and objectives.
@@ -239,7 +254,7 @@ class Evaluations:
     `metrics` has the columns of `safevar_sumo.metrics.METRICS`; an undefined value is NaN.
     `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count. `reasons` says, by the bytes of a
     setting, why it could not be simulated. `files` are digests, by name, of files that user code
-    read for the first time in a batch; they belong to the batch, not to its rows.
+    read for the first time in a batch; they belong to the batch, not to its rows. `cells` is what a rating asks for.
     """
 
     settings: FloatArray
@@ -250,6 +265,7 @@ class Evaluations:
     f_num_diff: FloatArray
     reasons: Mapping[bytes, str] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
+    cells: CellResults | None = None
 
     def __len__(self) -> int:
         return len(self.settings)

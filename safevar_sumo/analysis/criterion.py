@@ -11,27 +11,35 @@ import scipy
 
 from safevar_sumo.analysis.evaluator import Bench
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.records import BoolArray, Evaluations, Outcome
 from safevar_sumo.results import half_of
 
-EXPECTED = "collision, or below=X with a safety degree X [m, or minus a collision's speed in m/s]"
+EXPECTED = "collision, points=X with X points of a rating, or below=X with a safety degree X [m, or minus a collision's speed in m/s]"
 CONFIDENCE = 0.95
 """Of the intervals of shares, where no option says otherwise."""
+FIRST, DECIMALS = 1.0, 6
+"""Loss of points that counts as unsafe in a rated study, and decimals of points."""
 PROBED = 1024
 """Settings over the whole domain that decide whether a study has collisions at all."""
 
 
 @dataclass(frozen=True)
 class Unsafe:
-    """A collision; or, with `below`, a safety degree below that limit [m, or -m/s]."""
+    """A collision; or, with `below`, a safety degree below that limit [m, or -m/s]; or, with `points`, no more points of a rating."""
 
     below: float | None = None
+    points: float | None = None
 
     def __str__(self) -> str:
+        if self.points is not None:
+            return f"points={self.points!r}"
         return "collision" if self.below is None else f"below={self.below!r}"
 
     def of(self, evaluations: Evaluations) -> BoolArray:
         """Which evaluations are unsafe; shape (M,). An undefined safety degree is not unsafe."""
+        if self.points is not None:
+            return np.asarray(evaluations.column(RATING_POINTS.name) <= self.points)
         return evaluations.collided if self.below is None else np.asarray(evaluations.f_safe < self.below)
 
     @classmethod
@@ -49,12 +57,25 @@ class Unsafe:
             return cls()
         kind, _, text = criterion.partition("=") if isinstance(criterion, str) else ("below", "", criterion)
         try:
-            below = float(text) if kind == "below" else math.nan
+            below = float(text) if kind in ("below", "points") else math.nan
         except (TypeError, ValueError):
             below = math.nan
         if not math.isfinite(below):
             raise InputError("unsafe", repr(criterion), EXPECTED)
-        return cls(below)
+        return cls(points=below) if kind == "points" else cls(below)
+
+    @classmethod
+    def first_point(cls, points: float) -> Unsafe:
+        """The default of a rated study: a vehicle that has lost the first of the original's points.
+
+        Raises
+        ------
+        InputError
+            If the original has none to lose.
+        """
+        if not points >= FIRST:
+            raise InputError("unsafe", f"the original vehicle earns {points:g} points and has none to lose", EXPECTED)
+        return cls(points=round(points - FIRST, DECIMALS))
 
     @classmethod
     def usual(cls, evaluations: Evaluations, original: Evaluations) -> Unsafe:
@@ -65,6 +86,8 @@ class Unsafe:
         InputError
             If nothing collides and the original's safety degree is no distance.
         """
+        if RATING_POINTS.name in original.metrics:
+            return cls.first_point(float(original.column(RATING_POINTS.name)[0]))
         if evaluations.collided.any() or original.collided.any():
             return cls()
         if not original.f_safe[0] > 0:
@@ -73,7 +96,11 @@ class Unsafe:
 
     @classmethod
     def of_solutions(cls, solutions: pd.DataFrame, degree: float) -> Unsafe:
-        """The default for solutions, as `safevar_sumo.results.unsafe_rows` applies it; `degree` is the original's safety degree."""
+        """The default for solutions, as `safevar_sumo.results.unsafe_rows` applies it; `degree` is the original's safety degree, or its
+        points in a rated study.
+        """
+        if RATING_POINTS.name in solutions:
+            return cls.first_point(degree)
         collide = (solutions["outcome"] == str(Outcome.COLLISION)).any()
         return cls() if collide or math.isnan(degree) else cls(half_of(degree))
 
@@ -87,6 +114,8 @@ def criterion_of(text: str | None, bench: Bench, original: Evaluations | None = 
     if text is not None:
         return Unsafe.parse(text)
     original = bench.original() if original is None else original
+    if RATING_POINTS.name in original.metrics:
+        return Unsafe.usual(original, original)
     return Unsafe.usual(bench.evaluate(bench.spread(PROBED), "settings over the whole domain"), original)
 
 

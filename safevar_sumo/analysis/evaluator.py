@@ -12,14 +12,17 @@ import scipy
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
-from safevar_sumo.workers.batches import evaluate_all
-from safevar_sumo.workers.evaluation import Pool
-from safevar_sumo.workers.local import available_cores, local_pool
+from safevar_sumo.workers.batches import evaluate_all, inputs_of
+from safevar_sumo.workers.evaluation import Pool, packed
+from safevar_sumo.workers.local import available_cores, first_of, local_pool
+from safevar_sumo.workers.retrying import RetryingPool
 
+PARTS = 2
+"""Parts of a rating's cells for each worker."""
 Progress = Callable[[str, int, int], None]
 """Called with the stage, how many of its settings are done, and how many there are."""
 
@@ -92,6 +95,33 @@ class Bench:
             return spread(self.characteristics, drawn, seed)[drawn - some:]
 
         return self.region.sampled(following, number, rng, filtered=filtered, rejections=SPREAD)
+
+    def cells(self, settings: FloatArray, stage: str) -> CellResults:
+        """What settings, shape (M, n), do in every cell of a rated study: each worker has a part of the cells, not of the settings.
+
+        Raises
+        ------
+        SimulationError
+            If a setting cannot be simulated.
+        """
+        number = len(assemble(self.study).matrix)
+        parts = min(PARTS * self._pool.workers, number)
+        inputs, pool = inputs_of(self.study, self._pool), RetryingPool(self._pool, self.study)
+        self.progress(stage, 0, number)
+        futures = {pool.submit(packed(self.study, inputs, cells=(k, parts)), settings): k for k in range(parts)}
+        found, done = dict[int, CellResults](), 0
+        while len(found) < parts:
+            for future in first_of([future for future, k in futures.items() if k not in found]):
+                evaluations = future.result()
+                if evaluations.cells is None:
+                    raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {evaluations.reason(0)}")
+                found[futures[future]] = evaluations.cells
+                done += evaluations.cells.impact.shape[1]
+                self.progress(stage, done, number)
+        order = np.argsort(np.concatenate([np.arange(k, number, parts) for k in range(parts)]))
+        self.simulated += len(settings)
+        columns = zip(*(found[k] for k in range(parts)), strict=True)
+        return CellResults._make(np.concatenate(column, axis=1)[:, order] for column in columns)
 
     def original(self) -> Evaluations:
         """The original vehicle's evaluation.

@@ -16,9 +16,11 @@ from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.search import Search
 from safevar_sumo.study import Study, foreign_names
-from safevar_sumo.sumo import Engine
+from safevar_sumo.sumo import Engine, assemble, evaluate
 from safevar_sumo.sumo.matrix import LARGEST_WORLD
+from safevar_sumo.sumo.rater import driven_in_sumo
 from safevar_sumo.workers.evaluation import packed
+from safevar_sumo.workers.identity import networks_of
 from safevar_sumo.workers.isolation import refuse_difference, refuse_unlike_sumo
 from safevar_sumo.workers.retrying import RetryingPool, reproducing
 
@@ -34,7 +36,9 @@ class Verification:
         self._study, self._pool, self._begun, self._observer = study, pool, begun, observer
         self._alone = packed(study, results.inputs, engine=engine, afresh=True) if foreign_names(study) else b""
         self._is_recorded = engine is Engine.RECORDED
-        self._in_sumo = Batcher(pool, packed(study, results.inputs, engine=Engine.LIBSUMO), LARGEST_WORLD)
+        self._driven = driven_in_sumo(study, assemble(study).weather)
+        inputs = results.inputs if self._driven is study else {**results.inputs, "network": networks_of(assemble(self._driven))}
+        self._in_sumo = Batcher(pool, packed(self._driven, inputs, engine=Engine.LIBSUMO), LARGEST_WORLD)
         self._leaks: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}
         self._unverified: dict[Run, tuple[Evaluations, int]] = {}
         """What runs hold of settings that are driven in SUMO, and how many of them have not come back."""
@@ -68,6 +72,8 @@ class Verification:
         known = run.solutions_and_others(rng) if self._is_recorded else None
         if not known:
             return False
+        if self._driven is not self._study:  # SUMO drives settings in a few of a rating's cells
+            known = evaluate(assemble(self._driven), known.settings)
         self._unverified[run] = known, len(known)
         self._in_sumo.ask(run, known.settings)
         return True

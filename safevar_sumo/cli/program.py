@@ -31,6 +31,7 @@ COMMANDS = {
     "tolerance": ("questions", "Find how far each characteristic may go: alone, in pairs, and all together."),
     "risk": ("questions", "Estimate the probability of an unsafe outcome, and which characteristics decide it."),
     "rules": ("questions", "Find rules that describe where it is unsafe, in physical units."),
+    "rating": ("rating", "Rate a vehicle and a worn variant of it as Euro NCAP does: points, colours, robustness layers."),
     "tables": ("report", "Answer the research questions as tables."),
     "figures": ("report", "Draw the figures of results."),
     "report": ("report", "Write one page about results: verdict, causes, replays, tables, figures."),

@@ -3,6 +3,7 @@
 from safevar_sumo.metrics.base import F_DIFF, F_NUM_DIFF, F_SAFE, Metric, MetricFacts, Objective, Scoring, foreign_metric
 from safevar_sumo.metrics.comfort import BRAKE_HARSHNESS, MAX_JERK, RMS_ACCELERATION
 from safevar_sumo.metrics.deceleration import AVE_DECE
+from safevar_sumo.metrics.rating_points import RATING_POINTS
 from safevar_sumo.metrics.safety_degree import SAFETY_DEGREE_METRIC
 from safevar_sumo.metrics.time_to_collision import TET, TIT, time_to_collision
 
@@ -24,5 +25,5 @@ SAFEVAR = Scoring(metrics=tuple(metric.facts for metric in METRICS.values()), ob
 """Metrics and objectives of the published study (method sections 3 and 4)."""
 
 __all__ = [
-    "FURTHER", "F_DIFF", "F_NUM_DIFF", "F_SAFE", "METRICS", "OBJECTIVES", "SAFEVAR", "Metric", "MetricFacts", "Objective", "Scoring",
-    "foreign_metric", "time_to_collision"]
+    "FURTHER", "F_DIFF", "F_NUM_DIFF", "F_SAFE", "METRICS", "OBJECTIVES", "RATING_POINTS", "SAFEVAR", "Metric", "MetricFacts", "Objective",
+    "Scoring", "foreign_metric", "time_to_collision"]

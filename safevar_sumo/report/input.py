@@ -143,7 +143,7 @@ class ReportInput:
         new = {setting.tobytes(): setting for setting in settings if setting.tobytes() not in self._again}
         if new:
             at_points = at_every_point(self.system, np.stack(list(new.values())))
-            evaluations, points = aggregated(self.system, at_points), points_of(self.system, at_points, self.unsafe)
+            evaluations, points = aggregated(at_points), points_of(self.system, at_points, self.unsafe)
             for row, key in enumerate(new):
                 self._again[key] = Again(evaluations.take([row]), points[row])
         return [self._again[setting.tobytes()] for setting in settings]

@@ -13,7 +13,7 @@ from typing import Any
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import DIGITS, Files, digest_of, located
 from safevar_sumo.results.files import make_durable, write_whole
-from safevar_sumo.study import WORDS, Study, refuse_other_than_file, tables_of
+from safevar_sumo.study import WORDS, RatingTable, Study, refuse_other_than_file, tables_of
 
 MANIFEST, RUNS = "manifest.json", "runs"
 PLACES, LATER = "places.json", "read-*.json"
@@ -62,6 +62,10 @@ def fixed(study: Study) -> dict[str, Any]:
     for characteristic in everything["vehicle"]["characteristics"].values():
         for key in WORDS:
             del characteristic[key]
+    if study.rating == RatingTable():
+        del everything["rating"]  # as results have it that were computed before there were ratings
+    if study.matrix is not None and not study.matrix.protocol:
+        del everything["matrix"]["protocol"]
     search = {key: value for key, value in everything["search"].items() if key not in FREE_OF_SEARCH}
     return {**{key: value for key, value in everything.items() if key not in FREE}, "search": search}
 

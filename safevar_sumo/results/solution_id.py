@@ -80,11 +80,18 @@ def half_of(degree: float) -> float:
 
 
 def unsafe_rows(solutions: pd.DataFrame, original: float) -> pd.Series[bool]:
-    """Which solutions are unsafe: collisions, or if none collides, those below half of the original's safety degree [m]."""
+    """Which solutions are unsafe: collisions, or if none collides, those below half of the original's safety degree [m].
+
+    In a rated study `original` are the original's points: those that have lost the first of them.
+    """
+    if RATED in solutions:
+        return solutions[RATED] <= original - 1.0
     collisions = solutions["outcome"] == str(Outcome.COLLISION)
     return collisions if collisions.any() else solutions["f_safe"] < half_of(original)
 
 
+RATED = "rating_points"
+"""Column of the points of a rated study."""
 CHOICES = {
     "most_severe": ["f_safe", "f_num_diff", "f_diff"],
     "fewest": ["f_num_diff", "f_safe", "f_diff"],

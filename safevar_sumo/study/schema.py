@@ -125,23 +125,30 @@ def label_of(algorithm: str) -> str:
 class MatrixTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A test of a matrix: its scenario at every combination of the values in `over`, in every one of the weathers.
 
-    `parameters` are added to those of the study's scenario; with another `model` they stand alone.
+    `parameters` are added to those of the study's scenario; with another `model` they stand alone. A weather is a name or a table.
     """
 
     name: Annotated[str, Meta(min_length=1)]
     model: str = ""
     parameters: Parameters = {}
     over: dict[str, Annotated[list[Any], Meta(min_length=1)]] = {}
-    weathers: list[str] = []
+    weathers: list[str | Weather] = []
+
+
+class RatingTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a manufacturer states for a rating: `claims` are robustness layers by test that nothing here simulates, such as glare."""
+
+    claims: dict[str, list[str]] = {}
 
 
 class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Several scenario points in which every setting is simulated.
+    """Several scenario points in which every setting is simulated: `tests`, or all cells of a `protocol`, which then rates every setting.
 
     `aggregate` combines their safety degrees: the worst counts. (A mean would average distances with minus the speeds of collisions.)
     """
 
-    tests: Annotated[list[MatrixTest], Meta(min_length=1)]
+    tests: list[MatrixTest] = []
+    protocol: Literal["", "euro_ncap_2026"] = ""
     aggregate: Literal["worst", "mean"] = "worst"
 
 
@@ -200,6 +207,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A whole study as its TOML file gives it; `load_study` reads one.
 
     `matrix` are the scenario points that it is simulated in, if there is more than the one scenario;
+    `rating` is what the user claims for a rating;
     `step_length` is the simulation's time step [s], by default the one of the network's options;
     `published` are the original vehicle's metrics in the published study, by name, as far as there are any;
     `repeatability` are standard deviations of repeats of one setting there;
@@ -217,6 +225,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     metrics: MetricsTable
     search: SearchTable
     matrix: MatrixTable | None = None
+    rating: RatingTable = RatingTable()
     step_length: Annotated[float, Meta(ge=0.001, le=1)] | None = None
     published: dict[str, float] = {}
     repeatability: dict[str, Annotated[float, Meta(gt=0, le=1e6)]] = {}

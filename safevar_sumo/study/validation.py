@@ -147,6 +147,9 @@ def implausible(source: object, study: Study) -> Iterator[InputError]:
     for name, free in study.calibration.items():
         if free.lower >= free.upper:
             yield InputError(source, f"calibration.{name!r}: lower = {free.lower} and upper = {free.upper}", "numbers, lower < upper")
+    if study.matrix is not None and bool(study.matrix.tests) == bool(study.matrix.protocol):
+        yield InputError(source, f"matrix: {len(study.matrix.tests)} tests and protocol = {study.matrix.protocol!r}",
+                         "tests, or a protocol")
     if study.matrix is not None and study.matrix.aggregate == "mean":
         yield InputError(source, "matrix.aggregate = 'mean' would average distances [m] with minus the speeds of collisions [m/s]",
                          "'worst', the point in which a setting comes off worst")

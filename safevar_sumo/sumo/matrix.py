@@ -12,13 +12,15 @@ import numpy.typing as npt
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Contact, Encounter, Evaluations, FloatArray, Outcome, SimulationRuns, Trace
+from safevar_sumo.metrics import RATING_POINTS
+from safevar_sumo.records import CellResults, Contact, Encounter, Evaluations, FloatArray, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.batch import Watcher, drive_all, reason_for_sumo, score
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.network import lanes_of
+from safevar_sumo.sumo.rater import cell_columns, in_some_cells, joined_cells
 from safevar_sumo.sumo.staging import all_staged
 from safevar_sumo.sumo.system import System, assemble
 
@@ -30,6 +32,13 @@ LARGEST_ROADS = 100_000
 """Lanes of all copies in one simulation: beyond, loading takes minutes and gigabytes."""
 NEAREST = 4
 """Points that are told to who names one that there is not."""
+
+
+class Scored(NamedTuple):
+    """What N settings are worth at one point of a study."""
+
+    point: Point
+    evaluations: Evaluations
 
 
 class AtPoint(NamedTuple):
@@ -84,9 +93,38 @@ def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     """
     most = _most_vehicles(system, engine)
     parts = [settings[first:first + most] for first in range(0, len(settings), most)] or [settings]
-    found = [aggregated(system, at_every_point(system, part, engine)) if system.matrix
-             else score(system, part, simulate(system, part, engine)) for part in parts]
+    found = [_evaluated(system, part, engine) for part in parts]
     return found[0] if len(found) == 1 else Evaluations.concatenate(found)
+
+
+def _evaluated(system: System, settings: FloatArray, engine: Engine) -> Evaluations:
+    if system.rater is not None:
+        return rated_settings(system, settings, engine)[0]
+    if system.matrix:
+        return aggregated(at_every_point(system, settings, engine))
+    return score(system, settings, simulate(system, settings, engine))
+
+
+def rated_settings(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> tuple[Evaluations, CellResults]:
+    """Settings, shape (N, n), in all cells of a protocol: what they are worth, with their points, and what they did in every cell.
+
+    Nothing else of the simulations is kept: their traces would take gigabytes.
+    """
+    scored, columns = dict[str, Scored](), dict[str, Any]()
+    for group in _groups(system, settings, engine):
+        for one in group:
+            scored[one.point.name], columns[one.point.name] = Scored(one.point, one.evaluations), cell_columns(one.drives)
+    cells = joined_cells([columns[point.name] for point in system.points])
+    found = aggregated([scored[point.name] for point in system.points])
+    if system.rater is None:  # in some of the cells
+        return found, cells
+    return replace(found, metrics={**found.metrics, RATING_POINTS.name: system.rater.points(cells).total}), cells
+
+
+def in_cells(system: System, settings: FloatArray, part: tuple[int, int], engine: Engine = Engine.RECORDED) -> Evaluations:
+    """Settings, shape (N, n), in every n-th cell of a protocol from the k-th on, `part` being (k, n): evaluations with their `cells`."""
+    found, cells = rated_settings(replace(system, matrix=system.matrix[part[0]::part[1]], rater=None), settings, engine)
+    return replace(found, cells=cells)
 
 
 def settings_per_batch(system: System, engine: Engine) -> int:
@@ -103,7 +141,7 @@ def _most_vehicles(system: System, engine: Engine) -> int:
     return min(max(LARGEST_ROADS // max(lanes, 1), 1), LARGEST_WORLD)
 
 
-def aggregated(system: System, found: Sequence[AtPoint]) -> Evaluations:
+def aggregated(found: Sequence[AtPoint | Scored]) -> Evaluations:
     """What settings that were simulated at every point are worth."""
     settings = found[0].evaluations.settings
     row_of, columns = worst_points(found), np.arange(len(settings))
@@ -135,15 +173,20 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
 
 def at_every_point(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = ()) -> list[AtPoint]:
     """Settings, shape (N, n), at every point, in the points' order; raises as `simulate`."""
-    n, found = len(settings), dict[str, AtPoint]()
+    found = {one.point.name: one for group in _groups(system, settings, engine, options) for one in group}
+    return [found[point.name] for point in system.points]
+
+
+def _groups(system: System, settings: FloatArray, engine: Engine, options: tuple[str, ...] = ()) -> Iterator[list[AtPoint]]:
+    """Settings at every point, group by group of the points that are simulated together."""
+    n = len(settings)
     recorded = engine is Engine.RECORDED and not reason_for_sumo(system)
     for points in _together(system.points, LARGEST_BATCH // max(n, 1)) if recorded else ((point,) for point in system.points):
         drives = drive_all(replace(system, matrix=points), settings, engine, options)
         evaluations = score(system, np.tile(settings, (len(points), 1)), drives)
-        for k, point in enumerate(points):
-            rows = slice(k * n, (k + 1) * n)
-            found[point.name] = AtPoint(point, evaluations.take(np.arange(rows.start, rows.stop)), drives.of(rows))
-    return [found[point.name] for point in system.points]
+        parts = [slice(k * n, (k + 1) * n) for k in range(len(points))]
+        yield [AtPoint(point, evaluations.take(np.arange(rows.start, rows.stop)), drives.of(rows))
+               for point, rows in zip(points, parts, strict=True)]
 
 
 def at_worst(system: System, settings: FloatArray) -> System:
@@ -182,6 +225,8 @@ def study_at(study: Study, name: str, source: object) -> Study:
     system = assemble(study)
     named_point(system, name, source)
     assert study.matrix is not None
+    if system.rater is not None:
+        return in_some_cells(study, system.weather, [next(k for k, point in enumerate(system.matrix) if point.name == name)])
     place = dict(next(point for point in system.matrix if point.name == name).place)
     title, weather = place.pop("test"), place.pop("weather")
     test = next(one for one in study.matrix.tests
@@ -200,7 +245,7 @@ def _together(points: Sequence[Point], most: int) -> Iterator[tuple[Point, ...]]
             yield tuple(group[start:start + max(most, 1)])
 
 
-def worst_points(found: Sequence[AtPoint]) -> npt.NDArray[np.intp]:
+def worst_points(found: Sequence[AtPoint | Scored]) -> npt.NDArray[np.intp]:
     """For every setting the number of the point with the least safety degree; among equals the first by name.
 
     A collision at a valid point stands, whatever the others are. Without one, a single invalid test makes it unknown whether the

@@ -17,13 +17,14 @@ import numpy as np
 
 from safevar_sumo.ads import ADS, ADS_CONTRACT, REACTIONS, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown
-from safevar_sumo.metrics import FURTHER, METRICS, Metric, Objective, Scoring, foreign_metric
+from safevar_sumo.metrics import FURTHER, METRICS, RATING_POINTS, Metric, Objective, Scoring, foreign_metric
 from safevar_sumo.metrics import OBJECTIVES as BY_OBJECTIVE
 from safevar_sumo.plugins import Guard, Lookup, Member, OwnModules, check_parameters, guard_process_state, instance_of
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, WEATHERS, GuardedScenario, Point, Scenario, weather_of
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, foreign_names
 from safevar_sumo.sumo.network import check_network, network_remarks
+from safevar_sumo.sumo.rater import Rater, is_rated, rated, rater_of
 from safevar_sumo.sumo.sources import is_network, is_shipped
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.traci_module import importable
@@ -63,14 +64,15 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     InputError
         If there is no such record, it is wrong, or its name is taken.
     """
-    metrics, found = dict(METRICS), list[Member]()
+    metrics, found = {**METRICS, **({RATING_POINTS.name: RATING_POINTS} if is_rated(study) else {})}, list[Member]()
+    known = dict(metrics)
     changes = {name: change for name, change in CHANGES.items() if name not in TAKEN}
     by_name: dict[str, Metric | Change] = {}
 
     def taken_in(name: str, key: str) -> Metric | Change:
         if name in by_name:
             return by_name[name]
-        own = {**METRICS, **FURTHER, **(CHANGES if key == OBJECTIVES else {})}
+        own = {**known, **FURTHER, **(CHANGES if key == OBJECTIVES else {})}
         member = lookup.find(own, name, key)
         if member.guard is None:
             if name in FURTHER:
@@ -127,8 +129,8 @@ class Models(NamedTuple):
 class System:
     """What a simulation is made of.
 
-    `step_length` [s] is None where the network's own counts; `metrics` are thresholds, `measuring` is what is computed
-    with them; `members` are how everything was found.
+    `step_length` [s] is None where the network's own counts; `rater` rates what happens in the matrix of a protocol; `metrics` are
+    thresholds, `measuring` is what is computed with them; `members` are how everything was found.
     """
 
     characteristics: CharacteristicSet
@@ -143,6 +145,7 @@ class System:
     region: FeasibleRegion
     step_length: float | None = None
     matrix: tuple[Point, ...] = ()
+    rater: Rater | None = None
 
     @property
     def points(self) -> tuple[Point, ...]:
@@ -151,7 +154,7 @@ class System:
 
     def at(self, point: Point) -> System:
         """The same at one point alone."""
-        return replace(self, scenario=point.scenario, weather=point.weather, matrix=())
+        return replace(self, scenario=point.scenario, weather=point.weather, matrix=(), rater=None)
 
     def check_feasible(self, settings: FloatArray, source: object, *, filtered: bool, switch: str = "beyond=True") -> None:
         """Refuse settings, shape (M, n), that violate a constraint of the study; raises as `FeasibleRegion.check`."""
@@ -206,7 +209,8 @@ def _assembled(study: Study, source: str) -> System:
     for name in study.published:
         if name not in measuring.metrics:
             raise unknown(source, f"published.{name} is no metric", name, measuring.metrics)
-    matrix = _matrix(study, source)
+    rater = rater_of(study, source)
+    matrix = _matrix(study if rater is None else rated(study, models.weather), source)
     for network in dict.fromkeys(scenario.network for scenario in (models.scenario, *(point.scenario for point in matrix))):
         check_network(network)
     region = region_of(study, source)
@@ -221,7 +225,7 @@ def _assembled(study: Study, source: str) -> System:
         characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
         metrics=study.metrics, nominal=nominal, members=(*models.members, *measuring.members, *region.members),
         measuring=measuring, region=region,
-        step_length=study.step_length, matrix=matrix)
+        step_length=study.step_length, matrix=matrix, rater=rater)
 
 
 def models_of(study: Study, source: str) -> Models:

@@ -14,6 +14,7 @@ from safevar_sumo.plugins import Files, digest_of, digests, located, named_files
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, foreign_names
 from safevar_sumo.sumo import Engine, assemble, reason_for_sumo, settings_per_batch
+from safevar_sumo.sumo.rater import driven_in_sumo
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.identity import Inputs, networks_of
@@ -58,9 +59,13 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     starts = range(0, len(unique), size)
     futures = {persistent.submit(work, unique[start:start + size]): start for start in starts}
     verified = np.linspace(0, len(unique) - 1, min(VERIFIED - _verified.get(work, 0), len(unique))).astype(int)
-    in_sumo = None
+    in_sumo = in_scenes = None
     if recorded and len(verified):
-        in_sumo = persistent.submit(packed(study, inputs, engine=Engine.LIBSUMO), unique[verified])
+        driven = driven_in_sumo(study, assemble(study).weather)
+        there = inputs if driven is study else inputs_of(driven, pool)
+        in_sumo = persistent.submit(packed(driven, there, engine=Engine.LIBSUMO), unique[verified])
+        if driven is not study:
+            in_scenes = persistent.submit(packed(driven, there), unique[verified])
     parts: dict[int, Evaluations] = {}
     while len(parts) < len(futures):
         for future in first_of([future for future, start in futures.items() if start not in parts]):
@@ -68,7 +73,8 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
             done(len(parts[futures[future]]))
     found = Evaluations.concatenate([parts[start] for start in starts])
     if in_sumo is not None:
-        refuse_unlike_sumo(study, found.take(verified[~found.failed[verified]]), result_of(in_sumo).take(~found.failed[verified]))
+        known = found.take(verified) if in_scenes is None else result_of(in_scenes)
+        refuse_unlike_sumo(study, known.take(~known.failed), result_of(in_sumo).take(~known.failed))
         _verified[work] = _verified.get(work, 0) + len(verified)
     return found.take(row_of.ravel())
 

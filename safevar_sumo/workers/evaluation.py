@@ -17,7 +17,7 @@ from safevar_sumo.plugins import Files, changes, digests, forget_foreign, noted_
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, foreign_packages
 from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import evaluate, in_cells
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers.identity import Inputs, networks_of
 
@@ -55,6 +55,7 @@ class _Work(msgspec.Struct, frozen=True):
     engine: Engine
     afresh: bool
     check: bool
+    cells: tuple[int, int] | None = None
 
 
 class _How(msgspec.Struct, frozen=True):
@@ -62,10 +63,11 @@ class _How(msgspec.Struct, frozen=True):
 
     afresh: bool
     check: bool
+    cells: tuple[int, int] | None = None
 
 
 def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Engine = Engine.RECORDED, afresh: bool = False,
-           check: bool = False) -> bytes:
+           check: bool = False, cells: tuple[int, int] | None = None) -> bytes:
     """A study as it travels to a worker.
 
     Parameters
@@ -79,11 +81,13 @@ def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Eng
         By models that are loaded anew, with nothing in their modules and classes that earlier batches left there.
     check
         A batch checks the code from outside; its `reasons` are remarks on that.
+    cells
+        (k, n): of a rated study what settings do in every n-th cell from the k-th on, instead of what they are worth in all.
     """
     if inputs is None:
         inputs = {"network": networks_of(assemble(study))}
     return msgspec.msgpack.encode(_Work(study, {layer: dict(inputs[layer]) for layer in SHARED if layer in inputs}, engine, afresh,
-                                        check))
+                                        check, cells))
 
 
 def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
@@ -104,11 +108,17 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
     else:
         assembled = _assembled
     with noted_reading() as reading:
-        this, system = assembled(work)
+        cells = how.cells
+        this, system = assembled(work if cells is None else _in_all_cells(work))
         _refuse_changes(this.inputs, system)
-        evaluations = evaluate(system, settings, this.engine)
+        evaluations = evaluate(system, settings, this.engine) if cells is None else in_cells(system, settings, cells, this.engine)
     _refuse_changes(this.inputs, system)
     return replace(evaluations, files=_unknown(this, digests(reading.files(foreign_packages(this.study)), this.study.origin.places)))
+
+
+def _in_all_cells(work: bytes) -> bytes:
+    """The same for all cells: parts of them share a system."""
+    return msgspec.msgpack.encode(msgspec.structs.replace(msgspec.msgpack.decode(work, type=_Work), cells=None))
 
 
 @lru_cache(maxsize=4)

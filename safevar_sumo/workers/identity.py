@@ -43,7 +43,7 @@ def identity_of(study: Study, system: System, sources: Mapping[str, str] = Mappi
                      if isinstance(value, str) or any(named_files(value, study.origin.places))}
             resolved[table] = {**resolved[table], "parameters": {**msgspec.to_builtins(model), **names}}
     resolved["weather"] = msgspec.to_builtins(system.weather)
-    if system.matrix:
+    if system.matrix and system.rater is None:
         resolved["weathers"] = [msgspec.to_builtins(point.weather) for point in system.matrix]
     return {"resolved": resolved, "network": networks_of(system), "sources": dict(sources), "results": RESULTS, "platform": _platform()}
 

@@ -1,0 +1,222 @@
+"""Rates the original vehicle and variants of it: all cells and robustness layers are simulated, and scored by the official rules."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent
+from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, NOT_RED, RED, Block, Cell, Points, Protocol, points_of
+from safevar_sumo.records import CellResults, FloatArray
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.rater import by_night, rated_study
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.workers.evaluation import Pool
+
+DECIMALS = 9
+"""Of points and speeds in JSON, beyond which there is nothing but rounding."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RatedTest:
+    """A test of one vehicle, in one light where it is tested by day and by night; points of (standard, extended, robustness).
+
+    `layers` says which robustness layers hold: None for one that is neither simulated nor claimed; by day for both lights.
+    """
+
+    block: Block
+    points: tuple[float, float, float]
+    layers: Mapping[str, bool | None]
+
+    @property
+    def total(self) -> float:
+        return sum(self.points)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rated:
+    """One vehicle: its setting, and what it did and earned; `fails` if a required cell is not green, so that it earns nothing."""
+
+    name: str
+    setting: Mapping[str, float]
+    protocol: Protocol
+    cells: CellResults
+    scored: Points
+    claims: Mapping[str, Sequence[str]]
+
+    @property
+    def points(self) -> float:
+        return float(self.scored.total[0])
+
+    @property
+    def fails(self) -> bool:
+        return bool(self.scored.fails[0])
+
+    @cached_property
+    def tests(self) -> list[RatedTest]:
+        tests = []
+        for block in self.protocol.blocks:
+            standard, extended, robustness = (round(float(value), DECIMALS) for value in self.scored.tests[block.name][0])
+            tests.append(RatedTest(block=block, points=(standard, extended, robustness), layers=self._layers(block)))
+        return tests
+
+    def _layers(self, block: Block) -> dict[str, bool | None]:
+        claimed = self.claims.get(block.test, ())
+        return {one.layer: bool(self.scored.layers[block.test, one.layer][0]) if one.simulated else (True if one.layer in claimed else None)
+                for one in self.protocol.layers_of(block.test)}
+
+    def colour(self, number: int) -> str | None:
+        """Of the cell of that number; None where the test could not be driven."""
+        colour = int(self.scored.colours[0, number])
+        return None if colour < 0 else COLOURS[colour]
+
+    def passes(self, number: int) -> bool:
+        """Whether a cell of a robustness layer meets what the layer asks."""
+        here, nominal = self.scored.colours[0, [number, self.nominal(number)]].tolist()
+        return bool(here >= 0 and (here < RED if self.protocol.cells[number].criterion == NOT_RED else here <= nominal))
+
+    def nominal(self, number: int) -> int:
+        """The cell of a matrix that a cell of a layer varies."""
+        cell = self.protocol.cells[number]
+        return self.protocol.matrix_of[cell.block.name, cell.row, cell.column]
+
+    def cell(self, number: int) -> dict[str, Any]:
+        """A cell as `rating --json` has it."""
+        one, impact = self.protocol.cells[number], finite_or_none(self.cells.impact[0, number])
+        warning = finite_or_none(self.cells.warning[0, number])
+        return {"range": one.range, "vut_speed": one.vut, "target_speed": one.target, "impact_location": one.location,
+                "colour": self.colour(number), "relative_impact_speed": None if impact is None else round(impact, DECIMALS),
+                "warning_ttc": None if warning is None else round(warning, DECIMALS)}
+
+    def to_dict(self) -> dict[str, Any]:
+        of_block: dict[str, list[int]] = {}
+        for number, cell in enumerate(self.protocol.cells):
+            of_block.setdefault(cell.block.name, []).append(number)
+        kinds = ("standard", "extended", "robustness")
+        tests = [{"test": one.block.test, "light": one.block.light, **dict(zip(kinds, one.points, strict=True)),
+                  "possible": dict(zip(kinds, one.block.points, strict=True)),
+                  "cells": [self.cell(number) for number in of_block[one.block.name]], "layers": dict(one.layers)} for one in self.tests]
+        return {"name": self.name, "setting": dict(self.setting), "points": round(self.points, DECIMALS),
+                "possible": possible(self.protocol), "tests": tests}
+
+
+def possible(protocol: Protocol) -> float:
+    """All points of the tests that are simulated."""
+    return round(sum(sum(block.points) for block in protocol.blocks), DECIMALS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rating:
+    """A rating of the original vehicle, `variants[0]`, and of variants of it."""
+
+    study: Study
+    protocol: Protocol
+    variants: list[Rated]
+
+    @property
+    def original(self) -> Rated:
+        return self.variants[0]
+
+    @property
+    def variant(self) -> Rated | None:
+        """The vehicle that is compared with the original."""
+        return self.variants[1] if len(self.variants) > 1 else None
+
+    @property
+    def lost(self) -> float:
+        """Points that the variant has less than the original; less than 0 if it has more."""
+        return 0.0 if self.variant is None else round(self.original.points - self.variant.points, DECIMALS)
+
+    @property
+    def left_open(self) -> float:
+        """Points of robustness layers in simulated tests that are neither simulated nor claimed."""
+        claims, open_points = self.original.claims, 0.0
+        for test, blocks in self.protocol.tests.items():
+            layers = self.protocol.layers_of(test)
+            unknown = [one for one in layers if not one.simulated and one.layer not in claims.get(test, ())]
+            open_points += sum(block.points[2] for block in blocks) * len(unknown) / len(layers)
+        return round(open_points, DECIMALS)
+
+    def turned(self, variant: Rated | None = None) -> list[tuple[Cell, str | None, str | None]]:
+        """Cells whose colour differs from the original's, with both colours."""
+        other = variant or self.variant
+        if other is None:
+            return []
+        numbers = np.flatnonzero(self.original.scored.colours[0] != other.scored.colours[0]).tolist()
+        return [(self.protocol.cells[number], self.original.colour(number), other.colour(number)) for number in numbers]
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row for each vehicle and test.
+
+        Columns: `vehicle`, `test`, `light`, `standard`, `extended`, `robustness`, `total`, `possible` [points].
+        """
+        return pd.DataFrame([{
+            "vehicle": one.name, "test": test.block.test, "light": test.block.light,
+            **dict(zip(("standard", "extended", "robustness"), test.points, strict=True)), "total": test.total,
+            "possible": sum(test.block.points)} for one in self.variants for test in one.tests])
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON of `rating`."""
+        return {"study": self.study.name, "variants": [variant.to_dict() for variant in self.variants],
+                "not_simulated": [{"test": test, "points": points} for test, points in self.protocol.not_simulated.items()]}
+
+    def __repr__(self) -> str:
+        vehicles = "; ".join(f"{one.name} {one.points:.2f}" for one in self.variants)
+        return f"<Rating of {self.study.name}, points of {possible(self.protocol):g}: {vehicles}>"
+
+
+def rate(study: Study, settings: Mapping[str, FloatArray], *, pool: Pool | None = None, jobs: int | None = None,
+         progress: Progress = silent) -> Rating:
+    """Rate the original vehicle of a study and variants of it, settings of shape (n,) by name, as they are, without the filter.
+
+    Raises
+    ------
+    InputError
+        If the study cannot be assembled.
+    SimulationError
+        If a vehicle cannot be simulated.
+    """
+    with open_bench(rated_study(study, EURO_NCAP_2026), pool, jobs, progress) as bench:
+        return rate_on(bench, settings)
+
+
+def rate_on(bench: Bench, settings: Mapping[str, FloatArray]) -> Rating:
+    """The same on a bench of the rated study."""
+    rater = assemble(bench.study).rater
+    assert rater is not None
+    names = CharacteristicSet.of(bench.study.vehicle.characteristics).names
+    rows = {"original": bench.characteristics.original, **settings}
+    cells = bench.cells(np.stack(list(rows.values())), "cells and robustness layers")
+    variants = [Rated(name=name, setting=dict(zip(names, setting.tolist(), strict=True)), protocol=rater.protocol, cells=cells.of([row]),
+                      scored=points_of(rater.protocol, cells.of([row]), rater.claims), claims=rater.claims)
+                for row, (name, setting) in enumerate(rows.items())]
+    return Rating(study=bench.study, protocol=rater.protocol, variants=variants)
+
+
+def remarks(rating: Rating) -> list[str]:
+    """What a user should know of a rating."""
+    weather = assemble(rating.study).weather
+    found = []
+    if weather.wet or weather.road_friction != 1:
+        found.append(f"Euro NCAP tests on a dry road; this is rated in the weather {weather.name!r}, by night {by_night(weather).name!r}.")
+    for one in rating.variants:
+        if one.fails:
+            found.append(f"{one.name}: nothing is earned, as CCRs at 10 and 20 km/h is not green in all of the standard range.")
+        required = [number for number, cell in enumerate(one.protocol.cells) if cell.block.test == "CPNA" and cell.vut == 10
+                    and cell.location == 75 and not cell.is_varied]
+        if not one.fails and any(one.colour(number) != "green" for number in required):
+            found.append(f"{one.name}: CPNA at 10 km/h and 75 % is not green, which Euro NCAP requires; its calculator "
+                         f"{one.protocol.calculator} does not check it, and neither do these points.")
+        invalid = int(np.count_nonzero(~one.cells.valid))
+        if invalid:
+            found.append(f"{one.name}: {invalid} cells are no valid tests and earn nothing: the vehicle cannot hold their speed.")
+    if all(np.isnan(one.cells.warning).all() for one in rating.variants):
+        found.append("The driving system never warns: rows with FCW are red.")
+    return found
+

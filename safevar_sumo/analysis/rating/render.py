@@ -1,0 +1,214 @@
+"""A rating as text on the terminal and as a picture of its matrices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.text import Text
+
+from safevar_sumo.analysis.figures import FONT, literal, new_figure
+from safevar_sumo.analysis.rating.compute import Rated, RatedTest, Rating, possible
+from safevar_sumo.analysis.words import joined
+from safevar_sumo.protocol import COLOURS, Block
+from safevar_sumo.terminal import WholeTable, print_text
+from safevar_sumo.vehicles import CharacteristicSet
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LETTERS = {colour: colour[0].upper() for colour in COLOURS}
+ON_TERMINAL = {"green": "black on green", "yellow": "black on bright_yellow", "orange": "black on dark_orange",
+               "brown": "white on dark_red", "red": "white on red"}
+DARK = ("green", "brown", "red")
+"""Colours that are written on in white."""
+LIGHTS = {"day": " by day", "night": " by night", None: ""}
+COLUMNS_OF_PAIRS = 4
+
+
+def print_rating(console: Console, result: Rating) -> None:
+    """The verdict, points of every test, which robustness layers hold, and what was not simulated."""
+    print_text(console, result.study.title)
+    print_text(console, verdict(result))
+    console.print(_points(result))
+    console.print(_layers(result))
+    print_text(console, not_simulated(result))
+
+
+def verdict(result: Rating) -> str:
+    """The rating in a sentence: what a variant loses and where, or what the original vehicle earns."""
+    whole, variant = possible(result.protocol), result.variant
+    if variant is None:
+        return f"The original vehicle earns {result.original.points:.2f} of the {whole:g} points of the tests that are simulated."
+    changed = _changed(result, variant)
+    of = f"of the {result.original.points:.2f} points that the original earns (of {whole:g} that are simulated)"
+    if not result.lost:
+        return f"With {changed} the vehicle keeps all {of}."
+    if result.lost < 0:
+        return f"With {changed} the vehicle earns {-result.lost:.2f} points more, {variant.points:.2f} in place {of}."
+    losses = lost_by_test(result)
+    test, most = losses[0]
+    share = "all" if len(losses) == 1 else "most" if most > result.lost / 2 else f"{most:.2f}"
+    return f"With {changed} the vehicle loses {result.lost:.2f} {of}, {share} of them in {_in_words(test)}."
+
+
+def lost_by_test(result: Rating) -> list[tuple[RatedTest, float]]:
+    """Tests in which the variant has fewer points than the original, the largest loss first."""
+    if result.variant is None:
+        return []
+    pairs = zip(result.original.tests, result.variant.tests, strict=True)
+    losses = [(before, round(before.total - after.total, 9)) for before, after in pairs]
+    return sorted((pair for pair in losses if pair[1] > 0), key=lambda pair: -pair[1])
+
+
+def not_simulated(result: Rating) -> str:
+    """What the points leave open."""
+    tests = result.protocol.not_simulated
+    named = ", ".join(f"{test} {points:g}" for test, points in tests.items())
+    text = f"Not simulated, neither passed nor failed: {named}; {sum(tests.values()):g} points."
+    if result.left_open:
+        text += f" Robustness layers that are neither simulated nor claimed: {result.left_open:.2f} points of the tests above."
+    return text
+
+
+def _in_words(test: RatedTest) -> str:
+    return f"{test.block.test}{LIGHTS[test.block.light]}"
+
+
+def _changed(result: Rating, variant: Rated) -> str:
+    members = CharacteristicSet.of(result.study.vehicle.characteristics)
+    parts = [f"{member.short_name} {variant.setting[member.name]:g}{member.suffix}" for member in members
+             if variant.setting[member.name] != member.original]
+    return joined(parts) if parts else "no change at all"
+
+
+def _points(result: Rating) -> WholeTable:
+    """Points of every test as standard + extended + robustness = total."""
+    names = [one.name for one in result.variants]
+    table = WholeTable("test", right=[*names, *(["lost"] if result.variant else []), "of"],
+                       title="Points: standard + extended + robustness = total")
+    for tests in zip(*(one.tests for one in result.variants), strict=True):
+        lost = round(tests[0].total - tests[-1].total, 2)
+        table.add_row(tests[0].block.name, *(_sum(test.points) for test in tests),
+                      *([f"{lost:.2f}" if lost else ""] if result.variant else []), f"{sum(tests[0].block.points):.2f}")
+    table.add_section()
+    totals = [[sum(test.points[kind] for test in one.tests) for kind in range(3)] for one in result.variants]
+    table.add_row("all", *map(_sum, totals), *([f"{result.lost:.2f}"] if result.variant else []), f"{possible(result.protocol):g}")
+    return table
+
+
+def _sum(points: Sequence[float]) -> str:
+    return f"{'+'.join(f'{value:.2f}' for value in points)} = {sum(points):.2f}"
+
+
+def _layers(result: Rating) -> WholeTable:
+    """The layers that are simulated or claimed; those of a variant where they are others than the original's."""
+    table = WholeTable("test", "vehicle", "robustness layers that hold", "that do not", "that are claimed", title="Robustness layers")
+    for tests in zip(*(one.tests for one in result.variants), strict=True):
+        claimed = result.original.claims.get(tests[0].block.test, ())
+        for one, test in zip(result.variants, tests, strict=True):
+            if test.block.light != "night" and (one is result.original or test.layers != tests[0].layers):
+                holding, failing = ([layer for layer, holds in test.layers.items() if holds is wanted and layer not in claimed]
+                                    for wanted in (True, False))
+                table.add_row(test.block.test, one.name, ", ".join(holding), ", ".join(failing), ", ".join(claimed))
+    return table
+
+
+def print_matrices(console: Console, result: Rating) -> None:
+    """Every matrix: a letter and a colour for each cell, the speed of the impact [km/h] or time to collision of the warning [s]."""
+    for block in result.protocol.blocks:
+        columns = [f"{location:g} %" for location in block.impact_locations] or [f"{speed:g} km/h" for speed in block.target_speeds]
+        of = "impact location" if block.impact_locations else "speed of the target"
+        table = WholeTable("VUT", "target" if block.impact_locations else "", right=columns, title=f"{block.name}, {of}")
+        for k, row in enumerate(block.rows):
+            cells = [_cell(result, block, k, column) if letter != "-" else Text("") for column, letter in enumerate(row.ranges)]
+            function = " FCW" if block.is_warning(k) else ""
+            table.add_row(f"{row.vut:g} km/h{function}", "" if row.target is None else f"{row.target:g} km/h", *cells)
+        console.print(table)
+    names = ", ".join(f"{letter} {colour}" for colour, letter in LETTERS.items())
+    compared = "; original > variant where they differ" if result.variant else ""
+    print_text(console, f"{names}; in brackets: extended range; with the relative speed of the impact [km/h], or with the time to "
+                        f"collision of the warning [s] in rows with FCW{compared}.")
+
+
+def _cell(result: Rating, block: Block, row: int, column: int) -> Text:
+    number = result.protocol.matrix_of[block.name, row, column]
+    texts = [_cell_text(one, number) for one in result.variants]
+    differs = len({one.colour(number) for one in result.variants}) > 1
+    text = Text()
+    for k, part in enumerate(texts if differs else texts[:1]):
+        text.append(" > " if k else "")
+        text.append(part, style=ON_TERMINAL.get(result.variants[k].colour(number) or "", ""))
+    return text
+
+
+def _cell_text(one: Rated, number: int) -> str:
+    cell, colour = one.protocol.cells[number], one.colour(number)
+    record = one.cell(number)
+    value = record["warning_ttc"] if cell.judged == "warning" else record["relative_impact_speed"]
+    letter = "?" if colour is None else LETTERS[colour]
+    text = letter if value is None else f"{letter} {value:.1f}"
+    return f"({text})" if cell.range == "extended" else text
+
+
+def matrices_figure(result: Rating) -> Figure:
+    """All matrices, the variant's beside the original's: colours and letters, extended cells hatched, cells that differ framed."""
+    blocks = result.protocol.blocks
+    rows = -(-len(blocks) // COLUMNS_OF_PAIRS)
+    figure, axes = new_figure(verdict_title(result), rows, COLUMNS_OF_PAIRS, (15, 2.6 * rows))
+    for axis in axes.flat[len(blocks):]:
+        axis.set_axis_off()
+    for axis, block in zip(axes.flat, blocks, strict=False):
+        _draw(axis, result, block)
+    names = ", ".join(f"{letter} {colour}" for colour, letter in LETTERS.items())
+    figure.supxlabel(f"impact location [% of the width], or speed of the target [km/h] in CCCscp and CMCscp; {names}; hatched: extended "
+                     "range; thick frame: another colour than the original's", fontsize=FONT)
+    figure.supylabel("speed of the vehicle under test [km/h]", fontsize=FONT)
+    return figure
+
+
+def verdict_title(result: Rating) -> str:
+    points = "; ".join(f"{one.name}: {one.points:.2f} points" for one in result.variants)
+    return f"{result.study.name}: {points} of {possible(result.protocol):g}" + (" (original left, variant right)" if result.variant else "")
+
+
+def _draw(axis: Axes, result: Rating, block: Block) -> None:
+    from matplotlib.patches import Rectangle
+
+    wide = max(len(row.ranges) for row in block.rows)
+    heads = block.impact_locations or block.target_speeds
+    ticks: list[tuple[float, str]] = []
+    for k, one in enumerate(result.variants):
+        shift = k * (wide + 0.6)
+        ticks += [(shift + column + 0.5, f"{head:g}") for column, head in enumerate(heads)]
+        for row, column, number in _cells_of(block, result):
+            colour, is_extended = one.colour(number), result.protocol.cells[number].range == "extended"
+            turned = k > 0 and colour != result.original.colour(number)
+            face = f"#{result.protocol.colours[colour]}" if colour else "#808080"
+            ink = "white" if colour in DARK or colour is None else "black"
+            axis.add_patch(Rectangle((shift + column, row), 1, 1, facecolor=face, edgecolor="white", linewidth=0.6,
+                                     hatch="///" if is_extended else None))
+            if turned:
+                axis.add_patch(Rectangle((shift + column + 0.08, row + 0.08), 0.84, 0.84, fill=False, edgecolor="black", linewidth=1.8))
+            axis.text(shift + column + 0.5, row + 0.5, LETTERS.get(colour or "", "?"), ha="center", va="center", fontsize=FONT - 2,
+                      color=ink)
+    axis.set_xlim(0, len(result.variants) * (wide + 0.6) - 0.6)
+    axis.set_ylim(len(block.rows), 0)
+    axis.set_xticks([place for place, _ in ticks], [text for _, text in ticks], fontsize=FONT - 3)
+    names = [f"{row.vut:g}{' FCW' if block.is_warning(k) else ''}" for k, row in enumerate(block.rows)]
+    axis.set_yticks([k + 0.5 for k in range(len(names))], names, fontsize=FONT - 2)
+    axis.grid(visible=False)
+    axis.set_title(literal(f"{block.name}: {_totals(result, block)} of {sum(block.points):g}"), fontsize=FONT)
+
+
+def _totals(result: Rating, block: Block) -> str:
+    return " / ".join(f"{test.total:.2f}" for one in result.variants for test in one.tests if test.block is block)
+
+
+def _cells_of(block: Block, result: Rating) -> Iterator[tuple[int, int, int]]:
+    for row, line in enumerate(block.rows):
+        for column, letter in enumerate(line.ranges):
+            if letter != "-":
+                yield row, column, result.protocol.matrix_of[block.name, row, column]

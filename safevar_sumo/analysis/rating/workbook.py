@@ -1,0 +1,187 @@
+"""The official spreadsheet: predictions, claimed layers and input parameters in its template, measurements in a preprocessed one.
+
+Nothing is assumed of a spreadsheet: every cell that is written to is found where the protocol's data has it, with its headings, or the
+spreadsheet is refused.
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import openpyxl
+from openpyxl.utils import coordinate_to_tuple
+from openpyxl.utils.exceptions import InvalidFileException
+
+from safevar_sumo.analysis.rating.compute import Rated
+from safevar_sumo.errors import InputError
+from safevar_sumo.protocol import EURO_NCAP_2026, Block, protocol_of
+from safevar_sumo.protocol.points import DECIMALS, half_up
+
+PARAMETERS, VERSION = "Input parameters", "Version"
+NOT_ASSESSED, PREDICTED = "N/A", "Self claimed"
+HEADS = ("Scenario", "Test point", "Range", "Value")
+MADE_BY = "that pip install 'euroncap-rating-2026=={}' and euroncap_rating_2026 crash_avoidance {} write"
+
+
+class _Book:
+    """A spreadsheet that is read and checked at once, and filled and saved later."""
+
+    made_by = "generate-template"
+
+    def __init__(self, source: Path, output: Path) -> None:
+        self.source, self.output, self.protocol = source, output, protocol_of(EURO_NCAP_2026)
+        try:
+            self._book = openpyxl.load_workbook(source)
+        except (OSError, InvalidFileException, zipfile.BadZipFile, KeyError, ValueError) as error:
+            raise InputError(source, f"is no spreadsheet that can be read: {error}", self._legal) from None
+        self._check_version()
+
+    @property
+    def _legal(self) -> str:
+        return f"the file {MADE_BY.format(self.protocol.calculator, self.made_by)}"
+
+    def _sheet(self, name: str) -> Any:
+        if name not in self._book.sheetnames:
+            raise InputError(self.source, f"has no sheet {name!r}", self._legal)
+        return self._book[name]
+
+    def _expect(self, sheet: str, cell: str, expected: object, found: object) -> None:
+        if str(found).strip() != str(expected):
+            raise InputError(self.source, f"sheet {sheet!r}, cell {cell}: {found!r} in place of {str(expected)!r}", self._legal)
+
+    def _check_version(self) -> None:
+        version = str(self._sheet(VERSION)["B1"].value)
+        if version.split(".")[:2] != self.protocol.calculator.split(".")[:2]:
+            raise InputError(self.source, f"sheet {VERSION!r}, cell B1: version {version!r}", self._legal)
+
+    def _save(self) -> None:
+        try:
+            self._book.save(self.output)
+        except OSError as error:
+            raise InputError("--xlsx", f"cannot write {self.output}: {error.strerror or error}",
+                             "a file in a directory that exists") from None
+
+
+class Template(_Book):
+    """The template that the calculator generates, to be filled with predictions."""
+
+    def __init__(self, source: Path, output: Path) -> None:
+        super().__init__(source, output)
+        for block in self.protocol.blocks:
+            self._check_block(block)
+        for layer in self.protocol.layers:
+            sheet, (row, column) = self._sheet(layer.sheet), coordinate_to_tuple(layer.cell)
+            self._expect(layer.sheet, sheet.cell(1, column).coordinate, layer.test, sheet.cell(1, column).value)
+            self._expect(layer.sheet, f"B{row}", layer.layer, sheet.cell(row, 2).value)
+        scenarios = {test for test, _, _ in self._parameters()}
+        for test in self.protocol.tests:
+            if test not in scenarios:
+                raise InputError(self.source, f"sheet {PARAMETERS!r} has no scenario {test!r}", self._legal)
+
+    def _check_block(self, block: Block) -> None:
+        sheet, (top, left) = self._sheet(block.sheet), coordinate_to_tuple(block.first)
+        self._expect(block.sheet, block.label, block.name, sheet[block.label].value)
+        for k, location in enumerate(block.impact_locations):
+            cell = sheet.cell(top - 1, left + k)
+            is_number = isinstance(cell.value, int | float)
+            self._expect(block.sheet, cell.coordinate, f"{location:g}", f"{100 * cell.value:g}" if is_number else cell.value)
+        for k, speed in enumerate(block.target_speeds):
+            cell = sheet.cell(top - 1, left + k)
+            self._expect(block.sheet, cell.coordinate, f"{speed:g} km/h", cell.value)
+        for k, row in enumerate(block.rows):
+            self._expect(block.sheet, f"A{top + k}", f"{row.vut:g} km/h", sheet.cell(top + k, 1).value)
+
+    def _parameters(self) -> Iterator[tuple[str, str, Any]]:
+        """Scenario, parameter and cell of every input parameter."""
+        sheet, test = self._sheet(PARAMETERS), ""
+        self._expect(PARAMETERS, "E1", "Scenario", sheet["E1"].value)
+        self._expect(PARAMETERS, "G1", "Value", sheet["G1"].value)
+        for row in range(2, sheet.max_row + 1):
+            test = str(sheet.cell(row, 5).value or test).strip()
+            if sheet.cell(row, 6).value is not None:
+                yield test, str(sheet.cell(row, 6).value).strip(), sheet.cell(row, 7)
+
+    def fill(self, rated: Rated) -> None:
+        """Fill in a vehicle's colours, which rows are warned of, which layers hold or are claimed, and which tests are predicted."""
+        for number, cell in enumerate(self.protocol.cells):
+            if not cell.is_varied:
+                top, left = coordinate_to_tuple(cell.block.first)
+                colour = rated.colour(number) or "red"
+                self._sheet(cell.block.sheet).cell(top + cell.row, left + cell.column).value = colour.capitalize()
+        for block in self.protocol.blocks:
+            top, _ = coordinate_to_tuple(block.first)
+            for k, row in enumerate(block.rows):
+                if row.choice:
+                    self._sheet(block.sheet)[f"{block.function}{top + k}"].value = "FCW" if block.is_warning(k) else "AEB"
+        holds = {(one.block.test, layer): held for one in rated.tests for layer, held in one.layers.items()}
+        for layer in self.protocol.layers:
+            self._sheet(layer.sheet)[layer.cell].value = "YES" if holds[layer.test, layer.layer] else "NO"
+        for test, parameter, cell in self._parameters():
+            if "Heading correction" not in parameter:  # of lane departure, which takes no N/A
+                cell.value = PREDICTED if test in self.protocol.tests else NOT_ASSESSED
+        self._save()
+
+
+class Preprocessed(_Book):
+    """What the calculator has preprocessed: it has drawn cells, whose measurements are filled in."""
+
+    made_by = "preprocess"
+
+    def __init__(self, source: Path, output: Path) -> None:
+        super().__init__(source, output)
+        self._sheets = [f"{sheet.removesuffix('pred.')}verif." for sheet in dict.fromkeys(block.sheet for block in self.protocol.blocks)]
+        self._rows = [drawn for sheet in self._sheets for drawn in self._drawn(sheet)]
+
+    def _drawn(self, name: str) -> list[tuple[Any, dict[str, int], int, int]]:
+        """Sheet, columns by their heads, row, and number of the cell, of everything that was drawn."""
+        sheet, drawn = self._sheet(name), []
+        columns: dict[str, int] = {}
+        for row in range(1, sheet.max_row + 1):
+            values = [str(cell.value or "").strip() for cell in sheet[row]]
+            if "Test point" in values:
+                columns = {value: k + 1 for k, value in enumerate(values) if value}
+                for head in HEADS:
+                    if head not in columns:
+                        raise InputError(self.source, f"sheet {name!r}, row {row}: there is no column {head!r}", self._legal)
+                continue
+            point = values[columns["Test point"] - 1] if columns else ""
+            if not point:
+                continue
+            scenario = values[columns["Scenario"] - 1]
+            if scenario not in {block.name for block in self.protocol.blocks}:
+                continue  # of a test that is not simulated
+            place = point.strip("()").split(",")
+            number = self.protocol.matrix_of.get((scenario, int(place[0]), int(place[1]))) if all(
+                part.strip().isdigit() for part in place) and len(place) == 2 else None
+            if number is None:
+                raise InputError(self.source, f"sheet {name!r}, row {row}: {scenario} has no test point {point!r}", self._legal)
+            drawn.append((sheet, columns, row, number))
+        if not columns:
+            raise InputError(self.source, f"sheet {name!r} has no column 'Test point'", self._legal)
+        return drawn
+
+    def fill(self, rated: Rated) -> None:
+        """Fill in what was simulated in every cell that was drawn, and whether the robustness layer that was drawn with it held there."""
+        varied = {(cell.block.name, cell.row, cell.column, cell.range, cell.condition): number
+                  for number, cell in enumerate(self.protocol.cells) if cell.is_varied}
+        for sheet, columns, row, number in self._rows:
+            cell = self.protocol.cells[number]
+            sheet.cell(row, columns["Value"]).value = _measured(rated, number)
+            if "Verification condition" in columns and "Robustness" in columns:
+                layer, condition = (str(sheet.cell(row, columns[head]).value or "")
+                                    for head in ("Robustness layer", "Verification condition"))
+                of_layer = varied.get((cell.block.name, cell.row, cell.column, layer, condition))
+                if of_layer is not None:
+                    sheet.cell(row, columns["Robustness"]).value = "PASS" if rated.passes(of_layer) else "FAIL"
+        self._save()
+
+
+def _measured(rated: Rated, number: int) -> float:
+    """Relative speed of the impact [km/h], 0 if there is none; of a row that is warned of, the time to collision then [s]."""
+    is_warning = rated.protocol.cells[number].judged == "warning"
+    value = float((rated.cells.warning if is_warning else rated.cells.impact)[0, number])
+    return 0.0 if math.isnan(value) else float(half_up(max(value, 0.0), DECIMALS))  # type: ignore[arg-type]

@@ -1,0 +1,110 @@
+"""The command rating: Euro NCAP points of a vehicle and of one variant, as tables, JSON, a picture and the official spreadsheet."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+
+from safevar_sumo.analysis.rating import RatingOptions
+from safevar_sumo.cli.options import PICTURES, check_output, read_changes, settings_of
+from safevar_sumo.cli.program import commands
+from safevar_sumo.cli.target import Target, jobs_option, json_option, now_option, options_of, target_of
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import FloatArray
+from safevar_sumo.terminal import stages
+from safevar_sumo.vehicles import CharacteristicSet
+
+SHEET = (".xlsx",)
+FILE = click.Path(path_type=Path)
+
+
+@commands.command(name="rating")
+@click.argument("place", metavar="STUDY|DIR")
+@options_of(RatingOptions)
+@click.option("--matrix", is_flag=True, help="Print every matrix: speed by impact location, with the colours of the cells.")
+@click.option("--plot", type=FILE, metavar="FILE", help="Draw the matrices here: png, pdf or svg.")
+@click.option("--xlsx", type=FILE, metavar="FILE", help="Write the official spreadsheet with the variant's predictions, or the original's, "
+                                                       "here; takes --template, or --preprocessed.")
+@click.option("--template", type=FILE, metavar="FILE", help="What the official calculator's generate-template wrote: ca_template.xlsx.")
+@click.option("--preprocessed", type=FILE, metavar="FILE", help="What the calculator's preprocess wrote: its verification sheets are "
+                                                               "filled with what was simulated, in --xlsx or with --force in this file.")
+@click.option("--force", is_flag=True, help="Overwrite files that exist.")
+@now_option
+@jobs_option
+@json_option
+def rating(place: str, changes: tuple[str, ...], solution: str | None, matrix: bool, plot: Path | None, xlsx: Path | None,
+           template: Path | None, preprocessed: Path | None, force: bool, jobs: int | None, as_json: bool) -> None:
+    """Rate the vehicle of STUDY as Euro NCAP does in 2026, and one variant beside it: points, colours, robustness layers."""
+    from safevar_sumo.analysis.figures import save
+    from safevar_sumo.analysis.rating.compute import rate, remarks
+    from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating
+
+    target = target_of(place, solution, None)
+    variant = _variant(target, changes)
+    if plot is not None:
+        check_output(plot, "--plot", PICTURES)
+        _refuse_existing(plot, "--plot", force)
+    book = _workbook(xlsx, template, preprocessed, force)
+    with stages(Console(stderr=True)) as progress:
+        result = rate(target.study, variant, jobs=jobs, progress=progress)
+    for remark in remarks(result):
+        click.echo(f"note: {remark}", err=True)
+    if as_json:
+        click.echo(json.dumps(result.to_dict(), indent=2, allow_nan=False))
+    else:
+        print_rating(Console(), result)
+    if matrix and not as_json:
+        print_matrices(Console(), result)
+    if plot is not None:
+        save(matrices_figure(result), plot, "--plot")
+    if book is not None:
+        rated = result.variant or result.original
+        book.fill(rated)
+        click.echo(f"Spreadsheet of {rated.name}: {book.output}", err=True)
+
+
+def _variant(target: Target, changes: tuple[str, ...]) -> dict[str, FloatArray]:
+    """The variant by its name, if one is asked for: a solution, or the original, with changes."""
+    characteristics = CharacteristicSet.of(target.study.vehicle.characteristics)
+    values = read_changes(changes, characteristics, False)
+    for name, several in values.items():
+        if len(several) > 1:
+            raise InputError("--set", f"{name} takes {len(several)} values", "one value: one variant stands beside the original")
+    if target.setting is None and not values:
+        return {}
+    base = characteristics.original if target.setting is None else target.setting
+    name = "variant" if target.handle is None else str(target.handle) + (" changed" if values else "")
+    return {name: settings_of(values, base, characteristics)[0]}
+
+
+def _refuse_existing(path: Path, flag: str, force: bool) -> None:
+    if path.exists() and not force:
+        raise InputError(flag, f"{path} exists", "another file, or --force")
+
+
+def _workbook(xlsx: Path | None, template: Path | None, preprocessed: Path | None, force: bool) -> Any:
+    """The spreadsheet to fill, read and checked before anything is simulated; None if none is asked for."""
+    if template is not None and preprocessed is not None:
+        raise InputError("--template", "--preprocessed is given too", "one of them: --preprocessed holds the template's sheets already")
+    source = template if template is not None else preprocessed
+    if source is None:
+        if xlsx is not None:
+            raise InputError("--xlsx", f"{xlsx} takes the official template, which pip install 'euroncap-rating-2026' and "
+                                       "euroncap_rating_2026 crash_avoidance generate-template write",
+                             "--template FILE, or --preprocessed FILE")
+        return None
+    if template is not None and xlsx is None:
+        raise InputError("--template", "there is no --xlsx to write to", "--xlsx FILE")
+    output = xlsx if xlsx is not None else source
+    flag = "--xlsx" if xlsx is not None else "--preprocessed"
+    _refuse_existing(output, flag, force)
+    check_output(output, flag, SHEET)
+    try:
+        from safevar_sumo.analysis.rating.workbook import Preprocessed, Template
+    except ModuleNotFoundError:
+        raise InputError(flag, "openpyxl is not installed", "pip install 'safevar_sumo[rating]'") from None
+    return (Preprocessed if template is None else Template)(source, output)

@@ -1,0 +1,123 @@
+"""Derives `safevar_sumo/protocol/euro_ncap_2026.toml` from the official calculator; runs in an environment that has it.
+
+`python tests/rating/derive.py > safevar_sumo/protocol/euro_ncap_2026.toml` after `pip install euroncap-rating-2026 'pandas<3'`.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from importlib.resources import files
+
+import openpyxl
+from euroncap_rating_2026 import common
+from euroncap_rating_2026.crash_avoidance import data_model, matrix_processing, robustness_layer
+
+KEY = data_model.StageSubelementKey.FC
+NOT_SIMULATED = ("CCFhos", "CCFhol", "CCFtap", "CMFtap", "CPTA", "CBTA")
+MASK = {matrix_processing.TestRange.STANDARD: "S", matrix_processing.TestRange.EXTENDED: "E"}
+
+
+def number(text: object) -> float:
+    value = float(str(text).removesuffix(" km/h"))
+    return int(value) if value.is_integer() else value
+
+
+def quoted(values: object) -> str:
+    return "[" + ", ".join(f'"{value}"' if isinstance(value, str) else f"{value:g}" for value in values) + "]"
+
+
+def block(sheet, frame, name: str) -> list[str]:
+    """A matrix of a prediction sheet as TOML."""
+    place = matrix_processing.get_matrix_indices(frame, name)
+    # A choice of function is taken as AEB up to CCRs and CMRs, where AEB is assessed either way, and as FCW for CPLA and CBLA.
+    top, left, n_rows, n_columns = place["start_row"] + 2, place["start_col"] + 1, place["n_rows"], place["n_cols"]
+    headings = {sheet.cell(top - 2, column).value: column for column in range(2, left + 1)}
+    test, _, light = name.partition(" ")
+    along = "impact_location" if "Impact location" in [sheet.cell(top - 2, c).value for c in range(1, left + 1)] else "target_speed"
+    columns = [sheet.cell(top - 1, left + k).value for k in range(n_columns)]
+    columns = [round(100 * value) for value in columns] if along == "impact_location" else [number(value) for value in columns]
+    points = {(p.row, p.col): p for p in matrix_processing.get_test_matrix(frame, name, KEY)}
+    rows = []
+    for k in range(n_rows):
+        function = sheet.cell(top + k, headings["Function"]).value if "Function" in headings else "AEB"
+        speeds = f"vut = {number(sheet.cell(top + k, 1).value)}"
+        if along == "impact_location":
+            speeds += f", target = {number(sheet.cell(top + k, headings['Target speed']).value)}"
+        mask = "".join(MASK[points[k, j].test_range] if (k, j) in points else "-" for j in range(n_columns))
+        rows.append(f'  {{ {speeds}, ranges = "{mask}"{"" if function else ", choice = true"} }},')
+    total = data_model.TOTAL_SCORES[name]
+    return [
+        "", "[[blocks]]", f'test = "{test}"', *([f'light = "{light}"'] if light else []), f'criterion = "{criterion(name)}"',
+        f'sheet = "{sheet.title}"', f'label = "A{top - 2}"', f'first = "{sheet.cell(top, left).coordinate}"',
+        *([f'function = "{sheet.cell(top, headings["Function"]).column_letter}"'] if "Function" in headings else []),
+        f"points = [{', '.join(f'{total[kind] or 0:g}' for kind in ('Standard', 'Extended', 'Robustness'))}]",
+        f"{along}s = {quoted(columns)}", "rows = [", *rows, "]"]
+
+
+def criterion(name: str) -> str:
+    return {"mitigation or avoidance": "mitigation", "avoidance": "avoidance"}[data_model.get_criteria_for_test(name).value]
+
+
+def bands(test: str, attributes: dict[str, str], colours: list[str]) -> str:
+    """Upper ends of the colours of a measured value, found by asking the calculator at every hundredth: those after the first one."""
+    asked = []
+    for hundredth in range(6001):
+        point = matrix_processing.TestPoint(0, 0, common.PredictionColor.GREY, matrix_processing.TestRange.STANDARD, attributes)
+        colour = matrix_processing.ComputedTestPoint(point, test, hundredth / 100).measured_color.value
+        if not asked or asked[-1][0] != colour:
+            asked.append((colour, hundredth / 100))
+    assert [colour for colour, _ in asked] == [colour for colour in colours if colour in dict(asked)]
+    return "{ " + ", ".join(f"{colour} = {start:g}" for colour, start in asked) + " }"
+
+
+def main() -> None:
+    path = files("data").joinpath("ca_template.xlsx")
+    book, frames = openpyxl.load_workbook(str(path)), common.read_excel_file_to_dfs(str(path))
+    print("# Euro NCAP's crash avoidance, frontal collisions, protocol v1.2 (July 2026): matrices, points and robustness layers.")
+    print(f"# Derived by tests/rating/derive.py from euroncap-rating-2026 {version('euroncap-rating-2026')} (PyPI, Apache-2.0):")
+    print("# its template ca_template.xlsx and its modules crash_avoidance.data_model, matrix_processing, robustness_layer. Do not edit.")
+    print("# ranges: a letter for each column, S standard, E extended, - no cell; choice: the manufacturer chooses AEB or FCW.")
+    print(f'\ncalculator = "{version("euroncap-rating-2026")}"')
+    colours = {colour.value: "".join(f"{round(255 * part):02X}" for part in rgb) for colour, rgb in common.PREDICTION_COLOR_MAP.items()}
+    print("colours = { " + ", ".join(f'{name} = "{colours[name]}"' for name in ("green", "yellow", "orange", "brown", "red")) + " }")
+    best_first = ["green", "yellow", "orange", "brown", "red"]
+    print("\n# From which relative speed at impact [km/h] a cell has a colour, by the speed of the vehicle under test [km/h], the last"
+          "\n# row for all faster ones; and from which time to collision at the warning [s]. Measured values have two decimals.")
+    print("[mitigation]")
+    for vut in (10, 20, 30, 40, 50):
+        print(f'{vut} = {bands("CCRs", {"VUT speed": f"{vut} km/h"}, best_first)}')
+    assert bands("CCRs", {"VUT speed": "130 km/h"}, best_first) == bands("CCRs", {"VUT speed": "50 km/h"}, best_first)
+    print("[criteria]")
+    print(f'avoidance = {bands("CCCscp", {"VUT speed": "50 km/h"}, best_first)}')
+    print(f'warning = {bands("CBLA", {"VUT speed": "50 km/h", "Function": "FCW"}, best_first[::-1])}')
+    lines = ["", "# Points of every test of the stage: standard, extended, robustness.", "[scenarios]"]
+    scenario: dict[str, list[float]] = {}
+    for row in book["Scenario Scores"].iter_rows(min_row=2, values_only=True):
+        name = row[4] or name  # noqa: F821
+        scenario.setdefault(name, []).append(row[7])
+    lines += [f'"{name}" = [{", ".join(f"{value:g}" for value in [*points, 0, 0][:3])}]' for name, points in scenario.items()]
+    subs = data_model.STAGE_SUBELEMENT_TO_LOADCASES["FC"]
+    simulated = []
+    for part, names in subs.items():
+        for name in names:
+            test = data_model.SUBTEST_TO_TEST_DICT.get(name, name)
+            if test not in NOT_SIMULATED:
+                lines += block(book[f"FC - {part} pred."], frames[f"FC - {part} pred."], name)
+                simulated.append((test, part))
+    for test, part in dict.fromkeys(simulated):
+        sheet = book[f"FC - {part} robust. pred."]
+        column = next(cell.column for cell in sheet[1] if cell.value == test)
+        for row in range(2, sheet.max_row + 1):
+            cell, layer = sheet.cell(row, column), sheet.cell(row, 2).value
+            if cell.fill.fill_type and cell.fill.fgColor.tint:
+                known = robustness_layer.ROBUSTNESS_LAYER_TO_VERIFICATION_CONDITION
+                found = next((known[one].get(test, []) for one in known if one.value == layer), [])
+                found = [found] if isinstance(found, tuple) else found
+                conditions = [f'{{ condition = "{text}", criterion = "{kind.value}" }}' for text, kind in found]
+                lines += ["", "[[layers]]", f'test = "{test}"', f'layer = "{layer}"', f'sheet = "{sheet.title}"',
+                          f'cell = "{cell.coordinate}"', f"conditions = [{', '.join(conditions)}]"]
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,107 @@
+"""Euro NCAP's own calculator accepts our spreadsheets, and scores and colours them as we do. It is built from PyPI."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import openpyxl
+import pytest
+
+from safevar_sumo.analysis.rating.compute import Rated, rate
+from safevar_sumo.analysis.rating.workbook import Preprocessed, Template
+from safevar_sumo.errors import InputError
+from safevar_sumo.protocol import EURO_NCAP_2026, points_of, protocol_of
+from safevar_sumo.records import CellResults
+from safevar_sumo.study import load_study
+from safevar_sumo.vehicles import CharacteristicSet
+from tests.rating.calculator import Calculator
+
+pytestmark = pytest.mark.slow
+PROTOCOL = protocol_of(EURO_NCAP_2026)
+N = len(PROTOCOL.cells)
+CLAIMS = {"CCRs": ["Driver input pre-crash", "Illumination (Sun glare)"], "CPNCO": ["Driver input pre-crash", "Type"]}
+
+
+@pytest.fixture(scope="module")
+def calculator(tmp_path_factory: pytest.TempPathFactory) -> Calculator:
+    return Calculator.built(tmp_path_factory.mktemp("calculator") / "environment")
+
+
+@pytest.fixture(scope="module")
+def template(calculator: Calculator, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return calculator.template(tmp_path_factory.mktemp("template"))
+
+
+def agrees(rated: Rated, calculator: Calculator, template: Path, place: Path) -> None:
+    """The calculator's points of every simulated test and its colour of every cell that it has drawn are ours."""
+    place.mkdir(exist_ok=True)
+    Template(template, place / "predicted.xlsx").fill(rated)
+    drawn = calculator.preprocessed(place / "predicted.xlsx", place / "drawn")
+    Preprocessed(drawn, place / "measured.xlsx").fill(rated)
+    theirs = calculator.scored(place / "measured.xlsx", place / "scored")
+    ours: dict[str, np.ndarray] = {}
+    for test in rated.tests:
+        ours[test.block.test] = ours.get(test.block.test, np.zeros(3)) + np.array(test.points)
+    for name, points in ours.items():
+        assert theirs.points[name] == pytest.approx(points, abs=0.01), name
+    simulated = {block.name for block in PROTOCOL.blocks}
+    verified = [row for row in theirs.verified if row["Scenario"] in simulated]
+    assert verified or rated.points == 0
+    for row in verified:
+        across, down = map(int, str(row["Test point"]).strip("()").split(","))
+        assert str(row["Colour"]).lower() == rated.colour(PROTOCOL.matrix_of[str(row["Scenario"]), across, down]), row
+
+
+def test_the_protocols_data_is_what_the_calculator_has(calculator: Calculator) -> None:
+    shipped = Path(__file__).parents[2] / "safevar_sumo/protocol/euro_ncap_2026.toml"
+    assert calculator.derived() == shipped.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_vehicles_with_any_colours_score_alike(seed: int, calculator: Calculator, template: Path, tmp_path: Path) -> None:
+    """Colours at random, with speeds that round to a bound; layers as their cells or at random, some claimed."""
+    rng = np.random.default_rng(seed)
+    speeds = rng.choice([0.004, 5, 9.996, 10, 15, 20, 25, 30, 40], (1, N))
+    impact = np.where(rng.random((1, N)) < rng.choice([0.1, 0.3, 0.7]), speeds, np.nan)
+    if seed:
+        impact[:, [k for k, cell in enumerate(PROTOCOL.cells) if cell.block.test == "CCRs" and cell.vut <= 20]] = np.nan
+    warning = np.where(rng.random((1, N)) < 0.7, 1.9, rng.choice([np.nan, 1.2, 1.696], (1, N)))
+    nominal = [PROTOCOL.matrix_of[cell.block.name, cell.row, cell.column] for cell in PROTOCOL.cells] if seed % 2 else list(range(N))
+    cells, claims = CellResults(impact[:, nominal], warning[:, nominal], np.ones((1, N), dtype=bool)), CLAIMS if seed % 3 else {}
+    rated = Rated(name="any", setting={}, protocol=PROTOCOL, cells=cells, scored=points_of(PROTOCOL, cells, claims), claims=claims)
+    assert rated.fails == (seed == 0)
+    agrees(rated, calculator, template, tmp_path)
+
+
+def test_the_original_half_the_brakes_the_worst_wear_and_who_never_brakes(calculator: Calculator, template: Path, tmp_path: Path) -> None:
+    study = load_study("euro_ncap_rating")
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    worst = characteristics.setting({"treadDepth": 1.6, "brakeTorque": 0.5, "brakeResponse": 0.4, "payload": 525, "payloadCentre": 3.2,
+                                     "sensorRange": 15, "sensorLatency": 0.4}, "worst")
+    result = rate(study, {"half": characteristics.setting({"brakeTorque": 0.5}, "half"), "worst": worst})
+    idle = rate(load_study(
+        study, ads={"model": "aeb", "parameters": {"reach": 0.001}}), {})
+    for number, vehicle in enumerate([*result.variants, idle.original]):
+        agrees(vehicle, calculator, template, tmp_path / str(number))
+    assert result.original.points > result.variants[1].points > result.variants[2].points
+    assert idle.original.points == 0
+
+
+def test_other_cells_and_sheets_are_refused_by_name(template: Path, tmp_path: Path) -> None:
+    for sheet, cell, value, message in (
+            ("FC - Car & PTW pred.", "A3", "15 km/h", "A3"), ("FC - Ped & Cyc pred.", "A72", "CPNX day", "A72"),
+            ("FC - Ped & Cyc robust. pred.", "B3", "Velocity", "B3"), ("Version", "B1", "5.9.0", "Version")):
+        book = openpyxl.load_workbook(shutil.copy(template, tmp_path / "other.xlsx"))
+        book[sheet][cell] = value
+        book.save(tmp_path / "other.xlsx")
+        with pytest.raises(InputError, match=message):
+            Template(tmp_path / "other.xlsx", tmp_path / "out.xlsx")
+    book = openpyxl.load_workbook(template)
+    del book["FC - Car & PTW pred."]
+    book.save(tmp_path / "other.xlsx")
+    with pytest.raises(InputError, match=r"has no sheet 'FC - Car & PTW pred\.'"):
+        Template(tmp_path / "other.xlsx", tmp_path / "out.xlsx")
+    with pytest.raises(InputError, match=r"has no sheet 'FC - Car & PTW verif.'"):
+        Preprocessed(template, tmp_path / "out.xlsx")

@@ -1,0 +1,193 @@
+"""Colours and points against the protocol's tables; that worse never earns more; spreadsheets that are refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import openpyxl
+import pytest
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from safevar_sumo.analysis.rating.compute import Rated, Rating
+from safevar_sumo.analysis.rating.render import verdict
+from safevar_sumo.analysis.rating.workbook import Preprocessed, Template
+from safevar_sumo.cli.program import commands
+from safevar_sumo.errors import InputError
+from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, points_of, protocol_of
+from safevar_sumo.protocol.points import colours_of
+from safevar_sumo.records import CellResults
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import at_every_point, evaluate, in_cells, study_at
+from safevar_sumo.sumo.system import assemble
+
+PROTOCOL = protocol_of(EURO_NCAP_2026)
+CELLS = PROTOCOL.cells
+N = len(CELLS)
+BANDS = {10: [0.01], 20: [0.01], 30: [None, None, 0.01, 10], 40: [None, 0.01, 10, 20], 50: [0.01, 10, 20, 30], 130: [0.01, 10, 20, 30]}
+"""From which relative speed on a cell is yellow, orange, brown, red, by the speed of the vehicle (protocol 5.2); one number: red alone."""
+
+
+def results(impact: Any = np.nan, warning: Any = 2.0, vehicles: int = 1) -> CellResults:
+    return CellResults(np.broadcast_to(impact, (vehicles, N)).astype(float), np.broadcast_to(warning, (vehicles, N)).astype(float),
+                       np.ones((vehicles, N), dtype=bool))
+
+
+def numbers(test: str, kind: str = "", light: str | None = None) -> list[int]:
+    return [number for number, cell in enumerate(CELLS) if cell.block.test == test and (not kind or cell.range == kind)
+            and (light is None or cell.block.light == light)]
+
+
+def rated(cells: CellResults, name: str = "original", claims: dict[str, list[str]] | None = None) -> Rated:
+    return Rated(name=name, setting={}, protocol=PROTOCOL, cells=cells, scored=points_of(PROTOCOL, cells, claims), claims=claims or {})
+
+
+@pytest.mark.parametrize("vut", BANDS)
+def test_a_bound_belongs_to_the_worse_colour(vut: int) -> None:
+    number = next(k for k in numbers("CCRb" if vut > 20 else "CCRs") if CELLS[k].vut == vut)
+    bounds = BANDS[vut] if len(BANDS[vut]) > 1 else [None, None, None, BANDS[vut][0]]
+    for colour, bound in zip(COLOURS[1:], bounds, strict=True):
+        if bound is not None:
+            assert COLOURS[colours_of(PROTOCOL, results(bound))[0, number]] == colour
+            assert COLOURS[colours_of(PROTOCOL, results(bound - 0.006))[0, number]] != colour
+
+
+def test_a_warning_is_green_from_1_7_s_and_measured_values_have_two_decimals() -> None:
+    (row,) = {CELLS[k].row for k in numbers("CBLA") if CELLS[k].judged == "warning" and CELLS[k].vut == 70}
+    number = next(k for k in numbers("CBLA", "standard") if CELLS[k].row == row)
+    shown = [COLOURS[colours_of(PROTOCOL, results(50.0, warning))[0, number]] for warning in (1.7, 1.695, 1.694, np.nan)]
+    assert shown == ["green", "green", "red", "red"]
+
+
+def test_who_avoids_everything_earns_all_that_is_simulated_and_who_never_brakes_nothing() -> None:
+    whole = points_of(PROTOCOL, results(vehicles=2), {test: [one.layer for one in PROTOCOL.layers_of(test) if not one.simulated]
+                                                      for test in PROTOCOL.tests})
+    assert whole.total.tolist() == [40.0, 40.0]
+    assert sum(PROTOCOL.not_simulated.values()) + whole.total[0] == 100
+    assert points_of(PROTOCOL, results(60.0, np.nan)).total.tolist() == [0.0]
+
+
+@pytest.mark.parametrize(("good", "share"), [(16, 1), (15, 0.75), (12, 0.75), (11, 0.5), (8, 0.5), (7, 0)])
+def test_the_extended_range_is_stepped(good: int, share: float) -> None:
+    impact, extended = np.full(N, np.nan), numbers("CMRs", "extended")
+    assert len(extended) == 16
+    impact[extended[good:]] = 50.0
+    assert points_of(PROTOCOL, results(impact)).tests["CMRs"][0, 1] == pytest.approx(0.15 * share)
+
+
+def test_robustness_counts_from_half_of_the_standard_range_and_claims_count_as_held() -> None:
+    impact, standard = np.full(N, np.nan), numbers("CBNA", "standard")
+    for red, earned in ((6, True), (7, False)):
+        impact[standard[:red]] = 50.0
+        points = points_of(PROTOCOL, results(impact)).tests["CBNA"][0]
+        assert points[0] == pytest.approx(1 - red / 12)
+        assert (points[2] > 0) == earned
+    layers = PROTOCOL.layers_of("CBNA")
+    held, claim = sum(bool(one.simulated) for one in layers), next(one.layer for one in layers if not one.simulated)
+    shares = [points_of(PROTOCOL, results(), claims).tests["CBNA"][0, 2] / 0.125 for claims in ({}, {"CBNA": [claim]})]
+    assert shares == pytest.approx([held / len(layers), (held + 1) / len(layers)])
+
+
+def test_a_required_cell_that_is_not_green_costs_everything() -> None:
+    impact = np.full(N, np.nan)
+    impact[numbers("CCRs", "standard")[0]] = 1.0
+    assert points_of(PROTOCOL, results(impact)).total.tolist() == [0.0]
+    assert points_of(PROTOCOL, results(impact)).fails.tolist() == [True]
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.floats(0.5, 40))
+def test_faster_impacts_never_gain_points_in_a_matrix(seed: int, share: float, more: float) -> None:
+    """Where a layer asks for the colour of its cell or better, a cell that turns worse lowers what the layer must reach."""
+    rng = np.random.default_rng(seed)
+    impact = np.where(rng.random(N) < share, rng.uniform(0, 45, N), np.nan)
+    worse = np.where(rng.random(N) < 0.3, np.nan_to_num(impact, nan=0.0) + more, impact)
+    before, after = points_of(PROTOCOL, results(impact)), points_of(PROTOCOL, results(worse))
+    for name in before.tests:
+        assert (after.tests[name][0, :2] <= before.tests[name][0, :2] + 1e-12).all() or before.fails[0]
+        assert not after.fails[0] or (after.tests[name] == 0).all()
+
+
+def test_cells_are_what_their_points_are_alone_and_in_any_batch() -> None:
+    study = load_study("euro_ncap_rating")
+    system = assemble(study)
+    settings_ = np.array([system.characteristics.original, system.characteristics.lower])
+    found = in_cells(system, settings_, (7, 620))
+    assert found.cells is not None
+    points = system.matrix[7::620]
+    assert [point.name.rpartition(", ")[0] for point in points] == [cell.name for cell in CELLS[7::620]]
+    for column, point in enumerate(points):
+        (alone,) = at_every_point(assemble(study_at(study, point.name, "")), settings_[::-1])
+        np.testing.assert_array_equal(found.cells.impact[:, column], alone.drives.relative_speed[::-1] * 3.6)
+        np.testing.assert_array_equal(found.cells.warning[:, column], np.broadcast_to(alone.drives.warning_ttc, 2)[::-1])
+
+
+def test_a_rated_study_has_its_points_as_an_objective_and_another_one_has_not() -> None:
+    system = assemble(load_study("euro_ncap_rating"))
+    few = replace(system, matrix=system.matrix[::930], rater=None)
+    assert "rating_points" in system.measuring.metrics
+    assert [objective.name for objective in system.measuring.scoring.objectives] == ["rating_points", "f_diff", "f_num_diff"]
+    assert len(evaluate(few, system.characteristics.original[np.newaxis])) == 1
+    with pytest.raises(InputError, match="rating_points"):
+        assemble(load_study("wear", search={"objectives": ["rating_points", "f_diff"]}))
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"rating": {"claims": {"CCRx": ["Type"]}}}, "CCRx"), ({"rating": {"claims": {"CCRs": ["Typo"]}}}, "Typo"),
+    ({"rating": {"claims": {"CCRs": ["Trajectory/Heading"]}}}, "is simulated"), ({"matrix": {"protocol": "euro_ncap_2023"}}, "protocol"),
+    ({"matrix": {"protocol": ""}}, "tests, or a protocol")])
+def test_claims_and_protocols_that_there_are_not_are_refused_by_name(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        assemble(load_study("euro_ncap_rating", **changes))
+
+
+def test_the_verdict_names_what_is_lost_and_where() -> None:
+    impact = np.full(N, np.nan)
+    impact[numbers("CPNCO", "standard", "night")] = 40.0
+    result = Rating(study=load_study("euro_ncap_rating"), protocol=PROTOCOL, variants=[rated(results()), rated(results(impact), "variant")])
+    result.variants[0].__dict__["setting"] = {name: row.original for name, row in result.study.vehicle.characteristics.items()}
+    result.variants[1].__dict__["setting"] = {**result.variants[0].setting, "treadDepth": 3.0}
+    assert verdict(result).startswith("With tread depth of the tyres 3 mm the vehicle loses 1.")
+    assert verdict(result).endswith("all of them in CPNCO by night.")
+    record = json.loads(json.dumps(result.to_dict(), allow_nan=False))
+    assert set(record) == {"study", "variants", "not_simulated"}
+    assert set(record["variants"][0]) == {"name", "setting", "points", "possible", "tests"}
+    assert {(one["test"], one["light"]) for one in record["variants"][0]["tests"]} >= {("CCRs", None), ("CPNCO", "night")}
+    assert set(record["variants"][0]["tests"][0]["cells"][0]) == {
+        "range", "vut_speed", "target_speed", "impact_location", "colour", "relative_impact_speed", "warning_ttc"}
+
+
+def _rate(*arguments: str) -> Any:
+    return CliRunner().invoke(commands, ["rating", "euro_ncap_rating", *arguments])
+
+
+def test_what_a_command_cannot_write_or_read_is_refused_before_anything_is_simulated(tmp_path: Path) -> None:
+    book = openpyxl.Workbook()
+    book.save(there := tmp_path / "there.xlsx")
+    (text := tmp_path / "text.xlsx").write_text("no spreadsheet")
+    new = str(tmp_path / "new.xlsx")
+    for arguments, message in (
+            (["--xlsx", new], "--template FILE"), (["--template", str(there)], "--xlsx FILE"),
+            (["--template", str(there), "--xlsx", str(there)], "--force"), (["--preprocessed", str(there)], "--force"),
+            (["--template", str(there), "--preprocessed", str(there), "--xlsx", new], "one of them"),
+            (["--template", str(text), "--xlsx", new], "text.xlsx"), (["--template", str(there), "--xlsx", new], "has no sheet 'Version'"),
+            (["--set", "treadDepth=1.6..8:3"], "one value"), (["--solution", "nsga2:0:0"], "has no solutions"),
+            (["--set", "treadDepth=1"], "treadDepth"), (["--plot", str(there)], ".png")):
+        error = _rate(*arguments).exception
+        assert isinstance(error, InputError), (arguments, error)
+        assert message in str(error), (arguments, str(error))
+    assert not Path(new).exists()
+
+
+@pytest.mark.parametrize("kind", [Template, Preprocessed])
+def test_a_spreadsheet_of_another_version_is_refused_by_its_version(kind: Any, tmp_path: Path) -> None:
+    book = openpyxl.Workbook()
+    book.create_sheet("Version")["B1"] = "6.0.0"
+    book.save(path := tmp_path / "other.xlsx")
+    with pytest.raises(InputError, match=r"version '6\.0\.0'"):
+        kind(path, tmp_path / "out.xlsx")
