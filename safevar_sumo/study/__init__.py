@@ -33,5 +33,5 @@ from safevar_sumo.study.validation import converted, invalid
 __all__ = [
     "OBJECTIVES", "SAFETY_DEGREE", "WORDS", "CharacteristicTable", "Constraint", "FitTable", "FreeParameter", "MatrixTable",
     "MatrixTest", "MetricsTable", "ModelTable", "Origin", "RatingTable", "SearchTable", "Study", "StudyLike", "VehicleTable", "Weather",
-    "check_writable", "converted", "foreign_names", "foreign_packages", "invalid", "label_of", "load_study", "of_today", "refuse_other_than_file",
-    "study_names", "study_path", "tables_of", "write_study"]
+    "check_writable", "converted", "foreign_names", "foreign_packages", "invalid", "label_of", "load_study", "of_today",
+    "refuse_other_than_file", "study_names", "study_path", "tables_of", "write_study"]

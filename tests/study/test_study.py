@@ -93,7 +93,7 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
     ('[calibration."ads.parameters.brake_gap"]\nlow = 1', "calibration.'ads.parameters.brake_gap'.low: there is no such key"),
     ('[published]\ntet = "much"', "published.tet = 'much'"),
     ('title = "a\\u001b[31mred"', "title = "),
-    ("nothing = 1", "nothing: there is no such key\nexpected: one of ads, calibration"),
+    ("zzz = 1", "zzz: there is no such key\nexpected: one of ads, calibration"),
     ("[origin]\nplaces = []", "origin"),
     ("[vehicle]\ncharacteristics = 3", "vehicle.characteristics = 3"),
     ("search = 3", "search = 3"),
