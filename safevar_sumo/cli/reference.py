@@ -29,6 +29,7 @@ from safevar_sumo.reference import (
     calibrate_together,
     calibration_comment,
     cost_line,
+    covered_by_spread,
     effects_of,
     evaluations_of,
     fitted_as,
@@ -40,6 +41,7 @@ from safevar_sumo.reference import (
 )
 from safevar_sumo.reference.effects import LEAST as LEAST_EFFECT
 from safevar_sumo.reference.effects import SHARE as EFFECT_SHARE
+from safevar_sumo.reference.profiles import plot_profiles
 from safevar_sumo.reference.replication import Nearness, nearness, paired, replication
 from safevar_sumo.results import write_imported, write_whole
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, load_study, study_names, write_study
@@ -59,8 +61,9 @@ from safevar_sumo.workers.local import available_cores, local_pool
 @click.option("--totals", type=click.Path(path_type=Path), metavar="FILE.toml",
               help="Keep rank correlations, errors and counts of collisions there too: no row of the data.")
 @click.option("--effects", "with_effects", is_flag=True, help="How strongly each characteristic acts there and here, by linear regression.")
+@click.option("--spread", "with_spread", is_flag=True, help="How many rows the model's own uncertainty and that of repeats cover.")
 def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, as_json: bool, totals: Path | None,
-             with_effects: bool) -> None:
+             with_effects: bool, with_spread: bool) -> None:
     """Compare STUDY with settings and metrics in the published package's CSV format."""
     chosen = load_study(study)
     tell_remarks(chosen)
@@ -84,13 +87,17 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     if totals is not None:
         keep_totals(totals, chosen, reference.name, result)
     effects = effects_of(data, here, system.characteristics) if with_effects else []
+    covered = covered_by_spread(data, chosen) if with_spread else None
     if as_json:
         told = {one.name: {"reference": one.reference, "here": one.here, "agrees": one.agrees} for one in effects}
-        click.echo(json.dumps({**result.to_dict(), **({"effects": told} if with_effects else {})}, indent=2, allow_nan=False))
+        more = {**({"effects": told} if with_effects else {}), **({"spread": covered.to_dict()} if covered is not None else {})}
+        click.echo(json.dumps({**result.to_dict(), **more}, indent=2, allow_nan=False))
     else:
         print_agreement(Console(), chosen, result)
         if with_effects:
             print_effects(Console(), effects)
+        if covered is not None:
+            Console().print(str(covered))
 
 
 @commands.command(name="calibrate")
@@ -101,10 +108,11 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
 @click.option("--starts", type=click.IntRange(min=0, max=1000), help="Random places to start from, too.  [default: the first study's]")
 @click.option("--from-scratch", is_flag=True, help="Start from random places alone, as if the studies' values were not known.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
+@click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw the loss over every parameter.")
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE.toml",
               help="Study file to write; of several studies, the directory of their files.  [default: STUDY-calibrated.toml]")
 def calibrate_command(study: str, others: tuple[str, ...], trials: int | None, seed: int | None, starts: int | None,
-                      from_scratch: bool, jobs: int | None, out: Path | None) -> None:
+                      from_scratch: bool, jobs: int | None, plot: Path | None, out: Path | None) -> None:
     """Fit what STUDY declares under [calibration] to the published values and to rows of reference files, as [fit] says.
 
     Several studies are fitted together: they share the parameters that they give one value, unless [calibration] says that it is their
@@ -119,6 +127,8 @@ def calibrate_command(study: str, others: tuple[str, ...], trials: int | None, s
     if len({one.name for one in chosen}) < len(chosen):
         raise InputError("STUDY", f"two studies are called {chosen[0].name!r}", "studies of different names")
     targets = _targets(chosen, out)
+    if plot is not None:
+        check_output(plot, "--plot", PICTURES)
     owners = [_owner(file, chosen) for file in files]
     for source in (*map(Path, names), *(path for _, path in owners)):
         for target in targets:
@@ -153,6 +163,8 @@ def calibrate_command(study: str, others: tuple[str, ...], trials: int | None, s
                 write_study(target, fitted_as(one, found), account)
             click.echo(f"interrupted: the best of {tried} trials is in {', '.join(map(str, targets))}", err=True)
         raise
+    if plot is not None and calibrations[0].profiles is not None:
+        plot_profiles(plot, calibrations[0].profiles, chosen)
     for one, calibration, references, target in zip(chosen, calibrations, data, targets, strict=True):
         print_calibration(Console(), one, calibration)
         write_study(target, fitted_as(one, calibration.study), calibration_comment(calibration, one, references, from_scratch=from_scratch))
@@ -323,9 +335,7 @@ def print_agreement(console: Console, study: Study, result: Agreement) -> None:
 def print_effects(console: Console, effects: Sequence[Effect]) -> None:
     """Effects there and here, and whether they agree."""
     title = f"Linear effects on the safety degree over a domain, m (agree: within {EFFECT_SHARE:.0%} or {LEAST_EFFECT:g} m)"
-    table = WholeTable("characteristic", title=title, title_justify="left")
-    for head in ("there", "here", "agree"):
-        table.add_column(head, justify="right")
+    table = WholeTable("characteristic", right=("there", "here", "agree"), title=title)
     for one in effects:
         told = "-" if one.agrees is None else "yes" if one.agrees else "no"
         table.add_row(one.name, *("-" if value is None else f"{value:+.2f}" for value in (one.reference, one.here)), told)
@@ -338,11 +348,11 @@ def _number(value: float | None) -> str:
 
 def print_calibration(console: Console, study: Study, result: Calibration) -> None:
     """Fitted values, and how well they agree with both halves of the data."""
-    table = WholeTable("parameter", "unit", right=("fitted", "lower", "upper"), title=study.title)
+    table = WholeTable("parameter", "unit", right=("fitted", "as good from", "to", "lower", "upper"), title=study.title)
     for name, value in result.values.items():
         row = result.bounds[name]
         shared = f" (shared with {', '.join(result.together)})" if name in result.shared else ""
-        table.add_row(name + shared, row.unit, *(f"{number:.5g}" for number in (value, row.lower, row.upper)))
+        table.add_row(name + shared, row.unit, *(f"{number:.5g}" for number in (value, *result.intervals[name], row.lower, row.upper)))
     console.print(table)
     for name in result.used:
         both = WholeTable("", right=("Spearman's rho", "mean abs. error", "bias"), title=f"{name}: rows used / held back")

@@ -12,6 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
+from safevar_sumo.analysis.model_spread import ModelSpread, model_spreads, studies_of_sets
 from safevar_sumo.api.simulation import Simulation, beside_the_original, evaluated
 from safevar_sumo.cli.options import (
     PICTURES,
@@ -54,9 +55,10 @@ FILE = click.Path(path_type=Path)
               help="How many times slower than real time --gui plays.")
 @now_option
 @click.option("--point", metavar="NAME", help="Of a study with a matrix: this point alone.")
+@click.option("--spread", is_flag=True, help="The vehicle model's own uncertainty too: other parameters that fit published data as well.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def simulate_command(study: str, solution: str | None, choice: str | None, changes: tuple[str, ...], no_filter: bool, beyond: bool,
-                     trace: Path | None, point: str | None, as_json: bool, **shown: Any) -> None:
+                     trace: Path | None, point: str | None, spread: bool, as_json: bool, **shown: Any) -> None:
     """Simulate STUDY once, or a solution of the results directory DIR with the study as recorded there."""
     target, showing = target_of(study, solution, choice), Shown(**shown)
     system = assemble(target.study, target.source)
@@ -69,10 +71,12 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
         system.check_feasible(asked, "--set", filtered=not no_filter, switch="--beyond")
     _check_outputs(study, trace, showing)
     if any(len(values) > 1 for values in swept.values()):
-        if trace is not None or showing.asked:
-            raise InputError("--set", f"{' '.join(changes)} is a sweep", "one value for each with --trace, --plot, --animate or --gui")
+        if trace is not None or showing.asked or spread:
+            legal = "one value for each with --trace, --plot, --animate, --gui or --spread"
+            raise InputError("--set", f"{' '.join(changes)} is a sweep", legal)
         _sweep(target, system, asked, tuple(swept), not no_filter, as_json)
         return
+    of_sets = studies_of_sets(target.study) if spread else []
     simulation = beside_the_original(target.study, system, asked[0], filtered=not no_filter)
     if target.recorded is not None and not changes:
         _warn_of_differences(target, simulation)
@@ -80,7 +84,9 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
         _write_trace(trace, simulation)
     if showing.asked:
         showing.show(target.study, system, simulation.evaluation.settings[0])
-    _tell(target, system, simulation, as_json)
+    rows = np.stack([simulation.evaluation.settings[0], system.characteristics.original])
+    found = model_spreads(target.study, rows, point or "") if of_sets else []
+    _tell(target, system, simulation, found, as_json)
 
 
 def _check_outputs(study: str, trace: Path | None, showing: Shown) -> None:
@@ -109,14 +115,17 @@ def _sweep(target: Target, system: System, asked: FloatArray, names: tuple[str, 
                    err=True)
 
 
-def _tell(target: Target, system: System, simulation: Simulation, as_json: bool) -> None:
+def _tell(target: Target, system: System, simulation: Simulation, spreads: Sequence[ModelSpread], as_json: bool) -> None:
     points = at_every_point(system, simulation.evaluation.settings) if system.matrix else []
     if as_json:
         replayed = {} if target.handle is None else {"solution": str(target.handle)}
         matrix = {"points": [point_record(one) for one in points]} if points else {}
-        click.echo(json.dumps({**simulation.to_dict(), **replayed, **matrix}, indent=2, allow_nan=False))
+        spread = {"spread": {**spreads[0].to_dict(), "original": spreads[1].to_dict()}} if spreads else {}
+        click.echo(json.dumps({**simulation.to_dict(), **replayed, **matrix, **spread}, indent=2, allow_nan=False))
     else:
         print_simulation(Console(), simulation)
+        for what, one in zip(("the simulated vehicle", "the original"), spreads, strict=False):
+            print_text(Console(), f"The vehicle model's own uncertainty, {what}: {one}.")
         print_matrix(Console(), points)
         if types := tags(system.points):
             print_text(Console(), types)

@@ -10,12 +10,12 @@ from safevar_sumo.reference.calibration import (
     fitted_as,
     on_a_bound,
 )
-from safevar_sumo.reference.effects import Effect, effects_of
-from safevar_sumo.reference.parameters import with_values
+from safevar_sumo.reference.effects import Coverage, Effect, covered_by_spread, effects_of
 from safevar_sumo.reference.rows import ReferenceData, evaluations_of, original_metrics, package_filter, read_reference
 from safevar_sumo.reference.validation import Agreement, Totals, agreement, keep_totals, plot_agreement, quoted
+from safevar_sumo.sumo.parameters import with_values
 
 __all__ = [
-    "Agreement", "Calibration", "Effect", "ReferenceData", "Subject", "Totals", "agreement", "calibrate", "calibrate_together",
-    "calibration_comment", "cost_line", "effects_of", "evaluations_of", "fitted_as", "keep_totals", "on_a_bound", "original_metrics",
-    "package_filter", "plot_agreement", "quoted", "read_reference", "with_values"]
+    "Agreement", "Calibration", "Coverage", "Effect", "ReferenceData", "Subject", "Totals", "agreement", "calibrate", "calibrate_together",
+    "calibration_comment", "cost_line", "covered_by_spread", "effects_of", "evaluations_of", "fitted_as", "keep_totals", "on_a_bound",
+    "original_metrics", "package_filter", "plot_agreement", "quoted", "read_reference", "with_values"]

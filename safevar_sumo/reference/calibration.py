@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
+from types import MappingProxyType
 from typing import NamedTuple
 
 import msgspec
@@ -14,11 +15,13 @@ from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.fit import LARGEST, Search, Together, original_cost, reference_cost
-from safevar_sumo.reference.parameters import Free, free_parameters, value_of, with_values
+from safevar_sumo.reference.parameters import Free, free_parameters
+from safevar_sumo.reference.profiles import Profiles
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.reference.validation import Agreement, agreement
 from safevar_sumo.study import SAFETY_DEGREE, FitTable, FreeParameter, Study
 from safevar_sumo.sumo import Engine, settings_per_batch
+from safevar_sumo.sumo.parameters import value_of, with_values
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import evaluate_all, inputs_of
@@ -90,7 +93,8 @@ class Calibration(NamedTuple):
 
     `reached` is the lowest cost that each search came to, the last one from the studies' own values unless these were forgotten.
     `together` are the studies that were fitted with this one, `shared` the parameters that it has in common with one of them,
-    `search` is the table [fit] whose trials, seed and starts counted.
+    `search` is the table [fit] whose trials, seed and starts counted, `intervals` are the least and the greatest value of each
+    parameter that fit as well, `profiles` what the trials came to.
     """
 
     values: dict[str, float]
@@ -103,6 +107,8 @@ class Calibration(NamedTuple):
     search: FitTable
     together: tuple[str, ...] = ()
     shared: frozenset[str] = frozenset()
+    intervals: Mapping[str, tuple[float, float]] = MappingProxyType({})
+    profiles: Profiles | None = None
 
 
 def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
@@ -145,7 +151,7 @@ def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[
         used.append({name: data.take(~rows[name]) for name, data in references.items()})
         held_back.append({name: data.take(rows[name]) for name, data in references.items()})
     trial = _Trial(free, [_Fitted(study, data, pool) for study, data in zip(studies, used, strict=True)])
-    search = Search(trial, fit.population, fit.trials, done)
+    search = Search(trial, fit.population, fit.trials, done, fit.alike)
     if not from_scratch and search.tried([studies])[0] >= LARGEST:
         names = " and ".join(f"study {study.name!r}" for study in studies)
         raise SimulationError(f"{names} cannot be simulated with {'its' if len(studies) == 1 else 'their'} own values")
@@ -156,13 +162,16 @@ def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[
     search.race(searches)
     assert search.best is not None, "there is a trial at least"
     reached, results = [one.lowest for one in searches if one.lowest < np.inf], []
+    profiles = Profiles.of(free, trial, search, trial.shares(search.best))
     for k, best in enumerate(search.best):
         mine = [one for one in free if k in one.studies]
+        best = msgspec.structs.replace(best, spread=profiles.spread(k))
         results.append(Calibration(
             {one.key: value_of(best, one.key) for one in mine}, best, search.cost, reached, _told(best, used[k], pool),
             _told(best, held_back[k], pool), {one.key: one.bounds for one in mine}, fit,
             tuple(study.name for study in studies if study is not studies[k]),
-            frozenset(one.key for one in mine if len(one.studies) > 1)))
+            frozenset(one.key for one in mine if len(one.studies) > 1),
+            {one.key: profiles.interval(i) for i, one in enumerate(free) if k in one.studies}, profiles))
     return results
 
 
@@ -182,9 +191,13 @@ class _Trial:
         self._free, self._fitted = free, fitted
         self._lower, self._upper = np.array([(one.bounds.lower, one.bounds.upper) for one in free]).T
 
+    def values(self, shares: FloatArray) -> FloatArray:
+        """Values at places in the unit cube of the bounds, shape (..., parameters)."""
+        return np.asarray(self._lower + np.asarray(shares) * (self._upper - self._lower))
+
     def at(self, shares: FloatArray) -> Together:
         """The studies at a place in the unit cube of the bounds."""
-        values = (self._lower + np.asarray(shares) * (self._upper - self._lower)).tolist()
+        values = self.values(shares).tolist()
         return tuple(
             with_values(one.study, {free.key: value for free, value in zip(self._free, values, strict=True) if k in free.studies})
             for k, one in enumerate(self._fitted))

@@ -1,4 +1,4 @@
-"""How strongly each characteristic acts on the safety degree, there and here: linear regression over all rows of a file."""
+"""How strongly each characteristic acts on the safety degree, there and here; and how many rows the model's uncertainty covers."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from safevar_sumo.analysis.model_spread import BAND, band, evaluations_of_sets
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.reference.rows import ReferenceData
-from safevar_sumo.study import SAFETY_DEGREE
+from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 SHARE, LEAST = 0.2, 0.1
@@ -60,3 +61,45 @@ def effects_of(data: ReferenceData, here: Evaluations, characteristics: Characte
     there, ours = (linear_effects(data.settings, values, characteristics) for values in (data.metrics[SAFETY_DEGREE], here.f_safe))
     return [Effect(name, *(None if np.isnan(value) else float(value) for value in pair))
             for name, *pair in zip(characteristics.names, there, ours, strict=True)]
+
+
+class Coverage(NamedTuple):
+    """How many sets of parameters there are, and the share of rows within the band of their predictions and of repeats.
+
+    `held_back` is the share of those that were not used for the fit, `width` the band's median width [m], `needed` by how much it would
+    have to be wider on each side to cover 90 % of the rows held back [m].
+    """
+
+    sets: int
+    rows: int
+    all_rows: float
+    held_back: float
+    width: float
+    needed: float
+
+    def to_dict(self) -> dict[str, float]:
+        """As plain values."""
+        return self._asdict()
+
+    def __str__(self) -> str:
+        return (f"The {BAND:.0%} band of {self.sets} parameter sets and of repeats is {self.width:.2f} m wide (median) and covers "
+                f"{self.all_rows:.0%} of {self.rows} rows, {self.held_back:.0%} of those held back; {self.needed:.2f} m more on each side "
+                f"would cover {BAND:.0%} of these.")
+
+
+def covered_by_spread(data: ReferenceData, study: Study) -> Coverage:
+    """How many published rows lie within the model's own uncertainty.
+
+    Raises
+    ------
+    InputError
+        If the study has no spread.
+    """
+    found = evaluations_of_sets(study, data.settings)
+    lower, upper = band(np.stack([one.f_safe for one in found]), study.repeatability.get(SAFETY_DEGREE, 0.0))
+    there = data.metrics[SAFETY_DEGREE]
+    outside = np.maximum(np.maximum(lower - there, there - upper), 0.0)
+    held_back = np.arange(len(there)) % study.fit.hold_out == study.fit.hold_out - 1
+    of = held_back if held_back.any() else np.ones(len(there), dtype=bool)
+    return Coverage(len(found), len(there), float(np.mean(outside == 0)), float(np.mean(outside[of] == 0)), float(np.median(upper - lower)),
+                    float(np.quantile(outside[of], BAND)))

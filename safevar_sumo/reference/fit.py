@@ -71,6 +71,10 @@ class Trial(Protocol):
     def costs(self, tried: Sequence[Together]) -> list[float]: ...
 
 
+NOTED = 1.25
+"""Times the lowest cost up to which a trial is kept: what profiles and the spread are made of."""
+
+
 class Search:
     """Keeps the best of all that are tried, and count of the trials that are left.
 
@@ -80,11 +84,16 @@ class Search:
         Trials in a generation.
     done
         Is called after every trial with the lowest cost so far, and the studies that have it.
+    alike
+        Share of the lowest cost within which trials fit as well.
     """
 
-    def __init__(self, trial: Trial, population: int, trials: int, done: Callable[[float, Together], None]) -> None:
+    def __init__(self, trial: Trial, population: int, trials: int, done: Callable[[float, Together], None], alike: float = 0.0) -> None:
+        self.alike = alike
         self.best: Together | None = None
         self.cost, self.left = np.inf, trials
+        self.seen: list[tuple[float, FloatArray]] = []
+        """Costs and places of what was tried and came to no more than `NOTED` times the lowest cost until then."""
         self.trial, self.population, self._done = trial, population, done
 
     def tried(self, studies: Sequence[Together]) -> list[float]:
@@ -133,6 +142,7 @@ class OneSearch:
         for left in range(trials, 0, -search.population):
             shares = self._strategy.ask()
             costs = search.tried([search.trial.at(share) for share in shares[:left]])
+            search.seen += [(cost, share) for cost, share in zip(costs, shares, strict=False) if cost <= NOTED * search.cost]
             self.lowest = min(self.lowest, min(costs))
             if len(costs) == len(shares):
                 self._strategy.tell(shares, costs)

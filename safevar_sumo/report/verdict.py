@@ -12,14 +12,15 @@ import numpy as np
 from safevar_sumo.ads import ADS
 from safevar_sumo.analysis.explain.necessity import BORDERLINE, is_borderline
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST
+from safevar_sumo.analysis.model_spread import model_spreads
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, collided
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import KMH, FloatArray, Outcome
 from safevar_sumo.reference import Totals, quoted
 from safevar_sumo.replay.comparison import number, raised
-from safevar_sumo.report.findings import Failures, handle_of
-from safevar_sumo.report.input import ReportInput
+from safevar_sumo.report.findings import FIRST, Failures, handle_of
+from safevar_sumo.report.input import ReportInput, stored
 from safevar_sumo.results import SolutionId, chosen_handle, unsafe_rows
 from safevar_sumo.scenarios import SCENARIOS, Point, tags
 from safevar_sumo.study import SAFETY_DEGREE
@@ -285,4 +286,24 @@ def trust(material: ReportInput, explained: Failures | None) -> dict[str, Any]:
                         f"fewer than {BORDERLINE:.0%} of their neighbours are unsafe too.")
     if not rows:
         remarks.append("No published values of the original vehicle are known to hold the study against.")
-    return {"published": rows, "remarks": remarks, "general": NOT_MODELLED, "agreement": agreement_with_published(material)["rows"]}
+    return {"published": rows, "remarks": remarks, "general": NOT_MODELLED, "agreement": agreement_with_published(material)["rows"],
+            "spread": own_uncertainty(material)}
+
+
+def own_uncertainty(material: ReportInput) -> list[dict[str, Any]]:
+    """What other parameter sets make of the original vehicle and of the solutions that are shown first; nothing without such sets."""
+    case = material.case
+    if not case.study.spread or material.system is None:
+        return []
+    degree = case.original[SAFETY_DEGREE]
+    unsafe = not case.solutions.empty and unsafe_rows(case.solutions, degree).any()
+    chosen = [str(chosen_handle(case.solutions, degree, choice, material.place)) for choice in FIRST] if unsafe else []
+    handles = list(dict.fromkeys(chosen))
+    settings = [case.characteristics.original, *(material.setting_of(SolutionId.parse(handle)) for handle in handles)]
+
+    def compute() -> list[dict[str, Any]]:
+        return [one.to_dict() for one in model_spreads(case.study, np.stack(settings), material.point)]
+
+    here = [degree, *(material.solutions[handle]["f_safe"] for handle in handles)]
+    return [{"name": name, "here": value, **one} for name, value, one in zip(
+        ("original vehicle", *handles), here, stored(material, "spread", compute), strict=True)]

@@ -185,6 +185,7 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     linear effects over the domain of characteristic c| / unit + `collisions` * share of rows that collide on one side alone. w_m are
     `weights` by metric; a unit is the study's repeatability or, where it is not known, the standard deviation of the data. Studies that
     are fitted together have the mean of their losses. Of every `hold_out` rows one is used for nothing but to be reported.
+    Sets of parameters whose loss is within the share `alike` of the lowest one fit as well: they become the study's `spread`.
     `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own values and from
     `starts` random places in the bounds, of which the worse half gives up after every round. `seed` is the seed of all that.
     """
@@ -199,6 +200,7 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     rank: Weight = 5.0
     collisions: Weight = 10.0
     effects: Weight = 0.0
+    alike: Annotated[float, Meta(ge=0, le=1)] = 0.02
     weights: dict[str, Weight] = msgspec.field(
         default_factory=lambda: {SAFETY_DEGREE: 1.0, "tet": 0.3, "tit": 0.3, "ave_dece": 0.5})
 
@@ -211,7 +213,8 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `step_length` is the simulation's time step [s], by default the one of the network's options;
     `published` are the original vehicle's metrics in the published study, by name, as far as there are any;
     `repeatability` are standard deviations of repeats of one setting there;
-    `calibration` tells which parameters are free, by their keys in the file, such as `ads.parameters.corridor`, `fit` how they are found;
+    `calibration` tells which parameters are free, by their keys in the file, such as `ads.parameters.corridor`, `fit` how they are found,
+    `spread` sets of their values that fit the published data as well, a list for each parameter, the study's own set first;
     `variation` and `correlations` tell how characteristics vary in the world, by name: uniformly where nothing is said;
     `constraints` tell what the characteristics of one vehicle satisfy together.
     """
@@ -231,6 +234,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     repeatability: dict[str, Annotated[float, Meta(gt=0, le=1e6)]] = {}
     fit: FitTable = msgspec.field(default_factory=FitTable)
     calibration: dict[str, FreeParameter] = {}
+    spread: dict[str, list[float]] = {}
     variation: dict[str, Distribution] = {}
     correlations: list[Correlation] = []
     constraints: list[Constraint] = []

@@ -150,6 +150,8 @@ def implausible(source: object, study: Study) -> Iterator[InputError]:
     if study.matrix is not None and bool(study.matrix.tests) == bool(study.matrix.protocol):
         yield InputError(source, f"matrix: {len(study.matrix.tests)} tests and protocol = {study.matrix.protocol!r}",
                          "tests, or a protocol")
+    if len({len(values) for values in study.spread.values()}) > 1 or not all(study.spread.values()):
+        yield InputError(source, "spread: its lists differ in length or are empty", "a list for each parameter, all of one length")
     if study.matrix is not None and study.matrix.aggregate == "mean":
         yield InputError(source, "matrix.aggregate = 'mean' would average distances [m] with minus the speeds of collisions [m/s]",
                          "'worst', the point in which a setting comes off worst")

@@ -14,7 +14,8 @@ from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.reference import ReferenceData, Subject, agreement, calibrate, calibrate_together, with_values
 from safevar_sumo.reference.effects import linear_effects
 from safevar_sumo.reference.fit import Search, original_cost, reference_cost
-from safevar_sumo.reference.parameters import free_parameters
+from safevar_sumo.reference.parameters import Free, free_parameters
+from safevar_sumo.reference.profiles import Profiles
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
@@ -188,3 +189,30 @@ def test_a_race_finds_the_bottom_from_whatever_half() -> None:
     search = Search(Bowl(), 8, 1200, silent)
     search.race([search.begun(np.array([place, 0.9]), 0.1, 3) for place in (0.9, 0.8, 0.1, 0.7)])
     assert search.best == pytest.approx([0.2, 0.2], abs=0.01)
+
+
+class Basin(Bowl):
+    """A bowl whose bottom is at one, on [0, 1] x [0, 10]: within 4 % of it is what is 0.2 from the bottom."""
+
+    def costs(self, studies: Sequence[Any]) -> list[float]:
+        return [1 + cost for cost in super().costs(studies)]
+
+    def values(self, shares: FloatArray) -> FloatArray:
+        return np.asarray(shares * np.array([1.0, 10.0]))
+
+
+def test_what_fits_as_well_is_an_interval_and_sets_that_are_far_apart() -> None:
+    basin = Basin()
+    search = Search(basin, 8, 800, silent, alike=0.04)
+    search.race([search.begun(np.array([place, 0.6]), 0.3, 3) for place in (0.3, 0.5)])
+    assert search.best is not None
+    bounds = FreeParameter(lower=0, upper=1, unit="-", meaning="place")
+    profiles = Profiles.of([Free("a", (0,), bounds), Free("b", (1,), bounds)], basin, search, np.asarray(search.best))
+    for (low, high), whole in ((profiles.interval(0), 0.4), (profiles.interval(1), 4.0)):
+        assert 0 <= low < 0.3 * whole, "no more than what is as good, and most of it"
+        assert 0.7 * whole < high <= whole
+    assert list(profiles.spread(1)) == ["b"]
+    sets = profiles.spread(0)["a"]
+    assert len(sets) == 20
+    assert sets[0] == pytest.approx(0.2, abs=0.001)
+    assert (min(sets), max(sets)) == pytest.approx(profiles.interval(0), abs=0.1)

@@ -1,0 +1,115 @@
+"""What the data does not tell of parameters: profiles of the loss over a search's trials, and sets of values that fit as well."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from safevar_sumo.analysis.figures import save
+from safevar_sumo.records import FloatArray
+from safevar_sumo.reference.fit import Search
+from safevar_sumo.reference.parameters import Free
+from safevar_sumo.study import Study
+
+SETS = 20
+"""Sets of values in a spread, at the most, the best among them."""
+DIGITS = 6
+"""Significant digits of a spread's values."""
+
+
+class Places(Protocol):
+    """Values at places in the unit cube of the bounds."""
+
+    def values(self, shares: FloatArray) -> FloatArray: ...
+
+
+class Profiles(NamedTuple):
+    """Trials of a fit.
+
+    Attributes
+    ----------
+    free
+        The parameters.
+    costs, values
+        Of the trials that came near the lowest cost, shape (K,), and their values, shape (K, parameters); the best first.
+    sets
+        Rows of up to `SETS` trials that fit as well as the best and are as far apart as can be; the best first.
+    limit
+        The cost up to which a trial fits as well.
+    """
+
+    free: Sequence[Free]
+    costs: FloatArray
+    values: FloatArray
+    sets: list[int]
+    limit: float
+
+    @classmethod
+    def of(cls, free: Sequence[Free], places: Places, search: Search, best: FloatArray) -> Profiles:
+        """The trials of a search that is over, and where the best of them lies."""
+        limit = search.cost * (1 + search.alike)
+        near = sorted((one for one in search.seen if search.cost < one[0]), key=lambda one: one[0])
+        costs = np.array([search.cost, *(cost for cost, _ in near)])
+        shares = np.array([best, *(share for _, share in near)])
+        return cls(free, costs, places.values(shares), _apart(shares[costs <= limit]), limit)
+
+    def spread(self, study: int) -> dict[str, list[float]]:
+        """The sets that fit as well, as a study's table [spread] has them."""
+        return {free.key: [float(f"{value:.{DIGITS}g}") for value in self.values[self.sets, k]]
+                for k, free in enumerate(self.free) if study in free.studies}
+
+    def interval(self, k: int) -> tuple[float, float]:
+        """Least and greatest value of a parameter among all trials that fit as well as the best."""
+        alike = self.values[self.costs <= self.limit, k]
+        return float(alike.min()), float(alike.max())
+
+
+def _apart(shares: FloatArray) -> list[int]:
+    """Rows that are as far apart as can be, one after the other, the first one first (farthest-point sampling)."""
+    chosen = [0]
+    nearest = np.linalg.norm(shares - shares[0], axis=1)
+    while len(chosen) < min(SETS, len(shares)) and nearest.max() > 0:
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, np.linalg.norm(shares - shares[chosen[-1]], axis=1))
+    return chosen
+
+
+def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> None:
+    """Draw cost against every parameter: each trial a dot, those that fit as well as the best in colour, the interval a band.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written or its ending names no picture format.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    import seaborn as sns
+
+    columns = 4
+    rows = -(-len(profiles.free) // columns)
+    with sns.axes_style("whitegrid"), plt.rc_context({"font.size": 9}):
+        figure, axes = plt.subplots(rows, columns, figsize=(12, 2.1 * rows + 0.6), layout="constrained", squeeze=False, sharey=True)
+        alike = profiles.costs <= profiles.limit
+        for k, axis in enumerate(axes.flat):
+            if k >= len(profiles.free):
+                axis.set_axis_off()
+                continue
+            free, values = profiles.free[k], profiles.values[:, k]
+            axis.axvspan(*profiles.interval(k), color="#0072b2", alpha=0.12, linewidth=0)
+            axis.scatter(values[~alike], profiles.costs[~alike], s=3, alpha=0.25, color="#808080", linewidths=0)
+            axis.scatter(values[alike], profiles.costs[alike], s=5, alpha=0.6, color="#0072b2", linewidths=0)
+            axis.axvline(values[0], color="black", linewidth=0.8, linestyle="--")
+            axis.set_xlim(free.bounds.lower, free.bounds.upper)
+            key = free.label(studies).replace("vehicle.parameters.", "").replace("ads.parameters.", "")
+            axis.set_xlabel(key + ("" if free.bounds.unit == "-" else f" [{free.bounds.unit}]"))
+            if k % columns == 0:
+                axis.set_ylabel("loss")
+        figure.suptitle(f"Loss of {' and '.join(study.name for study in studies)} over each parameter; band: fits as well as the best")
+        save(figure, path, "plot")
+        plt.close(figure)

@@ -1,0 +1,61 @@
+"""The vehicle model's own uncertainty is what its parameter sets make of a setting."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from safevar_sumo.analysis.model_spread import band, model_spreads, studies_of_sets
+from safevar_sumo.errors import InputError
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.system import assemble
+from tests.in_process import refused, run
+
+GAP = "ads.parameters.brake_gap"
+OWN = float(load_study("sun").ads.parameters["brake_gap"])
+
+
+def test_a_band_holds_nine_tenths_of_the_sets_and_of_the_repeats() -> None:
+    lower, upper = band(np.column_stack([np.linspace(0, 1, 101), np.full(101, np.nan)]), 0.1)
+    assert (lower[0], upper[0]) == pytest.approx((0.05 - 0.1645, 0.95 + 0.1645))
+    assert np.isnan([lower[1], upper[1]]).all()
+
+
+def test_the_sets_are_simulated_one_by_one() -> None:
+    study = load_study("sun", spread={GAP: [OWN, OWN - 1, OWN + 1]}, repeatability={"safety_degree": 1e-9})
+    setting = assemble(study).characteristics.setting({"tireFric": 1.3}, "a test")[np.newaxis]
+    alone = [evaluate(assemble(load_study("sun", ads={"parameters": {"brake_gap": gap}})), setting) for gap in (OWN, OWN - 1, OWN + 1)]
+    (found,) = model_spreads(study, setting)
+    degrees = [float(one.f_safe[0]) for one in alone]
+    assert (found.lower, found.upper) == pytest.approx(np.quantile(degrees, [0.05, 0.95]).tolist(), abs=1e-6)
+    assert (found.sets, found.collisions) == (3, sum(int(one.collided[0]) for one in alone))
+
+
+def test_a_study_keeps_what_it_gives_another_value() -> None:
+    study = load_study("sun", spread={GAP: [OWN, 5.0], "ads.parameters.corridor": [2.5, 2.0]}, ads={"parameters": {"brake_gap": 8.0}})
+    assert [one.ads.parameters["brake_gap"] for one in studies_of_sets(study)] == [8.0, 8.0]
+    assert [one.ads.parameters["corridor"] for one in studies_of_sets(study)] == [2.5, 2.0]
+
+
+def test_another_vehicle_or_driver_has_no_spread_and_lists_are_of_one_length() -> None:
+    assert not load_study(load_study("sun", spread={GAP: [OWN, 5.0]}), ads={"model": "full_braking"}).spread
+    with pytest.raises(InputError, match="spread"):
+        load_study("sun", spread={GAP: [OWN], "ads.parameters.corridor": [2.5, 2.0]})
+    with pytest.raises(InputError, match="spread"):
+        studies_of_sets(load_study("native"))
+
+
+def test_simulate_tells_the_models_own_uncertainty(in_tmp: Path) -> None:
+    Path("mine.toml").write_text(f'extends = "sun"\nname = "mine"\n[spread]\n"{GAP}" = [{OWN}, 8.0]\n')
+    words = ("simulate", "mine.toml", "--set", "tireFric=1.1", "--spread")
+    told = json.loads(run(*words, "--json").stdout)["spread"]
+    assert told["sets"] == 2
+    assert told["lower"] < told["upper"]
+    assert set(told["original"]) == {"sets", "lower", "upper", "collisions"}
+    assert "own uncertainty" in " ".join(run(*words).stdout.split())
+    refused("simulate", "native", "--spread", told=("native", "[spread]"))
+    refused("simulate", "mine.toml", "--set", "tireFric=1..2", "--spread", told=("--set", "--spread"))
