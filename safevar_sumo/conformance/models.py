@@ -1,0 +1,237 @@
+"""Probes of driving systems and vehicles, and of whole studies: vehicles whose results must not depend on how they are grouped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safevar_sumo.ads import Ads, GuardedAds
+from safevar_sumo.ads.aeb import Aeb
+from safevar_sumo.conformance.probe import Outputs, Probe, Reaction, Rows, corners, cost_of, guard_of, timed
+from safevar_sumo.conformance.subject import Subject
+from safevar_sumo.records import Command, FloatArray, Nominal, Observation
+from safevar_sumo.sumo import Engine, reason_for_sumo
+from safevar_sumo.sumo.batch import drive_all
+from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.system import System
+from safevar_sumo.vehicles import LEVEL, CharacteristicSet, GuardedVehicle, slope_of
+from safevar_sumo.vehicles.sumo import SumoVehicle
+
+STEP = 0.05  # s
+STEPS = 100
+
+
+class _Traffic(NamedTuple):
+    """How vehicles come upon somebody: shape (T, N)."""
+
+    speed: FloatArray
+    gap: FloatArray
+    closing_speed: FloatArray
+    lateral: FloatArray
+    lateral_speed: FloatArray
+    obstacle_speed: FloatArray
+
+
+# Speed [m/s], gap [m], lateral offset [m], lateral speed [m/s], obstacle's speed [m/s], and since when it is detected [s].
+ENCOUNTERS = np.array([
+    *((speed, 3.0 * speed, 0.0, 0.0, 0.0, 0.0) for speed in (5.0, 10.0, 15.0, 20.0, 25.0, 8.0)),
+    (5.0, 15.0, -4.0, 1.5, 0.0, 0.0), (10.0, 25.0, -6.0, 2.2, 0.0, 0.3),
+    (10.0, 30.0, 0.0, 0.0, 0.0, 99.0), (0.0, 30.0, 0.0, 0.0, 0.0, 99.0), (0.0, 30.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.5, 0.0, 0.0, 0.0, 0.0),
+    (15.0, 30.0, 0.0, 0.0, 10.0, 0.0), (10.0, 40.0, 0.0, 0.0, -5.0, 0.0), (10.0, 30.0, 10.0, 0.0, 0.0, 0.0),
+    (12.0, 30.0, 0.0, 0.0, 0.0, 1.5)])
+COURSE, FREE = slice(0, 6), 8
+"""Encounters on a collision course; and one without anybody, which else is the second of those."""
+
+
+def _traffic() -> _Traffic:
+    """Vehicles that hold their speed for half of the time and then brake with 4 m/s^2."""
+    speed0, gap0, lateral0, lateral_speed, obstacle, since = (column[np.newaxis] for column in ENCOUNTERS.T)
+    times = np.arange(STEPS)[:, np.newaxis] * STEP
+    speed = np.maximum(speed0 - 4.0 * np.maximum(times - STEPS * STEP / 2, 0.0), 0.0)
+    driven = np.vstack([np.zeros((1, len(ENCOUNTERS))), np.cumsum(speed[:-1] * STEP, axis=0)])
+    detected = times >= since
+    shape = speed.shape
+    return _Traffic(speed, np.where(detected, gap0 + obstacle * times - driven, np.inf), np.where(detected, speed - obstacle, 0.0),
+                    np.where(detected, lateral0 + lateral_speed * times, np.inf), np.where(detected, lateral_speed, 0.0) + np.zeros(shape),
+                    np.where(detected, obstacle, 0.0) + np.zeros(shape))
+
+
+class AdsProbe(Probe):
+    """An ADS comes upon somebody in many ways."""
+
+    methods = ("drive", "start")
+    number = len(ENCOUNTERS)
+
+    def __init__(self, subject: Subject) -> None:
+        super().__init__(subject)
+        self._nominal: Nominal
+        self._traffic = _traffic()
+
+    def fresh(self) -> Ads:
+        system = self.system()
+        self._nominal = system.nominal
+        self._nominal.tables()
+        return GuardedAds(system.ads, guard_of(self.subject)) if self.subject.is_ours else system.ads
+
+    def run(self, model: Ads, rows: Rows) -> Outputs:
+        n, nothing = len(rows), np.zeros(len(rows))
+        memory, command = model.start(n, self._nominal, STEP), Command(nothing, nothing)
+        pedals = np.zeros((2, STEPS, n))
+        for step in range(STEPS):
+            speed, gap, closing, lateral, lateral_speed, obstacle = (column[step, rows] for column in self._traffic)
+            seen = Observation(step * STEP, speed, gap, closing, lateral, lateral_speed, 0.9, obstacle, command.throttle, command.brake)
+            command, memory = model.drive(seen, memory)
+            pedals[:, step] = command.throttle, command.brake
+        return {"throttle": pedals[0], "brake": pedals[1]}
+
+    def reactions(self, model: Ads, outputs: Outputs) -> Iterator[Reaction]:
+        brake, throttle = outputs["brake"], outputs["throttle"]
+        if not brake[:, COURSE].any():
+            yield Reaction(("drive",), "a brake pedal above 0 at some time before an obstacle that stands in its way",
+                           f"never brakes, at 5 to 25 m/s with {STEPS * STEP:g} s to look on")
+        elif np.ptp(brake[:, 1]) == 0 and all(np.array_equal(pedal[:, 1], pedal[:, FREE]) for pedal in (throttle, brake)):
+            yield Reaction(("drive",), "other pedals before an obstacle than on a free road", "the same with an obstacle and without")
+
+    def cost(self, model: Ads, seconds: float) -> tuple[float, str]:
+        return cost_of(seconds, timed(lambda: self.run(Aeb(), np.arange(self.number))), "aeb", self.number, STEPS)
+
+
+class VehicleProbe(Probe):
+    """A vehicle accelerates, coasts and brakes, with the corners of every characteristic's domain."""
+
+    methods = ("advance", "sense", "prepare", "at_rest", "sumo_type", "at_speed")
+    PHASES = ((1.0, 0.0, 40), (0.3, 0.0, 5), (0.0, 0.0, 5), (0.0, 0.2, 5), (0.5, 0.5, 5), (0.0, 1.0, 30), (0.0, 0.0, 2))
+    """Throttle, brake, and for how many steps."""
+    STEP = 0.1  # s
+
+    def __init__(self, subject: Subject) -> None:
+        super().__init__(subject)
+        self._members = CharacteristicSet.of(subject.study.vehicle.characteristics)
+        self.settings = corners(self._members)
+        self.number = len(self.settings)
+
+    def fresh(self) -> Any:
+        vehicle = self.system().vehicle
+        return GuardedVehicle(vehicle, guard_of(self.subject)) if self.subject.is_ours else vehicle
+
+    def run(self, model: Any, rows: Rows) -> Outputs:
+        n, outputs = len(rows), dict[str, list[np.ndarray]]()
+        values = dict(zip(self._members.names, np.ascontiguousarray(self.settings[rows].T), strict=True))
+        slope = slope_of(np.full(n, 5.0)) if model.takes_slope else LEVEL
+        for surface in ((1.0, self.STEP), (0.5, self.STEP, slope, np.ones(n, dtype=bool))):  # dry and level; wet and, if it can be, steep
+            prepared = model.prepare(values, *surface)
+            for name, column in zip(model.sumo_type(prepared)._fields, model.sumo_type(prepared), strict=True):
+                outputs.setdefault(f"{name} of sumo_type", []).append(column)
+            state, sample = model.at_rest(prepared), 0
+            if model.can_start_moving:
+                self._drive(model, prepared, model.at_speed(prepared, np.full(n, 5.0)), 5, 0.0, 0.5, outputs)
+            for throttle, brake, steps in self.PHASES:
+                state = self._drive(model, prepared, state, steps, throttle, brake, outputs, sample)
+                sample += steps
+        return {name: np.stack(columns) for name, columns in outputs.items()}
+
+    def _drive(self, model: Any, prepared: Any, state: Any, steps: int, throttle: float, brake: float,
+               outputs: dict[str, list[np.ndarray]], sample: int = 0) -> Any:
+        n = len(state.speed)
+        nothing = np.zeros(n)
+        for step in range(sample, sample + steps):
+            gap = 100.0 - step + nothing
+            seen = Observation(step * self.STEP, state.speed, gap, state.speed, nothing + 2 - 0.02 * step, nothing - 0.2, 0.9, nothing,
+                               state.throttle, state.brake)
+            sensed, state = model.sense(prepared, state, seen)
+            state = model.advance(prepared, state, Command(nothing + throttle, nothing + brake))
+            for name in ("speed", "throttle", "brake", "gear"):
+                outputs.setdefault(name, []).append(getattr(state, name))
+            for name in ("gap", "closing_speed", "lateral"):
+                outputs.setdefault(f"{name} sensed", []).append(getattr(sensed, name))
+        return state
+
+    def reactions(self, model: Any, outputs: Outputs) -> Iterator[Reaction]:
+        start = 5 if model.can_start_moving else 0
+        speed, braked = outputs["speed"][start:, 0], start + sum(steps for *_, steps in self.PHASES[:5])
+        fastest = outputs["speed"][start + self.PHASES[0][2] - 1, 0]
+        if not fastest > 0:
+            yield Reaction(("advance",), "a speed above 0 after 4 s of full throttle", f"the original vehicle goes {fastest:g} m/s")
+        elif not speed[braked - start + self.PHASES[5][2] - 1] < speed[braked - start - 1]:
+            yield Reaction(("advance",), "a lower speed after 3 s of full brake", "the original vehicle does not slow down")
+        for column, name in enumerate(self._members.names):
+            lower, upper = 5 + 2 * column, 6 + 2 * column
+            if all(np.array_equal(values[..., lower], values[..., upper]) for values in outputs.values()):
+                yield Reaction(("prepare", "advance"), f"another drive, type or observation at the two ends of {name}",
+                               f"{name} = {self.settings[lower, column]:g} and {self.settings[upper, column]:g} are the same to the bit")
+
+    def cost(self, model: Any, seconds: float) -> tuple[float, str]:
+        steps = 2 * sum(phase[-1] for phase in self.PHASES) + 10 * model.can_start_moving
+        return cost_of(seconds, timed(lambda: _drive_ours(self.number, steps)), "sumo", self.number, steps)
+
+
+def _drive_ours(n: int, steps: int) -> None:
+    """Drive so many of our plainest vehicle."""
+    values = {"mass": 1500.0, "accel": 3.0, "decel": 8.0, "maxSpeed": 40.0, "tau": 0.1, "sensorRange": 100.0, "reactionTime": 0.1,
+              "brakeDelay": 0.1, "brakeGain": 1.0}
+    vehicle = SumoVehicle()
+    prepared = vehicle.prepare({name: np.full(n, value) for name, value in values.items()}, 1.0, STEP)
+    state, command = vehicle.at_rest(prepared), Command(np.full(n, 0.5), np.zeros(n))
+    ten = np.full(n, 10.0)
+    seen = Observation(0.0, ten, ten, ten, ten, ten, 1.0)
+    for _ in range(steps):
+        _, state = vehicle.sense(prepared, state, seen)
+        state = vehicle.advance(prepared, state, command)
+
+class StudyProbe(Probe):
+    """The subject's study simulated: the original vehicle and corners of the domains."""
+
+    methods = ("observe", "encounter", "begin", "step", "drive", "advance")
+    number = 5
+
+    def __init__(self, subject: Subject) -> None:
+        super().__init__(subject)
+        members = CharacteristicSet.of(subject.study.vehicle.characteristics)
+        self.settings = members.filter(corners(members)[:5])
+
+    def fresh(self) -> System:
+        return self.system()
+
+    def run(self, model: System, rows: Rows) -> Outputs:
+        found = evaluate(model, self.settings[rows])
+        return {"outcome": found.outcome, "collision_speed": found.collision_speed, **found.metrics}
+
+    def reactions(self, model: System, outputs: Outputs) -> Iterator[Reaction]:
+        if self.subject.kind not in ("scenario", "traci"):
+            return
+        runs = drive_all(replace(model, matrix=()), self.settings[:1])
+        gap, speed = runs.trace.gap[:, 0], runs.trace.speed[:, 0]
+        near = np.isfinite(gap)
+        if self.subject.kind == "traci":
+            if outputs["outcome"][0] == "never-moved":
+                yield Reaction(("step",), "a wish that moves the vehicle: setSpeed, slowDown, setAcceleration", "the vehicle never moves")
+            elif outputs["outcome"][0] == "collision" and not runs.trace.brake.any():
+                yield Reaction(("step",), "a brake pedal above 0 at some time before somebody in its way", "never brakes, and collides")
+            return
+        if not near.any():
+            yield Reaction(("observe",), "a finite gap to somebody at some time", "a gap that is infinite all the time")
+        elif speed.max() > 1 and np.ptp(gap[near]) == 0:
+            yield Reaction(("observe",), "a gap that shrinks as the vehicle drives", f"a gap of {gap[near][0]:g} m all the time")
+        elif not (runs.encounter.in_conflict & runs.trace.active).any():
+            yield Reaction(("encounter",), "in_conflict true at some time, so that metrics are defined", "in_conflict is always false")
+        if not reason_for_sumo(model) and not self.subject.is_ours:
+            yield from self._reacting_actors(model, outputs)
+
+    def _reacting_actors(self, model: System, outputs: Outputs) -> Iterator[Reaction]:
+        """Actors that react although the scenario says that they do not: SUMO itself then gives other results."""
+        in_sumo = evaluate(model, self.settings, Engine.LIBSUMO)
+        for name, values in {"outcome": in_sumo.outcome, **in_sumo.metrics}.items():
+            if not (np.array_equal(outputs[name], values) if values.dtype.kind == "U" else
+                    np.allclose(outputs[name], values, rtol=0, atol=1e-9, equal_nan=True)):
+                yield Reaction(("observe",), "reactive_actors = True where somebody reacts to the vehicle under test",
+                               f"{name} is {outputs[name][0]} in the recorded scene and {values[0]} in SUMO")
+                return
+
+    def cost(self, model: System, seconds: float) -> tuple[float, str]:
+        if self.subject.kind != "traci":
+            return 0.0, ""
+        mine = seconds / self.number / len(drive_all(model, self.settings).trace.time)
+        return mine, f"{mine * 1e6:.2g} microseconds per vehicle and step, SUMO's own included"

@@ -1,0 +1,103 @@
+"""What a subject is given to do: a probe, and what probes share."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from safevar_sumo.conformance.finding import crowd
+from safevar_sumo.conformance.subject import Subject
+from safevar_sumo.plugins import Guard, Lookup, forget_foreign
+from safevar_sumo.records import FloatArray
+from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.traci_module import importable
+from safevar_sumo.vehicles import CharacteristicSet
+
+Rows = npt.NDArray[np.intp]
+Outputs = Mapping[str, np.ndarray]
+"""Results by name; the last axis is that of the vehicles."""
+POINTS = 2
+"""Points of a matrix that a study is tried at."""
+
+
+class Reaction(NamedTuple):
+    """What a subject should have reacted to and did not; `methods` are where that belongs."""
+
+    methods: tuple[str, ...]
+    expected: str
+    got: str
+
+
+class Probe(ABC):
+    """Situations for `number` vehicles. `methods` are those of the subject that are called."""
+
+    methods: tuple[str, ...] = ()
+    number: int
+
+    def __init__(self, subject: Subject) -> None:
+        self.subject = subject
+
+    def system(self) -> System:
+        """The subject's study put together, with everybody's modules loaded anew."""
+        forget_foreign()
+        system = assemble(self.subject.study)
+        return replace(system, matrix=system.matrix[::max(len(system.matrix) // POINTS, 1)])
+
+    @abstractmethod
+    def fresh(self) -> Any:
+        """The subject, loaded anew."""
+
+    @abstractmethod
+    def run(self, model: Any, rows: Rows) -> Outputs:
+        """Results of some of the vehicles, in that order."""
+
+    def again(self, model: Any, rows: Rows) -> Outputs:
+        """The same results once more, from a subject that has been used."""
+        return self.run(model, rows)
+
+    def reactions(self, model: Any, outputs: Outputs) -> Iterator[Reaction]:
+        """What the subject does not react to."""
+        yield from ()
+
+    def cost(self, model: Any, seconds: float) -> tuple[float, str]:
+        """Time per vehicle and step [s] of a run that took so long, and a sentence on it."""
+        return 0.0, ""
+
+
+def loaded_again(subject: Subject) -> Any:
+    """The class, function or record, from its module as it is loaded now."""
+    if subject.is_ours:
+        return subject.member.what
+    with importable():
+        return Lookup("check", subject.study.origin.places).find({}, subject.name, subject.key).what
+
+
+def guard_of(subject: Subject) -> Guard:
+    return subject.member.guard or Guard("check", subject.key)
+
+
+def timed(run: Callable[[], Any]) -> float:
+    """Time that a call takes [s], as it would if nothing else ran on this machine."""
+    start = time.perf_counter()
+    run()
+    return (time.perf_counter() - start) / crowd()
+
+
+def cost_of(mine: float, ours: float, whose: str, vehicles: int, steps: int) -> tuple[float, str]:
+    """Time per vehicle and step [s], and a sentence that compares it."""
+    mine, ours = mine / (vehicles * steps), ours / (vehicles * steps)
+    return mine, f"{mine * 1e6:.2g} microseconds per vehicle and step, {vehicles} at once; ours ({whose}) takes {ours * 1e6:.2g}"
+
+def corners(members: CharacteristicSet) -> FloatArray:
+    """The original, the corners of all domains together, both ends of every domain alone, and corners drawn at random."""
+    lower, upper, number = members.lower, members.upper, np.arange(len(members))
+    together = [members.original, lower, upper, np.where(number % 2, lower, upper), np.where(number % 2, upper, lower)]
+    alone = [np.where(number == i, end, members.original) for i in number for end in (lower, upper)]
+    drawn = np.where(np.random.default_rng(0).random((24, len(members))) < 0.5, lower, upper)
+    return np.array([*together, *alone, *drawn])
