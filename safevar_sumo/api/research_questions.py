@@ -82,7 +82,7 @@ def figures(*results: Results | str | Path) -> Figures:
     InputError
         If none can be drawn.
     """
-    from safevar_sumo.analysis.research_questions.figures import draw
+    from safevar_sumo.analysis.research_questions.gallery import draw
 
     drawn, lacking = draw(_cases(results))
     result = Figures(drawn)

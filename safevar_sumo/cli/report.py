@@ -11,8 +11,8 @@ from rich.console import Console
 
 from safevar_sumo.analysis.research_questions.answer import QUESTIONS, answer
 from safevar_sumo.analysis.research_questions.case import load_cases
-from safevar_sumo.analysis.research_questions.figures import FORMATS as PICTURES
-from safevar_sumo.analysis.research_questions.figures import draw_all
+from safevar_sumo.analysis.research_questions.gallery import FORMATS as PICTURES
+from safevar_sumo.analysis.research_questions.gallery import draw_all
 from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS, LAID_OUT, LAYOUTS_BY_NAME
 from safevar_sumo.cli.options import check_output
 from safevar_sumo.cli.program import commands

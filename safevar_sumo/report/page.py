@@ -19,7 +19,7 @@ from markupsafe import Markup
 from safevar_sumo.analysis.evaluator import Progress, silent
 from safevar_sumo.analysis.research_questions.answer import answer
 from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
-from safevar_sumo.analysis.research_questions.figures import draw
+from safevar_sumo.analysis.research_questions.gallery import draw
 from safevar_sumo.analysis.research_questions.layout import Bold, Table, lay_out
 from safevar_sumo.errors import InputError, did_you_mean
 from safevar_sumo.replay.comparison import raised

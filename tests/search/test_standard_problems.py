@@ -57,9 +57,9 @@ class Standard(NamedTuple):
 
 
 PROBLEMS = {
-    "zdt1": Standard(30, zdt(lambda first, g: 1 - np.sqrt(first / g)), (2.0, 2.0)),
-    "zdt2": Standard(30, zdt(lambda first, g: 1 - (first / g) ** 2), (2.0, 2.0)),
-    "zdt3": Standard(30, zdt(lambda first, g: 1 - np.sqrt(first / g) - first / g * np.sin(10 * np.pi * first)), (2.0, 2.0)),
+    "zdt1": Standard(30, zdt(lambda first, g: 1 - np.sqrt(first / g)), (11.0, 11.0)),
+    "zdt2": Standard(30, zdt(lambda first, g: 1 - (first / g) ** 2), (11.0, 11.0)),
+    "zdt3": Standard(30, zdt(lambda first, g: 1 - np.sqrt(first / g) - first / g * np.sin(10 * np.pi * first)), (11.0, 11.0)),
     "dtlz2": Standard(12, dtlz2, (2.0, 2.0, 2.0)),
 }
 

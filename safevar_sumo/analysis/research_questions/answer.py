@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
+from safevar_sumo.analysis.research_questions.algorithms import pairs, ranks
 from safevar_sumo.analysis.research_questions.case import NSGA2, Case, Unanswerable, counted
 from safevar_sumo.analysis.research_questions.changes import (
     collisions,
@@ -33,6 +34,8 @@ OF_A_CASE: Mapping[str, Callable[[Case], Frames]] = {
     "rq2": lambda case: {"rq2": rq2(case)},
     "rq1-runs": lambda case: {"rq1-runs": rq1_runs(case)},
     "rq2-runs": lambda case: {"rq2-runs": rq2_runs(case)},
+    "rq2-pairs": lambda case: {"rq2-pairs": pairs(case)},
+    "rq2-ranks": lambda case: {"rq2-ranks": ranks(case)},
     "rq3.1": lambda case: {"rq3.1": rq31(case)},
     "rq3.2": lambda case: {"rq3.2": rq32(case)},
     "rq3.3": lambda case: {"rq3.3": rq33(case), SAFETY: rq33_safety(case)},

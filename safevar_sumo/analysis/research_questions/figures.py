@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from itertools import combinations
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from safevar_sumo.analysis.figures import FONT, as_formula, literal, new_figure, panels, save
+from safevar_sumo.analysis.figures import FONT, as_formula, literal, new_figure, panels
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
 from safevar_sumo.analysis.research_questions.changes import ANY, critical, effects, rq31, rq32
 from safevar_sumo.analysis.research_questions.indicators import WORST, convergence, nondominated, objectives
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FORMATS = ("png", "pdf", "svg")
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Okabe and Ito's, which colour-blind readers can tell apart; markers and line styles tell the same again."""
 MARKERS, DASHES = ("o", "X", "^", "s", "D", "v"), ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
@@ -144,13 +142,13 @@ def pareto_fronts(case: Case) -> Figure:
             axis.plot(original[first], original[second], linestyle="", marker="*", markersize=9, color="black", label="original vehicle")
         if goals[first] == F_SAFE:
             axis.axvline(0, color="black", linewidth=0.8, linestyle="--", label="collision: 0 and left of it")
-        axis.set_xlabel(_objective_title(goals[first]))
-        axis.set_ylabel(_objective_title(goals[second]))
-    _legend_below(figure, axes.flat[0])
+        axis.set_xlabel(objective_title(goals[first]))
+        axis.set_ylabel(objective_title(goals[second]))
+    legend_below(figure, axes.flat[0])
     return _spaced(figure)
 
 
-def _objective_title(objective: Objective) -> str:
+def objective_title(objective: Objective) -> str:
     return OBJECTIVE_TITLES.get(objective.name) or f"{literal(objective.title)} [{as_formula(objective.unit)}]"
 
 
@@ -175,73 +173,8 @@ def hypervolume_growth(case: Case) -> Figure:
                   label=f"{_title(str(algorithm))} ({group['run'].nunique()} runs)")
     axis.set_xlabel("evaluations")
     axis.set_ylabel(f"hypervolume of all found, normalised\n(thick: median, thin: range over runs; reference point {WORST:g})")
-    _legend_below(figure, axis)
+    legend_below(figure, axis)
     return _spaced(figure)
-
-
-OF_ALL: Mapping[str, Callable[[Sequence[Case]], Figure]] = {"rq3.1-number-of-changes": number_of_changes}
-OF_A_CASE: Mapping[str, Callable[[Case], Figure]] = {
-    "rq3.2-changed-characteristics": changed_characteristics,
-    "rq3.3-sizes-of-changes": sizes_of_changes,
-    "pareto-fronts": pareto_fronts,
-    "convergence": hypervolume_growth,
-}
-
-
-def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
-    """Every figure of the cases by name, and why some are not there; with several cases, a case's figures begin with its name.
-
-    Raises
-    ------
-    Unanswerable
-        If no figure can be drawn.
-    """
-    figures, refused = {}, []
-    alone = len(cases) == 1
-    for name, of_all in OF_ALL.items():
-        able, unable = _able(cases)
-        refused += unable
-        if able:
-            figures[name] = of_all(able)
-    for case in cases:
-        for name, group in OF_A_CASE.items():
-            try:
-                figures[name if alone else f"{case.name}-{name}"] = group(case)
-            except Unanswerable as error:
-                refused.append(error)
-    if not figures:
-        raise refused[0]
-    return figures, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in refused))
-
-
-def _able(cases: Sequence[Case]) -> tuple[list[Case], list[Unanswerable]]:
-    """The cases that RQ3.1 can be asked of, and why the others cannot."""
-    able, refused = [], []
-    for case in cases:
-        try:
-            rq31(case)
-            able.append(case)
-        except Unanswerable as error:
-            refused.append(error)
-    return able, refused
-
-
-def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Path], list[str]]:
-    """Draw every figure into a file; returns the files, and why some figures are not there.
-
-    Raises
-    ------
-    InputError
-        If the directory cannot be written, or no figure can be drawn.
-    """
-    figures, lacking = draw(cases)
-    written = []
-    for name, figure in figures.items():
-        path = directory / f"{_file_name(f'{cases[0].name}-{name}' if len(cases) == 1 else name)}.{kind}"
-        directory.mkdir(parents=True, exist_ok=True)
-        save(figure, path)
-        written.append(path)
-    return written, lacking
 
 
 def _spaced(figure: Figure) -> Figure:
@@ -250,7 +183,7 @@ def _spaced(figure: Figure) -> Figure:
     return figure
 
 
-def _legend_below(figure: Figure, axis: Axes) -> None:
+def legend_below(figure: Figure, axis: Axes) -> None:
     handles, labels = axis.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3), frameon=False, fontsize=FONT)
 
@@ -271,8 +204,3 @@ def _whole_numbers(axis: object, steps: int = 6) -> None:
 
 def _title(algorithm: str) -> str:
     return literal(ALGORITHM_TITLES.get(algorithm, algorithm))
-
-
-def _file_name(name: str) -> str:
-    """A case's name without what file systems dislike."""
-    return "".join(sign if sign.isalnum() or sign in "._-" else "-" for sign in name).strip("-")

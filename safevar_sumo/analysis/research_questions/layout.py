@@ -31,6 +31,8 @@ TITLES = {
     "rq2": "RQ2: NSGA-II against the other algorithms",
     "rq1-runs": f"RQ1 over runs: run means against the original vehicle ({HOLM})",
     "rq2-runs": f"RQ2 over runs: NSGA-II's runs against those of the other algorithms ({HOLM})",
+    "rq2-pairs": f"RQ2 for every pair of algorithms, over runs ({HOLM})",
+    "rq2-ranks": f"RQ2: ranks of the algorithms over runs (1 is best; {HOLM})",
     "rq3.1": "RQ3.1: number of changed characteristics",
     "rq3.2": "RQ3.2: % of critical solutions in which a characteristic is changed",
     "rq3.3": "RQ3.3: size of changes",
@@ -168,6 +170,43 @@ def _rq2_runs(answer: Answer) -> list[Table]:
         non_collision_note(answer.metrics)))]
 
 
+def _rq2_pairs(answer: Answer) -> list[Table]:
+    """A table for each pair: its metrics, cases side by side."""
+    frame, names = answer.frame, _names(answer)
+
+    def cells(row: Row) -> tuple[str, ...]:
+        if pd.isna(row["p_value"]):
+            return (UNDEFINED,) * 4
+        significant = row["p_holm"] < ALPHA
+        effect = _bold(f"{row['effect_size']:.3f}", significant)
+        return p_value(row["p_value"]), _bold(p_value(row["p_holm"]), significant), effect, row["magnitude"]
+
+    notes = ("One value for each run; A12 above 0.5: the first is better (a better front, more unsafe solutions).",
+             non_collision_note(answer.metrics), "Holm's correction is for all pairs and metrics of a setting.")
+    return [pivoted(TITLES["rq2-pairs"], frame, ("algorithm", "other", "metric"), cells, ("p", "p Holm", "A12", "magnitude"), names=names,
+                    notes=notes)]
+
+
+def _rq2_ranks(answer: Answer) -> list[Table]:
+    """Mean ranks, an algorithm a column; a table for each case."""
+    names, tables = _names(answer), []
+    for case, group in answer.frame.groupby("setting", sort=False):
+        algorithms = list(dict.fromkeys(group["algorithm"]))
+        rows: list[tuple[str, ...]] = []
+        for metric, part in group.groupby("metric", sort=False):
+            first = part.iloc[0]
+            significant = not pd.isna(first["p_holm"]) and first["p_holm"] < ALPHA
+            p, holm = (UNDEFINED if pd.isna(first[name]) else p_value(first[name]) for name in ("p_value", "p_holm"))
+            rows.append((names.get(str(metric), str(metric)), *(_number(rank, ".2f") for rank in part["mean_rank"]),
+                         _number(first["critical_difference"], ".2f"), p, _bold(holm, significant), str(first["runs"])))
+        heads = ("metric", *(names.get(name, name) for name in algorithms), "critical difference", "p", "p Holm", "runs")
+        tables.append(Table(f"{TITLES['rq2-ranks']}: {case}", heads, rows, 1, notes=(
+            "p: Friedman's test, runs of the same number being a block; Holm's correction is for all metrics of a setting.",
+            f"Mean ranks that differ by less than the critical difference are not told apart (Nemenyi, {ALPHA:g}).",
+            non_collision_note(answer.metrics))))
+    return tables
+
+
 def _rq31(answer: Answer) -> list[Table]:
     counts = answer.frame.groupby(["setting", "j"], sort=False)["count"].agg(list).reset_index()
     return [pivoted(TITLES["rq3.1"], counts, ("j",),
@@ -283,7 +322,8 @@ def p_value(value: float) -> str:
 
 
 LAYOUTS: Layouts = {
-    "rq1": _rq1, "rq2": _rq2, "rq1-runs": _rq1_runs, "rq2-runs": _rq2_runs, "rq3.1": _rq31, "rq3.2": _rq32, "rq3.3": by_setting(_rq33),
+    "rq1": _rq1, "rq2": _rq2, "rq1-runs": _rq1_runs, "rq2-runs": _rq2_runs,
+    "rq2-pairs": _rq2_pairs, "rq2-ranks": _rq2_ranks, "rq3.1": _rq31, "rq3.2": _rq32, "rq3.3": by_setting(_rq33),
     SAFETY: by_setting(_safety), "collisions": _collisions, "combinations": _combinations, "weather": _weather}
 PAPER: Layouts = {
     **LAYOUTS, "combinations": _paper_combinations,

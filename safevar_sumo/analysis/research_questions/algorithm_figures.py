@@ -1,0 +1,117 @@
+"""Pictures of algorithms beside each other: critical differences, and what part of the objectives their runs attain."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from safevar_sumo.analysis.figures import FONT, literal, new_figure
+from safevar_sumo.analysis.research_questions.algorithms import ATTAINED, attainment, ranks
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
+from safevar_sumo.analysis.research_questions.comparisons import ALPHA
+from safevar_sumo.analysis.research_questions.figures import COLOURS, legend_below, objective_title
+from safevar_sumo.analysis.research_questions.indicators import INDICATOR_TITLES
+from safevar_sumo.records import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ROW = 0.34
+"""Height of an algorithm's line in a diagram [inch]."""
+
+
+def critical_differences(case: Case) -> Figure:
+    """Mean ranks of the algorithms by each quality indicator; bars join those that Nemenyi's test does not tell apart.
+
+    Raises
+    ------
+    Unanswerable
+        If there are fewer than three algorithms, or no run in which all of them have solutions.
+    """
+    frame = ranks(case)
+    frame = frame[frame["metric"].isin(list(INDICATOR_TITLES)) & frame["mean_rank"].notna()]
+    if frame.empty:
+        raise Unanswerable(case.name, "has no run in which every algorithm has solutions", "results of three algorithms or more")
+    metrics, number = list(dict.fromkeys(frame["metric"])), frame["algorithm"].nunique()
+    runs, difference = int(frame["runs"].iloc[0]), float(frame["critical_difference"].iloc[0])
+    title = f"{case.name}: mean ranks over {runs} runs, critical difference {difference:.2f}"
+    figure, axes = new_figure(title, len(metrics), 1, (6.8, 0.9 + len(metrics) * (0.75 + ROW * number)))
+    for axis, metric in zip(axes.flat, metrics, strict=True):
+        part = frame[frame["metric"] == metric].sort_values("mean_rank", kind="stable")
+        _diagram(axis, part["algorithm"].tolist(), part["mean_rank"].to_numpy(dtype=float), difference)
+        axis.set_ylabel(INDICATOR_TITLES[metric])
+        axis.set_xlabel("mean rank, 1 is best")
+    figure.supxlabel(f"a bar joins ranks that differ by less than the critical difference (Nemenyi's test at {ALPHA:g})", fontsize=FONT)
+    return figure
+
+
+def _diagram(axis: Axes, algorithms: list[str], mean: FloatArray, difference: float) -> None:
+    number = len(algorithms)
+    axis.set_xlim(0.85, number + 0.25 * number)
+    axis.set_ylim(-0.6 * len(mean) - 0.4, number)
+    for place, (name, rank) in enumerate(zip(algorithms, mean, strict=True)):
+        height = number - 1 - place
+        axis.plot([rank, rank], [height, -0.2], color="black", linewidth=0.8)
+        axis.plot(rank, height, marker="o", markersize=4, color="#0072b2")
+        axis.annotate(f"{literal(ALGORITHM_TITLES.get(name, name))} {rank:.2f}", (rank, height), xytext=(6, 0),
+                      textcoords="offset points", va="center", fontsize=FONT)
+    for line, (first, last) in enumerate(cliques(mean, difference)):
+        axis.plot([mean[first] - 0.03, mean[last] + 0.03], [-0.6 - 0.5 * line] * 2, color="#d55e00", linewidth=3, solid_capstyle="round")
+    axis.set_yticks([])
+    axis.grid(visible=False)
+    for spine in ("left", "right"):
+        axis.spines[spine].set_visible(False)
+    axis.set_xticks(range(1, number + 1))
+    axis.xaxis.set_ticks_position("bottom")
+
+
+def cliques(mean: FloatArray, difference: float) -> list[tuple[int, int]]:
+    """First and last of the largest groups of sorted mean ranks that differ by less than the critical difference."""
+    found: list[tuple[int, int]] = []
+    for first in range(len(mean)):
+        last = int(np.flatnonzero(mean - mean[first] < difference)[-1])
+        if last > first and (not found or last > found[-1][1]):
+            found.append((first, last))
+    return found
+
+
+def attainment_surfaces(case: Case) -> Figure:
+    """What one run, half of the runs and all runs of each algorithm attain of the first two objectives.
+
+    Raises
+    ------
+    Unanswerable
+        If there are no runs with solutions.
+    """
+    surfaces, goals = attainment(case), case.scoring.objectives[:2]
+    columns = min(len(surfaces), 3)
+    rows = -(-len(surfaces) // columns)
+    figure, axes = new_figure(f"{case.name}: empirical attainment", rows, columns, (max(3.0 * columns, 5.2), 0.8 + 3.1 * rows),)
+    corners = np.concatenate([points for levels in surfaces.values() for points in levels.values()])
+    for axis, (algorithm, levels) in zip(axes.flat, surfaces.items(), strict=False):
+        ends = np.array([np.min(corners[:, i]) if goal.maximised else np.max(corners[:, i]) for i, goal in enumerate(goals)])
+        for i, (level, points) in enumerate(levels.items()):
+            label = {ATTAINED[0]: "half of the runs", ATTAINED[1]: "every run"}.get(level, "the best run somewhere")
+            axis.plot(*_stairs(points, ends).T, color=COLOURS[i % len(COLOURS)], linestyle=("-", "--", "-.")[i % 3], linewidth=1.4,
+                      label=label)
+        axis.set_title(literal(ALGORITHM_TITLES.get(algorithm, algorithm)), fontsize=FONT)
+        axis.set_xlabel(objective_title(goals[0]))
+        axis.set_ylabel(objective_title(goals[1]))
+    for axis in list(axes.flat)[len(surfaces):]:
+        axis.set_axis_off()
+    legend_below(figure, axes.flat[0])
+    return figure
+
+
+def _stairs(points: FloatArray, ends: FloatArray) -> FloatArray:
+    """The border of what is no better than one of the points, from and to the worst values; shape (K, 2)."""
+    order = points[np.argsort(points[:, 0], kind="stable")]
+    if np.sign(ends[0] - np.mean(order[:, 0])) < 0:
+        order = order[::-1]
+    border = [(order[0, 0], ends[1])]
+    for place, (x, y) in enumerate(order):
+        border.append((x, y))
+        border.append((order[place + 1, 0] if place + 1 < len(order) else ends[0], y))
+    return np.array(border)

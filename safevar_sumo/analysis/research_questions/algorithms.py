@@ -1,0 +1,136 @@
+"""RQ2 for any set of algorithms: every pair, ranks over runs (Friedman), and which part of the objectives runs attain."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations
+from typing import Any
+
+import moocore
+import numpy as np
+import pandas as pd
+import scipy
+
+from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
+from safevar_sumo.analysis.research_questions.comparisons import ALPHA, compare_samples, turned
+from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, indicators, objectives
+from safevar_sumo.analysis.research_questions.over_runs import holm, series_of_means
+from safevar_sumo.records import FloatArray
+
+PAIR_COLUMNS = ["setting", "algorithm", "other", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2", "method"]
+RANK_COLUMNS = ["setting", "metric", "algorithm", "mean_rank", "median", "runs", "statistic", "p_value", "p_holm", "critical_difference"]
+ATTAINED = (50.0, 100.0)
+"""Percentages of the runs whose attainment surfaces are found, beside that of a single run."""
+
+
+def pairs(case: Case) -> pd.DataFrame:
+    """Every pair of algorithms, run against run: indicators and metrics' run means, Mann-Whitney U.
+
+    Columns: `PAIR_COLUMNS`. `effect_size` is A12, turned so that a higher one means that `algorithm` is better than `other`. `p_holm` is
+    `p_value` corrected by Holm's method for all pairs and metrics of this setting. What is undefined is None.
+
+    Raises
+    ------
+    Unanswerable
+        If there are no runs, or those of one algorithm alone.
+    """
+    samples, rows = _samples(case, 2), list[dict[str, Any]]()
+    for first, second in combinations(case.algorithms, 2):
+        for metric, (more_is_better, by_algorithm) in samples.items():
+            test = compare_samples(*(by_algorithm[name].dropna() for name in (first, second)))
+            rows.append({"setting": case.name, "algorithm": first, "other": second, "metric": metric,
+                         **(test if more_is_better else turned(test))._asdict()})
+    for row, p in zip(rows, holm([row["p_value"] for row in rows]), strict=True):
+        row["p_holm"] = p
+    return pd.DataFrame(rows, columns=PAIR_COLUMNS, dtype=object)
+
+
+def ranks(case: Case) -> pd.DataFrame:
+    """Mean ranks of the algorithms over runs, metric by metric, with Friedman's test.
+
+    Runs of the same number form a block; a block in which an algorithm has no value is left out. Columns: `RANK_COLUMNS`. Rank 1 is the
+    best, `runs` counts blocks, `statistic` and `p_value` are Friedman's, `p_holm` is corrected for all metrics of this setting. Mean
+    ranks that differ by less than `critical_difference` are not told apart (Nemenyi's test at 0.01; Demsar 2006).
+
+    Raises
+    ------
+    Unanswerable
+        If there are no runs, or fewer than three algorithms.
+    """
+    tests, rows = dict[str, float | None](), list[dict[str, Any]]()
+    for metric, (more_is_better, by_algorithm) in _samples(case, 3).items():
+        blocks = pd.DataFrame(by_algorithm).dropna()
+        values = blocks.to_numpy(dtype=float)
+        ranked = scipy.stats.rankdata(-values if more_is_better else values, axis=1)
+        statistic, p = _friedman(values)
+        tests[metric] = p
+        rows += [{"setting": case.name, "metric": metric, "algorithm": name, "runs": len(blocks), "statistic": statistic, "p_value": p,
+                  "mean_rank": float(ranked[:, i].mean()) if len(blocks) else None,
+                  "median": float(np.median(values[:, i])) if len(blocks) else None,
+                  "critical_difference": critical_difference(len(blocks.columns), len(blocks)) if len(blocks) else None}
+                 for i, name in enumerate(blocks.columns)]
+    corrected = dict(zip(tests, holm(list(tests.values())), strict=True))
+    return pd.DataFrame([{**row, "p_holm": corrected[row["metric"]]} for row in rows], columns=RANK_COLUMNS, dtype=object)
+
+
+def critical_difference(algorithms: int, runs: int, alpha: float = ALPHA) -> float:
+    """By how much two mean ranks must differ (Nemenyi 1963): q sqrt(k (k + 1) / (6 N)), q the studentised range over sqrt(2)."""
+    q = float(scipy.stats.studentized_range.ppf(1 - alpha, algorithms, np.inf)) / np.sqrt(2)
+    return float(q * np.sqrt(algorithms * (algorithms + 1) / (6 * runs)))
+
+
+def attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
+    """Empirical attainment surfaces of the first two objectives, by algorithm and percentage of its runs.
+
+    Points, shape (K, 2), in the objectives' units, in the order of the first one: a setting at least as good as one of them
+    was found by so many of the runs (Fonseca, Guerreiro, Lopez-Ibanez, Paquete 2011).
+
+    Raises
+    ------
+    Unanswerable
+        If there are no runs with solutions.
+    """
+    surfaces: dict[str, dict[float, FloatArray]] = {}
+    signs = np.array([objective.sign for objective in case.scoring.objectives[:2]])
+    for algorithm in case.algorithms:
+        solutions = case.solutions_of(algorithm)
+        fronts = [objectives(case, solutions[solutions["run"] == run])[:, :2] for run in case.runs_of(algorithm)]
+        fronts = [front for front in fronts if len(front)]
+        if fronts:
+            sets = np.repeat(np.arange(len(fronts)), [len(front) for front in fronts])
+            wanted = sorted({100 / len(fronts), *ATTAINED})
+            points = moocore.eaf(np.concatenate(fronts), sets, percentiles=wanted)
+            levels = np.unique(points[:, 2])
+            surfaces[algorithm] = {level: (group := points[points[:, 2] == level, :2])[np.argsort(group[:, 0], kind="stable")] * signs
+                                   for level in levels.tolist()}
+    if not surfaces:
+        raise Unanswerable(case.name, "has no solution", "results with at least one finished run")
+    return surfaces
+
+
+def _samples(case: Case, fewest: int) -> Mapping[str, tuple[bool, dict[str, pd.Series[float]]]]:
+    """Of every indicator and metric whether more is better, and by algorithm its value in every run that has one."""
+    if not case.has_runs:
+        case.runs_of(next(iter(case.algorithms), ""))  # says why there is no answer
+    if len(case.algorithms) < fewest:
+        raise Unanswerable(case.name, f"has finished runs of {len(case.algorithms)} algorithms: {', '.join(case.algorithms) or 'none'}",
+                           f"results of {fewest} algorithms or more")
+    found: dict[str, tuple[bool, dict[str, pd.Series[float]]]] = {}
+    if len(case.solutions):
+        quality = indicators(case).set_index(["algorithm", "run"])
+        for name, more_is_better in MORE_IS_BETTER.items():
+            found[name] = more_is_better, {one: quality.loc[quality.index.get_level_values(0) == one, name].droplevel(0)
+                                           for one in case.algorithms}
+    for metric in case.scoring.metrics:
+        found[metric.name] = metric.more_is_unsafe, {one: series_of_means(case, one, metric) for one in case.algorithms}
+    return found
+
+
+def _friedman(values: FloatArray) -> tuple[float | None, float | None]:
+    """Friedman's statistic and p-value of blocks, shape (N, k); 0 and 1 where nothing differs, None where there are too few blocks."""
+    if len(values) < 2:
+        return None, None
+    if np.all(values == values[:, :1]):
+        return 0.0, 1.0
+    test = scipy.stats.friedmanchisquare(*values.T)
+    return float(test.statistic), float(test.pvalue)

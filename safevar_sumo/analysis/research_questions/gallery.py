@@ -1,0 +1,98 @@
+"""Every picture of results by name, drawn for all cases that it can be drawn for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from safevar_sumo.analysis.figures import save
+from safevar_sumo.analysis.research_questions.algorithm_figures import attainment_surfaces, critical_differences
+from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
+from safevar_sumo.analysis.research_questions.changes import rq31
+from safevar_sumo.analysis.research_questions.figures import (
+    changed_characteristics,
+    hypervolume_growth,
+    number_of_changes,
+    pareto_fronts,
+    sizes_of_changes,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FORMATS = ("png", "pdf", "svg")
+FEWEST = 3
+"""Algorithms whose ranks are drawn; of two, a pair's test says all."""
+OF_ALL: Mapping[str, Callable[[Sequence[Case]], Figure]] = {"rq3.1-number-of-changes": number_of_changes}
+OF_A_CASE: Mapping[str, Callable[[Case], Figure]] = {
+    "rq3.2-changed-characteristics": changed_characteristics,
+    "rq3.3-sizes-of-changes": sizes_of_changes,
+    "pareto-fronts": pareto_fronts,
+    "convergence": hypervolume_growth,
+    "critical-differences": critical_differences,
+    "attainment": attainment_surfaces,
+}
+
+
+def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
+    """Every figure of the cases by name, and why some are not there; with several cases, a case's figures begin with its name.
+
+    Raises
+    ------
+    Unanswerable
+        If no figure can be drawn.
+    """
+    figures, refused = {}, []
+    alone = len(cases) == 1
+    for name, of_all in OF_ALL.items():
+        able, unable = _able(cases)
+        refused += unable
+        if able:
+            figures[name] = of_all(able)
+    for case in cases:
+        for name, group in OF_A_CASE.items():
+            if group is critical_differences and len(case.algorithms) < FEWEST:
+                continue
+            try:
+                figures[name if alone else f"{case.name}-{name}"] = group(case)
+            except Unanswerable as error:
+                refused.append(error)
+    if not figures:
+        raise refused[0]
+    return figures, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in refused))
+
+
+def _able(cases: Sequence[Case]) -> tuple[list[Case], list[Unanswerable]]:
+    """The cases that RQ3.1 can be asked of, and why the others cannot."""
+    able, refused = [], []
+    for case in cases:
+        try:
+            rq31(case)
+            able.append(case)
+        except Unanswerable as error:
+            refused.append(error)
+    return able, refused
+
+
+def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Path], list[str]]:
+    """Draw every figure into a file; returns the files, and why some figures are not there.
+
+    Raises
+    ------
+    InputError
+        If the directory cannot be written, or no figure can be drawn.
+    """
+    figures, lacking = draw(cases)
+    written = []
+    for name, figure in figures.items():
+        path = directory / f"{_file_name(f'{cases[0].name}-{name}' if len(cases) == 1 else name)}.{kind}"
+        directory.mkdir(parents=True, exist_ok=True)
+        save(figure, path)
+        written.append(path)
+    return written, lacking
+
+
+def _file_name(name: str) -> str:
+    """A case's name without what file systems dislike."""
+    return "".join(sign if sign.isalnum() or sign in "._-" else "-" for sign in name).strip("-")
