@@ -104,7 +104,8 @@ def subjects_of(study: Study) -> Iterator[Subject]:
     seen = set[str]()
     for kind, names in named.items():
         for name in dict.fromkeys(names):
-            if name in seen or name in METRICS or name == "f_safe":
+            of_a_metric = kind == "objective" and ":" not in name and name not in CHANGES  # by the name of a metric's column
+            if name in seen or of_a_metric:
                 continue
             seen.add(name)
             with importable():

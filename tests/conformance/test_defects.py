@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
 from safevar_sumo import testing
-from safevar_sumo.conformance import KINDS, check, checked, subject_of, suite
-from tests.in_process import run
+from safevar_sumo.conformance import KINDS, check, checked, subject_of, subjects_of, suite
+from safevar_sumo.study import load_study
+from safevar_sumo.workers.isolation import check_code
+from safevar_sumo.workers.retrying import RetryingPool
+from tests.in_process import Here, run
 
 SCALAR = """import random
 import time
@@ -197,6 +201,21 @@ def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) 
         run("check", wrong, expect=2)
     (in_tmp / "mine.py").write_text("1 / 0\n")
     run("check", "mine:Mine", expect=2)
+
+
+def test_everything_that_a_study_names_is_checked_and_remembered(in_tmp: Path) -> None:
+    """An objective may be named by a metric's column; what has passed is not checked again until a file changes."""
+    shutil.copytree(Path(__file__).parents[1] / "plugins/six", "six")
+    study = load_study("six/mine.toml")
+    assert {one.name for one in subjects_of(study)} == {
+        "my_vehicle:Cart", "my_ads:Careful", "my_scenario:Wall", "my_metrics:JERK", "my_objective:MEAN", "nsga2", "my_search:Halving"}
+    pool = RetryingPool(Here(), study)
+    assert check_code(study, {"sources": {"my_ads.py": "1"}}, pool) == []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pool, "submit", lambda *_, **__: pytest.fail("checked again"))
+        assert check_code(study, {"sources": {"my_ads.py": "1"}}, pool) == []
+        with pytest.raises(pytest.fail.Exception):
+            check_code(study, {"sources": {"my_ads.py": "2"}}, pool)
 
 
 def test_an_authors_test_class_has_a_test_for_each_check(in_tmp: Path) -> None:
