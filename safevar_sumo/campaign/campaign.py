@@ -21,6 +21,7 @@ from safevar_sumo.search import Problem, Search
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.matrix import LARGEST_WORLD
+from safevar_sumo.sumo.rater import is_rated
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.isolation import check_code
@@ -78,7 +79,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     if not original.valid[0]:
         raise InputError(f"study {study.name!r}", "the original vehicle leaves the tolerance of a test's speed before the ADS acts "
                          "(invalid-test): nothing can be compared with it", "tests whose speed the vehicle can hold")
-    if original.collided[0]:
+    if original.collided[0] and not is_rated(study):
         observer.warned(f"study {study.name!r}: the original vehicle itself collides, no change is needed for that")
     results.begin(original)
     problem = Problem(characteristics=characteristics, original=original, evaluations=study.search.evaluations,

@@ -14,8 +14,7 @@ from safevar_sumo.analysis.research_questions.indicators import nondominated
 from safevar_sumo.replay.comparison import differences, number, raised, spaced
 from safevar_sumo.report.input import ReportInput, stored
 from safevar_sumo.report.svg import Bar, rows
-from safevar_sumo.results import SolutionId, chosen_handle, unsafe_rows
-from safevar_sumo.study import SAFETY_DEGREE
+from safevar_sumo.results import SolutionId, chosen_handle, degree_of, unsafe_rows
 
 Failures = list[dict[str, Any]]
 """What `explain --json` prints."""
@@ -120,7 +119,7 @@ def replays(material: ReportInput, explained: Failures | None) -> list[dict[str,
 
 def _chosen(material: ReportInput, explained: Failures | None) -> list[str]:
     """Their handles, each once."""
-    solutions, degree = material.case.solutions, material.case.original[SAFETY_DEGREE]
+    solutions, degree = material.case.solutions, degree_of(material.case.original)
     if solutions.empty:
         return []
     unsafe = unsafe_rows(solutions, degree).tolist()

@@ -28,7 +28,7 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
 from safevar_sumo.replay.page import player_data
 from safevar_sumo.replay.scene import scene_of
-from safevar_sumo.results import RESULTS, SolutionId, handles, write_whole
+from safevar_sumo.results import RESULTS, SolutionId, degree_of, handles, write_whole
 from safevar_sumo.results.manifest import MANIFEST, read_manifest
 from safevar_sumo.results.store import SOLUTIONS
 from safevar_sumo.scenarios import Point
@@ -151,7 +151,7 @@ class ReportInput:
     @property
     def unsafe(self) -> Unsafe:
         """What counts as unsafe: a collision if a solution is one, else half of the original's safety degree."""
-        degree = self.case.original[SAFETY_DEGREE]
+        degree = degree_of(self.case.original)
         return Unsafe.of_solutions(self.case.solutions, degree)
 
     @cached_property

@@ -27,10 +27,12 @@ from safevar_sumo.replay.page import environment, player_parts
 from safevar_sumo.report.findings import best_of, causes, evenly, explanations, necessity_chart, replays
 from safevar_sumo.report.input import ReportInput, gather
 from safevar_sumo.report.limits import LIMITS
+from safevar_sumo.report.rated import rated_study_page
 from safevar_sumo.report.svg import Dot, scatter
 from safevar_sumo.report.verdict import tested, trust, verdict
 from safevar_sumo.shipped import RUN
 from safevar_sumo.study import Study, load_study, study_names
+from safevar_sumo.sumo.rater import is_rated
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -169,6 +171,13 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     for material in materials:
         for change in material.changed:
             warnings.warn(f"{material.place}: {change}", stacklevel=2)
+    are_rated = [is_rated(material.case.study) and not point for material in materials]
+    if any(are_rated):
+        if not all(are_rated):
+            raise InputError("directories", "some hold results of rated studies, others do not", "a report for each kind")
+        return environment(WEB).get_template("rated.html.j2").render(
+            title=f"Euro NCAP rating: {', '.join(material.case.name for material in materials)}", css=_part("report.css"),
+            studies=[rated_study_page(material, jobs, progress) for material in materials]) + "\n"
     studies = [_study(material, wanted, jobs, progress) for material in materials]
     progress("tables and figures", 0, 1)
     cases = [material.case for material in materials]

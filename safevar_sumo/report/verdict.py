@@ -21,7 +21,7 @@ from safevar_sumo.reference import Totals, quoted
 from safevar_sumo.replay.comparison import number, raised
 from safevar_sumo.report.findings import FIRST, Failures, handle_of
 from safevar_sumo.report.input import ReportInput, stored
-from safevar_sumo.results import SolutionId, chosen_handle, unsafe_rows
+from safevar_sumo.results import SolutionId, chosen_handle, degree_of, unsafe_rows
 from safevar_sumo.scenarios import SCENARIOS, Point, tags
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.sumo.matrix import vehicle_remarks
@@ -97,7 +97,7 @@ def verdict(material: ReportInput, explained: Failures | None, tolerance: Mappin
     All values of a failure are those of its solution as it was found, nowhere shrunk.
     """
     case = material.case
-    degree = case.original[SAFETY_DEGREE]
+    degree = degree_of(case.original)
     unsafe = case.solutions[unsafe_rows(case.solutions, degree)]
     hits = bool(collided(case.solutions).any())
     result: dict[str, Any] = {"unsafe": len(unsafe), "solutions": len(case.solutions), "rule": _rule(hits, degree), "findings": [],
@@ -133,7 +133,7 @@ def _findings(material: ReportInput, explained: Failures, *, any_unsafe: bool) -
                 reasons.setdefault(handle_of(failure), []).append(reason)
                 shares[handle_of(failure)] = failure["robustness"]
     if not reasons:
-        degree = material.case.original[SAFETY_DEGREE]
+        degree = degree_of(material.case.original)
         for choice in REASONS if any_unsafe else ("most_severe",):
             handle = chosen_handle(material.case.solutions, degree, choice, material.place)
             reasons.setdefault(str(handle), []).append(REASONS[choice])

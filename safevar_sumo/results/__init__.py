@@ -15,7 +15,7 @@ from safevar_sumo.results.manifest import (
     read_later,
     read_manifest,
 )
-from safevar_sumo.results.solution_id import CHOICES, SolutionId, chosen_handle, half_of, handles, position_of, unsafe_rows
+from safevar_sumo.results.solution_id import CHOICES, SolutionId, chosen_handle, degree_of, half_of, handles, position_of, unsafe_rows
 from safevar_sumo.results.store import ORIGINAL, SOLUTIONS, ResultsDirectory, evaluations_frame, record, solutions_frame
 
 __all__ = [
@@ -36,6 +36,7 @@ __all__ = [
     "StoredResults",
     "begun_and_now",
     "chosen_handle",
+    "degree_of",
     "differences_now",
     "evaluations_frame",
     "failure_lines",

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
+from safevar_sumo.study import SAFETY_DEGREE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -74,6 +76,15 @@ def position_of(solutions: pd.DataFrame, handle: SolutionId, source: object = "s
     raise InputError(source, f"there is no solution {handle}", legal)
 
 
+RATED = "rating_points"
+"""Column of the points of a rated study."""
+
+
+def degree_of(original: Mapping[str, Any]) -> float:
+    """What `unsafe_rows` takes of an original vehicle: its safety degree, or its points in a rated study."""
+    return float(original[RATED if original.get(RATED) is not None else SAFETY_DEGREE])
+
+
 def half_of(degree: float) -> float:
     """The limit below which a safety degree is unsafe where nothing collides [m]: half of the original's, to six digits as printed."""
     return float(f"{HALF * degree:.6g}")
@@ -90,12 +101,11 @@ def unsafe_rows(solutions: pd.DataFrame, original: float) -> pd.Series[bool]:
     return collisions if collisions.any() else solutions["f_safe"] < half_of(original)
 
 
-RATED = "rating_points"
-"""Column of the points of a rated study."""
 CHOICES = {
     "most_severe": ["f_safe", "f_num_diff", "f_diff"],
     "fewest": ["f_num_diff", "f_safe", "f_diff"],
     "smallest": ["f_diff", "f_safe", "f_num_diff"],
+    "most_points": [RATED, "f_num_diff", "f_diff"],
 }
 """Objectives that decide a choice, in order; smaller values first."""
 

@@ -12,15 +12,16 @@ from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, ope
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, course
 from safevar_sumo.analysis.explain.causes import MinimalCause, affordable, boundaries, minimal_causes, necessary
-from safevar_sumo.analysis.explain.necessity import distinct_causes, key_of, necessity, robustness, smallest_robust
+from safevar_sumo.analysis.explain.necessity import STEP_FACTORS, distinct_causes, key_of, necessity, robustness, smallest_robust
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
 from safevar_sumo.analysis.preventability import preventability, preventable_by
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles, position_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import AtPoint, at_every_point, worst_points
+from safevar_sumo.sumo.rater import is_rated
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers.evaluation import Pool
 
@@ -28,7 +29,7 @@ Causes = Mapping[int, list[MinimalCause]]
 Reasons = tuple[str, ...]
 
 
-LOOKED_AT = 4096
+LOOKED_AT, RATED_LOOKED_AT = 4096, 64
 """Settings over the whole domain that are searched for failures of a study without results."""
 
 
@@ -72,7 +73,8 @@ def failures_of(source: Study | Case, bench: Bench, original: Evaluations, named
     if isinstance(source, Study):
         if named:
             raise InputError("solution", f"{source.name!r} is a study and has no solutions", "a results directory")
-        settings = bench.characteristics.filter(bench.spread(LOOKED_AT, source.search.seed, filtered=True))
+        number = RATED_LOOKED_AT if is_rated(source) else LOOKED_AT
+        settings = bench.characteristics.filter(bench.spread(number, source.search.seed, filtered=True))
         called: list[SolutionId | None] = [None] * len(settings)
         recorded = None
         rows = None
@@ -128,6 +130,23 @@ def where(system: System, original: FloatArray, settings: FloatArray, unsafe: Un
     return places, at_points[0].drives.trace.step
 
 
+def turned(bench: Bench, original: FloatArray, settings: FloatArray) -> tuple[list[Where], float]:
+    """As `where` in a rated study: the cells that have another colour than the original's, and both at the one that turns most."""
+    system = assemble(bench.study)
+    assert system.rater is not None
+    colours = system.rater.points(bench.cells(np.concatenate([original, settings]), "cells that turn")).colours.astype(int)
+    places, step = list[Where](), 0.0
+    for row in range(1, len(colours)):
+        worse = colours[row] - colours[0]
+        point = system.matrix[int(np.argmax(worse))]
+        (there,) = at_every_point(system.at(point), np.concatenate([original, settings[row - 1:row]]))
+        first, other = (course(there.drives, column, float(there.evaluations.f_safe[column])) for column in (0, 1))
+        names = tuple(system.matrix[k].name for k in np.flatnonzero(worse).tolist())
+        places.append(Where(compare_braking(first, other, point.name), names))
+        step = there.drives.trace.step
+    return places, step
+
+
 def points_of(system: System, at_points: list[AtPoint], unsafe: Unsafe) -> list[tuple[str, ...]]:
     """For every setting the names of a matrix's points at which it is unsafe; none of a study without one."""
     if not system.matrix:
@@ -161,20 +180,25 @@ def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Poo
         failures = failures_of(source, bench, original, named, unsafe)
         settings, rows = failures.evaluations.settings, failures.rows
         sample = rows if named else [rows[i] for i in affordable(settings[rows], bench, limit)]
-        robust = None if named else _robust(failures, bench, original, limit)
+        robust = None if named or is_rated(study) else _robust(failures, bench, original, limit)
         reasons = dict.fromkeys(rows[:len(named)], ("asked for",)) if named else _that_matter(failures, robust)
         explained = sorted({*sample, *reasons})
         causes = dict(zip(explained, minimal_causes(bench, settings[explained], failures.unsafe), strict=True))
         if not named:
             reasons = _with_one_of_each_cause(failures, bench, {row: causes[row] for row in sample}, reasons, causes, options.top)
         explanations = _explained(failures, bench, original, causes, reasons)
-        preventable = preventability(bench, settings[failures.evaluations.collided])
+        preventable = preventability(bench, settings[_avoidable(study, failures.evaluations)])
     of_sample = [causes[row] for row in sample]
     return Explained(
         study=study, unsafe=failures.unsafe, original=original, explanations=explanations,
         necessity=necessity(bench.characteristics, bench.characteristics.changed(settings[sample]), of_sample, len(rows)),
         distinct=distinct_causes(bench.characteristics, of_sample), looked_at=len(failures.evaluations), failures=len(rows),
         analysed=len(sample), otherwise=failures.otherwise, preventability=preventable)
+
+
+def _avoidable(study: Study, evaluations: Evaluations) -> BoolArray:
+    """Collisions that another driver may avoid; of a rated study none, as every vehicle collides in some cell."""
+    return np.asarray(evaluations.collided & (not is_rated(study)))
 
 
 def _robust(failures: Failures, bench: Bench, original: Evaluations, limit: int) -> int | None:
@@ -218,10 +242,14 @@ def _explained(failures: Failures, bench: Bench, original: Evaluations, causes: 
         return ()
     rows = list(reasons)
     here, names = failures.evaluations.take(rows), bench.characteristics.names
-    beside, step = where(assemble(bench.study), original.settings, here.settings, failures.unsafe)
-    robust = robustness(bench, here.settings, step, failures.unsafe)
+    if is_rated(bench.study):
+        beside, step = turned(bench, original.settings, here.settings)
+        robust = robustness(bench, here.settings, step, failures.unsafe, STEP_FACTORS[:1])
+    else:
+        beside, step = where(assemble(bench.study), original.settings, here.settings, failures.unsafe)
+        robust = robustness(bench, here.settings, step, failures.unsafe)
     shrunk = iter(boundaries(bench, [cause for row in rows for cause in causes[row]], failures.unsafe))
-    collided = np.flatnonzero(here.collided)
+    collided = np.flatnonzero(_avoidable(bench.study, here))
     avoided = dict(zip(collided.tolist(), preventable_by(bench, here.settings[collided]), strict=True))
     explanations = []
     for i, row in enumerate(rows):

@@ -103,18 +103,20 @@ def is_borderline(share: float) -> bool:
     return share < BORDERLINE
 
 
-def robustness(bench: Bench, settings: FloatArray, step: float, unsafe: Unsafe) -> list[Robustness]:
+def robustness(bench: Bench, settings: FloatArray, step: float, unsafe: Unsafe,
+               factors: Sequence[float] = STEP_FACTORS) -> list[Robustness]:
     """How robust settings, shape (M, n), are.
 
     The neighbours of a setting differ from it in every characteristic by no more than the filter takes for no change;
-    they are simulated as they are, with the study's time step (`step` seconds), half of it and twice. Neighbours that cannot be simulated
+    they are simulated as they are, with `factors` of the study's time step (`step` seconds), by default itself, half of it and twice.
+    Neighbours that cannot be simulated
     are left out of the share.
     """
     members = bench.characteristics
     offsets = np.random.default_rng(bench.study.search.seed).uniform(-1, 1, (NEIGHBOURS, len(members))) * members.threshold
     around = np.clip(settings[:, np.newaxis] + offsets, members.lower, members.upper).reshape(-1, len(members))
     shares = {}
-    for factor in STEP_FACTORS:
+    for factor in factors:
         on = bench if factor == 1 else bench.with_step(step * factor)
         evaluations = on.evaluate(around, f"neighbours at {step * factor:g} s a step")
         outcomes, valid = (truths.reshape(len(settings), NEIGHBOURS) for truths in (unsafe.of(evaluations), evaluations.valid))

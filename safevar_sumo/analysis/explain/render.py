@@ -16,6 +16,7 @@ from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explain
 from safevar_sumo.analysis.explain.summary import LABELS, Finding, in_short
 from safevar_sumo.analysis.figures import CHANGED, FONT, INVOLVED, NECESSARY, literal, new_figure
 from safevar_sumo.analysis.words import ask, changes, command, decimal, number_of
+from safevar_sumo.sumo.rater import is_rated
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, print_constraints, print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
@@ -127,7 +128,10 @@ def _print_one(console: Console, again: Again, failure: Explanation, members: Ch
     print_text(console, f"Because: {sentence(failure.because, full=True)}")
     if failure.because.place:
         number = len(assemble(result.study).matrix)
-        print_text(console, points_in_words(failure.points, number, most=len(failure.points)))
+        if is_rated(result.study):
+            print_text(console, f"{number_of(len(failure.points), 'cell')} of {number} turn: {'; '.join(failure.points)}.")
+        else:
+            print_text(console, points_in_words(failure.points, number, most=len(failure.points)))
     if failure.preventable:
         print_text(console, f"In the same vehicle: {failure.preventable}.")
     console.print(_side_by_side(failure.because))

@@ -89,7 +89,7 @@ class Explanation:
                 {name: getattr(cause, name) for name in ("changes", "boundary", "fraction", "outcome", "safety_degree", "end")}
                 for cause in self.causes],
             "robustness": self.robustness.share, "because": sentence(self.because),
-            "reasons": list(self.reasons)}
+            "reasons": list(self.reasons), **({"points": list(self.points)} if self.points else {})}
 
 
 @dataclass(frozen=True, kw_only=True)

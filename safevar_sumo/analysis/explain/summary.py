@@ -15,7 +15,9 @@ from safevar_sumo.analysis.explain.compute import points_in_words, points_of, wh
 from safevar_sumo.analysis.explain.necessity import Robustness, robustness, smallest_robust
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, preventability
+from safevar_sumo.analysis.rating.summary import rated_lead
 from safevar_sumo.analysis.words import ENDS, ask, changes, joined, number_of
+from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.records import KMH, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, unsafe_rows
 from safevar_sumo.scenarios import Point
@@ -48,6 +50,8 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
     place
         The directory of the results.
     """
+    if RATING_POINTS.name in original.metrics:
+        return rated_lead(study, solutions, original, place)
     if original.collided[0]:
         return ["The original vehicle itself collides: no change is needed."]
     bench, degree = Bench(study, pool), float(original.f_safe[0])

@@ -51,7 +51,7 @@ def verdict(result: Rating) -> str:
     losses = lost_by_test(result)
     test, most = losses[0]
     share = "all" if len(losses) == 1 else "most" if most > result.lost / 2 else f"{most:.2f}"
-    return f"With {changed} the vehicle loses {result.lost:.2f} {of}, {share} of them in {_in_words(test)}."
+    return f"With {changed} the vehicle loses {result.lost:.2f} {of}, {share} of them in {test_in_words(test)}."
 
 
 def lost_by_test(result: Rating) -> list[tuple[RatedTest, float]]:
@@ -73,7 +73,7 @@ def not_simulated(result: Rating) -> str:
     return text
 
 
-def _in_words(test: RatedTest) -> str:
+def test_in_words(test: RatedTest) -> str:
     return f"{test.block.test}{LIGHTS[test.block.light]}"
 
 
@@ -119,38 +119,40 @@ def _layers(result: Rating) -> WholeTable:
 def print_matrices(console: Console, result: Rating) -> None:
     """Every matrix: a letter and a colour for each cell, the speed of the impact [km/h] or time to collision of the warning [s]."""
     for block in result.protocol.blocks:
-        columns = [f"{location:g} %" for location in block.impact_locations] or [f"{speed:g} km/h" for speed in block.target_speeds]
+        columns = [f"{location:g} %" for location in block.impact_locations] or [f"{speed:g}" for speed in block.target_speeds]
         of = "impact location" if block.impact_locations else "speed of the target"
-        table = WholeTable("VUT", "target" if block.impact_locations else "", right=columns, title=f"{block.name}, {of}")
+        heads = ["VUT", *(["target"] if block.impact_locations else [])]
+        table = WholeTable(*heads, right=columns, title=f"{block.name}: speeds [km/h], {of}")
         for k, row in enumerate(block.rows):
             cells = [_cell(result, block, k, column) if letter != "-" else Text("") for column, letter in enumerate(row.ranges)]
             function = " FCW" if block.is_warning(k) else ""
-            table.add_row(f"{row.vut:g} km/h{function}", "" if row.target is None else f"{row.target:g} km/h", *cells)
+            table.add_row(f"{row.vut:g}{function}", *([] if row.target is None else [f"{row.target:g}"]), *cells)
         console.print(table)
     names = ", ".join(f"{letter} {colour}" for colour, letter in LETTERS.items())
-    compared = "; original > variant where they differ" if result.variant else ""
-    print_text(console, f"{names}; in brackets: extended range; with the relative speed of the impact [km/h], or with the time to "
+    compared = "; original>variant where they differ" if result.variant else ""
+    print_text(console, f"{names}; small letters: extended range; with the relative speed of the impact [km/h], or with the time to "
                         f"collision of the warning [s] in rows with FCW{compared}.")
 
 
 def _cell(result: Rating, block: Block, row: int, column: int) -> Text:
     number = result.protocol.matrix_of[block.name, row, column]
-    texts = [_cell_text(one, number) for one in result.variants]
     differs = len({one.colour(number) for one in result.variants}) > 1
     text = Text()
-    for k, part in enumerate(texts if differs else texts[:1]):
-        text.append(" > " if k else "")
-        text.append(part, style=ON_TERMINAL.get(result.variants[k].colour(number) or "", ""))
+    for k, one in enumerate(result.variants if differs else result.variants[:1]):
+        text.append(">" if k else "")
+        is_last = k == len(result.variants) - 1 or not differs
+        text.append(_cell_text(one, number, with_value=is_last), style=ON_TERMINAL.get(one.colour(number) or "", ""))
     return text
 
 
-def _cell_text(one: Rated, number: int) -> str:
+def _cell_text(one: Rated, number: int, *, with_value: bool) -> str:
     cell, colour = one.protocol.cells[number], one.colour(number)
     record = one.cell(number)
     value = record["warning_ttc"] if cell.judged == "warning" else record["relative_impact_speed"]
     letter = "?" if colour is None else LETTERS[colour]
-    text = letter if value is None else f"{letter} {value:.1f}"
-    return f"({text})" if cell.range == "extended" else text
+    letter = letter.lower() if cell.range == "extended" else letter
+    is_told = with_value and value is not None and (colour != "green" or cell.judged == "warning")
+    return f"{letter}{value:.1f}" if is_told and value < 10 else f"{letter}{value:.0f}" if is_told else letter
 
 
 def matrices_figure(result: Rating) -> Figure:
@@ -193,7 +195,7 @@ def _draw(axis: Axes, result: Rating, block: Block) -> None:
             if turned:
                 axis.add_patch(Rectangle((shift + column + 0.08, row + 0.08), 0.84, 0.84, fill=False, edgecolor="black", linewidth=1.8))
             axis.text(shift + column + 0.5, row + 0.5, LETTERS.get(colour or "", "?"), ha="center", va="center", fontsize=FONT - 2,
-                      color=ink)
+                      color=ink, bbox={"facecolor": face, "edgecolor": "none", "pad": 0.8})
     axis.set_xlim(0, len(result.variants) * (wide + 0.6) - 0.6)
     axis.set_ylim(len(block.rows), 0)
     axis.set_xticks([place for place, _ in ticks], [text for _, text in ticks], fontsize=FONT - 3)

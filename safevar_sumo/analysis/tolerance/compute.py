@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -16,15 +17,19 @@ from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, ope
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.joint import Pair, SafeBox, no_box, planes, safe_box
 from safevar_sumo.errors import unknown
+from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.sumo.rater import is_rated
 from safevar_sumo.vehicles import Characteristic
 from safevar_sumo.workers.evaluation import Pool
 
-VALUES = 201
-"""Values over the domain; the original comes on top."""
-FINER, ROUNDS = 8, 4
+VALUES, RATED_VALUES = 201, 33
+"""Values over the domain, and in a rated study, where each of them is a whole matrix; the original comes on top."""
+FINER, ROUNDS, RATED_ROUNDS = 8, 4, 1
 """Into how many parts the place of a change is divided, and how often: to a 4096th of the distance of two values."""
+ALMOST_ONE, SAME_POINTS = 1 - 1e-6, 1e-9
+"""A loss that counts as one point, and one that is rounding."""
 SAFE, UNSAFE, NOT_SIMULATED, INFEASIBLE = range(4)
 Interval = tuple[float, float]
 
@@ -81,9 +86,26 @@ class OneAtATimeScan:
         """All intervals that violate a constraint of the study, as `unsafe`."""
         return [_ends(part) for part in self._intervals(INFEASIBLE)]
 
+    @property
+    def points(self) -> list[tuple[float, float]] | None:
+        """Values and the points that they keep, in their order; None of a study that is not rated."""
+        if RATING_POINTS.name not in self.profile:
+            return None
+        return list(zip(self.profile["value"].tolist(), self.profile[RATING_POINTS.name].tolist(), strict=True))
+
+    def first_loss(self, points: float = 0.0) -> float | None:
+        """The value nearest to the original with which more than so many points are lost; None if there is none."""
+        pairs, original = self.points or [], self.characteristic.original
+        full = next((kept for value, kept in pairs if value == original), math.nan)
+        losing = [value for value, kept in pairs if full - kept > points + SAME_POINTS]
+        return min(losing, key=lambda value: abs(value - original), default=None)
+
     def to_dict(self) -> dict[str, Any]:
-        """The entry of `alone` in `tolerance --json`."""
-        return {"characteristic": self.characteristic.name, "unit": self.characteristic.unit, "original": self.characteristic.original,
+        """The entry of `alone` in `tolerance --json`; of a rated study with points, and where the first of them are lost."""
+        rated = {} if self.points is None else {
+            "points": [list(pair) for pair in self.points], "any_lost": self.first_loss(), "first_point_lost": self.first_loss(ALMOST_ONE)}
+        return {**rated,
+                "characteristic": self.characteristic.name, "unit": self.characteristic.unit, "original": self.characteristic.original,
                 "safe": None if self.safe is None else list(self.safe), "unsafe": [list(interval) for interval in self.unsafe],
                 "not_simulated": [list(interval) for interval in self.not_simulated],
                 **({"infeasible": [list(interval) for interval in self.infeasible]} if self.infeasible else {})}
@@ -96,9 +118,10 @@ def _ends(part: pd.DataFrame) -> Interval:
 def scan(bench: Bench, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATimeScan]:
     """Scan the domains of some characteristics, one at a time."""
     members = bench.characteristics.members
-    values = [np.union1d(np.linspace(members[column].lower, members[column].upper, VALUES), members[column].original) for column in columns]
+    number, rounds = (RATED_VALUES, RATED_ROUNDS) if is_rated(bench.study) else (VALUES, ROUNDS)
+    values = [np.union1d(np.linspace(members[column].lower, members[column].upper, number), members[column].original) for column in columns]
     profiles = _evaluated(bench, columns, values, unsafe)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         between = [_where_it_changes(profile) for profile in profiles]
         if not any(map(len, between)):
             break
@@ -130,6 +153,8 @@ def _evaluated(bench: Bench, columns: Sequence[int], values: Sequence[FloatArray
     evaluations = bench.evaluate(settings, "one characteristic at a time")
     frame = pd.DataFrame({"value": np.concatenate(values), SAFETY_DEGREE: evaluations.f_safe, "outcome": evaluations.outcome,
                           "unsafe": unsafe.of(evaluations), "valid": evaluations.valid})
+    if RATING_POINTS.name in evaluations.metrics:
+        frame[RATING_POINTS.name] = evaluations.metrics[RATING_POINTS.name]
     return [frame.iloc[end - len(group):end].reset_index(drop=True) for group, end in zip(values, ends, strict=True)]
 
 
@@ -197,7 +222,8 @@ def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | Non
         alone = scan(bench, columns, unsafe)
         pairs = planes(bench, columns, unsafe) if options.pairs else None
         is_safe = not unsafe.of(original)[0]
-        box = safe_box(bench, columns, unsafe, _unsafe_settings(bench, alone, pairs or [])) if is_safe else no_box(bench, columns)
+        boxed = is_safe and not is_rated(study)  # thousands of whole matrices
+        box = safe_box(bench, columns, unsafe, _unsafe_settings(bench, alone, pairs or [])) if boxed else no_box(bench, columns)
     return Tolerance(study=study, unsafe=unsafe, original=original, alone=alone, pairs=pairs, joint=box)
 
 

@@ -8,11 +8,13 @@ import numpy as np
 from rich.console import Console
 
 from safevar_sumo.analysis.figures import DEGREE, FONT, NECESSARY, UNSAFE, as_formula, literal, panels
-from safevar_sumo.analysis.tolerance.compute import OneAtATimeScan, Tolerance
+from safevar_sumo.analysis.tolerance.compute import ALMOST_ONE, OneAtATimeScan, Tolerance
 from safevar_sumo.analysis.tolerance.joint import Pair
 from safevar_sumo.analysis.words import decimal
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.study import SAFETY_DEGREE
+from safevar_sumo.sumo.rater import is_rated
 from safevar_sumo.terminal import WholeTable, print_constraints, print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic
 
@@ -36,7 +38,21 @@ def print_tolerance(console: Console, result: Tolerance) -> None:
     print_meanings(console, [scan.characteristic for scan in result.alone])
     if result.pairs:
         _print_pairs(console, result)
-    print_text(console, _together(result))
+    if is_rated(result.study):
+        for scan in result.alone:
+            print_text(console, first_losses(scan))
+    else:
+        print_text(console, _together(result))
+
+
+def first_losses(scan: OneAtATimeScan) -> str:
+    """Where a characteristic alone costs points, in a sentence."""
+    member, anything, point = scan.characteristic, scan.first_loss(), scan.first_loss(ALMOST_ONE)
+    if anything is None:
+        return f"{member.name}: costs no points anywhere in its domain."
+    least = min(kept for _, kept in scan.points or [])
+    first = "; it never costs a whole point" if point is None else f"; the first point is lost at {point:.5g}{member.suffix}"
+    return f"{member.name}: points are lost from {anything:.5g}{member.suffix} on{first}; the fewest are {least:.2f}."
 
 
 def _together(result: Tolerance) -> str:
@@ -98,29 +114,34 @@ def _print_pairs(console: Console, result: Tolerance) -> None:
 
 def profiles_figure(result: Tolerance) -> Figure:
     """The safety degree over the domain of each characteristic alone; the original marked, what is unsafe shaded."""
-    title = f"{result.study.name}: one characteristic at a time (unsafe: {result.unsafe})"
+    title, column = f"{result.study.name}: one characteristic at a time (unsafe: {result.unsafe})", _column(result)
     figure, axes = panels(title, len(result.alone), 4, (2.3, 1.75), least_width=4.6, above=1.0)
-    degrees = np.concatenate([scan.profile[SAFETY_DEGREE].dropna() for scan in result.alone])
+    degrees = np.concatenate([scan.profile[column].dropna() for scan in result.alone])
     margin = 0.05 * (np.ptp(degrees) if degrees.size else 0.0) or 0.5
     for axis, scan in zip(axes, result.alone, strict=True):
-        _profile(axis, scan)
+        _profile(axis, scan, column)
         if degrees.size:
             axis.set_ylim(degrees.min() - margin, degrees.max() + margin)  # the same for all: a steep one is one that matters
-    figure.supylabel(DEGREE, fontsize=FONT)
+    figure.supylabel(DEGREE if column == SAFETY_DEGREE else RATING_POINTS.title, fontsize=FONT)
     notes = {"dot: the original vehicle": True, "hatched: unsafe": any(scan.unsafe for scan in result.alone),
-               "below the dashed line: collisions": bool(degrees.size) and degrees.min() <= 0}
+               "below the dashed line: collisions": column == SAFETY_DEGREE and bool(degrees.size) and degrees.min() <= 0}
     figure.supxlabel(";\n".join(words for words, is_drawn in notes.items() if is_drawn), fontsize=FONT)
     return figure
 
 
-def _profile(axis: Axes, scan: OneAtATimeScan) -> None:
+def _column(result: Tolerance) -> str:
+    """What profiles are of."""
+    return RATING_POINTS.name if is_rated(result.study) else SAFETY_DEGREE
+
+
+def _profile(axis: Axes, scan: OneAtATimeScan, column: str) -> None:
     member, profile = scan.characteristic, scan.profile
-    axis.plot(profile["value"], profile[SAFETY_DEGREE], color=NECESSARY, linewidth=1.2)
+    axis.plot(profile["value"], profile[column], color=NECESSARY, linewidth=1.2)
     for low, high in scan.unsafe:
         axis.axvspan(low, high, facecolor=UNSAFE, alpha=0.35, hatch="////", edgecolor="white", linewidth=0)
-    at_original = profile.loc[profile["value"] == member.original, SAFETY_DEGREE]
+    at_original = profile.loc[profile["value"] == member.original, column]
     axis.plot([member.original], at_original, marker="o", color="black", markersize=4)
-    if profile[SAFETY_DEGREE].min() <= 0:
+    if column == SAFETY_DEGREE and profile[SAFETY_DEGREE].min() <= 0:
         axis.axhline(0, color="black", linewidth=0.8, linestyle="--")
     axis.set_xlim(member.lower, member.upper)
     axis.set_title(literal(member.name), fontsize=FONT)

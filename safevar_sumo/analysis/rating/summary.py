@@ -1,0 +1,47 @@
+"""What a search found in a rated study, in words; nothing is simulated for it."""
+
+from __future__ import annotations
+
+from shlex import quote
+
+import pandas as pd
+
+from safevar_sumo.analysis.words import ask, changes, number_of
+from safevar_sumo.metrics import RATING_POINTS
+from safevar_sumo.records import Evaluations
+from safevar_sumo.results import chosen_handle, position_of, unsafe_rows
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
+
+TITLES = {"fewest": "Fewest changes that cost a point", "smallest": "Smallest largest change that costs a point",
+          "most_points": "Most points lost"}
+
+
+def rated_lead(study: Study, solutions: pd.DataFrame, original: Evaluations, place: str) -> list[str]:
+    """Summarise the solutions of a rated study in lines, the last of which has the commands to go on with.
+
+    Parameters
+    ----------
+    solutions
+        A frame as `safevar_sumo.results.solutions_frame` makes it.
+    original
+        The original vehicle's evaluation.
+    place
+        The directory of the results.
+    """
+    points, name = float(original.column(RATING_POINTS.name)[0]), RATING_POINTS.name
+    losing = unsafe_rows(solutions, points)
+    if not losing.any():
+        return [f"No solution loses a point of the original's {points:.2f}.",
+                f"Points against each characteristic: {ask('tolerance', place)}"]
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    lines = [f"The original vehicle earns {points:.2f} points. {int(losing.sum())} of {number_of(len(solutions), 'vehicle')} found lose at "
+             "least one of them."]
+    handle = None
+    for choice, title in TITLES.items():
+        handle = chosen_handle(solutions, points, choice, study.name)
+        row = solutions.iloc[position_of(solutions, handle)]
+        setting = {one: float(row[one]) for one in characteristics.names}
+        lines.append(f"{title}: {handle} loses {points - row[name]:.2f} points with {changes(characteristics, setting)}.")
+    return [*lines, f"Which cells turn: {ask('rating', place)} --solution {quote(str(handle))} --matrix; which changes do it: "
+                    f"{ask('explain', place)}"]

@@ -1,0 +1,124 @@
+"""Tolerance, explain, report and the summary of a rated study, in a protocol of two matrices, computed in this process."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from io import StringIO
+from typing import Any
+
+import msgspec
+import numpy as np
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from safevar_sumo.analysis.criterion import Unsafe
+from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.explain.compute import explain_failures
+from safevar_sumo.analysis.explain.render import print_explained
+from safevar_sumo.analysis.explain.summary import lead
+from safevar_sumo.analysis.rating import compute
+from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating
+from safevar_sumo.analysis.tolerance import ToleranceOptions
+from safevar_sumo.analysis.tolerance.compute import find_tolerances
+from safevar_sumo.analysis.tolerance.render import print_tolerance, profiles_figure
+from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.report.rated import picture
+from safevar_sumo.results import solutions_frame
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo import rater
+from safevar_sumo.workers.evaluation import evaluate_batch
+
+STUDY = load_study("euro_ncap_rating")
+WHOLE = protocol_of(EURO_NCAP_2026)
+
+
+class Here:
+    """A pool in this process."""
+
+    workers = 2
+
+    def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
+        future: Future[Evaluations] = Future()
+        try:
+            future.set_result(evaluate_batch(study, settings))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """CCRs at 10, 50 and 80 km/h, and CPNA by day and night at 50 km/h."""
+    blocks = []
+    for block in WHOLE.blocks:
+        speeds = {"CCRs": (10, 50, 80), "CPNA": (50,)}.get(block.test, ())
+        rows = tuple(row for row in block.rows if row.vut in speeds)
+        if rows:
+            blocks.append(msgspec.structs.replace(block, rows=rows))
+    layers = tuple(layer for layer in WHOLE.layers if layer.test in ("CCRs", "CPNA") and layer.layer not in ("Trajectory/Heading",))
+    protocol = msgspec.structs.replace(WHOLE, blocks=tuple(blocks), layers=layers)
+    monkeypatch.setattr(rater, "protocol_of", lambda name: protocol)
+
+
+def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
+    result = find_tolerances(STUDY, ToleranceOptions(characteristics=("brakeTorque",), unsafe="points=4.0"), pool=Here())
+    (scan,) = result.alone
+    assert scan.points is not None
+    points = dict(scan.points)
+    assert points[1.0] == max(points.values()) > points[0.5]
+    assert all(np.isfinite(list(points.values())))
+    first = scan.first_loss()
+    assert first is not None
+    assert points[first] < points[1.0]
+    assert all(kept == points[1.0] for value, kept in points.items() if value > first)
+    record = result.to_dict()["alone"][0]
+    assert record["any_lost"] == first
+    assert record["points"][-1] == [1.0, points[1.0]]
+    console = Console(record=True, width=120, file=StringIO())
+    print_tolerance(console, result)
+    assert "brakeTorque: points are lost from" in console.export_text()
+    assert profiles_figure(result).get_axes()
+
+
+def test_explain_names_the_cells_that_turn_and_the_summary_the_points_that_are_lost() -> None:
+    bench = Bench(STUDY, Here())
+    members = bench.characteristics
+    settings = np.array([members.setting({"brakeTorque": value, "payload": 200.0}, "it") for value in (0.5, 0.6)])
+    original, found = bench.original(), bench.evaluate(settings, "it")
+    case: Any = type("Case", (), {"study": STUDY, "solutions": solutions_frame(members.names, [(("nsga2", 0), found)]),
+                                  "characteristics": members})()
+    points = float(original.column("rating_points")[0])
+    lost = points - float(found.column("rating_points")[1])
+    assert lost > 0
+    result = explain_failures(case, ExplainOptions(solutions=("nsga2:0:0",), unsafe=f"points={points - 1e-3}"), pool=Here())
+    (failure,) = result.explanations
+    assert failure.points
+    assert all(name.startswith(("CCRs", "CPNA")) for name in failure.points)
+    assert [sorted(cause.changes) for cause in failure.causes] == [["brakeTorque"]]
+    console = Console(record=True, width=120, file=StringIO())
+    print_explained(console, "it", result, full=True)
+    assert "turn: CCRs" in console.export_text()
+    lines = lead(STUDY, case.solutions, original, Here(), "it")
+    assert f"{points:.2f}" in lines[0]
+    assert isinstance(case.solutions, pd.DataFrame)
+
+
+def test_a_rating_prints_draws_and_stands_in_a_page() -> None:
+    worn = Bench(STUDY, Here()).characteristics.setting({"brakeTorque": 0.5}, "it")
+    result = compute.rate(STUDY, {"variant": worn}, pool=Here())
+    assert result.lost > 0
+    assert result.turned()
+    assert Unsafe.first_point(result.original.points).points == pytest.approx(result.original.points - 1)
+    console = Console(record=True, width=80, file=StringIO())
+    print_rating(console, result)
+    print_matrices(console, result)
+    text = console.export_text()
+    assert "loses" in text
+    assert "G>" in text
+    assert matrices_figure(result).get_axes()
+    assert picture(result) == picture(result)
+    assert str(picture(result)).startswith("<svg")
+    assert result.to_frame().groupby("vehicle")["total"].sum().loc["variant"] == pytest.approx(result.variant.points)  # type: ignore[union-attr]
