@@ -19,6 +19,8 @@ STANDSTILL = 1e-3
 """Below this speed a vehicle counts as standing [m/s] (method section 4)."""
 KMH = 3.6
 """km/h per m/s."""
+TOUCH = 2e-3
+"""Bodies that overlap by less may just touch: SUMO takes a millimetre for nothing [m]."""
 TIME_DECIMALS = 9
 """Rounds sums of steps: 0.15 s, not 0.15000000000000002 s."""
 
@@ -224,8 +226,8 @@ class SimulationRuns:
         theirs = np.broadcast_to(trace.obstacle_speed, trace.speed.shape)
         (before, after), (gap, gone) = (([values[np.maximum(last - 1, 0), columns], values[last, columns]])
                                         for values in (trace.speed - theirs, trace.gap))
-        closes = (gap > 0) & np.isfinite(gap) & (gone <= 0) & (before > 0)
-        squared = before * before + 2 * (after - before) / trace.step * np.where(closes, gap, 0.0)
+        closes = (gap > -TOUCH) & np.isfinite(gap) & (gone <= 0) & (before > 0)
+        squared = before * before + 2 * (after - before) / trace.step * np.where(closes, np.maximum(gap, 0.0), 0.0)
         at_contact = np.minimum(np.maximum(np.sqrt(np.maximum(squared, 0.0)), np.minimum(before, after)), np.maximum(before, after))
         noted = self.collision_speed - theirs[last, columns]
         return np.asarray(np.where(closes & ~np.isnan(self.collision_speed), at_contact, noted))

@@ -133,6 +133,7 @@ def at_the_edges() -> Iterator[Cell]:
     yield from behind("CCRm", 130, 100, 70)
     yield from behind_braking("CMRb", 50, 90)
     yield from behind_braking("CCRb", 130, -25)
+    yield from behind_braking("CCRb", 90, 50)  # some gaps close just at the end of a step
     yield from along("CBLA", 80, 10, 20)
 
 
