@@ -120,7 +120,7 @@ def _driven(system: System, settings: FloatArray, world: Any, watch: Watcher | N
         if watch is not None:
             watch(world)
         speed = world.speeds()
-        scene = parts.scene()
+        scene = parts.scene(verdict.open)
         active = verdict.judge(speed, scene.over, contacts.collisions(world, verdict.open, scene), last=sample >= parts.last)
         seen = parts.seen(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
         seen, state = vehicle.sense(prepared, state, seen)

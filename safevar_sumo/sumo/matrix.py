@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import fields, replace
 from difflib import SequenceMatcher
 from typing import Any, NamedTuple
@@ -17,11 +17,11 @@ from safevar_sumo.records import CellResults, Contact, Encounter, Evaluations, F
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.study import SAFETY_DEGREE, Study
-from safevar_sumo.sumo.batch import Watcher, drive_all, reason_for_sumo, score
+from safevar_sumo.sumo.batch import Watcher, drive_all, reason_for_sumo, score, step_options
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.network import lanes_of
 from safevar_sumo.sumo.rater import cell_columns, in_some_cells, joined_cells
-from safevar_sumo.sumo.staging import all_staged
+from safevar_sumo.sumo.recording import Recording, recorded_scenes
 from safevar_sumo.sumo.system import System, assemble
 
 LARGEST_WORLD = 200
@@ -181,7 +181,8 @@ def _groups(system: System, settings: FloatArray, engine: Engine, options: tuple
     """Settings at every point, group by group of the points that are simulated together."""
     n = len(settings)
     recorded = engine is Engine.RECORDED and not reason_for_sumo(system)
-    for points in _together(system.points, LARGEST_BATCH // max(n, 1)) if recorded else ((point,) for point in system.points):
+    most, all_options = LARGEST_BATCH // max(n, 1), (*step_options(system), *options)
+    for points in _together(system.points, most, all_options) if recorded else ((point,) for point in system.points):
         drives = drive_all(replace(system, matrix=points), settings, engine, options)
         evaluations = score(system, np.tile(settings, (len(points), 1)), drives)
         parts = [slice(k * n, (k + 1) * n) for k in range(len(points))]
@@ -235,12 +236,13 @@ def study_at(study: Study, name: str, source: object) -> Study:
     return replace_in(study, matrix=replace_in(study.matrix, tests=[only]))
 
 
-def _together(points: Sequence[Point], most: int) -> Iterator[tuple[Point, ...]]:
-    """Points that share a network, types and routes, as many as one simulation may have."""
-    groups: dict[str, list[Point]] = {}
-    for point, network in zip(points, all_staged([point.scenario for point in points]), strict=True):
-        groups.setdefault(network.roads, []).append(point)
+def _together(points: Sequence[Point], most: int, options: Sequence[str]) -> Iterator[tuple[Point, ...]]:
+    """Points with recorded scenes of one road, as many as one simulation may have; those of short runs first."""
+    groups: dict[Hashable, list[Point]] = {}
+    for point, scene in zip(points, recorded_scenes([point.scenario for point in points], options), strict=True):
+        groups.setdefault(scene.road if isinstance(scene, Recording) else "", []).append(point)
     for group in groups.values():
+        group.sort(key=lambda point: point.scenario.duration)
         for start in range(0, len(group), max(most, 1)):
             yield tuple(group[start:start + max(most, 1)])
 

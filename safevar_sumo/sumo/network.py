@@ -89,14 +89,6 @@ def network_files(folder: str) -> dict[str, str]:
     return {name: hashlib.sha256(content).hexdigest()[:16] for name, content in zip(sources.files, contents, strict=True)}
 
 
-def roads_fingerprint(folder: str) -> str:
-    """Tells networks apart by everything but who is on them: sources, options, types and routes."""
-    sources = sources_of(folder)
-    nobody = ElementTree.Element("routes")
-    nobody.extend(child for child in parsed(sources.place / TRAFFIC) if _is_nobody(child))
-    return _digest((ElementTree.tostring(nobody), *sources.contents(*sources.roads, OPTIONS)), f"{sources.plain} {sources.options}")
-
-
 def netconvert_version() -> str:
     """Version of the SUMO that builds and simulates."""
     from importlib.metadata import version
@@ -136,11 +128,6 @@ def _copy_roads(sources: Sources, n: int, into: Path) -> None:
 
 def _copy_demand(sources: Sources, n: int, into: Path) -> None:
     write_demand(parsed(sources.place / TRAFFIC), n, into / TRAFFIC)
-
-
-def _is_nobody(child: ElementTree.Element) -> bool:
-    """Whether a part of a traffic file is a type or a route, not somebody on the road."""
-    return child.tag not in ("vehicle", "person")
 
 
 def _built(sources: Sources) -> Path:

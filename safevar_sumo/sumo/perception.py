@@ -8,10 +8,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from safevar_sumo.ads.driver import Late
-from safevar_sumo.records import EVERYWHERE, Encounter, FloatArray, Observation, Trace
+from safevar_sumo.records import EVERYWHERE, BoolArray, Encounter, FloatArray, Observation, Trace
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather
+from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.world import begin
 
 HIDDEN = np.array([[np.inf], [np.inf], [0.0], [0.0]])
@@ -50,15 +51,17 @@ class Parts:
                              for k, weather in enumerate(weathers) if weather not in weathers[:k]]
         self._order = np.argsort(np.concatenate([rows for _, rows in self._perceptions]))
         self._memories = [begin(point.scenario, part) for point, part in zip(points, self._worlds, strict=True)]
+        self._rests, self._scenes = isinstance(world, RecordedWorld), list[Scene]()
         self.last = np.repeat([round(point.scenario.duration / self._step) for point in points], size)
 
-    def scene(self) -> Scene:
-        """Where the obstacles of all vehicles are now."""
-        scenes = []
+    def scene(self, open_: BoolArray) -> Scene:
+        """Where the obstacles of all vehicles are now; where they were in a recorded scene in which no run is open any more."""
+        goes_on = [bool(open_[rows].any()) for rows in self._rows]
         for k, (point, world) in enumerate(zip(self._points, self._worlds, strict=True)):
-            scene, self._memories[k] = point.scenario.observe(world, self._step, self._memories[k])
-            scenes.append(scene)
-        return scenes[0] if len(scenes) == 1 else _joined(scenes, [self._size] * len(scenes))
+            if goes_on[k] or not self._rests or k >= len(self._scenes):
+                scene, self._memories[k] = point.scenario.observe(world, self._step, self._memories[k])
+                self._scenes[k:k + 1] = [scene]
+        return self._scenes[0] if len(self._scenes) == 1 else _joined(self._scenes, [self._size] * len(self._scenes))
 
     def seen(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
         """What all vehicles see of it."""

@@ -5,7 +5,7 @@ The vehicle under test stays where it starts meanwhile; `recorded_world.py` has 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
@@ -89,6 +89,11 @@ class Recording:
     lane_of: dict[str, str]
     tracks: dict[str, Track]
     extents: FloatArray
+
+    @property
+    def road(self) -> tuple[Hashable, ...]:
+        """What scenes have in common whose vehicles may be in one batch."""
+        return self.step_length, self.length, self.width, self.along.tobytes(), *(column.tobytes() for column in self.way)
 
 
 def recorded_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list[Recording | str]:

@@ -17,16 +17,15 @@ from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.scenarios import GuardedScenario, Lane, Scenario
 from safevar_sumo.scenarios.base import Actors, lane_through
 from safevar_sumo.sumo.copies import parsed
-from safevar_sumo.sumo.network import ROADS, built_network, network_fingerprint, roads_fingerprint
+from safevar_sumo.sumo.network import ROADS, built_network, network_fingerprint
 from safevar_sumo.sumo.sources import OPTIONS, TRAFFIC, Sources, options_of, sources_of
 
 
 class Staged(NamedTuple):
-    """The folder of a network with a scenario's traffic; digests of all that is in it, and of all but who is on the road."""
+    """The folder of a network with a scenario's traffic; a digest of all that is in it."""
 
     folder: str
     fingerprint: str
-    roads: str
 
 
 def staged(scenario: Scenario) -> Staged:
@@ -56,7 +55,7 @@ def _staged(scenario: Any, fingerprint: str) -> Staged:
         folder = str(_with_lanes(sources_of(folder), built_network(folder), changes))
     if actors is not None and (changes := actors(_BuiltRoads(folder))):
         folder = str(_with_traffic(sources_of(folder), changes))
-    return Staged(folder, fingerprint if folder == scenario.network else network_fingerprint(folder), roads_fingerprint(folder))
+    return Staged(folder, fingerprint if folder == scenario.network else network_fingerprint(folder))
 
 
 class _BuiltRoads:
