@@ -77,7 +77,7 @@ def _rho(result: Agreement) -> str:
     return "undefined" if rho is None else f"{rho:.3f}"
 
 
-NEAR, WIDE = 0.05, 0.3
+NEAR, WIDE = 0.02, 0.3
 """Standard deviation of the first trials around known values, and around a random place, as a share of a parameter's bounds."""
 
 

@@ -160,5 +160,5 @@ def test_validate_tells_effects_when_asked(in_tmp: Path) -> None:
     told = json.loads(run("validate", "sun", "rows.csv", "--json", "--effects").stdout)["effects"]
     assert list(told) == list(characteristics.names)
     assert told["mass"]["agrees"] is True
-    assert told["max_rpm"]["reference"] - told["max_rpm"]["here"] == pytest.approx(0.3, abs=0.02)
+    assert told["max_rpm"]["reference"] - told["max_rpm"]["here"] == pytest.approx(0.3, abs=0.05)
     assert "max_rpm" in run("validate", "sun", "rows.csv", "--effects").stdout

@@ -21,15 +21,19 @@ def test_the_published_settings_are_searched_as_published() -> None:
         assert len(study.vehicle.characteristics) == 12
 
 
+REACTS = {"recognition_delay", "hesitation", "brake_gap", "brake_gap_per_speed", "brake_place", "brake_gap_before", "brake_gap_past"}
+
+
 def test_rain_differs_from_sun_in_weather_and_in_how_late_its_driver_reacts_alone() -> None:
     sun, rain = load_study("sun"), load_study("rain")
     assert rain.weather != sun.weather
-    reactions = {name: rain.ads.parameters[name] for name in ("recognition_delay", "hesitation")}
-    assert msgspec.structs.replace(sun.ads, parameters={**sun.ads.parameters, **reactions}) == rain.ads
+    assert {name: value for name, value in rain.ads.parameters.items() if sun.ads.parameters.get(name) != value}.keys() == REACTS
+    assert msgspec.structs.replace(rain.ads, parameters=sun.ads.parameters) == sun.ads
     same = {"name": sun.name, "title": sun.title, "published": sun.published, "calibration": sun.calibration,
-            "repeatability": sun.repeatability, "fit": sun.fit}
+            "repeatability": sun.repeatability, "fit": sun.fit, "spread": sun.spread}
     assert msgspec.structs.replace(rain, weather=sun.weather, ads=sun.ads, **same) == sun
-    assert set(rain.calibration) == {"ads.parameters.recognition_delay", "ads.parameters.hesitation"}
+    assert set(rain.calibration) == {f"ads.parameters.{name}" for name in REACTS}
+    assert all(row.own for row in rain.calibration.values())
 
 
 def test_a_weathers_hesitation_of_former_files_is_the_drivers() -> None:

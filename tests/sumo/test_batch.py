@@ -217,11 +217,14 @@ def test_who_hesitates_brakes_later_and_lets_go_at_once() -> None:
 
 
 def test_rains_driver_lets_go_of_the_accelerator_and_brakes_a_hesitation_later() -> None:
-    rain = assemble(load_study("rain", ads={"parameters": {"hesitation": 0.2}}))
-    trace = simulate(rain, rain.characteristics.original[np.newaxis]).trace
-    braked = int(np.argmax(trace.brake[:, 0] == 1))
-    released = int(np.flatnonzero(trace.throttle[:braked, 0] > 0)[-1]) + 1
-    assert (braked - released) * trace.step == pytest.approx(0.2)
+    def driven(hesitation: float) -> tuple[Trace, int]:
+        rain = assemble(load_study("rain", ads={"parameters": {"hesitation": hesitation}}))
+        trace = simulate(rain, rain.characteristics.original[np.newaxis]).trace
+        return trace, int(np.argmax(trace.brake[:, 0] == 1))
+
+    (_, decides), (late, brakes) = driven(0.0), driven(0.2)
+    assert (brakes - decides) * late.step == pytest.approx(0.2)
+    assert late.throttle[decides:brakes].max() == 0
 
 
 @pytest.mark.parametrize("name", sorted({*ADS} - {"world_on_rails", "apollo"}))

@@ -39,7 +39,7 @@ def test_driving_and_braking_follow_the_differential_equations() -> None:
         def changes(time: float, state: np.ndarray, values: dict[str, float] = values, ratio: float = ratio, mass: float = mass,
                     radius: float = radius, limit: float = limit, friction: float = friction) -> list[float]:
             speed, wheel, engine = state
-            throttle = max(1 - 10 * max(time - 1.4, 0), 0.0)
+            throttle = max(1 - vehicle.throttle_fall * max(time - 1.4, 0), 0.0)
             brake = min(vehicle.brake_rise * max(time - 1.4, 0), 1.0)
             x = engine / limit
             torque = vehicle.engine_torque * min(400 + 100 * x * 5800 / 1890, 500 - 100 * (x * 5800 - 1890) / (5730 - 1890)) * (x <= 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from safevar_sumo.records import Command, Observation
 from safevar_sumo.vehicles.lgsvl import _tyre_stiffness
@@ -35,7 +36,8 @@ def test_air_slows_carlas_vehicle_by_half_rho_cd_a_v_squared() -> None:
 
 
 def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_and_waits_two_seconds() -> None:
-    vehicle, p = SYSTEMS["carla"].vehicle, prepared("carla")
+    vehicle = replace(SYSTEMS["carla"].vehicle, shift_up=0.65, shift_down=0.5, shift_latency=2.0)  # sun's are fitted
+    p = vehicle.prepare({member.name: np.full(1, float(member.original)) for member in SYSTEMS["carla"].characteristics}, 1.0, STEP)
     limit = 5800 * 2 * np.pi / 60
 
     def target(gear: int, share: float, since: float = 2.0) -> float:
