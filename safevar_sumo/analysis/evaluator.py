@@ -12,6 +12,7 @@ import scipy
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
+from safevar_sumo.protocol import part_of
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
@@ -104,7 +105,9 @@ class Bench:
         SimulationError
             If a setting cannot be simulated.
         """
-        number = len(assemble(self.study).matrix)
+        rater = assemble(self.study).rater
+        assert rater is not None
+        number = len(rater.protocol.cells)
         parts = min(PARTS * self._pool.workers, number)
         inputs, pool = inputs_of(self.study, self._pool), RetryingPool(self._pool, self.study)
         self.progress(stage, 0, number)
@@ -118,7 +121,7 @@ class Bench:
                 found[futures[future]] = evaluations.cells
                 done += evaluations.cells.impact.shape[1]
                 self.progress(stage, done, number)
-        order = np.argsort(np.concatenate([np.arange(k, number, parts) for k in range(parts)]))
+        order = np.argsort(np.concatenate([part_of(rater.protocol, k, parts) for k in range(parts)]))
         self.simulated += len(settings)
         columns = zip(*(found[k] for k in range(parts)), strict=True)
         return CellResults._make(np.concatenate(column, axis=1)[:, order] for column in columns)

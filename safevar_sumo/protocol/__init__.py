@@ -1,6 +1,6 @@
 """Euro NCAP's crash avoidance protocol as data: its matrices, what a colour is, and how points come about."""
 
-from safevar_sumo.protocol.cells import EURO_NCAP_2026, NOT_RED, PROTOCOLS, Block, Cell, CellScenario, Layer, Protocol, protocol_of
+from safevar_sumo.protocol.cells import EURO_NCAP_2026, NOT_RED, PROTOCOLS, Block, Cell, CellScenario, Layer, Protocol, part_of, protocol_of
 from safevar_sumo.protocol.points import COLOURS, RED, Points, points_of
 
 __all__ = [
@@ -15,6 +15,6 @@ __all__ = [
            "Layer",
            "Points",
            "Protocol",
-           "points_of",
+           "part_of", "points_of",
            "protocol_of",
 ]

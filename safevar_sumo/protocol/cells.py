@@ -227,6 +227,17 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
                                             target=cell.target + faster)
 
 
+def part_of(protocol: Protocol, part: int, parts: int) -> list[int]:
+    """Numbers of the cells in one of several parts, of 0 to `parts` - 1; cells on one network are in one part as far as possible."""
+    def network(number: int) -> tuple[Any, ...]:
+        cell = protocol.cells[number]
+        varied = (cell.scene.parameters.get("heading", 0.0), "start_share" in cell.scene.parameters)
+        return cell.scene.model, cell.block.test in ("CPNA", "CPFA", "CPNCO"), varied, cell.block.test
+
+    ordered = sorted(range(len(protocol.cells)), key=network)
+    return ordered[len(ordered) * part // parts:len(ordered) * (part + 1) // parts]
+
+
 @lru_cache
 def protocol_of(name: str) -> Protocol:
     """A protocol by its name, one of `PROTOCOLS`."""

@@ -13,6 +13,7 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS
+from safevar_sumo.protocol import part_of
 from safevar_sumo.records import CellResults, Contact, Encounter, Evaluations, FloatArray, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
@@ -122,8 +123,10 @@ def rated_settings(system: System, settings: FloatArray, engine: Engine = Engine
 
 
 def in_cells(system: System, settings: FloatArray, part: tuple[int, int], engine: Engine = Engine.RECORDED) -> Evaluations:
-    """Settings, shape (N, n), in every n-th cell of a protocol from the k-th on, `part` being (k, n): evaluations with their `cells`."""
-    found, cells = rated_settings(replace(system, matrix=system.matrix[part[0]::part[1]], rater=None), settings, engine)
+    """Settings, shape (N, n), in the k-th of n parts of a protocol's cells, `part` being (k, n): evaluations with their `cells`."""
+    assert system.rater is not None
+    points = tuple(system.matrix[number] for number in part_of(system.rater.protocol, *part))
+    found, cells = rated_settings(replace(system, matrix=points, rater=None), settings, engine)
     return replace(found, cells=cells)
 
 

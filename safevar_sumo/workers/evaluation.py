@@ -82,7 +82,7 @@ def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Eng
     check
         A batch checks the code from outside; its `reasons` are remarks on that.
     cells
-        (k, n): of a rated study what settings do in every n-th cell from the k-th on, instead of what they are worth in all.
+        (k, n): of a rated study what settings do in the k-th of n parts of the cells, instead of what they are worth in all.
     """
     if inputs is None:
         inputs = {"network": networks_of(assemble(study))}

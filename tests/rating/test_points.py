@@ -19,7 +19,7 @@ from safevar_sumo.analysis.rating.render import verdict
 from safevar_sumo.analysis.rating.workbook import Preprocessed, Template
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, points_of, protocol_of
+from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, part_of, points_of, protocol_of
 from safevar_sumo.protocol.points import colours_of
 from safevar_sumo.records import CellResults
 from safevar_sumo.study import load_study
@@ -117,10 +117,11 @@ def test_cells_are_what_their_points_are_alone_and_in_any_batch() -> None:
     study = load_study("euro_ncap_rating")
     system = assemble(study)
     settings_ = np.array([system.characteristics.original, system.characteristics.lower])
-    found = in_cells(system, settings_, (7, 620))
+    found, numbers_ = in_cells(system, settings_, (7, 620)), part_of(PROTOCOL, 7, 620)
     assert found.cells is not None
-    points = system.matrix[7::620]
-    assert [point.name.rpartition(", ")[0] for point in points] == [cell.name for cell in CELLS[7::620]]
+    assert sorted(number for k in range(620) for number in part_of(PROTOCOL, k, 620)) == list(range(N))
+    points = [system.matrix[number] for number in numbers_]
+    assert [point.name.rpartition(", ")[0] for point in points] == [CELLS[number].name for number in numbers_]
     for column, point in enumerate(points):
         (alone,) = at_every_point(assemble(study_at(study, point.name, "")), settings_[::-1])
         np.testing.assert_array_equal(found.cells.impact[:, column], alone.drives.relative_speed[::-1] * 3.6)
