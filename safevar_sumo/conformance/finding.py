@@ -170,7 +170,7 @@ class Source:
         for name in methods:
             function = inspect.unwrap(getattr(self._what, name, None) or object)
             code = getattr(function, "__code__", None)
-            if code is not None:
+            if code is not None and code.co_filename.startswith(self._folder):
                 return code.co_filename, code.co_firstlineno
         try:
             return self.file, max(inspect.getsourcelines(self._what)[1], 1)
@@ -185,7 +185,7 @@ class Source:
     def suspect(self, check: str) -> tuple[str, int] | None:
         """The line of the file that looks like the cause of a difference; None where nothing does."""
         try:
-            tree = ast.parse(_text(self.file))
+            tree = _part_of(ast.parse(_text(self.file)), str(getattr(self._what, "__name__", "")))
         except (SyntaxError, ValueError):
             return None
         lines = sorted({*SUSPECTS[check](tree)})
@@ -205,6 +205,21 @@ RANDOM = re.compile(r"(^|\.)(random|randint|uniform|gauss|normal|choice|shuffle|
 OVER_VEHICLES = ("mean", "sum", "max", "min", "std", "var", "median", "average", "any", "all", "cumsum", "sort", "argsort", "argmax",
                  "argmin", "linspace", "arange", "percentile", "quantile", "ptp", "prod", "dot", "norm", "accumulate", "roll", "unique")
 MUTATORS = ("append", "add", "update", "setdefault", "extend", "insert", "pop", "remove", "clear", "popleft", "appendleft")
+
+
+def _part_of(tree: ast.Module, name: str) -> ast.Module:
+    """Of a module what a class or function of that name uses: classes and functions that it names, and all assignments."""
+    defined = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
+    used, waiting = set[str](), [name]
+    while waiting:
+        one = waiting.pop()
+        if one in defined and one not in used:
+            used.add(one)
+            waiting += [node.id for node in ast.walk(defined[one]) if isinstance(node, ast.Name)]
+    if not used:
+        return tree
+    return ast.Module([node for node in tree.body if getattr(node, "name", "") in used or not isinstance(
+        node, ast.ClassDef | ast.FunctionDef)], [])
 
 
 def _functions(tree: ast.AST) -> Iterator[ast.FunctionDef]:

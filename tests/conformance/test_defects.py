@@ -59,6 +59,12 @@ mass  = { unit = "kg", original = 1000, lower = 800, upper = 1600 }
 power = { unit = "m/s^2", original = 3, lower = 2, upper = 4 }
 grip  = { unit = "m/s^2", original = 8, lower = 5, upper = 9 }
 """
+BESIDE = """
+
+class Other:
+    def drive(self, seen, memory):
+        return np.mean(seen.gap) + random.random()
+"""
 CONTROLLER = """STANDING_GAP = 3.0
 calls = []
 
@@ -94,6 +100,9 @@ DEFECTS = {
     "ads clock": planted("ads", "determinism", SCALAR, "BODY", "stopping += time.time() * 1e3 % 10"),
     "ads class variable": planted("ads", "state", SCALAR, "BODY", "Mine.seen_one = stopping = stopping + 0.01 * Mine.seen_one"),
     "ads shared list": planted("ads", "state", SCALAR, "BODY", "self.past.append(1); stopping += len(self.past) / 1e3"),
+    "ads module variable beside another class": planted("ads", "state", "known = {}\n" + SCALAR + BESIDE, "BODY",
+                                                        "known['n'] = known.get('n', 0) + 1; stopping += 0.1 * (known['n'] % 2)"),
+    "ads misspelt": planted("ads", "contract", SCALAR, "def drive(", "def drvie(", "class Mine"),
     "ads mean over vehicles": planted("ads", "batch", ARRAYS, "BODY", "memory = memory + np.mean(seen.speed)"),
     "ads changes what it sees": planted("ads", "inputs", ARRAYS, "BODY", "seen.gap[:] = np.minimum(seen.gap, 50)"),
     "ads never brakes": planted("ads", "reaction", SCALAR, "return 0.0, 1.0", "return 0.0, 0.0", "def drive(self, seen):"),
