@@ -17,7 +17,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.terminal import SECONDS_BETWEEN_LINES, print_text, stages
 
 SETTLED = 5.0
-"""Seconds of work after which a throughput is told: batches that end together make the first ones meaningless."""
+"""Seconds of work after which a throughput is shown: batches that end together make the first ones meaningless."""
 BAR = 10
 """Letters that a bar takes."""
 LEAST_ROOM = 26
@@ -25,7 +25,7 @@ LEAST_ROOM = 26
 
 
 class CampaignProgress:
-    """One bar for the whole study on a terminal, a line now and then elsewhere: how fast, how long yet, what was found."""
+    """One bar for the whole study on a terminal, a line every half minute elsewhere: throughput, time left, collisions."""
 
     def __init__(self, console: Console, study: Study, keys: list[RunKey], quiet: bool) -> None:
         self._console, self._quiet, self._name = console, quiet, study.name
@@ -79,7 +79,7 @@ class _Tally:
         self._seen: dict[RunKey, tuple[int, set[bytes]]] = {}
 
     def take_in(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
-        """What a run was answered; of settings that it asks for again, a collision counts once, as in `status` and in the summary."""
+        """Count evaluations of a run; a collision counts once, however often the run asks for its setting, as in `status`."""
         self._last = time.monotonic()
         if simulated and self._first is None:
             self._first = self._last  # how long the first ones took, with the start of the workers, nobody knows
@@ -103,7 +103,7 @@ class _Tally:
         self.total -= self._evaluations - asked
 
     def text(self, room: int | None = None) -> str:
-        """All of it, or what has place in so many letters: what comes first matters most."""
+        """The progress in words, cut to `room` letters; the most important parts come first."""
         collisions = [] if np.isinf(self._best) else [f"{self._collisions} collisions"]
         best = [] if np.isinf(self._best) else [f"best SD {self._best:.2f}"]
         rate = [f"{self._simulated / self._seconds:.0f}/s"] if self._simulated and self._seconds >= SETTLED else []

@@ -1,4 +1,4 @@
-"""Text of a user's as it is: no markup, no control characters; and tables in which nothing is cut off."""
+"""Text on the terminal: users' text without markup and control characters, tables in which nothing is cut off, progress bars."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from safevar_sumo.vehicles import Characteristic
 
 
 class WholeTable(Table):
-    """A table of plain text whose first column keeps its words, the names; what else does not fit goes on in the next line.
+    """A table of plain text whose first column, the names, is not broken within words; other cells wrap.
 
     Columns with the heads `left` hold text, those with the heads `right` numbers. Text is shown as it is, without markup.
     """
@@ -48,17 +48,17 @@ class WholeTable(Table):
 
 
 def plain(text: object, style: str = "") -> Text:
-    """For a rich table or line; what cannot be printed becomes a question mark, or a space if it is one."""
+    """Printable text for rich: other characters become question marks, and other spaces plain ones."""
     return Text("".join(sign if sign.isprintable() else " " if sign.isspace() else "?" for sign in str(text)), style)
 
 
 def print_text(console: Console, text: str) -> None:
-    """A line of text as it is: not wrapped, without markup."""
+    """Print a line of text without wrapping and markup."""
     console.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
 def print_meanings(console: Console, members: Iterable[Characteristic]) -> None:
-    """What characteristics are, a line for each that the study has words for."""
+    """Print the descriptions of characteristics, a line for each that has one."""
     table = Table.grid(padding=(0, 2))
     for member in members:
         if member.words:
@@ -76,7 +76,7 @@ def print_constraints(console: Console, study: Study) -> None:
 
 
 def print_names(console: Console, title: str, rows: Iterable[tuple[str, ...]], heads: tuple[str, ...]) -> None:
-    """A plain table of what there is."""
+    """Print a table of names."""
     table = WholeTable(*heads, title=title)
     for row in rows:
         table.add_row(*row)
@@ -90,7 +90,7 @@ StageProgress = Callable[[str, int, int], None]
 
 @contextmanager
 def stages(console: Console) -> Iterator[StageProgress]:
-    """A bar on a terminal, a line now and then elsewhere; yields what to call with the stage, what is done and how much there is."""
+    """A bar on a terminal, a line every half minute elsewhere; yields the function that reports progress."""
     columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=20), MofNCompleteColumn(), TimeRemainingColumn())
     spoke = time.monotonic()
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
@@ -110,7 +110,7 @@ def stages(console: Console) -> Iterator[StageProgress]:
 
 @contextmanager
 def shown(progress: bool | StageProgress) -> Iterator[StageProgress]:
-    """What to call with a stage, how much of it is done and how much there is: a bar for True, or the function that is given."""
+    """The function that reports progress: a bar's for True, else `progress` itself."""
     if progress is True:
         with stages(Console(stderr=True)) as bar:
             yield bar

@@ -39,7 +39,7 @@ def new_figure(title: str, rows: int, columns: int, size: tuple[float, float], *
 
 
 def panels(title: str, number: int, across: int, panel: tuple[float, float], least_width: float, above: float) -> tuple[Figure, list[Axes]]:
-    """A figure with a panel of a size for each of a number of things, at most so many across, and the panels' axes [inches]."""
+    """A figure with `number` panels, at most `across` side by side, of a size [inches], and the panels' axes."""
     columns = min(across, number)
     rows = -(-number // columns)
     figure, axes = new_figure(title, rows, columns, (max(panel[0] * columns, least_width), above + panel[1] * rows))

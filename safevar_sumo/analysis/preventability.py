@@ -25,14 +25,14 @@ from safevar_sumo.sumo.matrix import at_every_point, simulate, study_at, worst_p
 from safevar_sumo.sumo.system import System, assemble
 
 LIMIT = 20_000
-"""Simulations, about, that a study's preventability may take; of more collisions a random sample is looked at."""
+"""Approximate limit of simulations for a study's preventability; of more collisions a random sample is simulated."""
 
 TOGETHER = 20
-"""Settings that are simulated at all points of a matrix at once: enough to fill its simulations."""
+"""Settings that are simulated at all points of a matrix in one call: enough to fill its batches."""
 
 
 class PreventableBy(StrEnum):
-    """The least that it takes to avoid a collision in the same vehicle."""
+    """The weakest reference driver that avoids a collision in the same vehicle."""
 
     COMPETENT_DRIVER = "preventable by a competent driver"
     FULL_BRAKING = "preventable by full braking at the first possible moment"
@@ -41,12 +41,12 @@ class PreventableBy(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Preventability:
-    """Who avoids the collisions of a study: all of them, or a random sample.
+    """Classes of the collisions of a study, or of a random sample of them, by the drivers that avoid them.
 
     Attributes
     ----------
     numbers
-        How many of the collisions looked at each class has; the classes are disjoint.
+        Number of simulated collisions of each class; the classes are disjoint.
     collisions
         How many different collisions there are.
     """

@@ -27,7 +27,7 @@ from safevar_sumo.workers.identity import identity_of
 from safevar_sumo.workers.local import available_cores, local_pool
 
 ENGINES = {Engine.RECORDED: "recorded", Engine.LIBSUMO: "sumo"}
-"""What a command and a manifest call who moves the vehicles."""
+"""Names of engines in commands and manifests."""
 if TYPE_CHECKING:
     from safevar_sumo.analysis.evaluator import Progress
 

@@ -40,7 +40,7 @@ COMMANDS = {
     "replicate": ("reference", "Compare whole studies with published ones: tables, and which conclusions hold."),
     "calibrate": ("reference", "Fit a study's free parameters to reference data."),
 }
-"""Every command, in the order of the help: the module of this folder that it lives in, and what the help says of it."""
+"""Every command in the order of the help, with its module in this folder and its sentence in the help."""
 
 
 class OnDemand(click.Group):

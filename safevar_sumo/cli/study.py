@@ -150,7 +150,7 @@ def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, en
 
 
 def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path, pool: Pool) -> None:
-    """The answer; per algorithm what was found, beside the original vehicle; the most critical setting; what RQ1 and RQ2 say of it."""
+    """The answer; a table of the algorithms' solutions and the original; the most critical setting; RQ1 and RQ2 in brief."""
     from safevar_sumo.analysis.explain.summary import lead
     from safevar_sumo.analysis.research_questions.case import case_of
     from safevar_sumo.analysis.research_questions.over_runs import brief  # takes longer to load than all the rest

@@ -78,7 +78,7 @@ jobs_option = click.option("--jobs", type=click.IntRange(1, 1024), help="Worker 
 point_option = click.option("--point", metavar="NAME", help="Of a study with a matrix: ask about this point of it alone.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 AS_IT_IS_NOW = "safevar_sumo.as_it_is_now"
-"""Where the context of a command keeps that flag, for whatever of it reads a results directory."""
+"""Key of that flag in a command's context, for every function that reads a results directory."""
 
 
 def _keep(context: click.Context, _option: click.Parameter, value: bool) -> None:

@@ -1,4 +1,4 @@
-"""Code from outside the package: what its classes must have, how it is called, and what is checked of its results."""
+"""User code: the contracts of its classes, the guard that calls it, and checks of its results."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ INFINITE = float("inf")
 
 
 class Contract(NamedTuple):
-    """What a class must have, read off the protocol or base class that documents it.
+    """The members that a class must have, read off the protocol or base class that documents it.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Contract(NamedTuple):
     methods, optional
         The parameters of every method that must be there, and of every method that may be missing.
     attributes
-        What an instance must have beside methods.
+        Attributes of an instance beside its methods.
     base
         The class that it must derive from, if there is one.
     """
@@ -60,7 +60,7 @@ class Contract(NamedTuple):
         return self.base is None or (inspect.isclass(candidate) and issubclass(candidate, self.base))
 
     def violation(self, candidate: Any) -> str:
-        """Why `candidate` does not meet the contract, as far as a class shows without being called; "" if it does."""
+        """The reason why `candidate` does not meet the contract, by inspection alone; "" if it does."""
         if not inspect.isclass(candidate):
             kind = "module" if inspect.ismodule(candidate) else "function" if callable(candidate) else f"value of type {_type(candidate)}"
             return f"is a {kind}, not a class"

@@ -1,4 +1,4 @@
-"""Work with reference data: read it, hold a study against it, fit a study to it, take it over as results."""
+"""Reference data: read, compared with a study, fitted to, and imported as results."""
 
 from safevar_sumo.reference.calibration import (
     Calibration,

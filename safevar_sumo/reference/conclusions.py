@@ -1,4 +1,4 @@
-"""Two sides of the same tables, cell beside cell; what the published side concludes, and whether it holds here."""
+"""Tables of two sides, cell beside cell; the conclusions of the published side, and whether they hold here."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ KEYS: Mapping[str, Sequence[str]] = {
     "rq3.2": ("setting", "characteristic", "j"), "rq3.3": ("setting", "characteristic", "direction", "j"),
     "rq3.3-safety": ("setting", "quantity", "j"), "collisions": ("setting", "algorithm"), "combinations": ("setting", "place"),
     "weather": ("setting", "other", "characteristic")}
-"""What tells the rows of a table apart."""
+"""Columns that identify a row of a table."""
 NO_CELLS = ("method", "n1", "n2")
 
 
@@ -35,7 +35,7 @@ class Pairs(NamedTuple):
 
 
 class Beside(NamedTuple):
-    """A table of both sides: keys, then each quantity as two columns; and what to know about it."""
+    """A table of both sides: keys, then each quantity as two columns; and notes."""
 
     name: str
     frame: pd.DataFrame
@@ -95,7 +95,7 @@ def tables_beside(pairs: Pairs) -> list[Beside]:
 
 
 def _shares(cases: Sequence[Case]) -> pd.DataFrame:
-    """Which share of the critical solutions has j characteristics changed: RQ3.1 for solutions whose runs nobody knows [%]."""
+    """Share of the critical solutions with j characteristics changed [%]: RQ3.1 for solutions without runs."""
     rows: list[dict[str, Any]] = []
     for case in cases:
         try:
@@ -122,7 +122,7 @@ FACTOR = 1.5
 MOSTLY, PARTLY = 0.8, 0.6
 """Shares of the characteristics that are changed the same way, from which that holds, and holds in direction."""
 LEANING = 0.2
-"""A characteristic is mostly increased or decreased if that is by so much of its changes more frequent than the other."""
+"""Least difference between the shares of increases and decreases at which a characteristic leans to one of them."""
 RULES = (
     f"Tests (RQ1, RQ2): *{HOLDS}* if both are significant (p < {ALPHA:g}) or neither is, both effect sizes are of the same magnitude "
     f"(Kitchenham's negligible, small, medium, large) and, where they are significant and not negligible, on the same side of 0.5; "

@@ -1,4 +1,4 @@
-"""Does a search exploit the model? What published rows say that lie next to what it found."""
+"""The page that compares studies with published ones: conclusions, tables side by side, and published rows near each solution."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Nearness(NamedTuple):
 
 
 def nearness(case: Case, references: Sequence[ReferenceData]) -> list[Nearness]:
-    """By algorithm; references are rows of this study's vehicle."""
+    """For each algorithm its solutions beside the nearest rows of the references, which are of this study's vehicle."""
     domains = case.characteristics
     width = domains.upper - domains.lower
     rows = np.concatenate([data.settings for data in references]) / width
@@ -83,7 +83,7 @@ TITLES = {
     "rq3.3-safety": "RQ3.3: what they do to safety", "collisions": "Collisions", "combinations": "Four changed together",
     "weather": "One weather against another"}
 
-NOT_COMPARED = ": RQ2, RQ3 and the weathers are about them and are not compared"
+NOT_COMPARED = "; RQ2, RQ3 and the weathers need them and are not compared"
 
 
 def replication(pairs: Pairs, near: Sequence[Nearness]) -> str:
@@ -92,8 +92,8 @@ def replication(pairs: Pairs, near: Sequence[Nearness]) -> str:
     verdicts = conclusions(tables)
     parts = [_head(pairs, verdicts), _conclusions(verdicts)]
     if near:
-        parts.append(_near(near))
-    return "\n".join([*parts, "## Cell beside cell\n", *(_beside(table) for table in tables)])
+        parts.append(_nearest_rows(near))
+    return "\n".join([*parts, "## Cell beside cell\n", *(_side_by_side(table) for table in tables)])
 
 
 def _head(pairs: Pairs, verdicts: Sequence[Conclusion]) -> str:
@@ -124,18 +124,18 @@ def _conclusions(verdicts: Sequence[Conclusion]) -> str:
                       _markdown(("question", "setting", "published conclusion", "here", "why"), rows), ""])
 
 
-def _near(near: Sequence[Nearness]) -> str:
+def _nearest_rows(near: Sequence[Nearness]) -> str:
     rows = [(one.setting, one.algorithm, one.solutions, one.distance, one.distance_there, one.safety_here, one.safety_there,
              one.collisions, None if one.also_collide is None else 100 * one.also_collide) for one in near]
-    heads = ("setting", "algorithm", "solutions", "distance to published rows", "these to each other", "mean SD here", "mean SD there",
-             "collisions here", "published rows next to them that collide [%]")
+    heads = ("setting", "algorithm", "solutions", "distance to published rows", "distance among published rows", "mean SD here",
+             "mean SD there", "collisions here", "published rows next to them that collide [%]")
     return "\n".join([
         "## Does the search exploit the model?", "",
         f"The {NEIGHBOURS} published rows nearest to each solution, distances in widths of the domains (median). If the search found "
-        "holes in the model, the published rows next to what it found would be as safe as any.", "", _markdown(heads, rows), ""])
+        "holes in the model, the published rows next to its solutions would be as safe as others.", "", _markdown(heads, rows), ""])
 
 
-def _beside(table: Beside) -> str:
+def _side_by_side(table: Beside) -> str:
     lines = [f"### {TITLES[table.name]}", ""]
     if not table.frame.empty:
         keys = [column for column in table.frame if column not in _pairs(table.quantities)]

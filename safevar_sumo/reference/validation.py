@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 BINS = 8
 """Number of equally full bins of a characteristic's values in the picture."""
 FLIP = 2.0
-"""An outcome that lies within so many standard deviations of the repeats from the other one may be either."""
+"""Standard deviations of the repeats within which an outcome may turn into the other."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,9 +153,9 @@ def _mean(values: FloatArray) -> float | None:
 
 def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, reference: ReferenceData, here: Evaluations,
                    repeatability: float | None = None) -> None:
-    """Draw here against reference and error against what is predicted here, for every metric; the safety degree's by characteristic.
+    """Draw simulated against reference values, and errors against simulated values; those of the safety degree by characteristic.
 
-    A ring is around a setting whose outcome differs by no more than repeats of it do.
+    A ring marks a setting whose outcome differs by no more than its repeats do.
 
     Raises
     ------
@@ -293,7 +293,7 @@ def keep_totals(path: Path, study: Study, file: str, result: Agreement) -> None:
 
 
 def _rounded(values: Mapping[str, float | None]) -> dict[str, float]:
-    """To four decimals: more than anybody reads."""
+    """Values rounded to four decimals."""
     return {name: round(value, 4) for name, value in values.items() if value is not None}
 
 

@@ -27,9 +27,9 @@ Points = list[tuple[float, float]]
 WIDTH = 880
 """Of a picture [pixels]."""
 FINER = 2
-"""Drawn so much larger, then made smaller: smooth edges."""
+"""Factor by which pictures are drawn larger and then reduced, for smooth edges."""
 COLUMNS = (164, 250, 340, 450)
-"""Where the words begin [pixels]."""
+"""Left edges of the words [pixels]."""
 PANEL = 62
 """Height of the words above the road [pixels]."""
 GROUND, ROAD, SEAM, PATH, WHITE, INK, FAINT = "#eef0ec", "#9aa1a9", "#e8eaec", "#cfd3cf", "#ffffff", "#1d2329", "#5d666f"
@@ -167,7 +167,7 @@ def stripes(lane: Lane) -> Iterator[FloatArray]:
 SECONDS_PER_PICTURE = 0.1
 """Of a gif; it knows hundredths of a second only."""
 LAST_PICTURE = 2.0
-"""How long a gif rests on its last picture [s]."""
+"""Duration of a gif's last picture [s]."""
 COLOURS = 64
 LARGEST_GIF = 1_000_000
 """A longer one gets fewer pictures [bytes]."""
@@ -191,7 +191,7 @@ def animate(comparison: Comparison, path: Path) -> None:
 
 
 def check_animation(path: Path) -> None:
-    """Refuse what `animate` would, before anything is simulated."""
+    """Refuse a file that `animate` cannot write, before anything is simulated."""
     if path.suffix.lower() == ".mp4":
         _ffmpeg()
 

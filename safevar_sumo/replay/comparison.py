@@ -1,4 +1,4 @@
-"""The moments of a drive that tell its story: braking, nearest, end; and when two drives part."""
+"""A changed vehicle beside the original: braking, nearest moment and end of each run, and when their speeds part."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
 
 
 def _over(comparison: Comparison) -> float:
-    """When the last vehicle has come to its end or to rest, and its story with it [s]."""
+    """Time at which the last vehicle is nearest or comes to rest [s]."""
     drives = comparison.film.drives
     ends = [when for row in comparison.rows for when in (moments(drives, row).nearest, _comes_to_rest(drives, row)) if when is not None]
     return float(drives.trace.time[min(max(ends) + 1, len(drives.trace.time) - 1)])
@@ -76,7 +76,7 @@ def _comes_to_rest(drives: SimulationRuns, row: int) -> int:
 
 
 def _legend(figure: Figure, comparison: Comparison) -> None:
-    """Who is who, and what the marks mean."""
+    """The legend: vehicles and marks."""
     from matplotlib.lines import Line2D
 
     hit = bool(np.isfinite(comparison.film.drives.collision_speed).any())
@@ -91,7 +91,7 @@ def _legend(figure: Figure, comparison: Comparison) -> None:
 
 
 def _line(axis: Axes, comparison: Comparison, row: int, values: FloatArray) -> None:
-    """A quantity of one drive as far as it goes."""
+    """A quantity of one run until its end."""
     end = moments(comparison.film.drives, row).end + 1
     time = comparison.film.drives.trace.time[:end]
     axis.plot(time, values[:end], color=COLOURS[row], linestyle=DASHES[row], linewidth=1.6, zorder=3 + row)
@@ -138,7 +138,7 @@ def _mark_divergence(axes: np.ndarray, comparison: Comparison) -> None:
 
 
 def _heading(figure: Figure, comparison: Comparison) -> None:
-    """The study's title, and below it what is changed; no change is torn apart."""
+    """The study's title, and below it the changes; lines break between changes alone."""
     lines = textwrap.wrap(comparison.title, LINE)
     line = "changed:" if comparison.changes else "the original vehicle"
     for i, change in enumerate(comparison.changes):

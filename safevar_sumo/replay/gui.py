@@ -17,12 +17,12 @@ from safevar_sumo.sumo.window import Colour, Place, Window, open_window
 
 NAMES = {ORIGINAL: "blue", CHANGED: "orange"}
 REST = 2.0
-"""How long it rests at the nearest moment and at the end [s]."""
+"""Pause at the nearest moment and at the end [s]."""
 SPACE = 5.0
 """Between the two roads [m]."""
 ROAD, PATH, WHITE = (154, 161, 169, 255), (207, 211, 207, 255), (255, 255, 255, 255)
 ASIDE = 1.8
-"""Where the words stand above the lower end of what is shown [m]."""
+"""Height of the legend above the lower edge of the view [m]."""
 
 
 def show_in_gui(comparison: Comparison, network: str | None = None, *, slower: float = 1.0, rest: float = REST,
@@ -77,7 +77,7 @@ class _Turn:
 
 
 def _furnish(window: Window, scene: FlatScene, row: int, turn: _Turn) -> None:
-    """A row's road, where it is not SUMO's own, and everybody who drives or walks there."""
+    """The road of a row, if SUMO does not draw it, and its actors."""
     film = scene.comparison.film
     if row == CHANGED:
         for i, lane in enumerate(film.road):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 WEB = Path(__file__).parent / "web"
 LETTERS = 65
-"""So many heights of a letter the scene is wide."""
+"""Width of the scene in heights of a letter."""
 CENTIMETRES = 2
 """Decimals of a place [m]; a heading has one [degrees]."""
 
@@ -72,7 +72,7 @@ def _description(scene: FlatScene) -> str:
 
 
 def _moments(scene: FlatScene) -> list[dict[str, Any]]:
-    """Where one may jump to."""
+    """Moments that the player's buttons jump to."""
     jumps = []
     for row, one in enumerate(scene.moments):
         name = scene.comparison.name(row)

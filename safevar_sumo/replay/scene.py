@@ -16,7 +16,7 @@ from safevar_sumo.scenarios import VUT
 SEAM_WIDTH = 0.12
 """Of the line between two lanes, as it is drawn [m]."""
 MARGIN = 4.0
-"""What is shown around everybody [m]."""
+"""Free space around the actors [m]."""
 LEAST_HEIGHT = 11.0
 WIDEST = 75.0
 """A scene up to this long is shown whole; in a longer one the camera follows the vehicles [m]."""
@@ -27,7 +27,7 @@ NEAR = 30.0
 TEN = 10
 """Distance of two marks beside the road [m]."""
 SAME = 0.05
-"""Two copies of an actor whose places differ by less are one [m]."""
+"""Distance below which two copies of an actor are drawn as one [m]."""
 
 
 class FlatBody(NamedTuple):
@@ -126,7 +126,7 @@ def _seen_already(comparison: Comparison, name: str, row: int) -> bool:
 
 
 def _view(bodies: tuple[FlatBody, ...], length: int) -> View:
-    """All of it, or where that is too long, what a camera shows that follows the vehicles."""
+    """The whole road, or in a long scene the part in the view of a camera that follows the vehicles."""
     low = min(float(np.nanmin(body.x)) - body.length for body in bodies) - MARGIN / 2
     high = max(float(np.nanmax(body.x)) + (0 if body.is_vut else body.length) for body in bodies) + MARGIN
     sides = [side for body in bodies for side in (np.nanmin(body.y) - body.width / 2, np.nanmax(body.y) + body.width / 2)]

@@ -1,4 +1,4 @@
-"""One page that tells a study's findings to somebody who was not there. The package is callable: `safevar_sumo.report(...)`."""
+"""One page about a study's findings. The package is callable: `safevar_sumo.report(...)`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The findings: failures with their minimal causes, and the solutions that are worth a look, each with its replay."""
+"""Failures with their minimal causes, and selected solutions, each with its replay."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CAUSES = 6
 REPLAYS = 10
 """Solutions that a report shows, at the most; explained ones come on top."""
 FIRST = ("fewest", "smallest", "most_severe")
-"""What is shown before anything else."""
+"""Choices that are shown first."""
 OBJECTIVES = ["f_safe", "f_diff", "f_num_diff"]
 
 
@@ -102,7 +102,7 @@ def _shown(material: ReportInput, place: int, one: dict[str, Any]) -> dict[str, 
 
 
 def replays(material: ReportInput, explained: Failures | None) -> list[dict[str, Any]]:
-    """The solutions worth a look: the chosen ones, the explained ones, and unsafe ones that no other beats in every objective."""
+    """The solutions with a replay: the choices of `FIRST`, explained ones, and non-dominated unsafe ones."""
     shown, chosen = [], _chosen(material, explained)
     if material.system is not None and chosen:
         material.again([material.setting_of(SolutionId.parse(handle)) for handle in chosen])
@@ -132,7 +132,7 @@ def _chosen(material: ReportInput, explained: Failures | None) -> list[str]:
 
 
 def best_of(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The solutions that no other one beats in all three objectives, each point once."""
+    """The solutions that no other dominates in the three objectives, each point once."""
     if not rows:
         return []
     points = np.array([[row[name] for name in OBJECTIVES] for row in rows], dtype=float)
@@ -142,5 +142,5 @@ def best_of(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def evenly(number: int, most: int) -> list[int]:
-    """At most so many places, evenly over all of them."""
+    """At most `most` of `number` places, evenly spaced."""
     return sorted({round(place) for place in np.linspace(0, number - 1, min(number, most)).tolist()})

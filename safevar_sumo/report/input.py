@@ -78,7 +78,7 @@ SAMPLES = 4000
 
 
 class Again(NamedTuple):
-    """A setting simulated once more: what it is worth now, and at which points of a matrix it is unsafe."""
+    """A setting simulated once more: its evaluation now, and the points of a matrix at which it is unsafe."""
 
     evaluation: Evaluations
     points: tuple[str, ...]
@@ -265,6 +265,6 @@ def _identity(material: ReportInput, name: str) -> str:
 
 @cache
 def _package() -> str:
-    """Tells versions of this package apart, and states of it between two versions: an answer hangs on more code than results do."""
+    """Identity of the package's code, between versions too: an answer depends on more code than results do."""
     files = sorted(PACKAGE.rglob("*.py"))
     return repr([version("safevar_sumo"), RESULTS, [(file.relative_to(PACKAGE).as_posix(), digest_of(file)) for file in files]])

@@ -44,7 +44,7 @@ def risk(material: ReportInput, jobs: int | None, progress: Progress) -> Section
 
 
 def rules(material: ReportInput, jobs: int | None, progress: Progress) -> Section:
-    """Rules in words, with what they are worth on vehicles that they were not made from."""
+    """Rules in words, with density and coverage on vehicles that were not used to find them."""
     def compute() -> Section:
         regions = find_rules(material.case.study, material.options["rules"], jobs=jobs, progress=progress)
         sure = [rule for rule in regions.rules if rule.tells_more_than(regions.unsafe_share)]
@@ -61,7 +61,7 @@ def rules(material: ReportInput, jobs: int | None, progress: Progress) -> Sectio
 INDICES = {"first_order": "alone", "total": "with others"}
 """What the Sobol indices are called beside a bar."""
 LIMITS: Mapping[str, Callable[[ReportInput, int | None, Progress], Section]] = {"tolerance": tolerance, "risk": risk, "rules": rules}
-"""The sections that ask what the whole domain holds, by name."""
+"""The sections about the whole domain, by name."""
 
 
 def _bars(material: ReportInput, alone: list[Section]) -> Markup:

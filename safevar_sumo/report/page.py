@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DIGITS = re.compile(r"(\d\.\d\d)\d+")
-"""Of a number in a picture, what is too fine to be seen."""
+"""A number in a picture with digits that are too fine to be seen."""
 DOTS = 150
 """Points of a scatter chart, at the most."""
 TEXT = {"svg.fonttype": "none", "svg.hashsalt": "safevar_sumo", "font.family": ["sans-serif"]}
@@ -125,7 +125,7 @@ def reproduce(materials: Sequence[ReportInput], parts: Sequence[str]) -> list[di
 
 
 def _again(study: Study, out: str, place: Path) -> str:
-    """What carries a study out: the command where it is a shipped one with other options, else what the results record of it."""
+    """The command that runs a study again: for a shipped study with other options `study`, else a call with the recorded study."""
     search = study.search
     if study.name in study_names():
         options = {name: getattr(search, name) for name in ("seed", "runs", "evaluations", "algorithms")}
@@ -193,7 +193,7 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
 
 
 def _study(material: ReportInput, wanted: Sequence[str], jobs: int | None, show: Progress) -> Mapping[str, Any]:
-    """What one study gives to every section that is wanted."""
+    """The data of one study for every wanted section."""
     def progress(stage: str, done: int, total: int) -> None:
         show(f"{material.case.name}: {stage}", done, total)
 

@@ -16,7 +16,7 @@ RIGHT = 24
 
 
 class Dot(NamedTuple):
-    """A point of a scatter chart: what it is called, how it looks and where it leads."""
+    """A point of a scatter chart: its title, look and link."""
 
     x: float
     y: float
@@ -26,7 +26,7 @@ class Dot(NamedTuple):
 
 
 class Bar(NamedTuple):
-    """A piece of a row, from and to as fractions of the row; its look and what it says."""
+    """A bar in a row, its ends as fractions of the row, its look and its title."""
 
     start: float
     end: float

@@ -1,4 +1,4 @@
-"""What was tested, the verdict, and how far to trust it."""
+"""The sections about the tested system, the verdict, and how far to trust it."""
 
 from __future__ import annotations
 
@@ -92,9 +92,9 @@ UNKNOWN = "–"  # noqa: RUF001
 
 
 def verdict(material: ReportInput, explained: Failures | None, tolerance: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What happened to the original vehicle, and what makes it unsafe: the smallest robust failure first, every other one with a badge.
+    """The original's outcome, and the failures: the smallest robust one first, every other one with a badge.
 
-    All values of a failure are those of its solution as it was found, nowhere shrunk.
+    All values of a failure are those of its solution, not scaled back.
     """
     case = material.case
     degree = degree_of(case.original)
@@ -103,7 +103,7 @@ def verdict(material: ReportInput, explained: Failures | None, tolerance: Mappin
     result: dict[str, Any] = {"unsafe": len(unsafe), "solutions": len(case.solutions), "rule": _rule(hits, degree), "findings": [],
                               "original": _original(material), "hits": hits, "figures": [], "agreement": agreement_with_published(material)}
     if unsafe.empty and case.solutions.empty:
-        result["headline"] = "No solution was found: nothing to tell a failure from."
+        result["headline"] = "No solution was found."
         return result
     result["findings"] = _findings(material, explained or [], any_unsafe=not unsafe.empty)
     result["headline"] = _headline(result, material, explained)
@@ -124,7 +124,7 @@ def _original(material: ReportInput) -> str:
 
 
 def _findings(material: ReportInput, explained: Failures, *, any_unsafe: bool) -> list[dict[str, Any]]:
-    """The failures worth a sentence, each once, with all that it was chosen for; without explanations, chosen among the solutions alone."""
+    """The selected failures with the reasons of their selection; without explanations they are selected among the solutions alone."""
     reasons: dict[str, list[str]] = {}
     shares: dict[str, float] = {}
     for failure in explained:
@@ -258,7 +258,7 @@ def _row(one: Totals) -> dict[str, str]:
 
 
 NOT_MODELLED = (
-    "A search finds failures; that it finds none proves nothing about what it did not try.",
+    "A search that finds no failure proves nothing about the settings that it did not try.",
     "One vehicle in its lane: no steering beyond lane keeping, no single wheels and axles, no suspension, no wind, no sensor "
     "noise, no traffic beyond the scenario's own, unless the study says otherwise.",
     "Driving system and vehicle are models: the tables below show how far they agree with published data, where there is any.",
@@ -266,7 +266,7 @@ NOT_MODELLED = (
 
 
 def trust(material: ReportInput, explained: Failures | None) -> dict[str, Any]:
-    """What a reader should hold against the findings of one study."""
+    """The limits of one study's findings, and its agreement with published data."""
     case = material.case
     rows = [{"name": name, "published": case.study.published[name], "here": case.original[name]}
             for name in METRICS if name in case.study.published and not math.isnan(case.original[name])]

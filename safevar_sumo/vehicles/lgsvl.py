@@ -48,8 +48,8 @@ SUBSTEPS = 2
 class _Prepared(NamedTuple):
     """Constants of a run, SI but engine speeds in r/min, shape (N,) or ().
 
-    `pedals_follow` and `engine_follows` are the shares of an error that are gone after a step, and after a substep;
-    `traction_change` is what the traction control adds or takes away in a substep.
+    `pedals_follow` and `engine_follows` are the shares of an error that a step, and a substep, removes; `traction_change` is
+    the torque by which the traction control rises or falls in a substep [N m].
     """
 
     step: FloatArray
@@ -57,10 +57,10 @@ class _Prepared(NamedTuple):
     pedals_follow: FloatArray
     engine_follows: FloatArray
     mass: FloatArray
-    weight: FloatArray  # onto the road [N]
+    weight: FloatArray  # load on the road [N]
     body: FloatArray
-    back: float | FloatArray  # g sin of the slope
-    slowed: FloatArray  # by it in a substep
+    back: float | FloatArray  # deceleration by the slope, g sin(angle) [m/s^2]
+    slowed: FloatArray  # speed lost by the slope in a substep [m/s]
     standstill: FloatArray
     radius: FloatArray
     pull_by_stiffness: FloatArray
@@ -159,9 +159,9 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             heading=nothing + HEADING_ERROR, throttle=nothing, brake=nothing)
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> LgsvlState:
-        """What stays as it is under the pedals that hold the speed: every equation with its change set to zero.
+        """The steady state at a speed: every equation with its rate of change set to zero.
 
-        The lane keeping has no error left; the gear is the one that the gearbox has when it comes from below.
+        The lane keeping has no error left; the gear is the one in which the gearbox arrives while accelerating.
         """
         p, nothing = prepared, np.zeros_like(prepared.mass)
         force = (AIR_DRAG * speed + p.rolling_drag) * speed + p.body * p.back
@@ -259,7 +259,7 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
 
 
 def _torque_share(share: FloatArray) -> FloatArray:
-    """Engine torque over the largest one, at a share of maxRpm: a parabola, zero above the end (assumption)."""
+    """Engine torque over the largest one, at a share of maxRpm: a parabola, zero from maxRpm on (assumption)."""
     torque = TORQUE_IDLE + TORQUE_BEND * share * (ONE - share)
     torque[share >= ONE] = NOTHING
     return torque

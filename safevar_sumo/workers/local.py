@@ -54,7 +54,7 @@ def first_of(futures: Iterable[Future[Evaluations]]) -> set[Future[Evaluations]]
 
 
 def result_of(future: Future[Evaluations]) -> Evaluations:
-    """A future's result, waited for; raises what it failed with."""
+    """Wait for a future's result; raises its error."""
     first_of([future])
     return future.result()
 
@@ -116,7 +116,7 @@ class LocalPool:
             raise PoolLostError("the worker processes are closed down") from None
 
     def close(self) -> None:
-        """Drop what is not computed yet and end all workers."""
+        """Drop batches that are not computed yet and end all workers."""
         self._closed = True
         self._threads.shutdown(wait=False, cancel_futures=True)
         while self._living:
@@ -180,7 +180,7 @@ class _Worker:
         self._receive(START_LIMIT, "start")
 
     def compute(self, study: bytes, settings: FloatArray, time_limit: float) -> Evaluations:
-        """Have a batch computed; raises what it raised, or WorkerLostError."""
+        """Compute a batch; raises its error, or WorkerLostError."""
         with suppress(OSError):  # a dead worker is told by the answer that does not come
             self._pipe.send((study, settings))
         answer = self._receive(time_limit, "simulation")

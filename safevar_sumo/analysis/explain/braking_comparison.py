@@ -1,11 +1,11 @@
-"""Why a setting is less safe than the original: two runs side by side, and what the lost distance is made of.
+"""Why a setting is less safe than the original: two runs side by side, and the parts of the distance lost.
 
-A vehicle commands the brake with a gap G before it, at a speed v. A time t later its brake pedal stands where it is
-commanded to; until then it drives at a mean speed v - e and slows by d. From there on its mean deceleration is a. So it needs the distance
+The brake is commanded with a gap G ahead, at a speed v. The brake pedal has followed a time t later; meanwhile the mean speed
+is v - e, and the vehicle slows by d. From then on the mean deceleration is a. The stopping distance is
 
-    D = (v - e) t + (v - d)^2 / (2 a)
+    D = (v - e) t + (v - d)^2 / (2 a),
 
-to stand, and its margin is G - D. Differences of products are shared among their factors at the factors' means,
+and the margin is G - D. Differences of products are shared among their factors at the factors' means,
 D(x y) = Dx (y1 + y2) / 2 + Dy (x1 + x2) / 2, which is exact. So the margin lost between two runs is a sum of parts,
 each with the sign of one difference: place (G smaller), speed (v larger), delay (t larger), slowing (e and d: less speed
 lost while the pedal moves) and deceleration (a smaller).
@@ -21,24 +21,24 @@ from safevar_sumo.analysis.words import ENDS, joined
 from safevar_sumo.records import STANDSTILL, Outcome, SimulationRuns
 
 FULL = 0.9
-"""The brake pedal has followed its command where it stands at this share of it [-]: at 0.9 where full braking is commanded."""
+"""Share of the command at which the brake pedal counts as having followed it [-]: 0.9 where full braking is commanded."""
 REMAINDER = 0.05
-"""A part of the lost distance up to which it is not worth a word [m]."""
+"""Unexplained part of the distance lost that is small enough not to be mentioned [m]."""
 
 
 class Braking(NamedTuple):
-    """How a vehicle braked for what is before it.
+    """How a vehicle braked for the obstacle.
 
     Attributes
     ----------
     time, gap, speed
-        When it first commanded the brake, with how much distance there, how fast [s, m, m/s].
+        Time, gap and speed when the brake was first commanded [s, m, m/s].
     delay
         From the command until its brake pedal has followed it [s].
     mean_speed_lost, speed_lost
-        By how much its mean speed meanwhile, and its speed at the end of it, are below the one at the command [m/s].
+        Speed at the command less the mean speed during the delay, and less the speed at its end [m/s].
     deceleration
-        Mean deceleration over the distance from there on [m/s^2], as UN R13-H takes the mean of fully developed braking.
+        Mean deceleration over the distance after the delay [m/s^2], as UN R13-H averages fully developed braking.
     """
 
     time: float
@@ -51,7 +51,7 @@ class Braking(NamedTuple):
 
     @property
     def needed(self) -> float:
-        """Distance from the command until it stands [m]; where the run ends before, it goes on at that deceleration."""
+        """Distance from the command to standstill [m], at the mean deceleration beyond the end of the run."""
         return (self.speed - self.mean_speed_lost) * self.delay + (self.speed - self.speed_lost)**2 / (2 * self.deceleration)
 
     @property
@@ -61,9 +61,9 @@ class Braking(NamedTuple):
 
 
 class Course(NamedTuple):
-    """One run as far as it matters: how it ended, its braking (None without any), and the distance left at its closest.
+    """Summary of one run: its outcome, its braking (None without any), and the least gap.
 
-    `safety_degree` is in m, or -m/s; NaN if undefined. `closest` is the gap at the closest place [m], NaN on a collision.
+    `safety_degree` is in m, or -m/s; NaN if undefined. `closest` is the gap where the obstacle is nearest [m], NaN on a collision.
     """
 
     outcome: str
@@ -93,7 +93,7 @@ class BrakingComparison(NamedTuple):
 
 
 def course(runs: SimulationRuns, column: int, safety_degree: float) -> Course:
-    """What there is to tell of one of N runs."""
+    """Summary of one of N runs."""
     trace, encounter = runs.trace, runs.encounter
     active = np.flatnonzero(trace.active[:, column])
     counted = trace.active[:, column] & encounter.in_conflict[:, column]
@@ -127,7 +127,7 @@ def _braking(runs: SimulationRuns, column: int, first: int, last: int) -> Brakin
 
 def compare_braking(original: Course, changed: Course, place: str = "") -> BrakingComparison:
     """Compare a changed vehicle's run with the original's at the same place."""
-    one, other = original.braking, _as_the_original_would(changed, original)
+    one, other = original.braking, _braking_or_the_originals(changed, original)
     if one is None or other is None:
         return BrakingComparison(original, changed, {}, place)
     parts, slowing = _parts(one, other)
@@ -136,15 +136,15 @@ def compare_braking(original: Course, changed: Course, place: str = "") -> Braki
     return BrakingComparison(original, changed, {**parts, "remainder": rest[0] - rest[1]}, place, slowing)
 
 
-def _as_the_original_would(changed: Course, original: Course) -> Braking | None:
-    """A vehicle that hits without braking needs the way that the original would need from there, at its speed."""
+def _braking_or_the_originals(changed: Course, original: Course) -> Braking | None:
+    """The braking of a changed vehicle; one that collides without braking is given the original's braking, at its own speed."""
     if changed.braking is not None or original.braking is None or not np.isfinite(changed.collision_speed):
         return changed.braking
     return original.braking._replace(time=np.nan, gap=0.0, speed=max(changed.collision_speed, original.braking.speed_lost))
 
 
 def _parts(one: Braking, other: Braking) -> tuple[dict[str, float], tuple[float, float]]:
-    """What of the margin lost from one braking to the other comes from what [m], and what each saves while its pedal moves."""
+    """Parts of the margin lost between two brakings by their causes [m], and the distance that each saves while its pedal moves [m]."""
     mean_delay, mean_weakness = (one.delay + other.delay) / 2, (1 / one.deceleration + 1 / other.deceleration) / 2
     speeds = [braking.speed - braking.speed_lost for braking in (one, other)]
     mean_speed = sum(speeds) / 2
@@ -159,13 +159,13 @@ def _parts(one: Braking, other: Braking) -> tuple[dict[str, float], tuple[float,
 
 
 WORTH_A_WORD = 0.005
-"""A part of a distance that rounds to less than a centimetre is left out of a sentence [m]."""
+"""Smallest part of a distance that a sentence mentions [m]: half a centimetre."""
 PARTS = {
     "place": ("it begins to brake nearer", "it begins to brake farther away"), "speed": ("it is faster", "it is slower"),
     "delay": ("its brake pedal follows later", "its brake pedal follows sooner"),
     "slowing": ("it slows less while the pedal moves", "it slows more while the pedal moves"),
     "deceleration": ("it brakes more weakly", "it brakes harder")}
-"""What costs distance, and what gains some."""
+"""Words for a part that costs distance, and for one that gains some."""
 
 
 def how(course: Course) -> str:
@@ -202,13 +202,13 @@ def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
 
 
 def _numbers(comparison: BrakingComparison, part: str) -> str:
-    """What a part was, and what it is with the original."""
+    """The quantity behind a part, of the changed vehicle and of the original."""
     one, other = comparison.original.braking, comparison.changed.braking
     if one is None or other is None:
         return ""
     pairs = {"place": (other.gap, one.gap, "m before"), "speed": (other.speed, one.speed, "m/s at the command"),
              "delay": (other.delay, one.delay, "s after the command"), "slowing": (comparison.slowing[1], comparison.slowing[0], "m saved"),
              "deceleration": (other.deceleration, one.deceleration, "m/s^2")}
-    there, here, name = pairs[part]
-    decimals = next((digits for digits in range(2, 9) if f"{there:.{digits}f}" != f"{here:.{digits}f}"), 2)
-    return f" ({there:.{decimals}f} instead of {here:.{decimals}f} {name})"
+    changed, original, unit = pairs[part]
+    decimals = next((digits for digits in range(2, 9) if f"{changed:.{digits}f}" != f"{original:.{digits}f}"), 2)
+    return f" ({changed:.{decimals}f} instead of {original:.{decimals}f} {unit})"

@@ -24,7 +24,7 @@ CHUNK = 20_000
 
 
 class MinimalCause(NamedTuple):
-    """A smallest unsafe subset of a setting's changes: the columns that keep their values, and what they do by themselves.
+    """A smallest unsafe subset of a setting's changes: the columns that keep their values, and the outcome.
 
     `setting` has shape (n,); `safety_degree` is in m, or -m/s.
     """
@@ -66,9 +66,9 @@ def minimal_causes(bench: Bench, settings: FloatArray, unsafe: Unsafe) -> list[l
 
 
 def expected_cost(changes: int) -> int:
-    """About how many subsets of so many changes are simulated until the smallest unsafe ones are found.
+    """Estimate of the number of subsets of a number of changes that are simulated until the smallest unsafe ones appear.
 
-    As if these had half of the changes, which is about what causes of the shipped studies come to.
+    It assumes causes of half of the changes, about the size of those of the shipped studies.
     """
     return sum(comb(changes, size) for size in range((changes + 1) // 2 + 1))
 
@@ -94,9 +94,9 @@ def involved(causes: Sequence[MinimalCause]) -> frozenset[int]:
 
 
 GRID = 32
-"""Places that a line is looked at first: an island of unsafety as wide as one of them is not skipped."""
+"""Places simulated on a line at first: an unsafe island as wide as their distance is not skipped."""
 FINER = 8
-"""Into how many parts the last safe part is divided, again and again."""
+"""Number of parts into which the last safe part is divided, `ROUNDS` times."""
 ROUNDS = 3
 RESOLUTION = 1 / (GRID * FINER**ROUNDS)
 """Accuracy of a boundary, as a share of the line."""
@@ -147,7 +147,7 @@ def boundaries(bench: Bench, causes: list[MinimalCause], unsafe: Unsafe) -> list
 
 
 class Line(NamedTuple):
-    """Settings from `start` to `end`, shape (n,) each; those at the share `lowest` of it and below do not count."""
+    """Settings from `start` to `end`, shape (n,) each; settings at the share `lowest` of the line and below are left out."""
 
     start: FloatArray
     end: FloatArray
@@ -175,14 +175,14 @@ class Line(NamedTuple):
 
 
 def first_unsafe(bench: Bench, lines: list[Line], unsafe: Unsafe, what: str = "boundaries") -> FloatArray:
-    """The first unsafe share of every line, whose end is unsafe; exact to `RESOLUTION` of what counts of it."""
+    """The first unsafe share of every line, whose end is unsafe; exact to `RESOLUTION` of the line above `lowest`."""
     return edges(bench, lines, unsafe, what)[0]
 
 
 def edges(bench: Bench, lines: list[Line], unsafe: Unsafe, what: str = "boundaries") -> tuple[FloatArray, list[End]]:
-    """The first unsafe share of every line as `first_unsafe`, and what is just below it.
+    """The first unsafe share of every line as `first_unsafe`, and the state just below it.
 
-    A place that cannot be simulated is neither safe nor unsafe: the search goes past it as past a safe one, and tells if it ends there.
+    A place that cannot be simulated is neither safe nor unsafe: the search passes it and reports `NOT_SIMULATED` if it ends there.
     """
     lowest = np.array([line.lowest for line in lines])
     low, high, simulated = lowest, np.ones(len(lines)), np.ones(len(lines), dtype=bool)

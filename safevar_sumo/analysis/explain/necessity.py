@@ -1,4 +1,4 @@
-"""Over many failures: which characteristics are needed, beside how often they are changed; and which causes there are."""
+"""Statistics over many failures: how often each characteristic is changed and how often it is needed, distinct causes, robustness."""
 
 from __future__ import annotations
 
@@ -77,11 +77,11 @@ def distinct_causes(characteristics: CharacteristicSet, causes: Sequence[Sequenc
 
 NEIGHBOURS = 64
 STEP_FACTORS = (1.0, 0.5, 2.0)
-"""Of the study's time step: itself, half of it, and twice."""
+"""Factors on the study's time step."""
 BORDERLINE = 0.8
 """Share of unsafe neighbours below which a failure is called borderline."""
 TOGETHER = 8
-"""Failures, the smallest first, that are tried at a time."""
+"""Number of failures that are tried at a time, the smallest first."""
 
 
 class Robustness(NamedTuple):

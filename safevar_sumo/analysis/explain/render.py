@@ -33,7 +33,7 @@ Again = Callable[[Mapping[str, float]], str]
 
 
 def print_explained(console: Console, place: str, result: Explained, point: str = "", *, full: bool = False) -> None:
-    """The answer in about ten lines; `full` explains every chosen failure. The commands name `place` and `point`."""
+    """The answer in about ten lines; `full` explains every chosen failure. `place` and `point` stand in the printed commands."""
     members = CharacteristicSet.of(result.study.vehicle.characteristics)
     print_text(console, result.study.title)
     print_text(console, f"Unsafe: {result.unsafe}. {number_of(result.failures, 'failure')} among {result.looked_at} different settings.")
@@ -57,7 +57,7 @@ def print_explained(console: Console, place: str, result: Explained, point: str 
 
 
 def _print_answer(console: Console, again: Again, result: Explained, members: CharacteristicSet) -> None:
-    """The paragraph; of the failure that leads, why and how little is enough; which changes and causes are common."""
+    """The paragraph; why the first failure fails and how little is enough; the most frequent changes and causes."""
     first = result.explanations[0]
     by_reason = {reason: failure for failure in result.explanations for reason in failure.reasons}
     smallest, robust = by_reason.get(REASONS["fewest"], first), by_reason.get(ROBUST)
@@ -76,7 +76,7 @@ def _print_answer(console: Console, again: Again, result: Explained, members: Ch
 
 
 def _finding(failure: Explanation | None) -> Finding | None:
-    """A failure as the paragraph tells of it; None for what is not unsafe."""
+    """The record of a failure that the paragraph takes; None for a setting that is not unsafe."""
     if failure is None or not failure.causes:
         return None
     changes = {name: failure.setting[name] for name in failure.changed}
@@ -97,12 +97,12 @@ def _necessary(row: Mapping[Any, Any]) -> str:
 
 
 def _named(member: Characteristic) -> str:
-    """Its name with what it is, in short."""
+    """The name of a characteristic with its short description."""
     return member.name if member.short_name == member.name else f"{member.name} ({member.short_name})"
 
 
 def _sawtooth(result: Explained) -> str:
-    """How exact a value along a characteristic can be: the way that the vehicle covers between two decisions."""
+    """The accuracy of values along a characteristic: the distance that the vehicle covers between two decisions."""
     step = next(iter(result.explanations[0].robustness.by_step), None)
     braking = result.explanations[0].because.original.braking
     if step is None or braking is None:
@@ -157,7 +157,7 @@ def _print_cause(console: Console, again: Again, cause: Cause, members: Characte
 
 
 def _side_by_side(comparison: BrakingComparison) -> WholeTable:
-    """Original and changed vehicle, and what each line explains of the lost distance."""
+    """Original and changed vehicle, and the part of the lost distance that each line explains."""
     table = WholeTable("", "unit", right=("original", "changed", "explains, m"))
     parts = comparison.parts
     brakings = comparison.original.braking, comparison.changed.braking

@@ -101,13 +101,13 @@ class Explained:
     explanations
         The failures that were chosen.
     necessity, distinct
-        Frames over all failures looked into, of `safevar_sumo.analysis.explain.necessity`.
+        Frames over all analysed failures, of `safevar_sumo.analysis.explain.necessity`.
     looked_at, failures, analysed
-        How many settings were looked at, how many of them are unsafe, and over how many of these the two frames are.
+        Numbers of settings evaluated, of unsafe ones among them, and of those over which the two frames are.
     otherwise
-        How many solutions end otherwise than the results say.
+        Number of solutions whose outcome differs from the results.
     preventability
-        Who avoids the collisions among the settings looked at.
+        Shares of the collisions that reference drivers avoid.
     """
 
     study: Study

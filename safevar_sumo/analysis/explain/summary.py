@@ -170,11 +170,11 @@ def in_short(system: System, original: Evaluations, smallest: Finding | None, ro
     robust
         The robust failure with the fewest changes; None if none of those tried is robust.
     preventable
-        Who avoids the collisions failure.
+        Shares of the collisions that reference drivers avoid.
     """
     parts = [f"{_conditions(system)} the original vehicle {_end(system, original)}."]
     if smallest is None:
-        return " ".join([*parts, "Nothing unsafe was failure."])
+        return " ".join([*parts, "Nothing unsafe was found."])
     members = CharacteristicSet(system.characteristics.members)
     if not smallest.needed:
         return " ".join([*parts, "No change is needed for it to be unsafe."])
@@ -255,7 +255,7 @@ def _how_robust(failure: Finding) -> str:
 
 
 def _avoided(preventable: Preventability) -> list[str]:
-    """Shares of the collisions by who avoids them, in a sentence; empty without a collision."""
+    """Shares of the collisions that each reference driver avoids, in a sentence; empty without a collision."""
     if not preventable.looked_at:
         return []
     words = {PreventableBy.COMPETENT_DRIVER: "a competent driver avoids {}", PreventableBy.FULL_BRAKING:

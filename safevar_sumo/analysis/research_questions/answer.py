@@ -1,4 +1,4 @@
-"""The research questions by name, asked of several cases at once: tidy frames, and notes on what they lack."""
+"""Answers to the research questions, by name and over several cases: tidy frames, and notes on missing data."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def _ask(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd.DataFrame]
 
 
 def _notes(question: str, case: Case) -> list[str]:
-    """What a reader of this table should know of a case."""
+    """Notes on a case for the readers of a table."""
     notes = case.remarks
     if question in ("rq1", "rq2"):
         for metric in case.scoring.metrics:

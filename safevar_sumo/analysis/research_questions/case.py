@@ -1,4 +1,4 @@
-"""One case's results as the research questions need them: who found what, and what the original vehicle did."""
+"""The results of one study as the research questions need them: solutions by algorithm and run, and the original's metrics."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from safevar_sumo.study import Origin, Study, Weather, invalid, of_today
 from safevar_sumo.vehicles import CharacteristicSet
 
 NSGA2 = "nsga2"
-"""The algorithm that RQ2 asks about and whose solutions RQ3 looks at."""
+"""The algorithm that RQ2 compares with the others, and whose solutions RQ3 analyses."""
 ALGORITHM_TITLES = {"nsga2": "NSGA-II", "spea2": "SPEA2", "mocell": "MOCell", "rs": "RS", "safe_fuzzer": "SafeFuzzer"}
 
 
@@ -46,9 +46,9 @@ class Case:
     finished
         Algorithm and number of every finished run.
     scoring
-        Which metrics there are, and what was minimised.
+        The metrics and the minimised objectives.
     has_runs
-        False for imported solutions, of which nobody knows the run.
+        False for imported solutions, whose runs are unknown.
     failures
         Settings that could not be simulated.
     """
@@ -104,7 +104,7 @@ class Case:
 
     @property
     def remarks(self) -> list[str]:
-        """What a reader of any table of this case should know."""
+        """Notes for the readers of every table of this case."""
         lines = []
         if not self.has_runs:
             lines.append(f"{self.name}: imported solutions, without runs; the original vehicle as published or given.")

@@ -1,4 +1,4 @@
-"""Pictures of results: one function a picture, from a case, or all of them, to a matplotlib figure."""
+"""Figures of results: a function for each, which takes a case, or all cases, and returns a matplotlib figure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's, which colour-blind readers can tell apart; markers and line styles tell the same again."""
+"""Okabe and Ito's, which colour-blind readers can tell apart; markers and line styles repeat the distinction."""
 MARKERS, DASHES = ("o", "X", "^", "s", "D", "v"), ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
 INCREASE, DECREASE = COLOURS[1], COLOURS[0]
 OBJECTIVE_TITLES = {"f_safe": "f_safe: safety degree [m, -m/s]", "f_diff": "f_diff: largest change [fraction of the original]",
@@ -104,7 +104,7 @@ def sizes_of_changes(case: Case) -> Figure:
         axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
         _whole_numbers(axis.yaxis, 4)
     figure.supylabel(f"how many of {total} critical solutions", fontsize=9)
-    figure.supxlabel("orange, right of 0: increases; blue, left of 0: decreases; titles tell how many of each;\n"
+    figure.supxlabel("orange, right of 0: increases; blue, left of 0: decreases; titles count them;\n"
                      "each axis spans the characteristic's domain", fontsize=FONT)
     return _spaced(figure)
 
@@ -153,14 +153,14 @@ def objective_title(objective: Objective) -> str:
 
 
 def _of_original(case: Case, objective: Objective) -> float:
-    """The original vehicle's value; NaN where nobody knows it."""
+    """The original vehicle's value; NaN where it is unknown."""
     if objective.name in (F_DIFF.name, F_NUM_DIFF.name):
         return 0.0
     return case.original.get(SAFETY_DEGREE if objective == F_SAFE else objective.name, np.nan)
 
 
 def hypervolume_growth(case: Case) -> Figure:
-    """Convergence: the hypervolume of what was found against evaluations, median and range over the runs."""
+    """Convergence: the hypervolume of all settings so far against evaluations, median and range over the runs."""
     growth = convergence(case)
     figure, ((axis,),) = new_figure(f"{case.name}: convergence", 1, 1, (6.4, 4.0))
     for i, (algorithm, group) in enumerate(growth.groupby("algorithm", sort=False)):

@@ -111,9 +111,9 @@ def indicators(case: Case) -> pd.DataFrame:
 
 
 def convergence(case: Case, points: int = 50) -> pd.DataFrame:
-    """The hypervolume of what each run had found after so many evaluations; columns algorithm, run, evaluations, hypervolume.
+    """The hypervolume of each run's settings after a number of evaluations; columns algorithm, run, evaluations, hypervolume.
 
-    A run that ended early keeps what it had; a hypervolume is 0 while everything found is beyond the reference point.
+    A run that ended early keeps its last hypervolume; it is 0 while all settings lie beyond the reference point.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def _growth(case: Case, evaluations: pd.DataFrame, scale: Scale, grid: np.ndarra
 
 
 def _checked(points: FloatArray, what: str) -> FloatArray:
-    """Refuse what indicators would answer with their best value: no point, or undefined ones."""
+    """Refuse empty sets and undefined points, for which indicators would return their best value."""
     array = np.asarray(points, dtype=float)
     if array.ndim != 2 or not array.size:
         raise InputError(what, "is empty", "at least one point, shape (M, m)")

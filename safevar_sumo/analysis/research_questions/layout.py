@@ -1,4 +1,4 @@
-"""Answers laid out as tables: headings, number formats, what is bold; all that was computed, or as the paper has it. Plain data yet."""
+"""Answers laid out as tables of text, in full or in the paper's layout: headings, number formats, bold cells. `tables.py` renders them."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ Row = Mapping[Any, Any]
 
 
 class Bold(str):
-    """A cell that stands out."""
+    """A cell in bold."""
 
 
 class Table(NamedTuple):

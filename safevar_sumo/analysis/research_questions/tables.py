@@ -22,7 +22,7 @@ _LATEX = {
     "\N{DEGREE SIGN}": r"\textdegree{}", "\N{MICRO SIGN}": r"\textmu{}", "\N{GREEK SMALL LETTER MU}": r"\textmu{}",
     "\N{SUPERSCRIPT TWO}": r"\textsuperscript{2}", "\N{SUPERSCRIPT THREE}": r"\textsuperscript{3}",
     "\N{MIDDLE DOT}": r"\textperiodcentered{}", MINUS: r"\textminus{}"}
-"""How LaTeX has the characters that mean something to it, and some that units are made of."""
+"""LaTeX of its special characters, and of some that occur in units."""
 _LAST_PLAIN = "\N{LATIN SMALL LETTER Z WITH CARON}"
 """Up to here, LaTeX's T1 fonts have nearly every letter."""
 LATEX_NEEDS = r"% In the preamble: \usepackage[T1]{fontenc} \usepackage{textcomp} \usepackage{booktabs} \usepackage{graphicx}"
@@ -65,14 +65,14 @@ def as_json(answers: Sequence[Answer]) -> str:
 
 
 def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """A frame as plain values; what is undefined is None, a rank only stands where there is one."""
+    """The rows of a frame as plain values; undefined ones are None, and a missing rank has no key."""
     rows = [{str(name): _plain(value) for name, value in row.items()} for row in frame.to_dict("records")]
     return [{name: value for name, value in row.items() if not (name == "rank" and value is None)} for row in rows]
 
 
 LAYOUTS_BY_NAME: Mapping[str, Layouts] = {"full": LAYOUTS, "paper": PAPER}
 LAID_OUT: Mapping[str, Callable[..., str]] = {"text": text, "markdown": markdown, "latex": latex}
-"""Formats for readers, whose functions take layouts; the others hold the frames."""
+"""Formats for readers, whose functions take a layout; the other formats hold the frames."""
 FORMATS: Mapping[str, Callable[..., str]] = {**LAID_OUT, "csv": csv, "json": as_json}
 ENDINGS = {"text": "txt", "markdown": "md", "latex": "tex", "csv": "csv", "json": "json"}
 
@@ -116,7 +116,7 @@ def _markdown(table: Table) -> str:
 
 
 def _marked(plain: str) -> str:
-    """Plain text as Markdown, whose own signs are taken for what they are."""
+    """Plain text as Markdown, with Markdown's own signs escaped."""
     return re.sub(r"([\\`*_|<>\[\]~^#$])", r"\\\1", plain.replace("\n", " "))
 
 

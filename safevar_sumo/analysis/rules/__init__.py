@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class RulesOptions(Options):
-    """How rules are looked for."""
+    """Options of the search for rules."""
 
     question: ClassVar[str] = "rules"
     samples: int = option(16_384, "Settings over the whole domain: half of them make the rules, the other half judges them.",

@@ -263,7 +263,7 @@ def print_rules(console: Console, result: Rules) -> None:
 
 
 def rule_in_words(rule: Rule, characteristics: CharacteristicSet, unsafe: Unsafe) -> str:
-    """A rule with what it is worth: `tireFric below 1.35 and gearSwitchTime above 0.55 s: collides in 92% (..), covers 61% (..)`."""
+    """A rule with its density and coverage: `tireFric below 1.35 and gearSwitchTime above 0.55 s: collides in 92% (..), covers 61%`."""
     conditions = [_condition(member, *rule.limits[member.name]) for member in characteristics if member.name in rule.limits]
     what = "collides" if unsafe.below is None else f"SD is below {unsafe.below:g}"
     shares = [f"{word} {share:.0%} ({interval[0]:.0%} to {interval[1]:.0%})" if share is not None and interval is not None else f"{word} -"

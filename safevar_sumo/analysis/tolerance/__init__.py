@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ToleranceOptions(Options):
-    """How tolerances are looked for."""
+    """Options of the search for tolerances."""
 
     question: ClassVar[str] = "tolerance"
     unsafe: str | None = unsafe_option()

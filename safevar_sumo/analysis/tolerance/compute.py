@@ -54,21 +54,21 @@ class OneAtATimeScan:
         return [self.profile.iloc[[place for place, _ in run]] for value, run in runs if value == state]
 
     @property
-    def _around(self) -> pd.DataFrame | None:
+    def _safe_part(self) -> pd.DataFrame | None:
         """The safe values around the original."""
         return next((part for part in self._intervals(SAFE) if (part["value"] == self.characteristic.original).any()), None)
 
     @property
     def safe(self) -> Interval | None:
         """The safe interval around the original; None if the original itself is unsafe."""
-        return None if self._around is None else _ends(self._around)
+        return None if self._safe_part is None else _ends(self._safe_part)
 
     @property
     def margins(self) -> tuple[float | None, float | None]:
         """Safety degrees at the ends of the safe interval [m]."""
-        if self._around is None:
+        if self._safe_part is None:
             return None, None
-        low, high = self._around[SAFETY_DEGREE].iloc[[0, -1]]
+        low, high = self._safe_part[SAFETY_DEGREE].iloc[[0, -1]]
         return finite_or_none(low), finite_or_none(high)
 
     @property
@@ -122,7 +122,7 @@ def scan(bench: Bench, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATim
     values = [np.union1d(np.linspace(members[column].lower, members[column].upper, number), members[column].original) for column in columns]
     profiles = _evaluated(bench, columns, values, unsafe)
     for _ in range(rounds):
-        between = [_where_it_changes(profile) for profile in profiles]
+        between = [_between_states(profile) for profile in profiles]
         if not any(map(len, between)):
             break
         finer = _evaluated(bench, columns, between, unsafe)
@@ -131,7 +131,7 @@ def scan(bench: Bench, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATim
     return [OneAtATimeScan(characteristic=members[column], profile=profile) for column, profile in zip(columns, profiles, strict=True)]
 
 
-def _where_it_changes(profile: pd.DataFrame) -> FloatArray:
+def _between_states(profile: pd.DataFrame) -> FloatArray:
     """Values between two neighbours of different states."""
     values, states = profile["value"].to_numpy(), _states(profile)
     changes = np.flatnonzero(states[1:] != states[:-1])
@@ -173,15 +173,17 @@ class Tolerance:
     def verdict(self) -> str:
         """What is unsafe by itself, in one sentence."""
         single = [scan.characteristic.name for scan in self.alone if scan.unsafe]
-        double = [" with ".join(member.name for member in pair.characteristics) for pair in self.pairs or [] if pair.nearest is not None]
+        unsafe_pairs = [" with ".join(member.name for member in pair.characteristics) for pair in self.pairs or []
+                        if pair.nearest is not None]
         if self.unsafe.of(self.original)[0]:
             return "The original vehicle itself is unsafe."
         if single:
             return f"Unsafe alone: {', '.join(single)}."
         if self.pairs is None:
             return "No single characteristic makes it unsafe."
-        if double:
-            return f"No single characteristic makes it unsafe, but {len(double)} of {len(self.pairs)} pairs: {', '.join(double)}."
+        if unsafe_pairs:
+            pairs = f"{len(unsafe_pairs)} of {len(self.pairs)} pairs: {', '.join(unsafe_pairs)}"
+            return f"No single characteristic makes it unsafe, but {pairs}."
         return "No single characteristic and no pair makes it unsafe."
 
     def to_frame(self) -> pd.DataFrame:

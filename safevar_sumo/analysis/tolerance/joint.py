@@ -53,7 +53,7 @@ class Pair:
 
     @property
     def unsafe_share(self) -> float:
-        """Share of the plane that is unsafe, of what could be simulated of it, by the trapezoidal rule."""
+        """Unsafe share of the simulated part of the plane, by the trapezoidal rule."""
         simulated = np.sum(_WEIGHT * self.valid)
         return float(np.sum(_WEIGHT * self.unsafe) / simulated) if simulated else 0.0
 
