@@ -31,8 +31,8 @@ class Block(NamedTuple):
 
 
 def blocks(page: str) -> list[Block]:
-    found = re.findall(r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$', (ROOT / page).read_text(), flags=re.DOTALL | re.MULTILINE)
-    return [Block(*one) for one in found]
+    result = re.findall(r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$', (ROOT / page).read_text(), flags=re.DOTALL | re.MULTILINE)
+    return [Block(*one) for one in result]
 
 
 @pytest.mark.parametrize("page", [
@@ -100,12 +100,12 @@ class Numbers(NamedTuple):
 
 def marked(page: str) -> list[Numbers]:
     """Every comment that begins with `numbers:`: lines of commands, then lines of `path = number`."""
-    found = []
+    result = []
     for comment, paragraph in re.findall(r"<!-- numbers:\n(.*?)-->\n+(.*?)(?=\n\n|\Z)", (ROOT / page).read_text(), flags=re.DOTALL):
         lines = [line.strip() for line in comment.splitlines() if line.strip()]
         values = dict(line.split(" = ") for line in lines if not line.startswith(PROGRAM))
-        found.append(Numbers(page, [line for line in lines if line.startswith(PROGRAM)], values, paragraph))
-    return found
+        result.append(Numbers(page, [line for line in lines if line.startswith(PROGRAM)], values, paragraph))
+    return result
 
 
 MARKED = [one for page in PAGES for one in marked(page)]
@@ -127,7 +127,7 @@ def test_marked_numbers_are_those_that_their_commands_print(numbers: Numbers, in
         assert done.exit_code == 0, f"{command}\n{done.output}"
     records = json.loads(done.stdout)
     for path, value in numbers.values.items():
-        found = records
+        result = records
         for key in path.split("."):
-            found = found[int(key) if isinstance(found, list) else key]
-        assert f"{100 * found:.0f} %" == value, f"{numbers.page}: {path}"
+            result = result[int(key) if isinstance(result, list) else key]
+        assert f"{100 * result:.0f} %" == value, f"{numbers.page}: {path}"

@@ -63,6 +63,6 @@ def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> Non
     shown = [output.get("data", {}) for output in outputs]
     assert (sum("text/html" in data for data in shown), sum("image/png" in data for data in shown)) == (3, 4)
     printed = "".join(output["text"] for output in outputs if output.output_type == "stream" and output.name == "stdout")
-    for said in ("The original stops", "all together", "with 95 % confidence", "SD is below 1.1 in"):
-        assert said in printed
+    for result in ("The original stops", "all together", "with 95 % confidence", "SD is below 1.1 in"):
+        assert result in printed
     assert not [output for output in outputs if output.get("name") == "stderr"]

@@ -41,11 +41,6 @@ def case(slippery: Path) -> Case:
     return load_cases([slippery])[0]
 
 
-@pytest.fixture
-def told(explained: Explained) -> Explained:
-    return explained
-
-
 def collides(case: Case, settings: list[dict[str, float]]) -> list[bool]:
     members = case.characteristics
     rows = np.array([members.setting(values, "test") for values in settings])
@@ -53,17 +48,17 @@ def collides(case: Case, settings: list[dict[str, float]]) -> list[bool]:
     return list(Bench(case.study, Here()).evaluate(rows, "afresh").collided)
 
 
-def test_every_minimal_cause_is_unsafe_and_no_proper_subset_of_it_is(case: Case, told: Explained) -> None:
-    assert str(told.unsafe) == "collision"
-    causes = [cause.changes for one in told.explanations for cause in one.causes]
+def test_every_minimal_cause_is_unsafe_and_no_proper_subset_of_it_is(case: Case, explained: Explained) -> None:
+    assert str(explained.unsafe) == "collision"
+    causes = [cause.changes for one in explained.explanations for cause in one.causes]
     assert causes
     assert all(collides(case, causes))
     proper = [dict(subset) for changes in causes for size in range(len(changes)) for subset in combinations(changes.items(), size)]
     assert not any(collides(case, proper))
 
 
-def test_every_boundary_is_unsafe_and_just_below_it_is_safe(case: Case, told: Explained) -> None:
-    causes = [cause for one in told.explanations for cause in one.causes]
+def test_every_boundary_is_unsafe_and_just_below_it_is_safe(case: Case, explained: Explained) -> None:
+    causes = [cause for one in explained.explanations for cause in one.causes]
     assert all(collides(case, [cause.boundary for cause in causes]))
     original = dict(zip(case.characteristics.names, case.characteristics.original, strict=True))
     below = [{name: original[name] + (cause.fraction - 2 * RESOLUTION) * (value - original[name]) for name, value in cause.changes.items()}
@@ -71,14 +66,14 @@ def test_every_boundary_is_unsafe_and_just_below_it_is_safe(case: Case, told: Ex
     assert not any(collides(case, below))
 
 
-def test_the_records_are_those_of_the_solutions(case: Case, told: Explained) -> None:
-    assert repr(told).startswith(f"<Explained {case.study.name}, unsafe collision: {told.failures} of ")
-    *records, last = json.loads(json.dumps(told.to_dict(), allow_nan=False))
-    known = [str(handle) for handle in handles(case.solutions)]
+def test_the_records_are_those_of_the_solutions(case: Case, explained: Explained) -> None:
+    assert repr(explained).startswith(f"<Explained {case.study.name}, unsafe collision: {explained.failures} of ")
+    *records, last = json.loads(json.dumps(explained.to_dict(), allow_nan=False))
+    output = [str(handle) for handle in handles(case.solutions)]
     for one in records:
         assert list(one) == ["algorithm", "run", "index", "setting", "outcome", "safety_degree", "changed", "minimal_causes", "robustness",
                              "because", "reasons"]
-        row = case.solutions.iloc[known.index(f"{one['algorithm']}:{one['run']}:{one['index']}")]
+        row = case.solutions.iloc[output.index(f"{one['algorithm']}:{one['run']}:{one['index']}")]
         assert one["setting"] == row[list(case.characteristics.names)].to_dict()
         assert (one["outcome"], one["safety_degree"]) == (row["outcome"], row["safety_degree"])
         for cause in one["minimal_causes"]:
@@ -92,29 +87,29 @@ def test_the_records_are_those_of_the_solutions(case: Case, told: Explained) -> 
     preventable = last["summary"]["preventable"]
     assert list(preventable) == ["competent_driver", "full_braking", "nobody", "looked_at", "interval_competent_driver"]
     assert sum(list(preventable.values())[:3]) == pytest.approx(1)
-    assert preventable["looked_at"] == told.failures
+    assert preventable["looked_at"] == explained.failures
     assert all(share <= last["summary"]["changed"][name] for name, share in last["summary"]["necessary"].items())
 
 
-def test_the_failures_that_matter_come_first(case: Case, told: Explained) -> None:
+def test_the_failures_that_matter_come_first(case: Case, explained: Explained) -> None:
     crashes = case.solutions[case.solutions["outcome"] == "collision"]
-    reasons = {reason: one for one in told.explanations for reason in one.reasons}
+    reasons = {reason: one for one in explained.explanations for reason in one.reasons}
     assert len(reasons["fewest changes"].changed) == crashes["f_num_diff"].min()
     assert reasons["most severe"].safety_degree == crashes["safety_degree"].min()
-    assert told.failures == told.analysed == len(crashes[list(case.characteristics.names)].drop_duplicates())
+    assert explained.failures == explained.analysed == len(crashes[list(case.characteristics.names)].drop_duplicates())
 
 
-def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: Case, told: Explained) -> None:
+def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: Case, explained: Explained) -> None:
     """Every failure that is smaller, by number of changes and then by the largest, has less than 80 % of unsafe neighbours."""
-    (robust,) = [one for one in told.explanations if "smallest robust" in one.reasons]
-    assert told.explanations[0] == robust
+    (robust,) = [one for one in explained.explanations if "smallest robust" in one.reasons]
+    assert explained.explanations[0] == robust
     assert robust.robustness.share >= 0.8
     crashes = case.solutions[case.solutions["outcome"] == "collision"].sort_values(["f_num_diff", "f_diff", "f_safe"], kind="stable")
     settings = crashes[list(case.characteristics.names)].to_numpy()
     place = next(i for i, setting in enumerate(settings) if setting.tolist() == list(robust.setting.values()))
     if place:
         bench = Bench(case.study, Here())
-        assert max(one.share for one in robustness(bench, settings[:place], 0.05, told.unsafe)) < 0.8
+        assert max(one.share for one in robustness(bench, settings[:place], 0.05, explained.unsafe)) < 0.8
 
 
 def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
@@ -140,31 +135,31 @@ def test_what_cannot_be_read_is_refused(slippery: Path, arguments: list[str], sa
     assert says in str(done.exception)
 
 
-def printed(told: Explained, *, full: bool) -> str:
+def printed(explained: Explained, *, full: bool) -> str:
     console = Console(file=StringIO(), width=80, _environ={})
-    print_explained(console, "here", told, full=full)
+    print_explained(console, "here", explained, full=full)
     return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
 
 
-def test_the_answer_takes_ten_lines_and_the_rest_is_asked_for(told: Explained) -> None:
+def test_the_answer_takes_ten_lines_and_the_rest_is_asked_for(explained: Explained) -> None:
     """The vehicle covers v dt between two decisions: that is how high the sawtooth of a profile is."""
-    short, full = printed(told, full=False).splitlines(), printed(told, full=True)
+    short, full = printed(explained, full=False).splitlines(), printed(explained, full=True)
     assert len(short) <= 10
     assert short[:-1] == full.splitlines()[:len(short) - 1]
     assert short[-1].endswith("python -m safevar_sumo explain here --full")
-    assert_tells_a_manager(short[2], told)
-    braking = told.explanations[0].because.original.braking
+    assert_tells_a_manager(short[2], explained)
+    braking = explained.explanations[0].because.original.braking
     assert braking is not None
     assert f"frames of 0.05 s, in which the vehicle covers {braking.speed * 0.05:.2f} m at {braking.speed:.1f} m/s" in full
     assert re.search(r"max_rpm 5800 -> \d+ r/min", full), "28 r/min are no change at all: no decimals"
     assert not re.search(r"max_rpm 5800 -> \d+\.", full)
 
 
-def assert_tells_a_manager(paragraph: str, told: Explained) -> None:
+def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
     """Conditions, original, what suffices for what, how robust, avoidable by whom: the numbers are those of `explain`."""
-    by_reason = {reason: one for one in told.explanations for reason in one.reasons}
+    by_reason = {reason: one for one in explained.explanations for reason in one.reasons}
     fewest, robust = by_reason["fewest changes"], by_reason["smallest robust"]
-    degree = float(told.original.f_safe[0])
+    degree = float(explained.original.f_safe[0])
     assert paragraph.startswith(f"In wet leaves, the original vehicle stops {degree:.2f} m short of the pedestrian. ")
     for one in (fewest, robust):
         word = "borderline: only" if one.robustness.borderline else "robust:"
@@ -177,19 +172,19 @@ def assert_tells_a_manager(paragraph: str, told: Explained) -> None:
         else:
             assert f"for {collision}: " in paragraph
     assert f"The robust failure with the fewest changes, {robust.handle}: " in paragraph
-    members = CharacteristicSet.of(told.study.vehicle.characteristics)
+    members = CharacteristicSet.of(explained.study.vehicle.characteristics)
     largest = max((member for member in members if member.name in fewest.changed),
                   key=lambda member: abs(fewest.setting[member.name] / member.original - 1))
     assert f"{largest.short_name} {100 * (fewest.setting[largest.name] / largest.original - 1):+.0f} %" in paragraph
-    share = told.preventability.to_dict()["competent_driver"]
+    share = explained.preventability.to_dict()["competent_driver"]
     assert f"a competent driver avoids {100 * share:.0f} %" in paragraph
 
 
-def test_the_summary_of_a_study_leads_with_the_answer(case: Case, told: Explained) -> None:
+def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Explained) -> None:
     original = Bench(case.study, Here()).original()
     paragraph, first, *others, more = lead(case.study, case.solutions, original, Here(), "my results")
     crashes = int((case.solutions["outcome"] == "collision").sum())
-    assert_tells_a_manager(paragraph, told)
+    assert_tells_a_manager(paragraph, explained)
     assert first == f"{crashes} of {len(case.solutions)} vehicles found collide."
     assert [line.partition(":")[0] for line in others] == ["Fewest changes", "Smallest largest change", "Most severe"]
     assert all(" These changes alone cause it: " in line for line in others)
@@ -242,9 +237,9 @@ SAME = (10.0, 15.0, 0.2, 6.0)
     ((10.0, 15.0, 0.2, 3.5), "deceleration", 100 / 7 - 100 / 12),  # which hits
     ((8.0, 15.0, 0.2, 6.0), "speed", -2 * 0.2 - (100 - 64) / 12)])  # which gains
 def test_one_difference_is_one_part(other: tuple[float, float, float, float], part: str, lost: float) -> None:
-    told = compared(SAME, other)
-    assert told.parts[part] == pytest.approx(lost, abs=0.05)
-    assert all(abs(value) < 0.05 for name, value in told.parts.items() if name != part)
+    comparison = compared(SAME, other)
+    assert comparison.parts[part] == pytest.approx(lost, abs=0.05)
+    assert all(abs(value) < 0.05 for name, value in comparison.parts.items() if name != part)
 
 
 def test_a_creeping_deceleration_is_no_late_pedal() -> None:
@@ -256,11 +251,11 @@ def test_a_creeping_deceleration_is_no_late_pedal() -> None:
     drives.trace.speed[:, 1] = np.maximum(slower, 0.0)
     drives.trace.position[1:, 1] = np.cumsum((drives.trace.speed[1:, 1] + drives.trace.speed[:-1, 1]) / 2) * STEP
     drives.trace.gap[:, 1] = OBSTACLE - drives.trace.position[:, 1]
-    told = compare_braking(*(course(drives, column, 1.0) for column in (0, 1)))
-    assert told.parts["delay"] == 0
-    assert told.parts["deceleration"] == pytest.approx(told.lost)
-    assert "later" not in sentence(told)
-    assert "brakes more weakly" in sentence(told)
+    comparison = compare_braking(*(course(drives, column, 1.0) for column in (0, 1)))
+    assert comparison.parts["delay"] == 0
+    assert comparison.parts["deceleration"] == pytest.approx(comparison.lost)
+    assert "later" not in sentence(comparison)
+    assert "brakes more weakly" in sentence(comparison)
 
 
 COLLISION = Unsafe()
@@ -277,40 +272,40 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
     unsafe = [set(subset) for size in range(len(columns) + 1) for subset in combinations(columns, size)
               if table[sum(1 << column for column in subset)]]
     smallest = [subset for subset in unsafe if len(subset) == min(map(len, unsafe))]
-    (found,) = minimal_causes(made_up_bench(5, outcome), setting[np.newaxis], COLLISION)
-    assert [set(cause.columns) for cause in found] == smallest
-    for cause in found:
+    (result,) = minimal_causes(made_up_bench(5, outcome), setting[np.newaxis], COLLISION)
+    assert [set(cause.columns) for cause in result] == smallest
+    for cause in result:
         assert not any(set(subset) < set(cause.columns) for subset in unsafe)
-    assert necessary(found) == (set.intersection(*smallest) if smallest else set())
-    assert involved(found) == set().union(*smallest)
+    assert necessary(result) == (set.intersection(*smallest) if smallest else set())
+    assert involved(result) == set().union(*smallest)
 
 
 def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None:
     bench = made_up_bench(3, two_islands)
     (causes,) = minimal_causes(bench, np.array([[9.5, 1.0, 8.0]]), COLLISION)
-    (found,) = boundaries(bench, causes, COLLISION)
-    assert found.fraction == pytest.approx(1.5 / 4.5, abs=2 * RESOLUTION)
-    assert found.setting[0] > 6.5 >= found.setting[0] - 2 * RESOLUTION * 4.5
-    assert found.alone == {0: found.setting[0]}
-    assert (found.end, found.at_threshold) == (End.SAFE, None)
+    (result,) = boundaries(bench, causes, COLLISION)
+    assert result.fraction == pytest.approx(1.5 / 4.5, abs=2 * RESOLUTION)
+    assert result.setting[0] > 6.5 >= result.setting[0] - 2 * RESOLUTION * 4.5
+    assert result.alone == {0: result.setting[0]}
+    assert (result.end, result.at_threshold) == (End.SAFE, None)
 
 
 def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
     bench = made_up_bench(1, lambda settings: settings[:, 0] > ORIGINAL)
     (causes,) = minimal_causes(bench, np.array([[9.0]]), COLLISION)
-    (found,) = boundaries(bench, causes, COLLISION)
+    (result,) = boundaries(bench, causes, COLLISION)
     threshold = bench.characteristics.threshold[0]
-    assert found.setting[0] == pytest.approx(ORIGINAL + threshold, rel=1e-3)
-    assert bench.characteristics.filter(found.setting)[0] == found.setting[0]
-    assert (found.end, found.at_threshold) == (End.FILTER, 0)
+    assert result.setting[0] == pytest.approx(ORIGINAL + threshold, rel=1e-3)
+    assert bench.characteristics.filter(result.setting)[0] == result.setting[0]
+    assert (result.end, result.at_threshold) == (End.FILTER, 0)
 
 
 def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
     study = made_up_study(1)
     bench = Bench(study, Plant(study, lambda rows: rows[:, 0] > 7, failing=lambda rows: (rows[:, 0] > 6) & (rows[:, 0] <= 7)))
     (causes,) = minimal_causes(bench, np.array([[9.0]]), COLLISION)
-    (found,) = boundaries(bench, causes, COLLISION)
-    assert (found.setting[0], found.end) == (pytest.approx(7, abs=1e-3), End.NOT_SIMULATED)
+    (result,) = boundaries(bench, causes, COLLISION)
+    assert (result.setting[0], result.end) == (pytest.approx(7, abs=1e-3), End.NOT_SIMULATED)
 
 
 def test_robust_is_what_its_neighbours_are_too() -> None:

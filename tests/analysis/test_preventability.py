@@ -105,23 +105,23 @@ def weak(system: System) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def told(system: System, weak: np.ndarray) -> Where:
+def failure(system: System, weak: np.ndarray) -> Where:
     (one,), step = where(system, system.characteristics.original[np.newaxis], weak, Unsafe())
     assert step == 0.05
     return one
 
 
-def test_it_fails_where_it_collides_when_simulated_there_alone(system: System, weak: np.ndarray, told: Where) -> None:
+def test_it_fails_where_it_collides_when_simulated_there_alone(system: System, weak: np.ndarray, failure: Where) -> None:
     alone = [point.name for point in system.points if evaluate(system.at(point), weak).collided[0]]
-    assert list(told.points) == alone == ["CPLA, speed 40, clear", "CPLA, speed 40, night", "CPFA, speed 30, clear"]
+    assert list(failure.points) == alone == ["CPLA, speed 40, clear", "CPLA, speed 40, night", "CPFA, speed 30, clear"]
 
 
-def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(system: System, weak: np.ndarray, told: Where) -> None:
-    assert told.because.changed.safety_degree == evaluate(system, weak).f_safe[0]
-    at = next(point for point in system.points if point.name == told.because.place)
+def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(system: System, weak: np.ndarray, failure: Where) -> None:
+    assert failure.because.changed.safety_degree == evaluate(system, weak).f_safe[0]
+    at = next(point for point in system.points if point.name == failure.because.place)
     original = evaluate(system.at(at), system.characteristics.original[np.newaxis])
-    assert told.because.original.safety_degree == original.f_safe[0]
-    assert sentence(told.because).startswith(f"At {at.name}: the original ")
+    assert failure.because.original.safety_degree == original.f_safe[0]
+    assert sentence(failure.because).startswith(f"At {at.name}: the original ")
 
 
 def test_points_in_words() -> None:
@@ -130,9 +130,9 @@ def test_points_in_words() -> None:
     assert points_in_words((), 9) == "Fails at 0 of 9 points."
 
 
-def test_the_summary_of_a_matrix_asks_why_at_the_worst_point_alone(system: System, weak: np.ndarray, told: Where) -> None:
+def test_the_summary_of_a_matrix_asks_why_at_the_worst_point_alone(system: System, weak: np.ndarray, failure: Where) -> None:
     study = load_study("euro_ncap_pedestrian", matrix={"tests": TESTS})
     solutions = solutions_frame(system.characteristics.names, [(("nsga2", 0), evaluate(system, weak))])
     original = evaluate(system, system.characteristics.original[np.newaxis])
     more = lead(study, solutions, original, Here(), "out")[-1]
-    assert more.endswith(f": python -m safevar_sumo explain out --point '{told.because.place}'")
+    assert more.endswith(f": python -m safevar_sumo explain out --point '{failure.because.place}'")

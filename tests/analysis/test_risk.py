@@ -30,17 +30,17 @@ def of(region: Region, **options: Any) -> Risk:
 
 @pytest.mark.parametrize(("region", "volume"), [(box, 0.09), (two_islands, 0.15), (diagonal_band, 0.06), (nowhere, 0.0), (everywhere, 1.0)])
 def test_the_interval_holds_the_analytic_volume(region: Region, volume: float) -> None:
-    told = of(region, samples=8000, confidence=0.999)
-    low, high = told.interval
+    result = of(region, samples=8000, confidence=0.999)
+    low, high = result.interval
     assert low <= volume <= high
     assert high - low < 0.03
-    assert told.probability == told.failures / 8000
+    assert result.probability == result.failures / 8000
 
 
 def test_it_stops_as_soon_as_it_is_sure_enough() -> None:
-    told = of(box, samples=50_000, width=0.02)
-    assert 1000 < told.samples < 10_000
-    assert told.interval[1] - told.interval[0] <= 0.02
+    result = of(box, samples=50_000, width=0.02)
+    assert 1000 < result.samples < 10_000
+    assert result.interval[1] - result.interval[0] <= 0.02
 
 
 def ishigami(settings: FloatArray) -> FloatArray:
@@ -51,15 +51,15 @@ def ishigami(settings: FloatArray) -> FloatArray:
 def test_sobol_indices_of_ishigamis_function() -> None:
     """Analytic values of Saltelli et al., Global Sensitivity Analysis (2008), for a = 7, b = 0.1."""
     study = made_up_study(3)
-    told = risk(study, unsafe="collision", samples=100, pool=Plant(study, nowhere, ishigami))
-    assert told.sensitivity is not None
-    frame = told.sensitivity.set_index("characteristic")
+    result = risk(study, unsafe="collision", samples=100, pool=Plant(study, nowhere, ishigami))
+    assert result.sensitivity is not None
+    frame = result.sensitivity.set_index("characteristic")
     assert frame["first_order"].to_dict() == pytest.approx({"a": 0.3139, "b": 0.4424, "c": 0.0}, abs=0.05)
     assert frame["total"].to_dict() == pytest.approx({"a": 0.5576, "b": 0.4424, "c": 0.2437}, abs=0.05)
     assert (frame["first_order_lower"] < frame["first_order"]).all()
-    assert told.sensitivity_of_unsafe is not None
-    assert told.sensitivity_of_unsafe["total"].isna().all()
-    outputs = told.to_frame().pivot(index="characteristic", columns="output", values="total")
+    assert result.sensitivity_of_unsafe is not None
+    assert result.sensitivity_of_unsafe["total"].isna().all()
+    outputs = result.to_frame().pivot(index="characteristic", columns="output", values="total")
     assert outputs["safety_degree"].to_dict() == frame["total"].to_dict()
     assert outputs["unsafe"].isna().all()
 
@@ -109,9 +109,9 @@ def test_correlations_are_those_of_the_copula() -> None:
     settings = drawn(a=normal, b=normal, correlations=[{"between": ["a", "b"], "value": 0.8}])
     assert np.corrcoef(settings.T)[0, 1] == pytest.approx(0.8, abs=0.02)
     study = load_study(made_up_study(2), correlations=[{"between": ["a", "b"], "value": 0.8}])
-    told = risk(study, unsafe="collision", samples=100, pool=Plant(study, box))
-    assert told.to_dict()["sensitivity"] == []
-    assert told.to_frame().empty
+    result = risk(study, unsafe="collision", samples=100, pool=Plant(study, box))
+    assert result.to_dict()["sensitivity"] == []
+    assert result.to_frame().empty
 
 
 @pytest.mark.parametrize(("changes", "says"), [

@@ -20,12 +20,12 @@ def of(region: Region, n: int = 4, **options: Any) -> Rules:
 
 
 def test_a_box_is_one_rule_of_its_two_conditions() -> None:
-    told = of(box)
-    (rule,) = told.rules
+    result = of(box)
+    (rule,) = result.rules
     assert rule.limits == {"a": (pytest.approx(7, abs=0.02), None), "b": (None, pytest.approx(3, abs=0.02))}
     assert rule.density == pytest.approx(1, abs=0.02)
     assert rule.coverage == pytest.approx(1, abs=0.02)
-    assert told.unsafe_share == pytest.approx(0.09, abs=0.005)
+    assert result.unsafe_share == pytest.approx(0.09, abs=0.005)
     assert rule.density_interval is not None
     assert rule.density_interval[0] <= rule.density <= rule.density_interval[1]
 
@@ -37,10 +37,10 @@ def test_two_islands_are_two_rules() -> None:
 
 
 def test_a_region_that_is_no_box_is_covered_with_honest_densities() -> None:
-    told = of(diagonal_band, n=2)
+    result = of(diagonal_band, n=2)
     fresh = np.random.default_rng(5).uniform(0, 10, (20_000, 2))
-    assert told.rules
-    for rule in told.rules:
+    assert result.rules
+    for rule in result.rules:
         inside = np.ones(len(fresh), dtype=bool)
         for name, (low, high) in rule.limits.items():
             values = fresh[:, "ab".index(name)]
@@ -50,10 +50,10 @@ def test_a_region_that_is_no_box_is_covered_with_honest_densities() -> None:
 
 
 def test_a_rare_box_of_four_characteristics_is_found() -> None:
-    told = of(lambda settings: (settings[:, :4] > 7.8).all(axis=1), n=8)
-    assert told.unsafe_share == pytest.approx(0.22**4, abs=0.001)
-    assert set(told.rules[0].limits) <= set("abcd")
-    assert (told.rules[0].density or 0) > 0.4
+    result = of(lambda settings: (settings[:, :4] > 7.8).all(axis=1), n=8)
+    assert result.unsafe_share == pytest.approx(0.22**4, abs=0.001)
+    assert set(result.rules[0].limits) <= set("abcd")
+    assert (result.rules[0].density or 0) > 0.4
 
 
 def test_nothing_everything_and_too_little() -> None:
@@ -75,5 +75,5 @@ def test_the_promised_record_the_same_again_and_in_words() -> None:
     frame = first.to_frame().astype(object)
     assert frame.where(frame.notna(), None)[list(record["conditions"][0])].to_dict("records") == record["conditions"]
     assert frame["rule"].tolist() == [0, 0]
-    told = rule_in_words(first.rules[0], CharacteristicSet.of(first.study.vehicle.characteristics), first.unsafe)
-    assert told.startswith("a above 7 N m and b below 3 N m: collides in 100% (")
+    result = rule_in_words(first.rules[0], CharacteristicSet.of(first.study.vehicle.characteristics), first.unsafe)
+    assert result.startswith("a above 7 N m and b below 3 N m: collides in 100% (")

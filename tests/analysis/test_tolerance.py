@@ -52,41 +52,41 @@ def test_any_interval_is_found_that_is_as_wide_as_two_values_are_apart(ends: lis
 
 
 def test_a_plane_with_a_box_in_its_corner() -> None:
-    told = of(3, box, pairs=True)
-    assert told.pairs is not None
-    shares = {tuple(member.name for member in pair.characteristics): pair.unsafe_share for pair in told.pairs}
+    result = of(3, box, pairs=True)
+    assert result.pairs is not None
+    shares = {tuple(member.name for member in pair.characteristics): pair.unsafe_share for pair in result.pairs}
     assert shares == {("a", "b"): pytest.approx(0.09, abs=0.02), ("a", "c"): 0, ("b", "c"): 0}
-    first = told.pairs[0]
+    first = result.pairs[0]
     assert first.nearest == (pytest.approx(7, abs=0.5), pytest.approx(3, abs=0.5))
     assert box(np.array([first.nearest]))[0]
-    assert told.pairs[1].nearest is None
-    assert told.verdict == "No single characteristic makes it unsafe, but 1 of 3 pairs: a with b."
+    assert result.pairs[1].nearest is None
+    assert result.verdict == "No single characteristic makes it unsafe, but 1 of 3 pairs: a with b."
 
 
 @pytest.mark.parametrize(("region", "n", "factor"), [
     (box, 2, 0.4), (two_islands, 3, 0.3), (nowhere, 4, 1.0), (everywhere, 2, 0.0),
     (lambda rows: np.sum(rows - 5, axis=1) > 12, 4, 0.6)])  # a corner of all four, which no pair reaches
 def test_the_joint_factor_ends_before_what_is_unsafe(region: Region, n: int, factor: float) -> None:
-    told = of(n, region).joint
-    assert told.factor == pytest.approx(factor, rel=0.02)
-    assert told.factor <= factor
+    result = of(n, region).joint
+    assert result.factor == pytest.approx(factor, rel=0.02)
+    assert result.factor <= factor
     if factor:
-        error = 0.05 / 2**told.attempts
-        assert told.unsafe_at_most == pytest.approx(1 - error ** (1 / told.samples))
-        assert told.unsafe_at_most <= 0.003
+        error = 0.05 / 2**result.attempts
+        assert result.unsafe_at_most == pytest.approx(1 - error ** (1 / result.samples))
+        assert result.unsafe_at_most <= 0.003
 
 
 def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
-    told = of(2, two_islands, pairs=True, failing=lambda rows: (rows[:, 0] > 5.75) & (rows[:, 0] < 6.75))
-    first = told.alone[0]
+    result = of(2, two_islands, pairs=True, failing=lambda rows: (rows[:, 0] > 5.75) & (rows[:, 0] < 6.75))
+    first = result.alone[0]
     assert first.safe == (0.0, pytest.approx(5.75, abs=1e-4))
     assert first.not_simulated == [(pytest.approx(5.75, abs=1e-4), pytest.approx(6.75, abs=1e-4))]
     assert first.unsafe == [(pytest.approx(6.75, abs=1e-4), pytest.approx(7, abs=1e-4)), (pytest.approx(9, abs=1e-4), 10.0)]
     assert first.to_dict()["not_simulated"] == [list(first.not_simulated[0])]
-    assert told.pairs is not None
-    assert told.pairs[0].not_simulated_share == pytest.approx(0.1, abs=0.026)
-    assert told.pairs[0].unsafe_share == pytest.approx(1.25 / 9, abs=0.06)
-    box = told.joint
+    assert result.pairs is not None
+    assert result.pairs[0].not_simulated_share == pytest.approx(0.1, abs=0.026)
+    assert result.pairs[0].unsafe_share == pytest.approx(1.25 / 9, abs=0.06)
+    box = result.joint
     assert box.factor == pytest.approx(0.35, rel=0.02), "3.25 to 6.75, of which 1 could not be simulated"
     assert box.failed / box.samples == pytest.approx(1 / 3.5, abs=0.03)
     exact = scipy.stats.binomtest(box.failed, box.samples, alternative="less").proportion_ci(1 - 0.05 / 2**box.attempts, method="exact")
@@ -96,9 +96,9 @@ def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
 def test_the_box_varies_the_characteristics_that_are_asked_for() -> None:
     region = lambda rows: (rows[:, 0] > 9) | (rows[:, 2] > 6)  # noqa: E731
     assert of(3, region).joint.factor == pytest.approx(0.2, rel=0.02)
-    told = of(3, region, characteristics=["a", "b"]).joint
-    assert told.factor == pytest.approx(0.8, rel=0.02)
-    assert told.characteristics == ("a", "b")
+    result = of(3, region, characteristics=["a", "b"]).joint
+    assert result.factor == pytest.approx(0.8, rel=0.02)
+    assert result.characteristics == ("a", "b")
 
 
 def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,8 +113,8 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe(monkeypatch: py
     for seed in range(seeds):
         seeded = msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, seed=seed))
         bench = Bench(seeded, Plant(seeded, lambda rows: np.log(np.abs(rows[:, 0] - 5) + 1e-99) * 1e6 % 1 < q))
-        told = safe_box.safe_box(bench, [0, 1], Unsafe(), np.zeros((0, 2)))
-        wrong += told.unsafe_at_most < q
+        result = safe_box.safe_box(bench, [0, 1], Unsafe(), np.zeros((0, 2)))
+        wrong += result.unsafe_at_most < q
     assert 0 < wrong <= 0.05 * seeds
 
 
@@ -138,8 +138,8 @@ def test_the_promised_record() -> None:
         "factor", "confidence", "samples", "failed", "attempts", "unsafe_at_most", "characteristics"]
 
 
-@pytest.mark.parametrize(("region", "told"), [
+@pytest.mark.parametrize(("region", "expected"), [
     (nowhere, "dot: the original vehicle"),
     (two_islands, "dot: the original vehicle;\nhatched: unsafe;\nbelow the dashed line: collisions")])
-def test_the_figure_explains_what_it_draws_and_nothing_else(region: Region, told: str) -> None:
-    assert profiles_figure(of(1, region)).get_supxlabel() == told
+def test_the_figure_explains_what_it_draws_and_nothing_else(region: Region, expected: str) -> None:
+    assert profiles_figure(of(1, region)).get_supxlabel() == expected

@@ -56,15 +56,15 @@ def test_a_study_needs_no_file() -> None:
 
 
 def test_simulate_tells_of_the_setting_and_of_the_original_beside_it() -> None:
-    found = sv.simulate("rain", {"tireFric": 1.5, "mass": 2410.0})
-    assert found.setting["tireFric"] == 1.5
-    assert found.put_back == {"mass": 2410.0}
-    assert found.objectives["f_num_diff"] == 1
-    assert found.objectives["f_diff"] == pytest.approx(2 / 3.5)
-    assert found.metrics["safety_degree"] == found.objectives["f_safe"]
-    assert found.original.setting == {one.name: one.original for one in CharacteristicSet.of(found.study.vehicle.characteristics)}
-    assert found.original.original is found.original
-    assert found.original.metrics != found.metrics
+    result = sv.simulate("rain", {"tireFric": 1.5, "mass": 2410.0})
+    assert result.setting["tireFric"] == 1.5
+    assert result.put_back == {"mass": 2410.0}
+    assert result.objectives["f_num_diff"] == 1
+    assert result.objectives["f_diff"] == pytest.approx(2 / 3.5)
+    assert result.metrics["safety_degree"] == result.objectives["f_safe"]
+    assert result.original.setting == {one.name: one.original for one in CharacteristicSet.of(result.study.vehicle.characteristics)}
+    assert result.original.original is result.original
+    assert result.original.metrics != result.metrics
     assert sv.simulate("rain", {"mass": 2410.0}, filtered=False).objectives["f_num_diff"] == 1
 
 
@@ -148,13 +148,13 @@ def test_a_report_of_results_is_a_page(results: sv.Results, tmp_path: Path) -> N
     assert (tmp_path / "page.html").read_text(encoding="utf-8") == page == sv.make_report([results.directory], ["tested", "reproduce"], 1)
 
 
-@pytest.mark.parametrize(("settings", "told"), [
+@pytest.mark.parametrize(("settings", "expected"), [
     (pd.DataFrame({"weight": [1.0]}), "weight"), (pd.DataFrame({"mass": ["heavy"]}), "heavy"), ([[1.0, 2.0]], r"shape \(1, 2\)"),
     ({"mass": [2500.0]}, "a dict\nexpected: a list of mappings"), ([{"mass": 2500.0}, {"weight": 1.0}], "weight"),
     (pd.DataFrame({"mass": [2404.0, 9999.0]}), "row 1: mass = 9999"), (np.full((1, 17), np.nan), "shape|= nan"),
 ])
-def test_settings_that_cannot_be_used_are_told_before_any_is_simulated(settings: object, told: str) -> None:
-    with pytest.raises(sv.InputError, match=told):
+def test_settings_that_cannot_be_used_are_told_before_any_is_simulated(settings: object, expected: str) -> None:
+    with pytest.raises(sv.InputError, match=expected):
         sv.evaluate("sun", settings)  # type: ignore[arg-type]
 
 

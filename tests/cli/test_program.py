@@ -33,28 +33,28 @@ HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
 
 def loaded(code: str) -> set[str]:
     """Which of the heavy packages a fresh interpreter has loaded after some code."""
-    told = f"import sys\n{code}\nprint(*(set(sys.modules) & {HEAVY!r}))"
-    return set(subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=True).stdout.splitlines()[-1].split())
+    result = f"import sys\n{code}\nprint(*(set(sys.modules) & {HEAVY!r}))"
+    return set(subprocess.run([sys.executable, "-c", result], capture_output=True, text=True, check=True).stdout.splitlines()[-1].split())
 
 
 def test_every_command_is_listed_and_every_listed_one_is_there() -> None:
     for module in pkgutil.iter_modules(cli.__path__):
         importlib.import_module(f"safevar_sumo.cli.{module.name}")
     assert set(commands.commands) == set(COMMANDS)
-    told = " ".join(CliRunner().invoke(commands, ["--help"]).stdout.split())
+    output = " ".join(CliRunner().invoke(commands, ["--help"]).stdout.split())
     for name, (_, sentence) in COMMANDS.items():
-        assert f" {name} {sentence}" in told
+        assert f" {name} {sentence}" in output
         assert sentence.endswith(".")
 
 
 @pytest.mark.parametrize("command", list(COMMANDS))
 def test_every_command_and_each_of_its_options_has_a_whole_sentence_of_help(command: str) -> None:
-    found = commands.get_command(None, command)  # type: ignore[arg-type]
-    assert found is not None
-    assert str(found.help).strip().endswith(".")
-    told = CliRunner().invoke(commands, [command, "--help"])
-    assert told.exit_code == 0
-    for option in found.params:
+    results = commands.get_command(None, command)  # type: ignore[arg-type]
+    assert results is not None
+    assert str(results.help).strip().endswith(".")
+    result = CliRunner().invoke(commands, [command, "--help"])
+    assert result.exit_code == 0
+    for option in results.params:
         assert isinstance(option, click.Argument) or str(option.help).endswith((".", "]")), option.name  # type: ignore[attr-defined]
 
 
@@ -81,9 +81,9 @@ def test_what_the_library_says_of_a_parameter_is_said_of_its_flag(in_tmp: Path) 
     Path("file").write_text("")
     for arguments in (["import", "native", "--rs", "x.csv", "--out", "o", "--original", "sd"], ["study", "smoke", "--cluster", "nowhere"],
                       ["study", "smoke", "--out", "file"]):
-        told = CliRunner().invoke(commands, arguments).exception
-        assert isinstance(told, InputError)
-        assert told.source == arguments[-2]
+        result = CliRunner().invoke(commands, arguments).exception
+        assert isinstance(result, InputError)
+        assert result.source == arguments[-2]
 
 
 @pytest.mark.parametrize(("typed", "says"), [
@@ -101,15 +101,15 @@ def test_an_error_names_what_was_probably_meant(typed: str, says: str, in_tmp: P
                                                 capsys: pytest.CaptureFixture[str]) -> None:
     for name, text in (("weather", 'weather = "fogg"'), ("model", '[ads]\nmodel = "world_on_rail"'), ("key", "[search]\nrunns = 3")):
         Path(f"{name}.toml").write_text(f'extends = "sun"\n{text}\n')
-    made = in_tmp / "results" / "smoke"
-    made.mkdir(parents=True)
-    (made / "manifest.json").write_text("{}")
+    results = in_tmp / "results" / "smoke"
+    results.mkdir(parents=True)
+    (results / "manifest.json").write_text("{}")
     monkeypatch.setattr(sys, "argv", ["safevar-sumo", *typed.split()])
     with pytest.raises(SystemExit) as ended:
         main()
-    told = capsys.readouterr().err
+    result = capsys.readouterr().err
     assert ended.value.code == 2
-    assert says in told
+    assert says in result
 
 
 @pytest.mark.parametrize(("start", "says"), [
@@ -130,8 +130,8 @@ def test_where_it_cannot_run_it_says_so_in_one_line(start: str, says: str) -> No
     (["simulate", "nothing", "--set"], "t", set()), (["validate"], "lg", {"lgsvl"}),
 ])
 def test_names_complete(words: list[str], incomplete: str, expected: set[str]) -> None:
-    found = ShellComplete(commands, {}, "safevar-sumo", "_SAFEVAR_SUMO_COMPLETE").get_completions(words, incomplete)
-    assert expected == {item.value for item in found if item.type == "plain"} or expected <= {item.value for item in found}
+    result = ShellComplete(commands, {}, "safevar-sumo", "_SAFEVAR_SUMO_COMPLETE").get_completions(words, incomplete)
+    assert expected == {item.value for item in result if item.type == "plain"} or expected <= {item.value for item in result}
 
 
 def printed(table: WholeTable, width: int) -> list[str]:
@@ -153,13 +153,13 @@ def test_names_stay_whole_and_the_rest_goes_on_in_the_next_line(width: int) -> N
 
 
 def test_every_name_of_the_list_can_be_read_and_typed() -> None:
-    told = CliRunner(env={"COLUMNS": "80"}).invoke(commands, ["list"]).stdout
-    assert "┃ name            ┃ friction ┃ sight ┃ delay, s ┃ light ┃ road ┃" in told
-    assert "…" not in told
+    output = CliRunner(env={"COLUMNS": "80"}).invoke(commands, ["list"]).stdout
+    assert "┃ name            ┃ friction ┃ sight ┃ delay, s ┃ light ┃ road ┃" in output
+    assert "…" not in output
     for name in study_names():
         study = load_study(name)
         for text in (name, study.vehicle.model, study.ads.model, study.scenario.model, *study.vehicle.characteristics):
-            assert text in told
+            assert text in output
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="POSIX alone has named pipes")

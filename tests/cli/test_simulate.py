@@ -26,33 +26,33 @@ def simulate(*arguments: str) -> Result:
     ("tireFric=1.5..1:2", [1.5, 1.0]), ("tireFric = 1.0..2.0", [1 + i / 10 for i in range(11)]), ("mass=2.5e3", [2500.0]),
 ])
 def test_a_change_is_a_value_a_share_or_a_sweep(change: str, values: list[float]) -> None:
-    (found,) = read_changes((change,), SUN, beyond=False).values()
-    assert found == pytest.approx(values)
+    (result,) = read_changes((change,), SUN, beyond=False).values()
+    assert result == pytest.approx(values)
 
 
-@pytest.mark.parametrize(("changes", "told"), [
+@pytest.mark.parametrize(("changes", "expected"), [
     (("mass",), "NAME=VALUE"), (("mass=",), "NAME=VALUE"), (("mass=10%",), "NAME=VALUE"), (("mass=1..",), "NAME=VALUE"),
     (("mass=2300", "mass=2400"), "mass is set twice"), (("weight=1",), "weight"), (("mass=+50%",), "mass = 3606"),
     (("mass=2100..9000",), "mass = 2790"), (("mass=2100..2200:999", "tireFric=1..2:999"), "more than 10000 settings"),
     (("mass=nan",), "nan"),
 ])
-def test_a_change_that_cannot_be_used_is_told(changes: tuple[str, ...], told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_a_change_that_cannot_be_used_is_told(changes: tuple[str, ...], expected: str) -> None:
+    with pytest.raises(InputError, match=expected):
         read_changes(changes, SUN, beyond=False)
 
 
 def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them() -> None:
-    told = simulate("rain", "--set", "tireFric=1.1", "--set", "mass=2600", "--set", "dragCoeff=0.301")
-    assert "original" in told.stdout
-    assert "The original vehicle stops, with a safety degree of 1.92 m" in told.stdout
-    assert "less safe than the original" in told.stdout
-    assert "note: dragCoeff = 0.301 is so near the original that the filter put 0.3 back" in told.stderr
+    result = simulate("rain", "--set", "tireFric=1.1", "--set", "mass=2600", "--set", "dragCoeff=0.301")
+    assert "original" in result.stdout
+    assert "The original vehicle stops, with a safety degree of 1.92 m" in result.stdout
+    assert "less safe than the original" in result.stdout
+    assert "note: dragCoeff = 0.301 is so near the original that the filter put 0.3 back" in result.stderr
     assert "changed vehicle" not in simulate("rain").stdout
 
 
 def test_a_sweep_is_a_table_under_the_original_or_a_list() -> None:
-    told = simulate("rain", "--set", "tireFric=1.0..1.5:3", "--json")
-    records = json.loads(told.stdout)
+    result = simulate("rain", "--set", "tireFric=1.0..1.5:3", "--json")
+    records = json.loads(result.stdout)
     assert [one["vcs"]["tireFric"] for one in records] == [1.0, 1.25, 1.5]
     single = json.loads(simulate("rain", "--set", "tireFric=1.25", "--json").stdout)
     assert records[1] == single

@@ -31,7 +31,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-def found(number: int, first: int = 0) -> Evaluations:
+def evaluations_of(number: int, first: int = 0) -> Evaluations:
     """Collisions of different settings, from the first on."""
     values = np.full(number, -5.63)
     settings = np.tile(np.arange(first, first + number, dtype=float)[:, np.newaxis], 12)
@@ -45,7 +45,7 @@ def shown(study: Study, clock: list[float], *, terminal_width: int | None, quiet
     console = Console(file=out, force_terminal=terminal_width is not None, width=terminal_width or 80, _environ={})
     with CampaignProgress(console, study, all_runs(study), quiet) as progress:
         for i in range(5):
-            progress.evaluated(RunKey(("nsga2", "rs")[i % 2], 0), found(100, 100 * i), 100)
+            progress.evaluated(RunKey(("nsga2", "rs")[i % 2], 0), evaluations_of(100, 100 * i), 100)
             clock[0] += 10
         progress.finished(RunKey("nsga2", 0), 300)
     return out.getvalue()
@@ -77,10 +77,10 @@ def test_what_comes_from_journals_counts_as_done_and_not_as_fast(study: Study, c
     """A run of 1000 that was finished before, of 600 different settings; 500 settings of the next one; then 100 simulated in 20 s."""
     out = StringIO()
     with CampaignProgress(Console(file=out, width=80), study, all_runs(study), quiet=False) as progress:
-        progress.evaluated(RunKey("nsga2", 0), found(600), 0)
+        progress.evaluated(RunKey("nsga2", 0), evaluations_of(600), 0)
         progress.finished(RunKey("nsga2", 0), 1000)
-        progress.evaluated(RunKey("nsga2", 1), found(500), 0)
-        progress.evaluated(RunKey("nsga2", 1), found(100, 500), 100)
+        progress.evaluated(RunKey("nsga2", 1), evaluations_of(500), 0)
+        progress.evaluated(RunKey("nsga2", 1), evaluations_of(100, 500), 100)
         clock[0] += 40
-        progress.evaluated(RunKey("nsga2", 1), found(100, 500), 100)  # the same once more: no other collisions
+        progress.evaluated(RunKey("nsga2", 1), evaluations_of(100, 500), 100)  # the same once more: no other collisions
     assert out.getvalue() == "rain: 2/s, 0:28:40 left, 1200 collisions, runs 1/6, best SD -5.63\n"

@@ -12,7 +12,6 @@ import pandas as pd
 import pytest
 
 from safevar_sumo.shipped import STUDIES
-from safevar_sumo.study import study_names
 from tests.in_process import refused, run
 
 SLOW = pytest.mark.slow
@@ -37,17 +36,6 @@ def test_the_same_bytes_for_every_batch_size_and_from_run_to_run(study: str, in_
         run("study", study, "--algorithms", "nsga2", "--runs", "1", "--evaluations", "60", "--batch", batch, "--out", out, "--quiet")
         contents.add(((in_tmp / out / "solutions.csv").read_bytes(), (in_tmp / out / "manifest.json").read_bytes()))
     assert len(contents) == 1
-
-
-@pytest.mark.parametrize("study", [name if name in ("rain", "native") else pytest.param(name, marks=SLOW) for name in study_names()])
-def test_a_short_search_finds_less_safe_settings(study: str, in_tmp: Path) -> None:
-    """What the whole is for."""
-    run("study", study, "--algorithms", "nsga2", "--runs", "1", "--evaluations", "400", "--out", "out", "--quiet")
-    original = json.loads(Path("out/manifest.json").read_text())["original"]
-    solutions = pd.read_csv("out/solutions.csv")
-    assert solutions["f_safe"].min() < 0.8 * original["safety_degree"]
-    if study == "rain":
-        assert (solutions["outcome"] == "collision").any()
 
 
 def test_simulate_prints_the_promised_json() -> None:
@@ -96,7 +84,7 @@ def test_a_users_scalar_ads_is_named_in_a_study(in_tmp: Path) -> None:
     assert Path("results/mine/solutions.csv").is_file()
 
 
-@pytest.mark.parametrize(("arguments", "told"), [
+@pytest.mark.parametrize(("arguments", "expected"), [
     (["study", "sum"], ("sum", "rain")),
     (["study", "sun", "--algorithms", "nsga3"], ("nsga3", "nsga2")),
     (["study", "sun", "--batch", "many"], ("--batch", "many")),
@@ -106,12 +94,12 @@ def test_a_users_scalar_ads_is_named_in_a_study(in_tmp: Path) -> None:
     (["simulate", "sun", "--trace", "/proc/nowhere/trace.csv"], ("--trace", "/proc/nowhere/trace.csv")),
     (["simulate", "/"], ("/",)),
 ])
-def test_bad_input_ends_with_code_2_and_says_what_is_legal(arguments: list[str], told: tuple[str, ...], in_tmp: Path) -> None:
-    refused(*arguments, told=told)
+def test_bad_input_ends_with_code_2_and_says_what_is_legal(arguments: list[str], expected: tuple[str, ...], in_tmp: Path) -> None:
+    refused(*arguments, expected=expected)
     assert not list(in_tmp.rglob("*.csv"))
 
 
-@pytest.mark.parametrize(("old", "new", "told"), [
+@pytest.mark.parametrize(("old", "new", "expected"), [
     ('model = "carla"', 'model = "carl"', ("vehicle.model", "carl", "lgsvl")),
     ('model = "world_on_rails"', 'model = "wor"', ("ads.model", "wor", "apollo")),
     ('model = "pedestrian_crossing"', 'model = "crosing"', ("scenario.model", "crosing", "lead_vehicle_stopped")),
@@ -123,11 +111,11 @@ def test_bad_input_ends_with_code_2_and_says_what_is_legal(arguments: list[str],
     ('unit = "kg", ', 'unit = "t", ', ("vehicle.characteristics.mass.unit", "'t'", "kg")),
     ("lower = 2040, upper = 2700", "lower = 2700, upper = 2040", ("vehicle.characteristics.mass", "lower < upper")),
 ])
-def test_a_bad_study_file_ends_with_code_2(old: str, new: str, told: tuple[str, ...], in_tmp: Path) -> None:
+def test_a_bad_study_file_ends_with_code_2(old: str, new: str, expected: tuple[str, ...], in_tmp: Path) -> None:
     text = (STUDIES / "sun.toml").read_text()
     assert old in text
     Path("mine.toml").write_text(text.replace(old, new))
-    refused("simulate", "mine.toml", told=told)
+    refused("simulate", "mine.toml", expected=expected)
 
 
 @pytest.mark.parametrize("where", ["__init__", "drive"])
@@ -138,7 +126,7 @@ def test_an_ads_that_exits_is_a_fault_and_no_success(where: str, in_tmp: Path) -
         "    def drive(self, seen):\n        return 0.5, 0.0\n\n"
         f"    def {where}({arguments}):\n        sys.exit(3)\n")
     Path("mine.toml").write_text('extends = "sun"\nname = "mine"\n[ads]\nmodel = "my_ads:Careful"\n')
-    refused("simulate", "mine.toml", told=("my_ads:Careful", "SystemExit", "my_ads.py:10"))
+    refused("simulate", "mine.toml", expected=("my_ads:Careful", "SystemExit", "my_ads.py:10"))
 
 
 def test_a_title_is_no_markup(in_tmp: Path) -> None:
@@ -149,7 +137,7 @@ def test_a_title_is_no_markup(in_tmp: Path) -> None:
 
 @SLOW
 def test_a_study_ends_with_a_summary(in_tmp: Path) -> None:
-    told = run("study", "smoke").stdout
+    output = run("study", "smoke").stdout
     for part in ("original vehicle", "nsga2", "RQ1", "RQ2", "NSGA-II: SD", "too few runs for a test (8 are needed)",
                  "python -m safevar_sumo tables results/smoke"):
-        assert part in told
+        assert part in output

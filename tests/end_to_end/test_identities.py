@@ -64,9 +64,9 @@ def test_results_go_with_the_files_that_they_were_computed_with() -> None:
     edits = ("my_ads.py", "0.5", "0.65"), ("my_map.py", "9.0", "8.25"), ("my_net/traffic.rou.xml", "<route", "<!-- --><route")
     for path, old, new in edits:
         edited(path, old, new)
-        told = refused("study", "mine.toml", "--out", "out")
-        assert f"{Path(path).name} has changed since" in told
-        assert "another --out, or the" in told
+        result = refused("study", "mine.toml", "--out", "out")
+        assert f"{Path(path).name} has changed since" in result
+        assert "another --out, or the" in result
         edited(path, new, old)
     Path("mine.toml").write_text(STUDY.replace('name = "mine"', 'name = "mine"\ntitle = "Another title"'))
     study()
@@ -101,9 +101,9 @@ class Test(PedestrianCrossing, frozen=True):
 
 def refused(*words: str) -> str:
     """What a command says that ends with code 2."""
-    told = CliRunner().invoke(commands, words).exception
-    assert isinstance(told, InputError), (words, told)
-    return f"{told.problem}: {told.legal}"
+    result = CliRunner().invoke(commands, words).exception
+    assert isinstance(result, InputError), (words, result)
+    return f"{result.problem}: {result.legal}"
 
 
 def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results_refuses_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,8 +122,8 @@ def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results
             assert CliRunner().invoke(commands, ["simulate", "../out", "--most-severe"]).exit_code == 0, "a comment is no difference"
             Path("..", name).write_text(f"{text}\nX = 1\n")
         assert f"{name} has changed since" in refused("study", "../mine.toml", "--out", "../out", "--runs", "3")
-        assert "--as-it-is-now" in (told := refused("tolerance", "../out")), told
-        assert told.startswith(f"{name} has changed since: ")
+        assert "--as-it-is-now" in (result := refused("tolerance", "../out")), result
+        assert result.startswith(f"{name} has changed since: ")
         Path("..", name).write_text(text)
     Path("../far.txt").write_text("another")
     for words in ("simulate ../out", "simulate ../out --most-severe", "explain ../out", "risk ../out", "rules ../out", "report ../out"):

@@ -78,9 +78,9 @@ def test_torn_tails_are_cut_off_with_a_warning_and_damage_in_the_middle_names_it
         os.truncate(path, path.stat().st_size - lost)
     with (copied / "runs" / "rs-00.journal").open("ab") as file:
         file.write(b"SVJ\n rubbish")
-    told = study("--out", "out")
-    assert told.count("warning") == 3
-    assert "nsga2-00.journal" in told
+    result = study("--out", "out")
+    assert result.count("warning") == 3
+    assert "nsga2-00.journal" in result
     assert solutions("out") == solutions(whole)
     path = copied / "runs" / "rs-00.journal"
     content = bytearray(path.read_bytes())
@@ -90,7 +90,7 @@ def test_torn_tails_are_cut_off_with_a_warning_and_damage_in_the_middle_names_it
     assert path.read_bytes() == content
 
 
-@pytest.mark.parametrize(("arguments", "told"), [
+@pytest.mark.parametrize(("arguments", "expected"), [
     (["--jobs", "0"], ("--jobs", "0")),
     (["--shard", "3/2"], ("--shard", "'3/2'", "K in 1..N")),
     (["--shard", "0/2"], ("--shard", "'0/2'")),
@@ -99,16 +99,16 @@ def test_torn_tails_are_cut_off_with_a_warning_and_damage_in_the_middle_names_it
     (["--cluster", "nowhere"], ("--cluster", "'nowhere'", "tcp://host:8786")),
     (["--cluster", ""], ("--cluster", "''")),
 ])
-def test_bad_options_are_refused(arguments: list[str], told: tuple[str, ...]) -> None:
-    refused("study", "small.toml", "--out", "out", *arguments, told=told)
+def test_bad_options_are_refused(arguments: list[str], expected: tuple[str, ...]) -> None:
+    refused("study", "small.toml", "--out", "out", *arguments, expected=expected)
     assert not Path("out/runs").exists()
 
 
 def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
-    told = run("study", "small.toml", "--dry-run").stdout
+    output = run("study", "small.toml", "--dry-run").stdout
     for word in ("nsga2, rs, safe_fuzzer", "900", "evaluations/s", "min", "MB"):
-        assert word in told
-    assert max(map(len, told.splitlines())) <= 80
+        assert word in output
+    assert max(map(len, output.splitlines())) <= 80
     assert not Path("results").exists()
 
 
@@ -117,4 +117,4 @@ def test_an_ads_that_always_fails_ends_the_study_with_that_fault() -> None:
                                  "    def drive(self, seen):\n        return 1 / 0\n")
     Path("bad.toml").write_text('extends = "small.toml"\nname = "bad"\n[ads]\nmodel = "my_ads:Bad"\n')
     for options in ([], ["--dry-run"]):
-        refused("study", "bad.toml", "--out", "out", *options, told=("ZeroDivisionError", "simulate bad.toml"))
+        refused("study", "bad.toml", "--out", "out", *options, expected=("ZeroDivisionError", "simulate bad.toml"))

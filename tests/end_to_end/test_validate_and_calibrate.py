@@ -30,28 +30,28 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     characteristics = system.characteristics
     settings = np.random.default_rng(3).uniform(characteristics.lower, characteristics.upper, (40, 12))
     filtered = np.where(np.abs(settings - characteristics.original) > 1.2 * characteristics.threshold, settings, characteristics.original)
-    found = evaluate(system, filtered)
+    result = evaluate(system, filtered)
     frame = pd.DataFrame(filtered, columns=list(characteristics.names))
     for name, column in COLUMNS.items():
-        frame[column] = np.nan_to_num(found.metrics[name])
+        frame[column] = np.nan_to_num(result.metrics[name])
     path = tmp_path_factory.mktemp("data") / "mine.csv"
     frame.to_csv(path, index=False)
     return path
 
 
 def test_validate_agrees_perfectly_with_itself(data: Path, in_tmp: Path) -> None:
-    told = json.loads(run("validate", "sun", str(data), "--json", "--plot", "plot.png", "--totals", "kept.toml").stdout)
-    assert list(told) == ["rows", "spearman", "mean_absolute_error", "bias", "collisions", "original", "precision", "recall",
+    output = json.loads(run("validate", "sun", str(data), "--json", "--plot", "plot.png", "--totals", "kept.toml").stdout)
+    assert list(output) == ["rows", "spearman", "mean_absolute_error", "bias", "collisions", "original", "precision", "recall",
                           "collision_speed", "in_repeats", "undecided", "by_predicted"]
-    assert told["rows"] == 40
+    assert output["rows"] == 40
     for name in COLUMNS:
-        assert told["spearman"][name] == pytest.approx(1.0)
-        assert told["mean_absolute_error"][name] == pytest.approx(0.0, abs=1e-12)
-        assert set(told["original"][name]) == {"reference", "here"}
-    assert told["collisions"]["reference"] == told["collisions"]["here"] == told["collisions"]["both"]
+        assert output["spearman"][name] == pytest.approx(1.0)
+        assert output["mean_absolute_error"][name] == pytest.approx(0.0, abs=1e-12)
+        assert set(output["original"][name]) == {"reference", "here"}
+    assert output["collisions"]["reference"] == output["collisions"]["here"] == output["collisions"]["both"]
     assert (in_tmp / "plot.png").stat().st_size > 50_000
     kept = tomllib.loads((in_tmp / "kept.toml").read_text())["sun"]["mine.csv"]
-    assert (kept["rows"], kept["collisions"]) == (40, told["collisions"])
+    assert (kept["rows"], kept["collisions"]) == (40, output["collisions"])
     assert kept["spearman"]["safety_degree"] == pytest.approx(1.0)
 
 
@@ -71,8 +71,8 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
         '[calibration]\n"ads.parameters.brake_gap" = { lower = 7, upper = 12, unit = "m", meaning = "gap" }\n')
     truth = load_study("sun").ads.parameters["brake_gap"]
     done = run("calibrate", "mine.toml", str(data), "--trials", "37", "--seed", "3", "--out", "found.toml")
-    found = tomllib.loads(Path("found.toml").read_text())
-    assert abs(found["ads"]["parameters"]["brake_gap"] - truth) < 0.5 * abs(8.0 - truth)
+    result = tomllib.loads(Path("found.toml").read_text())
+    assert abs(result["ads"]["parameters"]["brake_gap"] - truth) < 0.5 * abs(8.0 - truth)
     assert "held back" in done.stdout
     head = Path("found.toml").read_text().split("\n\n")[0]
     for word in ("CMA-ES", "seed 3", "mine.csv, SHA-256", "Cost"):
@@ -83,32 +83,32 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
     assert Path("again/found.toml").read_bytes() == Path("found.toml").read_bytes()
 
 
-@pytest.mark.parametrize(("key", "told"), [
+@pytest.mark.parametrize(("key", "expected"), [
     ("vehicle.characteristics.mass.original", ("vehicle.characteristics.mass.original",)),
     ("ads.parameters.nothing", ("ads.parameters.nothing",)),
     ("weather.name", ("weather.name",)),
     ("ads.parameters.throttle.00", ("ads.parameters.throttle.00",)),
 ])
-def test_calibrate_touches_nothing_but_parameters(key: str, told: tuple[str, ...], in_tmp: Path) -> None:
+def test_calibrate_touches_nothing_but_parameters(key: str, expected: tuple[str, ...], in_tmp: Path) -> None:
     Path("mine.toml").write_text(
         f'extends = "sun"\nname = "mine"\n[calibration]\n"{key}" = {{ lower = 1, upper = 2, unit = "-", meaning = "none" }}\n')
-    refused("calibrate", "mine.toml", "--trials", "1", "--out", "x.toml", told=told)
+    refused("calibrate", "mine.toml", "--trials", "1", "--out", "x.toml", expected=expected)
 
 
-@pytest.mark.parametrize(("key", "lower", "upper", "told"), [
+@pytest.mark.parametrize(("key", "lower", "upper", "expected"), [
     ("weather.road_friction", -3, 3, ("weather.road_friction", "lower = -3", "> 0")),
     ("weather.road_friction", 0.5, 3, ("weather.road_friction", "upper = 3", "<= 1.5")),
     ("vehicle.parameters.camera_height", 0.01, 3, ("camera_height", "lower = 0.01", ">= 0.1")),
 ])
-def test_calibrate_refuses_bounds_that_the_models_do_not_take(key: str, lower: float, upper: float, told: tuple[str, ...],
+def test_calibrate_refuses_bounds_that_the_models_do_not_take(key: str, lower: float, upper: float, expected: tuple[str, ...],
                                                               in_tmp: Path) -> None:
     Path("mine.toml").write_text(f'extends = "sun"\nname = "mine"\n[calibration]\n'
                                  f'"{key}" = {{ lower = {lower}, upper = {upper}, unit = "-", meaning = "none" }}\n')
-    refused("calibrate", "mine.toml", "--trials", "13", "--out", "x.toml", told=told)
+    refused("calibrate", "mine.toml", "--trials", "13", "--out", "x.toml", expected=expected)
 
 
 def test_calibrate_does_not_write_over_what_it_starts_from(data: Path, in_tmp: Path) -> None:
-    refused("calibrate", "sun", str(data), "--trials", "1", "--out", str(data), told=("--out", data.name))
+    refused("calibrate", "sun", str(data), "--trials", "1", "--out", str(data), expected=("--out", data.name))
     assert data.read_text().startswith("max_rpm")
 
 

@@ -23,9 +23,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def mine(folder: Path) -> Mine:
     """Write mine.py and mine.toml, which extends smoke, and put the system together."""
-    def made(module: str, table: str = ADS) -> System:
+    def result(module: str, table: str = ADS) -> System:
         (folder / "mine.py").write_text(module)
         (folder / "mine.toml").write_text(f'extends = "smoke"\nname = "mine"\n{table}')
         return assemble(load_study(str(folder / "mine.toml")), "mine.toml")
 
-    return made
+    return result

@@ -28,30 +28,30 @@ def failing(system: object) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize(("body", "told"), [
+@pytest.mark.parametrize(("body", "expected"), [
     ("1 / 0", "raised in drive: ZeroDivisionError: division by zero"), ("raise SystemExit(0)", "raised in drive: SystemExit: 0"),
     ("pass", "returned None from drive"),
     ("return 0.5", "returned 0.5 from drive"), ("return 0.5, 0, 0", "returned (0.5, 0, 0) from drive"),
     ("return '0.5', 0", "returned throttle = '0.5' from drive"), ("return 0, 2", "returned brake = 2.0 from drive"),
     ("return float('nan'), 0", "returned throttle = nan"), ("return [0.1, 0.2], 0", "returned throttle of shape (2,)"),
 ])
-def test_a_scalar_ads_that_is_wrong(body: str, told: str, mine: Mine, folder: Path) -> None:
+def test_a_scalar_ads_that_is_wrong(body: str, expected: str, mine: Mine, folder: Path) -> None:
     message = failing(mine(SCALAR + f"    def drive(self, seen):\n        {body}\n"))
-    assert f"ads.model = 'mine:Mine' {told}" in message
-    if "raised" in told:
+    assert f"ads.model = 'mine:Mine' {expected}" in message
+    if "raised" in expected:
         assert f"{folder / 'mine.py'}:6" in message
 
 
 ADS = "class Mine:\n    def start(self, n, nominal, step):\n        return n\n\n    def drive(self, seen, memory):\n"
 
 
-@pytest.mark.parametrize(("body", "told"), [
+@pytest.mark.parametrize(("body", "expected"), [
     ("seen.speed[:] = 0", "ValueError: assignment destination is read-only"), ("return seen.speed", "from drive"),
     ("return (seen.speed * 0, 0)", "from drive"), ("return (seen.speed * 0, seen.speed[:2]), memory", "brake of shape (2,)"),
     ("return (0, 10**400), memory", "returned brake"),
 ])
-def test_an_ads_over_arrays_that_is_wrong(body: str, told: str, mine: Mine) -> None:
-    assert told in failing(mine(ADS + f"        {body}\n"))
+def test_an_ads_over_arrays_that_is_wrong(body: str, expected: str, mine: Mine) -> None:
+    assert expected in failing(mine(ADS + f"        {body}\n"))
 
 
 def vehicle(method: str, body: str) -> str:
@@ -65,7 +65,7 @@ def vehicle(method: str, body: str) -> str:
                                               ("advance", "prepared, state, command"))))
 
 
-@pytest.mark.parametrize(("method", "body", "told"), [
+@pytest.mark.parametrize(("method", "body", "expected"), [
     ("advance", "result = result._replace(speed=-result.speed - 1)", "returned speed = -"),
     ("advance", "result = result._replace(speed=result.speed * np.nan)", "returned speed = nan from advance"),
     ("advance", "result = result._replace(speed=result.speed + np.inf)", "returned speed = inf from advance"),
@@ -81,14 +81,14 @@ def vehicle(method: str, body: str) -> str:
     ("sumo_type", "result = result[0]", "from sumo_type"),
     ("sumo_type", "result = result._replace(max_speed=0 * result.max_speed + 2)", "expected: up to max_speed = 2 of its sumo_type"),
 ])
-def test_a_vehicle_that_is_wrong(method: str, body: str, told: str, mine: Mine) -> None:
+def test_a_vehicle_that_is_wrong(method: str, body: str, expected: str, mine: Mine) -> None:
     def tried() -> None:
         system = mine(vehicle(method, body), VEHICLE.format(ROWS))
         evaluate(system, np.repeat(system.characteristics.original[None], 3, axis=0))
 
     with pytest.raises(ForeignError) as caught:
         tried()
-    assert told in str(caught.value)
+    assert expected in str(caught.value)
     assert "vehicle.model = 'mine:Mine'" in str(caught.value)
 
 
@@ -110,7 +110,7 @@ def scenario(method: str, body: str) -> str:
                       for name, arguments in (("begin", "world"), ("observe", "world, step, memory"), ("encounter", "trace"))))
 
 
-@pytest.mark.parametrize(("method", "body", "told"), [
+@pytest.mark.parametrize(("method", "body", "expected"), [
     ("begin", "world.person_positions('nobody')", "raised in begin"), ("begin", "world.advance([1.0])", "has no 'advance'"),
     ("begin", "world.vehicle_positions('vut')[:] = 0", "read-only"),
     ("observe", "result = None", "returned None from observe"),
@@ -123,9 +123,9 @@ def scenario(method: str, body: str) -> str:
      "returned distance = nan"),
     ("encounter", "trace.speed[:] = 0", "read-only"),
 ])
-def test_a_scenario_that_is_wrong(method: str, body: str, told: str, mine: Mine) -> None:
+def test_a_scenario_that_is_wrong(method: str, body: str, expected: str, mine: Mine) -> None:
     message = failing(mine(scenario(method, body), SCENARIO))
-    assert told in message
+    assert expected in message
     assert "scenario.model = 'mine:Mine'" in message
 
 

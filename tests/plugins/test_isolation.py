@@ -203,9 +203,9 @@ def six(in_tmp: Path) -> None:
 
 
 def test_members_from_outside_are_simulated_and_scored(six: None) -> None:
-    told = json.loads(run("simulate", "six/mine.toml", "--set", "grip=5", "--json").stdout)
-    assert told["jerk"] > 0
-    assert told["mean_change"] == pytest.approx(3 / 8 / 3)
+    output = json.loads(run("simulate", "six/mine.toml", "--set", "grip=5", "--json").stdout)
+    assert output["jerk"] > 0
+    assert output["mean_change"] == pytest.approx(3 / 8 / 3)
 
 
 @pytest.mark.slow

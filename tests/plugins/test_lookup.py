@@ -38,8 +38,8 @@ def test_two_studies_with_modules_of_one_name_get_their_own_whatever_the_order(t
         (tmp_path / place / "mine.toml").write_text(f'extends = "smoke"\nname = "mine"\n{ADS}')
         (tmp_path / place / "mine.py").write_text("from sibling import VALUE\n" + CONSTANT.format("VALUE"))
         (tmp_path / place / "sibling.py").write_text(f"VALUE = {value}\n")
-    found = [throttle(tmp_path / place / "mine.toml") for place in ("a", "b", "a")]
-    assert found == [0.2, 0.4, 0.2]
+    result = [throttle(tmp_path / place / "mine.toml") for place in ("a", "b", "a")]
+    assert result == [0.2, 0.4, 0.2]
 
 
 def test_a_module_that_was_edited_is_read_anew_and_so_is_what_it_imports(mine: Mine, folder: Path) -> None:
@@ -58,7 +58,7 @@ def test_a_file_with_the_name_of_an_installed_module_is_refused_where_it_is_mean
         mine("", '[ads]\nmodel = "numpy:Mine"\n')
 
 
-@pytest.mark.parametrize(("model", "told"), [
+@pytest.mark.parametrize(("model", "expected"), [
     ("os:system", "is a function, not a class"),
     ("os:path", "is a module, not a class"),
     ("subprocess:Popen", "has no method start(n, nominal, step)"),
@@ -70,26 +70,26 @@ def test_a_file_with_the_name_of_an_installed_module_is_refused_where_it_is_mean
     ("__main__:Mine", "cannot import from __main__"),
     ("mine:", "mine:"), (":Mine", ":Mine"), ("no where:Mine", "no where:Mine"), ("mine:Mine.Inner", "mine:Mine.Inner"),
 ])
-def test_what_does_not_meet_the_contract_is_refused_before_it_is_called(model: str, told: str, mine: Mine, folder: Path) -> None:
+def test_what_does_not_meet_the_contract_is_refused_before_it_is_called(model: str, expected: str, mine: Mine, folder: Path) -> None:
     module = (SCALAR + "    pass\n\n\nclass Called:\n    def __init__(self):\n        open('called', 'w').close()\n\n"
               "    def start(self, n, nominal, step): ...\n\n\nclass NotEnough(Called):\n    def drive(self, seen): ...\n\n\n"
               "class Odd(Called):\n    drive = 3\n\n\nclass Scalar(ScalarAds):\n    def drive(self, seen, memory): ...\n")
     with pytest.raises(InputError) as caught:
         mine(module, f'[ads]\nmodel = "{model}"\nparameters = {{ command = "touch called" }}\n')
-    assert told in str(caught.value)
+    assert expected in str(caught.value)
     assert len(str(caught.value).splitlines()) <= 2
     assert not Path("called").exists()
 
 
-@pytest.mark.parametrize(("module", "told"), [
+@pytest.mark.parametrize(("module", "expected"), [
     ("import nothing_of_that_name\n", "ModuleNotFoundError: No module named 'nothing_of_that_name' ({}:1)"),
     ("\nraise SystemExit(3)\n", "SystemExit: 3 ({}:2)"), ("\n\n1 / 0\n", "ZeroDivisionError: division by zero ({}:3)"),
     ("x = (\n", "SyntaxError: '(' was never closed"),
 ])
-def test_a_module_that_fails_is_told_with_its_line_and_can_be_mended(module: str, told: str, mine: Mine, folder: Path) -> None:
+def test_a_module_that_fails_is_told_with_its_line_and_can_be_mended(module: str, expected: str, mine: Mine, folder: Path) -> None:
     with pytest.raises(InputError) as caught:
         mine(module)
-    assert told.format(folder / "mine.py") in str(caught.value)
+    assert expected.format(folder / "mine.py") in str(caught.value)
     assert mine(CONSTANT.format(0.3)).members[1].module == "mine"
     assert "mine" in sys.modules
 

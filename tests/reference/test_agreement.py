@@ -20,8 +20,8 @@ ONE = CharacteristicSet((Characteristic(name="c", unit="kg", original=5.0, lower
 
 
 def study(published: dict[str, float], repeatability: float | None) -> Study:
-    known = {} if repeatability is None else {"safety_degree": repeatability}
-    return msgspec.structs.replace(load_study("smoke"), published=published, repeatability=known)
+    result = {} if repeatability is None else {"safety_degree": repeatability}
+    return msgspec.structs.replace(load_study("smoke"), published=published, repeatability=result)
 
 
 def reference(safety: list[float], tet: list[float]) -> ReferenceData:
@@ -41,30 +41,30 @@ def here(safety: list[float], tet: list[float]) -> Evaluations:
 
 
 def test_every_number_is_what_it_says() -> None:
-    told = agreement(reference([1.0, 2.0, 3.0, -1.0], [1.0, 1.2, 1.4, 0]), here([1.5, 2.0, 2.0, 1.0], [1.1, 1.2, 1.2, 9.0]),
+    result = agreement(reference([1.0, 2.0, 3.0, -1.0], [1.0, 1.2, 1.4, 0]), here([1.5, 2.0, 2.0, 1.0], [1.1, 1.2, 1.2, 9.0]),
                      study({"safety_degree": 2.7}, 0.4), here([2.5], [1.0]))
-    assert told.rows == 4
-    assert told.mean_absolute_error["safety_degree"] == pytest.approx((0.5 + 0 + 1 + 2) / 4)
-    assert told.bias["safety_degree"] == pytest.approx((0.5 + 0 - 1 + 2) / 4)
-    assert told.bias["tet"] == pytest.approx((0.1 + 0 - 0.2) / 3), "over rows without collision on either side"
-    assert told.spearman["ave_dece"] is None
-    assert told.mean_absolute_error["ave_dece"] is None
-    assert told.collisions == {"reference": 1, "here": 0, "both": 0}
-    assert told.original["safety_degree"] == {"reference": 2.7, "here": 2.5}
-    assert (told.precision, told.recall) == (None, 0.0)
-    assert told.in_repeats["safety_degree"] == pytest.approx(3.5 / 4 / 0.4)
-    assert told.in_repeats["tet"] is None
-    assert told.undecided == {"differ": 1, "within_repeats": 0}
-    assert told.original["tet"] == {"reference": None, "here": 1.0}
+    assert result.rows == 4
+    assert result.mean_absolute_error["safety_degree"] == pytest.approx((0.5 + 0 + 1 + 2) / 4)
+    assert result.bias["safety_degree"] == pytest.approx((0.5 + 0 - 1 + 2) / 4)
+    assert result.bias["tet"] == pytest.approx((0.1 + 0 - 0.2) / 3), "over rows without collision on either side"
+    assert result.spearman["ave_dece"] is None
+    assert result.mean_absolute_error["ave_dece"] is None
+    assert result.collisions == {"reference": 1, "here": 0, "both": 0}
+    assert result.original["safety_degree"] == {"reference": 2.7, "here": 2.5}
+    assert (result.precision, result.recall) == (None, 0.0)
+    assert result.in_repeats["safety_degree"] == pytest.approx(3.5 / 4 / 0.4)
+    assert result.in_repeats["tet"] is None
+    assert result.undecided == {"differ": 1, "within_repeats": 0}
+    assert result.original["tet"] == {"reference": None, "here": 1.0}
 
 
 def test_collisions_are_counted_and_those_that_repeats_may_turn_are_told() -> None:
     """Four collide there and four here, three on both sides; of the two others one is 0.05 m from a collision."""
-    told = agreement(reference([-1.0, -2.0, -3.0, -1.0, 0.5, 2.0], [1.0] * 6), here([-2.0, -2.0, -2.0, 0.05, -1.5, 2.0], [1.0] * 6),
+    result = agreement(reference([-1.0, -2.0, -3.0, -1.0, 0.5, 2.0], [1.0] * 6), here([-2.0, -2.0, -2.0, 0.05, -1.5, 2.0], [1.0] * 6),
                      study({}, 0.03), here([2.5], [1.0]))
-    assert (told.precision, told.recall) == (0.75, 0.75)
-    assert told.collision_speed == {"reference": 2.0, "here": 2.0}
-    assert told.undecided == {"differ": 2, "within_repeats": 1}
+    assert (result.precision, result.recall) == (0.75, 0.75)
+    assert result.collision_speed == {"reference": 2.0, "here": 2.0}
+    assert result.undecided == {"differ": 2, "within_repeats": 1}
 
 
 def test_rank_correlation_of_known_orders() -> None:
@@ -131,16 +131,16 @@ def test_rows_outside_the_domains_are_counted_and_left_out(tmp_path: Path) -> No
     assert data.metrics["safety_degree"].tolist() == [2.5, 3.0]
 
 
-@pytest.mark.parametrize(("text", "told"), [
+@pytest.mark.parametrize(("text", "expected"), [
     ("", "is empty"),
     ("mass,radius\n", "has no rows"),
     ("mass,radius\n1,2\n", "lacks the columns max_rpm"),
     (",".join(SUN_COLUMNS) + "\n" + ",".join(["1"] * 12) + "\n", "lacks the columns SaftyDegree, TET, TIT"),
     ('a,b\n"1\n', "is not CSV"),
 ])
-def test_a_file_in_another_format_is_refused(tmp_path: Path, text: str, told: str) -> None:
+def test_a_file_in_another_format_is_refused(tmp_path: Path, text: str, expected: str) -> None:
     (tmp_path / "data.csv").write_text(text)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=expected):
         read_reference(tmp_path / "data.csv", SUN)
 
 

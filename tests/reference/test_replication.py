@@ -60,7 +60,7 @@ def sides(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def told(sides: Path, here: str, there: str) -> dict[tuple[str, str], str]:
+def verdicts_of(sides: Path, here: str, there: str) -> dict[tuple[str, str], str]:
     tables = tables_beside(paired(load_cases([sides / here]), load_cases([sides / there])))
     return {(one.question, one.words.split(":")[0]): one.verdict for one in conclusions(tables)}
 
@@ -80,7 +80,7 @@ def test_a_test_holds_in_direction_magnitude_and_significance(
 
 
 def test_what_differs_is_marked_by_the_rules(sides: Path) -> None:
-    verdicts = told(sides, "one", "other")
+    verdicts = verdicts_of(sides, "one", "other")
     assert verdicts["RQ1", "RS, safety_degree"] == HOLDS
     assert verdicts["RQ1", "NSGA-II, safety_degree"] == HOLDS, "more unsafe than the original on both sides"
     assert verdicts["collisions", "NSGA-II"] == DIFFERS, "20 here, none there"
@@ -141,10 +141,10 @@ def totals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.usefixtures("totals")
 def test_the_page_says_how_well_the_study_agrees() -> None:
     searched_otherwise = load_study("rain", title="Mine", search={"seed": 5, "evaluations": 100})
-    told = page_of(searched_otherwise)
+    page = page_of(searched_otherwise)
     for words in ("80 vehicles", "rank correlation of 0.61", "10 of the 40 published collisions", "recall 0.25", "precision 0.50"):
-        assert words in told["sentence"]
-    assert told["rows"] == [{"file": "made_up.csv", "vehicles": "80", "rho": "0.61", "error": "0.25", "reference": "40", "here": "20",
+        assert words in page["sentence"]
+    assert page["rows"] == [{"file": "made_up.csv", "vehicles": "80", "rho": "0.61", "error": "0.25", "reference": "40", "here": "20",
                              "both": "10", "recall": "0.25", "precision": "0.50"}]
 
 

@@ -36,9 +36,9 @@ ORDER = "return [...arguments[0].tBodies[0].rows].map((row) => parseFloat(row.ce
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
-    found = chromium(tmp_path_factory.mktemp("profile"))
-    yield found
-    found.quit()
+    result = chromium(tmp_path_factory.mktemp("profile"))
+    yield result
+    result.quit()
 
 
 @pytest.fixture(scope="module")
@@ -221,11 +221,11 @@ OPTIONS = (
 
 def program(*names: str) -> str:
     """The first of these programs that there is."""
-    found = next((path for path in map(shutil.which, names) if path), None)
-    if found is None and not os.environ.get(REQUIRED):
+    result = next((path for path in map(shutil.which, names) if path), None)
+    if result is None and not os.environ.get(REQUIRED):
         pytest.skip(f"{names[0]} is not installed")
-    assert found, f"none of {', '.join(names)} is installed"
-    return found
+    assert result, f"none of {', '.join(names)} is installed"
+    return result
 
 
 def chromium(profile: Path) -> webdriver.Chrome:
@@ -259,6 +259,6 @@ def axe_core(folder: Path) -> str:
 def violations(browser: webdriver.Chrome, axe: str) -> list[dict[str, Any]]:
     """What axe-core finds in the page that is serious or critical."""
     browser.execute_script(axe)
-    found = browser.execute_async_script("const done = arguments[0]; axe.run(document).then((found) => done(found.violations));")
+    result = browser.execute_async_script("const done = arguments[0]; axe.run(document).then((found) => done(found.violations));")
     return [{"rule": one["id"], "where": [node["html"][:150] for node in one["nodes"][:3]]}
-            for one in found if one["impact"] in ("serious", "critical")]
+            for one in result if one["impact"] in ("serious", "critical")]

@@ -159,19 +159,20 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
         record |= {"algorithm": algorithm, "run": int(run), "index": int(index)}
     summary = {"summary": {"preventable": {"competent_driver": 0.14, "full_braking": 0.1, "nobody": 0.76, "looked_at": 40,
                                            "interval_competent_driver": [0.05, 0.29]}}}
-    told = verdict(material, [fewest, robust, summary], {"joint": {"factor": 0.42, "samples": 1024}})
-    assert [(one["title"], one["borderline"]) for one in told["findings"]] == [("Smallest robust failure", False), ("Fewest changes", True)]
-    first = told["findings"][0]
+    result = verdict(material, [fewest, robust, summary], {"joint": {"factor": 0.42, "samples": 1024}})
+    assert [(one["title"], one["borderline"]) for one in result["findings"]] == [
+        ("Smallest robust failure", False), ("Fewest changes", True)]
+    first = result["findings"][0]
     setting = material.setting_of(SolutionId.parse(first["handle"]))
     assert [one["text"] for one in first["changes"]] == changes_in_words(material.case.characteristics, setting)
     number, needed = len(first["changes"]), len(robust["minimal_causes"][0]["changes"])
     assert 0 < needed < number, "or the next line tells nothing"
-    assert told["headline"].startswith(f"{number} changes lead to a collision that is robust ({needed} of them suffice")
+    assert result["headline"].startswith(f"{number} changes lead to a collision that is robust ({needed} of them suffice")
     robust["minimal_causes"] = [{"changes": {one["text"]: 1.0 for one in first["changes"]}}]
     every = verdict(material, [fewest, robust, summary], None)["headline"]
     assert every.startswith(f"{number} changes suffice for a collision that is robust: the vehicle hits")
-    assert [one["value"] for one in told["figures"][2:]] == ["14% of the collisions", "42.0% of the way"]
-    assert told["figures"][0]["value"].startswith(f"{len(first['changes'])} changes")
+    assert [one["value"] for one in result["figures"][2:]] == ["14% of the collisions", "42.0% of the way"]
+    assert result["figures"][0]["value"].startswith(f"{len(first['changes'])} changes")
 
 
 def test_every_replay_that_is_linked_is_there_and_hits_as_recorded(page: str, slippery: Path) -> None:
@@ -272,8 +273,8 @@ def test_the_command_writes_the_page_and_refuses_what_it_cannot(slippery: Path, 
 
 
 def test_a_chart_puts_its_points_where_they_belong_and_escapes_their_words() -> None:
-    chart = str(scatter("told", [Dot(0, 0, "a", "hit"), Dot(100, 2, "<b>", "miss", "x")], "x", "y", 0.0, "line"))
-    dots = [tuple(map(float, found)) for found in re.findall(r'cx="([\d.]+)" cy="([\d.]+)"', chart)]
+    chart = str(scatter("chart", [Dot(0, 0, "a", "hit"), Dot(100, 2, "<b>", "miss", "x")], "x", "y", 0.0, "line"))
+    dots = [tuple(map(float, result)) for result in re.findall(r'cx="([\d.]+)" cy="([\d.]+)"', chart)]
     level = float(re.search(r'class="level" d="M62 ([\d.]+)H', chart)[1])  # type: ignore[index]
     assert dots[0] == (62.0, level)
     assert dots[1][0] > 600
@@ -291,15 +292,15 @@ def test_tests_and_weathers_stand_down_and_speeds_across() -> None:
                 for speed in (10, 20, 30) for at in (25, 50)),
               point("along 30", test="along", speed=30, weather="clear"), point("along 40", test="along", speed=40, weather="clear"),
               point("safe 10", test="safe", speed=10, weather="clear")]
-    found = failing_places(matrix, ("near 20 50", "near 30 25", "near 30 50", "along 40"))
-    assert found["summary"] == "Fails at 4 of 9 points. Percentages are impact locations."
-    assert found["heads"] == ["10 km/h", "20 km/h", "30 km/h", "40 km/h"]
-    assert dict(found["rows"]) == {"near, night": [AVOIDED, "50 %", "25 %, 50 %", ""], "along, clear": ["", "", AVOIDED, "fails"]}
+    result = failing_places(matrix, ("near 20 50", "near 30 25", "near 30 50", "along 40"))
+    assert result["summary"] == "Fails at 4 of 9 points. Percentages are impact locations."
+    assert result["heads"] == ["10 km/h", "20 km/h", "30 km/h", "40 km/h"]
+    assert dict(result["rows"]) == {"near, night": [AVOIDED, "50 %", "25 %, 50 %", ""], "along, clear": ["", "", AVOIDED, "fails"]}
 
 
 def test_a_matrix_of_something_else_than_speeds_has_a_table_too() -> None:
-    found = failing_places([point("a", test="a", weather="fog", slope=0.1), point("b", test="b", weather="fog")], ["a"])
-    assert (found["heads"], found["rows"]) == ([""], [("a, fog, slope 0.1", ["fails"])])
+    result = failing_places([point("a", test="a", weather="fog", slope=0.1), point("b", test="b", weather="fog")], ["a"])
+    assert (result["heads"], result["rows"]) == ([""], [("a, fog, slope 0.1", ["fails"])])
     assert failing_places([point("b", test="b", weather="fog")], [])["rows"] == []
 
 
@@ -310,8 +311,8 @@ def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path:
     manifest["study"]["scenario"]["parameters"] = {"network": "/nowhere/gone"}
     write_manifest(tmp_path / "copy", manifest)
     page = make_report([tmp_path / "copy"], only=["tested", "verdict", *PARTS, "trust", "reproduce"], jobs=1)
-    told = re.findall(r"slippery: What this study is about cannot be simulated here: .*gone", page)
-    assert len(told) == 1 + len(LIMITS), "each section that would take simulations says so"
+    result = re.findall(r"slippery: What this study is about cannot be simulated here: .*gone", page)
+    assert len(result) == 1 + len(LIMITS), "each section that would take simulations says so"
     assert '<details class="replay"' in page
 
 
@@ -337,10 +338,10 @@ def test_what_comes_from_outside_is_called_by_its_name_once(slippery: Path) -> N
     points = [Point(scenario, material.case.weather)]  # type: ignore[arg-type]
     others: Any = SimpleNamespace(case=dataclasses.replace(material.case, study=study), manifest=material.manifest, lacking="", point="",
                                   system=SimpleNamespace(points=points, matrix=(), vehicle=None))
-    told = what.tested(others)
-    assert "Driving system: my_controller:Pilot. Scenario: pedestrian_crossing (" in told["who"]
-    assert "NSGA-II (1 run)" in told["how"]
-    assert not told["tags"]
+    result = what.tested(others)
+    assert "Driving system: my_controller:Pilot. Scenario: pedestrian_crossing (" in result["who"]
+    assert "NSGA-II (1 run)" in result["how"]
+    assert not result["tags"]
 
 
 def test_an_estimate_stands_beside_its_error_and_just_below_nothing_it_is_nothing() -> None:

@@ -69,8 +69,8 @@ def test_every_printed_command_gives_the_numbers_of_the_page(
     answers = place / "answers"
     for question in ("explain", "tolerance", "risk"):
         kept = json.loads((answers / f"{question}.json").read_text())
-        told = json.loads(output_of([*printed[question], "--json"]))
-        value = {**told, "verdict": kept["value"]["verdict"]} if question == "tolerance" else told
+        result = json.loads(output_of([*printed[question], "--json"]))
+        value = {**result, "verdict": kept["value"]["verdict"]} if question == "tolerance" else result
         (answers / f"{question}.json").write_text(json.dumps({**kept, "value": value}))
     assert make_report([place], jobs=2) == page
 
@@ -84,9 +84,9 @@ def test_every_printed_command_gives_the_numbers_of_the_page(
     section = page[page.index('<h2 id="questions">'):page.index('<h2 id="trust">')]
     shown = [re.sub("<.*?>", "", html.unescape(cell)) for cell in re.findall("<td.*?>(.*?)</td>", section)]
     assert len(shown) > 50
-    told = {cell.replace("\\", "").strip("*") for cell in cells}
+    result = {cell.replace("\\", "").strip("*") for cell in cells}
     printable = [one.strip().replace("²", "^2") for one in shown]
-    assert [one for one in printable if one and one not in told] == []
+    assert [one for one in printable if one and one not in result] == []
 
 
 def output_of(typed: list[str]) -> str:

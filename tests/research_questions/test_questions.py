@@ -35,9 +35,9 @@ HEAVY, GRIPLESS, BOTH = (1100.0, 2.0, 0.1), (1000.0, 1.0, 0.1), (1200.0, 1.5, 0.
 
 def only(frame: pd.DataFrame, **wanted: Any) -> dict[str, Any]:
     """The one row with these values."""
-    found = frame[(frame[list(wanted)] == pd.Series(wanted)).all(axis=1)]
-    assert len(found) == 1
-    return dict(found.iloc[0])
+    result = frame[(frame[list(wanted)] == pd.Series(wanted)).all(axis=1)]
+    assert len(result) == 1
+    return dict(result.iloc[0])
 
 
 def test_rq1_is_small_where_solutions_are_more_unsafe() -> None:
@@ -61,11 +61,11 @@ def test_a_tet_that_stands_at_a_collision_is_not_counted() -> None:
 
 
 def test_rq1_says_which_values_are_undefined() -> None:
-    told = answer([made_up(row(tet=None), row(sd=-1), row(), original={**ORIGINAL, "tit": None})], "rq1")[0]
-    assert only(told.frame, metric="tet")["n1"] == 1
-    assert only(told.frame, metric="tit")["p_value"] is None
-    assert any("tet is undefined in 1 of 2 solutions" in note for note in told.notes)
-    assert any("the original vehicle's tit is undefined" in note for note in told.notes)
+    result = answer([made_up(row(tet=None), row(sd=-1), row(), original={**ORIGINAL, "tit": None})], "rq1")[0]
+    assert only(result.frame, metric="tet")["n1"] == 1
+    assert only(result.frame, metric="tit")["p_value"] is None
+    assert any("tet is undefined in 1 of 2 solutions" in note for note in result.notes)
+    assert any("the original vehicle's tit is undefined" in note for note in result.notes)
 
 
 def test_rq2_is_high_where_nsga2_is_better() -> None:
@@ -86,16 +86,17 @@ def test_rq2_compares_runs_by_front_and_pooled_solutions_by_metric() -> None:
 
 
 def test_rq2_of_imported_solutions_leaves_the_fronts_open() -> None:
-    told = answer([made_up(row(sd=1), row("rs", sd=2), has_runs=False)], "rq2")[0]
-    assert only(told.frame, metric="igd")["p_value"] is None
-    assert only(told.frame, metric="igd")["n1"] == 0
-    assert only(told.frame, metric="safety_degree")["effect_size"] == 1
-    assert any("need runs" in note for note in told.notes)
+    result = answer([made_up(row(sd=1), row("rs", sd=2), has_runs=False)], "rq2")[0]
+    assert only(result.frame, metric="igd")["p_value"] is None
+    assert only(result.frame, metric="igd")["n1"] == 0
+    assert only(result.frame, metric="safety_degree")["effect_size"] == 1
+    assert any("need runs" in note for note in result.notes)
 
 
-@pytest.mark.parametrize(("rows", "told"), [([row("rs")], "no finished run of nsga2"), ([row()], "nsga2 alone"), ([], "no finished run")])
-def test_rq2_without_an_algorithm_is_refused(rows: list[dict[str, Any]], told: str) -> None:
-    with pytest.raises(InputError, match=told):
+@pytest.mark.parametrize(("rows", "expected"), [([row("rs")], "no finished run of nsga2"), ([row()], "nsga2 alone"),
+                                                   ([], "no finished run")])
+def test_rq2_without_an_algorithm_is_refused(rows: list[dict[str, Any]], expected: str) -> None:
+    with pytest.raises(InputError, match=expected):
         answer([made_up(*rows)], "rq2")
 
 
@@ -139,9 +140,9 @@ def test_the_footer_of_rq33() -> None:
                                 row(values=HEAVY, sd=-3, ave_dece=3)))
     expected = {"avgSD_mD": (1, 50, 2), "avgSD_cS": (3, None, 1), "TET": (0.75, 75, 2), "TIT": (0.3, 60, 2), "aveDece": (2, 100 / 3, 3)}
     for quantity, (value, percent, n) in expected.items():
-        told = only(frame, quantity=quantity, j="1")
-        assert (told["value"], told["n"]) == (pytest.approx(value), n)
-        assert told["percent"] == (None if percent is None else pytest.approx(percent))
+        result = only(frame, quantity=quantity, j="1")
+        assert (result["value"], result["n"]) == (pytest.approx(value), n)
+        assert result["percent"] == (None if percent is None else pytest.approx(percent))
     assert only(frame, quantity="avgSD_cS", j="2")["value"] is None
 
 
@@ -163,10 +164,10 @@ def test_combinations_of_exactly_four() -> None:
 
     case = made_up(study=study, finished=[("nsga2", 0)])
     solutions = pd.DataFrame([changed(names) for names in ("abcd", "bcde", "abcd", "cdef", "abcf", "abcde", "abc")])
-    found = combinations(dataclasses.replace(case, solutions=solutions))
-    assert found["characteristics"].tolist() == [list("abcd"), list("abcf"), list("bcde")]
-    assert found["percent"].tolist() == [40, 20, 20]
-    assert found["rank"].tolist() == [1, 2, 2]
+    result = combinations(dataclasses.replace(case, solutions=solutions))
+    assert result["characteristics"].tolist() == [list("abcd"), list("abcf"), list("bcde")]
+    assert result["percent"].tolist() == [40, 20, 20]
+    assert result["rank"].tolist() == [1, 2, 2]
 
 
 def test_weather_compares_settings_that_differ_in_it_alone() -> None:
@@ -175,20 +176,20 @@ def test_weather_compares_settings_that_differ_in_it_alone() -> None:
     other = made_up(row(values=BOTH), study=made_up_study(name="other", weather="hard_rain", metrics=made_up_study().metrics.__class__(
         ttc_threshold=9)))
     assert [(one.name, two.name) for one, two in weather_pairs([wet, other, clear])] == [("made-up", "wet")]
-    told = only(weather(clear, wet), characteristic="mass")
-    assert (told["percent"], told["percent_other"], told["difference"]) == (50, 100, 50)
-    assert (told["increase"], told["increase_other"], told["decrease"]) == (100, 200, None)
-    assert (told["rank"], told["rank_other"]) == (1, 1)
+    result = only(weather(clear, wet), characteristic="mass")
+    assert (result["percent"], result["percent_other"], result["difference"]) == (50, 100, 50)
+    assert (result["increase"], result["increase_other"], result["decrease"]) == (100, 200, None)
+    assert (result["rank"], result["rank_other"]) == (1, 1)
     with pytest.raises(InputError, match="differ in the weather alone"):
         answer([clear, other], "weather")
 
 
 def test_every_question_at_once_tells_what_is_lacking() -> None:
-    told = {one.name: one for one in answer([made_up(row(values=HEAVY))])}
-    assert not told["rq1"].frame.empty
-    assert told["rq2"].frame.empty
-    assert "nsga2 alone" in told["rq2"].notes[0]
-    assert told["weather"].frame.empty
+    result = {one.name: one for one in answer([made_up(row(values=HEAVY))])}
+    assert not result["rq1"].frame.empty
+    assert result["rq2"].frame.empty
+    assert "nsga2 alone" in result["rq2"].notes[0]
+    assert result["weather"].frame.empty
     with pytest.raises(InputError, match="no finished run"):
         answer([made_up()])
     with pytest.raises(InputError, match="rq9"):
@@ -198,9 +199,9 @@ def test_every_question_at_once_tells_what_is_lacking() -> None:
 def test_several_settings_stand_in_one_frame_and_the_refused_in_the_notes() -> None:
     good = made_up(row(), row("rs"))
     alone = made_up(row(), study=made_up_study(name="alone"))
-    told = answer([good, alone], "rq2")[0]
-    assert set(told.frame["setting"]) == {"made-up"}
-    assert any(note.startswith("alone: ") for note in told.notes)
+    result = answer([good, alone], "rq2")[0]
+    assert set(result.frame["setting"]) == {"made-up"}
+    assert any(note.startswith("alone: ") for note in result.notes)
 
 
 def test_the_brief_lines_say_what_the_data_allows() -> None:
@@ -238,8 +239,8 @@ HEAVIER = (1200.0, 2.0, 0.1)
 
 
 def test_no_share_of_an_original_that_is_zero() -> None:
-    told = rq33_safety(made_up(row(values=HEAVIER, tet=1.5, tit=0.5), original={**ORIGINAL, "tet": 0.0, "tit": 0.25}))
-    quantities = {one["quantity"]: one for one in told[told["j"] == "any"].to_dict("records")}
+    result = rq33_safety(made_up(row(values=HEAVIER, tet=1.5, tit=0.5), original={**ORIGINAL, "tet": 0.0, "tit": 0.25}))
+    quantities = {one["quantity"]: one for one in result[result["j"] == "any"].to_dict("records")}
     assert quantities["TET"]["value"] == 1.5
     assert quantities["TET"]["percent"] is None
     assert quantities["TIT"]["percent"] == 100
@@ -248,8 +249,8 @@ def test_no_share_of_an_original_that_is_zero() -> None:
 def test_what_a_table_tells_of_exposure_in_collisions_does_not_count() -> None:
     """Published rows have a TET and a TIT for collisions too."""
     crash = {**row(values=HEAVIER, sd=-2.0), "tet": 9.0, "tit": 9.0}
-    told = rq33_safety(made_up(row(values=HEAVIER, tet=1.5, tit=0.75), crash))
-    overall = {one["quantity"]: (one["value"], one["n"]) for one in told[told["j"] == "any"].to_dict("records")}
+    result = rq33_safety(made_up(row(values=HEAVIER, tet=1.5, tit=0.75), crash))
+    overall = {one["quantity"]: (one["value"], one["n"]) for one in result[result["j"] == "any"].to_dict("records")}
     assert (overall["TET"], overall["TIT"]) == ((0.5, 1), (0.25, 1))
 
 

@@ -116,10 +116,10 @@ def test_json_records_have_the_promised_keys(question: str, keys: set[str]) -> N
 
 def test_significant_and_notable_cells_stand_out() -> None:
     cases = [made_up(*(row(sd=1 - i / 100) for i in range(30)))]
-    told = answer(cases, "rq1")
-    assert "<0.001*  0.000*" in text(told)
-    assert r"\textbf{\textless{}0.001} & \textbf{0.000}" in latex(told)
-    assert r"**\<0.001** | **0.000**" in markdown(told)
+    result = answer(cases, "rq1")
+    assert "<0.001*  0.000*" in text(result)
+    assert r"\textbf{\textless{}0.001} & \textbf{0.000}" in latex(result)
+    assert r"**\<0.001** | **0.000**" in markdown(result)
     even = text(answer([made_up(row(sd=1), row(sd=3))], "rq1")).splitlines()
     assert next(line for line in even if " SD " in line).count("*") == 0
 
@@ -140,13 +140,13 @@ def test_what_cannot_be_told_is_never_a_nan(kind: str) -> None:
 
 def test_the_papers_layout_has_cases_by_metrics_and_cells_of_p_and_a12() -> None:
     cases = [made_up(*(row(sd=1 - i / 100) for i in range(30))), rich_setting(name="wet", weather="hard_rain")]
-    told = text(answer(cases, "rq1"), PAPER)
-    head = next(line for line in told.splitlines() if line.startswith("case"))
+    output = text(answer(cases, "rq1"), PAPER)
+    head = next(line for line in output.splitlines() if line.startswith("case"))
     assert head.split() == ["case", "algorithm", "SD", "TET", "TIT", "aveDece"]
-    assert "<0.001 / 0.000*" in told
+    assert "<0.001 / 0.000*" in output
     for one in answer(cases, "rq1")[0].frame.to_dict("records"):
         if one["p_value"] is not None and one["p_value"] >= 0.001:
-            assert f"{one['p_value']:.3f} / {one['effect_size']:.3f}" in told
+            assert f"{one['p_value']:.3f} / {one['effect_size']:.3f}" in output
 
 
 def random_setting(name: str) -> Case:
@@ -192,17 +192,17 @@ def test_cases_stand_side_by_side_in_one_figure(case: Case) -> None:
     figure = number_of_changes(cases)
     assert [axis.get_title() for axis in figure.axes if axis.axison] == [one.name for one in cases]
     _check_layout(figure, "rq3.1-number-of-changes")
-    found, lacking = draw(cases)
-    assert [name for name in found if name.startswith("rq3.1")] == ["rq3.1-number-of-changes"]
-    assert "case 1-convergence" in found
+    result, lacking = draw(cases)
+    assert [name for name in result if name.startswith("rq3.1")] == ["rq3.1-number-of-changes"]
+    assert "case 1-convergence" in result
     assert not lacking
 
 
 def test_the_original_vehicle_and_the_line_of_collisions_are_in_the_fronts(case: Case) -> None:
     for axis, marked in zip(pareto_fronts(case).axes, (True, True, False), strict=True):
-        told = {str(line.get_label()): line for line in axis.lines}
-        assert float(told["original vehicle"].get_xdata()[0]) == (case.original["safety_degree"] if marked else 0.0)  # type: ignore[index,arg-type]
-        assert ("collision: 0 and left of it" in told) == marked
+        output = {str(line.get_label()): line for line in axis.lines}
+        assert float(output["original vehicle"].get_xdata()[0]) == (case.original["safety_degree"] if marked else 0.0)  # type: ignore[index,arg-type]
+        assert ("collision: 0 and left of it" in output) == marked
 
 
 def _check_layout(figure: Figure, name: str) -> None:

@@ -118,10 +118,10 @@ def test_any_changed_byte_is_a_cut_tail_or_an_error_that_tells_where(tmp_path: P
         assert holds_the_first(BATCHES, content)
         assert not content.results
     else:
-        with pytest.raises(InputError) as told:
+        with pytest.raises(InputError) as caught:
             Journal(path, "study", "nsga2-00")
-        assert str(path) in str(told.value)
-        assert f"byte {start}" in str(told.value)
+        assert str(path) in str(caught.value)
+        assert f"byte {start}" in str(caught.value)
         assert path.read_bytes() == content, "a damaged file is left as it is"
 
 
@@ -158,20 +158,20 @@ def test_a_full_disk_leaves_what_was_there_and_can_go_on(tmp_path: Path, monkeyp
         room = written
 
         def write(self, content: memoryview) -> int:
-            taken = content[:self.room]
-            if not len(taken):
+            result = content[:self.room]
+            if not len(result):
                 raise OSError(28, "No space left on device")
-            self.room -= len(taken)
-            return int(file.write(taken))
+            self.room -= len(result)
+            return int(file.write(result))
 
         def __getattr__(self, name: str) -> object:
             return getattr(file, name)
 
     file = journal._file
     journal._file = Full()  # type: ignore[assignment]
-    with pytest.raises(SafevarError, match="No space left on device") as told:
+    with pytest.raises(SafevarError, match="No space left on device") as caught:
         journal.append(places(2), batch(2))
-    assert told.value.exit_code == 1
+    assert caught.value.exit_code == 1
     assert path.stat().st_size == end
     journal._file = file
     journal.append(places(2), batch(2))
@@ -182,9 +182,9 @@ def test_a_full_disk_leaves_what_was_there_and_can_go_on(tmp_path: Path, monkeyp
 
 def test_a_reason_is_kept_with_its_setting_and_costs_others_nothing(tmp_path: Path) -> None:
     failed = batch(0)
-    told = dataclasses.replace(failed, reasons={failed.settings[2].tobytes(): "SUMO failed: it said so"})
+    result = dataclasses.replace(failed, reasons={failed.settings[2].tobytes(): "SUMO failed: it said so"})
     sizes = []
-    for name, one in (("without", failed), ("with", told)):
+    for name, one in (("without", failed), ("with", result)):
         journal = Journal(tmp_path / name, "study", "nsga2-00")
         journal.append(places(0), one)
         journal.close()

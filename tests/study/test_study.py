@@ -54,7 +54,7 @@ def variant(tmp_path: Path, old: str, new: str) -> str:
     return str(path)
 
 
-@pytest.mark.parametrize(("old", "new", "told"), [
+@pytest.mark.parametrize(("old", "new", "expected"), [
     ("runs = 30", "runs = 30\ntime_limit = inf", "search.time_limit = inf"),
     ("runs = 30", "runs = 30\ntime_limit = 0", "search.time_limit = 0"),
     ("ttc_threshold = 1.5", "ttc_threshold = 1.5\nttc = 2", "metrics.ttc: there is no such key"),
@@ -73,17 +73,17 @@ def variant(tmp_path: Path, old: str, new: str) -> str:
     ('name = "sun"', 'name = "../sun"', "name = '../sun'"),
     ('name = "sun"', 'name = "sun"\nextends = "nothing"', "nothing"),
 ])
-def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str, new: str, told: str) -> None:
+def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str, new: str, expected: str) -> None:
     path = variant(tmp_path, old, new)
     with pytest.raises(InputError) as caught:
         load_study(path)
     message = str(caught.value)
-    assert told in message
+    assert expected in message
     assert path in message or "extends" in new
     assert len(message.splitlines()) <= 2
 
 
-@pytest.mark.parametrize(("text", "told"), [
+@pytest.mark.parametrize(("text", "expected"), [
     ("[ads.parameters]\nlatency = 2024-05-01", "ads.parameters.latency = 2024-05-01, a date or time"),
     ("[ads.parameters]\nmodel = { when = [07:30:00] }", "ads.parameters.model.when.0 = 07:30:00"),
     ("[ads.parameters]\nseed = 18446744073709551616", "ads.parameters.seed = an integer of 65 bits"),
@@ -104,12 +104,12 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
     ("extends = 3\n", "extends"),
     (f"[ads.parameters.{'.'.join(['deep'] * 1500)}]\nx = 1", "ads is nested too deeply\nexpected: at most 32 tables"),
 ])
-def test_what_nobody_can_use_is_refused_by_its_key(text: str, told: str, tmp_path: Path) -> None:
+def test_what_nobody_can_use_is_refused_by_its_key(text: str, expected: str, tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(text if text.startswith("extends") else f'extends = "smoke"\nname = "mine"\n{text}\n')
     with pytest.raises(InputError) as caught:
         load_study(str(path))
-    assert told in str(caught.value)
+    assert expected in str(caught.value)
     assert str(path) in str(caught.value)
     assert len(str(caught.value)) < 1000
 
@@ -145,6 +145,6 @@ def test_another_system_inherits_neither_title_nor_published_values(text: str, i
 
 def test_a_written_study_is_called_as_its_file(tmp_path: Path) -> None:
     write_study(tmp_path / "fitted.toml", load_study("sun"), "A comment\nof \x1b two lines.")
-    found = load_study(str(tmp_path / "fitted.toml"))
-    assert found.name == "fitted"
-    assert found.published == load_study("sun").published
+    output = load_study(str(tmp_path / "fitted.toml"))
+    assert output.name == "fitted"
+    assert output.published == load_study("sun").published

@@ -108,9 +108,9 @@ def multi_body(deceleration: float, **changed: float) -> float:
         return x[3] - UNTIL
 
     slow.terminal = True  # type: ignore[attr-defined]
-    found = solve_ivp(lambda _, x: vehicle_dynamics_mb(list(x), [0.0, asked], vehicle), (0, 12),
+    result = solve_ivp(lambda _, x: vehicle_dynamics_mb(list(x), [0.0, asked], vehicle), (0, 12),
                       init_mb([0, 0, 0, SPEED, 0, 0, 0], vehicle), events=slow, max_step=0.01, rtol=1e-4)
-    return float((SPEED - found.y[3, -1]) / found.t[-1])
+    return float((SPEED - result.y[3, -1]) / result.t[-1])
 
 
 def parameters() -> Any:

@@ -66,23 +66,23 @@ def test_carlas_pedals_rise_and_fall_at_their_own_rates() -> None:
 
 def test_sumo_is_told_what_carlas_vehicle_can_do() -> None:
     vehicle = SYSTEMS["carla"].vehicle
-    told = vehicle.sumo_type(prepared("carla"))
+    result = vehicle.sumo_type(prepared("carla"))
     grip = vehicle.tyre_friction * 3.5 * GRAVITY
-    assert told.max_speed[0] == pytest.approx(5800 * 2 * np.pi / 60 / 4.0 * 0.355), "the highest gear is 1.0, the final drive 4.0"
-    assert told.accel[0] == pytest.approx(min(vehicle.engine_torque * 500 * 2.85 * 4 / 0.355 / 2404, grip))
-    assert told.decel[0] == pytest.approx(min(4 * 1500 / 0.355 / 2404, grip))
-    assert told.tau[0] == pytest.approx(STEP + 1 / vehicle.brake_rise)
-    assert told.mass[0] == 2404
+    assert result.max_speed[0] == pytest.approx(5800 * 2 * np.pi / 60 / 4.0 * 0.355), "the highest gear is 1.0, the final drive 4.0"
+    assert result.accel[0] == pytest.approx(min(vehicle.engine_torque * 500 * 2.85 * 4 / 0.355 / 2404, grip))
+    assert result.decel[0] == pytest.approx(min(4 * 1500 / 0.355 / 2404, grip))
+    assert result.tau[0] == pytest.approx(STEP + 1 / vehicle.brake_rise)
+    assert result.mass[0] == 2404
     icy = vehicle.sumo_type(vehicle.prepare({m.name: np.full(1, float(m.original)) for m in SYSTEMS["carla"].characteristics}, 0.01, STEP))
     assert icy.accel[0] == pytest.approx(0.01 * grip)
     assert icy.decel[0] == pytest.approx(0.01 * grip)
 
 
 def test_sumo_is_told_what_lgsvls_vehicle_can_do() -> None:
-    told = SYSTEMS["lgsvl"].vehicle.sumo_type(prepared("lgsvl"))
-    assert told.max_speed[0] == pytest.approx(8299 * 2 * np.pi / 60 / (0.67 * 2.56) * 0.35)
-    assert told.decel[0] == pytest.approx(min(4 * 3000 / 0.35 / 2120, GRAVITY))
-    assert told.accel[0] == pytest.approx(min(450 * 4.17 * 2.56 / 0.35 / 2120, GRAVITY))
+    result = SYSTEMS["lgsvl"].vehicle.sumo_type(prepared("lgsvl"))
+    assert result.max_speed[0] == pytest.approx(8299 * 2 * np.pi / 60 / (0.67 * 2.56) * 0.35)
+    assert result.decel[0] == pytest.approx(min(4 * 3000 / 0.35 / 2120, GRAVITY))
+    assert result.accel[0] == pytest.approx(min(450 * 4.17 * 2.56 / 0.35 / 2120, GRAVITY))
 
 
 def test_lgsvls_gearbox_and_traction_control_have_their_numbers() -> None:
@@ -108,8 +108,8 @@ def test_lgsvls_tyres_follow_unitys_curve(slip: float, share: float) -> None:
 @pytest.mark.parametrize(("visibility", "seen"), [(1.0, True), (0.8, True), (0.7, False)])
 def test_sumos_sensor_sees_less_far_in_bad_sight(visibility: float, seen: bool) -> None:
     vehicle, p, one = SYSTEMS["sumo"].vehicle, prepared("sumo"), np.ones(1)
-    told, _ = vehicle.sense(p, vehicle.at_rest(p), Observation(0.0, one, 60 * one, one, 0 * one, 0 * one, visibility))
-    assert bool(np.isfinite(told.gap[0])) == seen, "80 m in clear sight"
+    result, _ = vehicle.sense(p, vehicle.at_rest(p), Observation(0.0, one, 60 * one, one, 0 * one, 0 * one, visibility))
+    assert bool(np.isfinite(result.gap[0])) == seen, "80 m in clear sight"
 
 
 def test_a_calibration_drive_finds_what_the_brake_adds_to_coasting() -> None:

@@ -84,8 +84,8 @@ def test_dirty_sensors_see_late_and_not_far() -> None:
     p, seen = prepared(1.0, sensorRange=30.0, sensorLatency=0.2), []
     state, one = CAR.at_rest(p), np.ones(1)
     for k in range(200):
-        told, state = CAR.sense(p, state, Observation(k * 0.05, one, (60 - 0.5 * k) * one, 10 * one, 0 * one, 0 * one, 1.0))
-        seen.append(float(told.gap[0]))
+        result, state = CAR.sense(p, state, Observation(k * 0.05, one, (60 - 0.5 * k) * one, 10 * one, 0 * one, 0 * one, 1.0))
+        seen.append(float(result.gap[0]))
     assert np.isinf(seen[:64]).all()
     assert seen[64] == pytest.approx(60 - 0.5 * 60)
     assert seen[100] == pytest.approx(60 - 0.5 * 96)

@@ -122,12 +122,12 @@ def read(place: Path) -> dict[str, str]:
 
 def test_what_is_read_while_models_are_loaded_made_and_first_run_counts_wherever_the_command_is_started(
         place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = read(place)
-    assert set(found) == READ
+    result = read(place)
+    assert set(result) == READ
     monkeypatch.chdir(place / "tiles")
-    assert read(place) == found
+    assert read(place) == result
     shutil.copytree(place, place.parent / "copy")
-    assert read(place.parent / "copy") == found, "no name holds where the study lies"
+    assert read(place.parent / "copy") == result, "no name holds where the study lies"
 
 
 @pytest.mark.parametrize("name", ["my_ads.py", "my_maps/rules.py", "my_space/roads.py", "my_lazy.py", "tiles/1.txt", "table.bin", "map.db"])

@@ -78,9 +78,9 @@ def test_what_takes_too_long_is_stopped() -> None:
 
 def test_an_error_of_the_study_arrives_as_it_is_and_a_bug_with_its_traceback(pool: LocalPool) -> None:
     wrong = SMOKE.replace(b"world_on_rails", b"world_on_roads")
-    with pytest.raises(InputError, match="world_on_roads") as told:
+    with pytest.raises(InputError, match="world_on_roads") as caught:
         pool.submit(wrong, ORIGINAL).result(timeout=30)
-    assert "expected" in str(told.value)
+    assert "expected" in str(caught.value)
     with pytest.raises(RuntimeError, match=r"(?s)Traceback.*evaluate_batch"):
         pool.submit(SMOKE, ORIGINAL[:, :3]).result(timeout=30)
     assert pool.submit(SMOKE, ORIGINAL).result(timeout=30).valid.all()
@@ -162,20 +162,20 @@ def deadly(*values: float) -> Callable[[np.ndarray, int], Exception | None]:
 
 def test_a_batch_that_lost_its_worker_once_is_tried_again() -> None:
     pool = ToldPool(lambda rows, before: None if before else died())
-    found = RetryingPool(pool, STUDY).submit(b"", settings(8)).result(timeout=5)
+    result = RetryingPool(pool, STUDY).submit(b"", settings(8)).result(timeout=5)
     assert pool.tried == [8, 8]
-    assert found.valid.all()
+    assert result.valid.all()
 
 
 def test_the_setting_that_kills_its_worker_alone_is_told_from_the_others() -> None:
     pool = ToldPool(deadly(4302, 4305))
-    found = RetryingPool(pool, STUDY).submit(b"", settings(8)).result(timeout=5)
-    assert np.array_equal(found.settings, settings(8))
-    assert np.array_equal(found.valid, ~np.isin(settings(8)[:, 0], (4302, 4305)))
-    assert found.outcome[2] == Outcome.SIMULATOR_ERROR
-    assert np.isnan(found.objectives[2, 0])
-    assert np.array_equal(found.f_safe[found.valid], settings(8)[found.valid, 0] / 3)
-    assert np.array_equal(found.f_num_diff, SUN.number_changed(settings(8)))
+    result = RetryingPool(pool, STUDY).submit(b"", settings(8)).result(timeout=5)
+    assert np.array_equal(result.settings, settings(8))
+    assert np.array_equal(result.valid, ~np.isin(settings(8)[:, 0], (4302, 4305)))
+    assert result.outcome[2] == Outcome.SIMULATOR_ERROR
+    assert np.isnan(result.objectives[2, 0])
+    assert np.array_equal(result.f_safe[result.valid], settings(8)[result.valid, 0] / 3)
+    assert np.array_equal(result.f_num_diff, SUN.number_changed(settings(8)))
     assert pool.tried.count(1) == 6 + 2 * (ATTEMPTS + 2), "each twice alone, the original in between, and once more"
 
 
@@ -204,11 +204,11 @@ def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it() -> No
         return ForeignError("study", "ads.model = 'my_ads:Mine' raised in drive: ZeroDivisionError") if 4313 in rows[:, 0] else None
 
     pool = ToldPool(fault)
-    with pytest.raises(ForeignError) as told:
+    with pytest.raises(ForeignError) as caught:
         RetryingPool(pool, FOREIGN).submit(b"", settings(50)).result(timeout=5)
-    assert "ZeroDivisionError; again by: python -m safevar_sumo simulate 'my study.toml' --set " in str(told.value)
-    assert f"--set {SUN.names[0]}=4313.0" in str(told.value)
-    assert str(told.value).count("--set") == 1, "what is not changed need not be set"
+    assert "ZeroDivisionError; again by: python -m safevar_sumo simulate 'my study.toml' --set " in str(caught.value)
+    assert f"--set {SUN.names[0]}=4313.0" in str(caught.value)
+    assert str(caught.value).count("--set") == 1, "what is not changed need not be set"
     assert len(pool.tried) < 15
 
 
@@ -221,8 +221,8 @@ def test_settings_that_fail_one_after_the_other_without_end_are_a_fault_of_the_s
 
 def test_failures_between_successes_are_no_fault_of_the_study() -> None:
     every_second = 4300 + np.arange(0, 200, 2)
-    found = RetryingPool(ToldPool(deadly(*every_second)), STUDY).submit(b"", settings(200)).result(timeout=5)
-    assert np.count_nonzero(~found.valid) == 100
+    result = RetryingPool(ToldPool(deadly(*every_second)), STUDY).submit(b"", settings(200)).result(timeout=5)
+    assert np.count_nonzero(~result.valid) == 100
 
 
 def test_the_original_vehicle_must_succeed() -> None:

@@ -10,11 +10,11 @@ class Halving:
         self.factor = factor
 
     def search(self, problem, rng):
-        known, original, reach = [], problem.characteristics.original, 1.0
+        result, original, reach = [], problem.characteristics.original, 1.0
         for start in range(0, problem.evaluations, 10):
             number = min(10, problem.evaluations - start)
             settings = original + reach * (problem.uniform(number, rng) - original)
-            known.append((yield problem.characteristics.filter(settings)))
+            result.append((yield problem.characteristics.filter(settings)))
             reach *= self.factor
-        everything = Evaluations.concatenate(known)
+        everything = Evaluations.concatenate(result)
         return everything.take(np.argsort(problem.scoring.values(everything)[:, 0], kind="stable")[:5])
