@@ -14,7 +14,7 @@ import scipy
 import tomli_w
 
 from safevar_sumo.analysis.evaluator import finite_or_none
-from safevar_sumo.analysis.figures import as_formula, new_figure, save
+from safevar_sumo.analysis.figures import FONT, as_formula, new_figure, save
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -181,7 +181,7 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
         lowest.append(low)
         highest.append(high)
         member = characteristics.members[i]
-        axis.set_xlabel(member.name + ("" if member.unit == "-" else f" [{member.unit}]"))
+        axis.set_xlabel(member.name + ("" if member.unit == "-" else f" [{as_formula(member.unit)}]"))
     margin = 0.1 * (max(highest) - min(lowest)) + 1e-6
     for i, axis in enumerate(axes[2:].flat):
         axis.set_ylim(min(lowest) - margin, max(highest) + margin)
@@ -209,7 +209,7 @@ def _scatter(axis: Axes, metric: str, reference: ReferenceData, here: Evaluation
         ends = [min(x.min(), y.min()), max(x.max(), y.max())]
         axis.plot(ends, ends, color="black", linewidth=0.8, linestyle="--")
     rho = rank_correlation(x, y)
-    axis.set_title(f"rho = {'-' if rho is None else f'{rho:.3f}'}, {x.size} rows")
+    axis.set_title(f"rho = {'-' if rho is None else f'{rho:.3f}'}, {x.size} rows", fontsize=FONT)
     label = _label(metric)
     axis.set_xlabel(f"reference: {label}")
     axis.set_ylabel(f"here: {label}")

@@ -173,7 +173,8 @@ def _headline(result: Mapping[str, Any], material: ReportInput, explained: Failu
     what = "a collision" if result["hits"] else "an unsafe outcome"
     robust = f"{what} that is robust" if ROBUST in first["reasons"] else what
     borderline = "Every failure that was tried is borderline. The one with the fewest changes: " if explained and robust == what else ""
-    return f"{borderline}{_enough(first, robust)}: the vehicle {first['end']}."
+    now = "simulated as it is now, " if material.changed else ""
+    return f"{borderline}{_enough(first, robust)}: {now}the vehicle {first['end']}."
 
 
 def _enough(finding: Mapping[str, Any], what: str) -> str:
