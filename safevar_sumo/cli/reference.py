@@ -337,8 +337,8 @@ def print_effects(console: Console, effects: Sequence[Effect]) -> None:
     title = f"Linear effects on the safety degree over a domain, m (agree: within {EFFECT_SHARE:.0%} or {LEAST_EFFECT:g} m)"
     table = WholeTable("characteristic", right=("there", "here", "agree"), title=title)
     for one in effects:
-        told = "-" if one.agrees is None else "yes" if one.agrees else "no"
-        table.add_row(one.name, *("-" if value is None else f"{value:+.2f}" for value in (one.reference, one.here)), told)
+        agrees = "-" if one.agrees is None else "yes" if one.agrees else "no"
+        table.add_row(one.name, *("-" if value is None else f"{value:+.2f}" for value in (one.reference, one.here)), agrees)
     console.print(table)
 
 
