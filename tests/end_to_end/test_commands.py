@@ -126,7 +126,7 @@ def test_an_ads_that_exits_is_a_fault_and_no_success(where: str, in_tmp: Path) -
         "    def drive(self, seen):\n        return 0.5, 0.0\n\n"
         f"    def {where}({arguments}):\n        sys.exit(3)\n")
     Path("mine.toml").write_text('extends = "sun"\nname = "mine"\n[ads]\nmodel = "my_ads:Careful"\n')
-    refused("simulate", "mine.toml", expected=("my_ads:Careful", "SystemExit", "my_ads.py:10"))
+    refused("simulate", "mine.toml", told=("my_ads:Careful", "SystemExit", "my_ads.py:10"))
 
 
 def test_a_title_is_no_markup(in_tmp: Path) -> None:

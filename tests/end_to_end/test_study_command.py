@@ -117,4 +117,4 @@ def test_an_ads_that_always_fails_ends_the_study_with_that_fault() -> None:
                                  "    def drive(self, seen):\n        return 1 / 0\n")
     Path("bad.toml").write_text('extends = "small.toml"\nname = "bad"\n[ads]\nmodel = "my_ads:Bad"\n')
     for options in ([], ["--dry-run"]):
-        refused("study", "bad.toml", "--out", "out", *options, expected=("ZeroDivisionError", "simulate bad.toml"))
+        refused("study", "bad.toml", "--out", "out", *options, told=("ZeroDivisionError", "simulate bad.toml"))

@@ -108,7 +108,7 @@ def test_calibrate_refuses_bounds_that_the_models_do_not_take(key: str, lower: f
 
 
 def test_calibrate_does_not_write_over_what_it_starts_from(data: Path, in_tmp: Path) -> None:
-    refused("calibrate", "sun", str(data), "--trials", "1", "--out", str(data), expected=("--out", data.name))
+    refused("calibrate", "sun", str(data), "--trials", "1", "--out", str(data), told=("--out", data.name))
     assert data.read_text().startswith("max_rpm")
 
 
