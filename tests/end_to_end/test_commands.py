@@ -95,7 +95,7 @@ def test_a_users_scalar_ads_is_named_in_a_study(in_tmp: Path) -> None:
     (["simulate", "/"], ("/",)),
 ])
 def test_bad_input_ends_with_code_2_and_says_what_is_legal(arguments: list[str], expected: tuple[str, ...], in_tmp: Path) -> None:
-    refused(*arguments, expected=expected)
+    refused(*arguments, told=expected)
     assert not list(in_tmp.rglob("*.csv"))
 
 
@@ -115,7 +115,7 @@ def test_a_bad_study_file_ends_with_code_2(old: str, new: str, expected: tuple[s
     text = (STUDIES / "sun.toml").read_text()
     assert old in text
     Path("mine.toml").write_text(text.replace(old, new))
-    refused("simulate", "mine.toml", expected=expected)
+    refused("simulate", "mine.toml", told=expected)
 
 
 @pytest.mark.parametrize("where", ["__init__", "drive"])

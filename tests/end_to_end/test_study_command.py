@@ -100,7 +100,7 @@ def test_torn_tails_are_cut_off_with_a_warning_and_damage_in_the_middle_names_it
     (["--cluster", ""], ("--cluster", "''")),
 ])
 def test_bad_options_are_refused(arguments: list[str], expected: tuple[str, ...]) -> None:
-    refused("study", "small.toml", "--out", "out", *arguments, expected=expected)
+    refused("study", "small.toml", "--out", "out", *arguments, told=expected)
     assert not Path("out/runs").exists()
 
 

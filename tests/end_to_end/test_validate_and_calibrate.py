@@ -92,7 +92,7 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
 def test_calibrate_touches_nothing_but_parameters(key: str, expected: tuple[str, ...], in_tmp: Path) -> None:
     Path("mine.toml").write_text(
         f'extends = "sun"\nname = "mine"\n[calibration]\n"{key}" = {{ lower = 1, upper = 2, unit = "-", meaning = "none" }}\n')
-    refused("calibrate", "mine.toml", "--trials", "1", "--out", "x.toml", expected=expected)
+    refused("calibrate", "mine.toml", "--trials", "1", "--out", "x.toml", told=expected)
 
 
 @pytest.mark.parametrize(("key", "lower", "upper", "expected"), [
@@ -104,7 +104,7 @@ def test_calibrate_refuses_bounds_that_the_models_do_not_take(key: str, lower: f
                                                               in_tmp: Path) -> None:
     Path("mine.toml").write_text(f'extends = "sun"\nname = "mine"\n[calibration]\n'
                                  f'"{key}" = {{ lower = {lower}, upper = {upper}, unit = "-", meaning = "none" }}\n')
-    refused("calibrate", "mine.toml", "--trials", "13", "--out", "x.toml", expected=expected)
+    refused("calibrate", "mine.toml", "--trials", "13", "--out", "x.toml", told=expected)
 
 
 def test_calibrate_does_not_write_over_what_it_starts_from(data: Path, in_tmp: Path) -> None:
