@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from safevar_sumo.analysis.model_spread import ModelSpread, model_spreads, studies_of_sets
+from safevar_sumo.analysis.words import ask
 from safevar_sumo.api.simulation import Simulation, beside_the_original, evaluated
 from safevar_sumo.cli.options import (
     PICTURES,
@@ -116,7 +117,7 @@ def _sweep(target: Target, system: System, asked: FloatArray, names: tuple[str, 
 
 
 def _tell(target: Target, system: System, simulation: Simulation, spreads: Sequence[ModelSpread], as_json: bool) -> None:
-    points = at_every_point(system, simulation.evaluation.settings) if system.matrix else []
+    points = at_every_point(system, simulation.evaluation.settings) if system.matrix and (as_json or system.rater is None) else []
     if as_json:
         replayed = {} if target.handle is None else {"solution": str(target.handle)}
         matrix = {"points": [point_record(one) for one in points]} if points else {}
@@ -126,7 +127,10 @@ def _tell(target: Target, system: System, simulation: Simulation, spreads: Seque
         print_simulation(Console(), simulation)
         for what, one in zip(("the simulated vehicle", "the original"), spreads, strict=False):
             print_text(Console(), f"The vehicle model's own uncertainty, {what}: {one}.")
-        print_matrix(Console(), points)
+        if system.rater is None:
+            print_matrix(Console(), points)
+        else:
+            print_text(Console(), f"{len(system.matrix)} cells and variations: {ask('rating', target.source)} --matrix")
         if types := tags(system.points):
             print_text(Console(), types)
     remarks = [remark for one in system.points for remark in remarks_of(one.scenario)]
