@@ -20,7 +20,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_there_are_no_others() -> None:
-    assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == {*SHOWN, "answers"}
+    assert {path.stem for path in NOTEBOOKS.glob("*.ipynb")} == {*SHOWN, "answers", "rating"}
 
 
 @pytest.mark.parametrize("name", SHOWN)
@@ -66,3 +66,16 @@ def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> Non
     for result in ("The original stops", "all together", "with 95 % confidence", "SD is below 1.1 in"):
         assert result in printed
     assert not [output for output in outputs if output.get("name") == "stderr"]
+
+
+@pytest.mark.slow
+def test_the_notebook_of_the_rating_tells_where_points_are_lost(tmp_path: Path) -> None:
+    file = NOTEBOOKS / "rating.ipynb"
+    assert file.stat().st_size < 500_000
+    stored = nbformat.read(file, as_version=4)
+    notebook = nbformat.read(file, as_version=4)
+    NotebookClient(notebook, timeout=1800, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}).execute()
+    for one in (stored, notebook):
+        texts = [output.data["text/plain"] for cell in one.cells if cell.cell_type == "code" for output in cell.outputs if "data" in output]
+        assert any("the vehicle loses" in text for text in texts)
+        assert sum("Axes" in text for text in texts) == 2
