@@ -14,6 +14,7 @@ from safevar_sumo.study import SAFETY_DEGREE
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int_]
 
 STANDSTILL = 1e-3
 """Below this speed a vehicle counts as standing [m/s] (method section 4)."""

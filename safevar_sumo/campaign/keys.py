@@ -10,7 +10,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.plugins import Files, Lookup, Member, digests, forget_foreign, guard_process_state, instance_of, noted_reading
-from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm, MoCell, Problem, Search
+from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS, Algorithm, GuardedAlgorithm, MapElites, MoCell, Problem, Search
 from safevar_sumo.study import SearchTable, Study
 
 
@@ -51,6 +51,8 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
         algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key, source)
     if isinstance(algorithm, MoCell):
         algorithm.sides(search.population, source)
+    if isinstance(algorithm, MapElites):
+        algorithm.cells(len(study.vehicle.characteristics), source)
     return algorithm if member.guard is None else GuardedAlgorithm(algorithm, member.guard)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import random
+import sys
 
 import moocore
 import msgspec
@@ -21,7 +23,7 @@ from scipy.stats import mannwhitneyu
 from safevar_sumo.api.running import prepared
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, Outcome
-from safevar_sumo.search import ALGORITHMS, MoCell, Problem
+from safevar_sumo.search import ALGORITHMS, MapElites, MoCell, Problem
 from safevar_sumo.search.evolution import Individual, fitness_of, tournament
 from safevar_sumo.search.nsga2 import survivors
 from safevar_sumo.search.safe_fuzzer import _improves, _Ranges, _scores
@@ -322,9 +324,34 @@ def test_options_that_cannot_be_used_are_refused(search: dict[str, object], prob
 
 @pytest.mark.parametrize(("name", "options"), [
     ("spea2", {"archive": 5}), ("spea2", {"normalised": False}), ("mocell", {"archive": 5}), ("mocell", {"grid": [2, 10]}),
-    ("mocell", {"neighbourhood": "von_neumann"}), ("nsga2", {"tournament_size": 3}), ("mocell", {"mutation_probability": 1.0})])
+    ("mocell", {"neighbourhood": "von_neumann"}), ("nsga2", {"tournament_size": 3}), ("mocell", {"mutation_probability": 1.0}),
+    ("map_elites", {"behaviour": "speed"})])
 def test_options_change_what_a_search_asks_for(name: str, options: dict[str, object]) -> None:
     algorithm = msgspec.convert(options, ALGORITHMS[name])
     found, asked = searched(name, 1, 200, algorithm=algorithm)
     assert not np.array_equal(asked[-1], searched(name, 1, 200)[1][-1])
-    assert len(found) <= options.get("archive", POPULATION)
+    assert len(found) <= options.get("archive", len(found))
+
+
+def test_an_atlas_has_the_smallest_collision_of_every_set_of_changes() -> None:
+    """Whatever has more than three changes collides."""
+    def colliding(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
+        good = sphere(characteristics, settings)
+        outcome = np.where(good.f_num_diff > 3, Outcome.COLLISION.value, good.outcome).astype("U16")
+        return dataclasses.replace(good, outcome=outcome)
+
+    found, asked = searched("map_elites", 1, 400, evaluate=colliding)
+    everything = colliding(SUN, np.concatenate(asked))
+    smallest: dict[bytes, float] = {}
+    for changed, size in zip(SUN.changed(everything.settings)[everything.collided], everything.f_diff[everything.collided], strict=True):
+        smallest[changed.tobytes()] = min(size, smallest.get(changed.tobytes(), np.inf))
+    assert {changed.tobytes(): size for changed, size in zip(SUN.changed(found.settings), found.f_diff, strict=True)} == smallest
+
+
+def test_an_atlas_that_cannot_be_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match="2\\^17 cells"):
+        MapElites().cells(17)
+    assert MapElites(behaviour="speed").cells(17) == 17 * 21
+    monkeypatch.setitem(sys.modules, "ribs", None)
+    with pytest.raises(InputError, match="needs pyribs"):
+        prepared(load_study("smoke", search={"algorithms": ["map_elites"]}))
