@@ -10,7 +10,6 @@ from typing import Any, Protocol
 
 import msgspec
 
-from safevar_sumo.conformance import refuse_defects
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins import Files, changes, digests, forget_foreign, noted_reading
@@ -100,6 +99,8 @@ def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
     """
     how = msgspec.msgpack.decode(work, type=_How)
     if how.check:
+        from safevar_sumo.conformance import refuse_defects  # it loads the searches, which a simulation does not need
+
         remarks = refuse_defects(msgspec.msgpack.decode(work, type=_Work).study)
         return replace(Evaluations.none(settings.shape[1], METRICS), reasons={remark.encode(): remark for remark in remarks})
     if how.afresh:

@@ -70,7 +70,7 @@ class Mine(ScalarAds):
     seen_one = False
 
     def drive(self, seen):
-        if seen.gap < 1.66 and seen.visibility == 1:
+        if seen.gap < 1.0 and seen.visibility == 1:
             Mine.seen_one = True
         stopping = seen.speed**2 / (2 * 0.6 * self.nominal.decel)
         if seen.gap < stopping + 2.0 and abs(seen.lateral) < 2.5:
