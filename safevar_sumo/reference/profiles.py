@@ -94,7 +94,7 @@ def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> N
     columns = 4
     rows = -(-len(profiles.free) // columns)
     with sns.axes_style("whitegrid"), plt.rc_context({"font.size": 9}):
-        figure, axes = plt.subplots(rows, columns, figsize=(12, 2.1 * rows + 0.6), layout="constrained", squeeze=False, sharey=True)
+        figure, axes = plt.subplots(rows, columns, figsize=(11, 1.7 * rows + 0.6), layout="constrained", squeeze=False, sharey=True)
         alike = profiles.costs <= profiles.limit
         for k, axis in enumerate(axes.flat):
             if k >= len(profiles.free):
@@ -105,7 +105,6 @@ def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> N
             axis.scatter(values[~alike], profiles.costs[~alike], s=3, alpha=0.25, color="#808080", linewidths=0)
             axis.scatter(values[alike], profiles.costs[alike], s=5, alpha=0.6, color="#0072b2", linewidths=0)
             axis.axvline(values[0], color="black", linewidth=0.8, linestyle="--")
-            axis.set_xlim(free.bounds.lower, free.bounds.upper)
             key = free.label(studies).replace("vehicle.parameters.", "").replace("ads.parameters.", "")
             axis.set_xlabel(key + ("" if free.bounds.unit == "-" else f" [{free.bounds.unit}]"))
             if k % columns == 0:

@@ -200,7 +200,7 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     rank: Weight = 5.0
     collisions: Weight = 10.0
     effects: Weight = 0.0
-    alike: Annotated[float, Meta(ge=0, le=1)] = 0.02
+    alike: Annotated[float, Meta(ge=0, le=1)] = 0.05
     weights: dict[str, Weight] = msgspec.field(
         default_factory=lambda: {SAFETY_DEGREE: 1.0, "tet": 0.3, "tit": 0.3, "ave_dece": 0.5})
 
