@@ -8,7 +8,6 @@ from contextlib import contextmanager
 
 import msgspec
 import numpy as np
-import scipy
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
@@ -168,6 +167,8 @@ def open_bench(study: Study, pool: Pool | None = None, jobs: int | None = None, 
 
 def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
     """Scrambled Sobol points in the unit cube, shape (number, dimensions); evenly spread where number is a power of two."""
+    import scipy  # takes longer to load than a simulation
+
     points = scipy.stats.qmc.Sobol(dimensions, rng=np.random.default_rng(seed)).random_base2(max(0, math.ceil(math.log2(number))))
     return np.asarray(points[:number])
 
