@@ -258,7 +258,7 @@ def _identity(material: ReportInput, name: str) -> str:
         file = material.place / kept
         content = file.read_bytes() if file.is_file() else b""
         digest.update(len(content).to_bytes(8, "big") + content)
-    parts = [material.case.finished, material.point, material.options[name]]
+    parts = [material.case.finished, material.point, material.options.get(name, material.case.study.spread)]
     digest.update(repr(parts).encode())
     return digest.hexdigest()
 

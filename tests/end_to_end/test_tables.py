@@ -75,7 +75,7 @@ def test_figures_are_files_of_the_kind_asked_for(results: Path, in_tmp: Path) ->
     for kind, start in (("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")):
         done = run("figures", str(results), "--out", kind, "--format", kind)
         files = sorted(Path(kind).iterdir())
-        assert len(files) == 5
+        assert len(files) == 6
         assert sorted(done.stdout.split()) == [str(path) for path in files]
         assert all(path.read_bytes().startswith(start) for path in files)
 

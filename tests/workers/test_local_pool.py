@@ -52,7 +52,7 @@ def test_workers_start_when_they_are_needed_and_end_with_the_block() -> None:
 def test_the_end_does_not_wait_for_what_is_computed() -> None:
     with local_pool(1, 600.0) as pool:
         pool.submit(SMOKE, ORIGINAL).result(timeout=30)
-        futures = [pool.submit(SMOKE, np.repeat(ORIGINAL, 2000, axis=0)) for _ in range(3)]
+        futures = [pool.submit(SMOKE, np.repeat(ORIGINAL, 100_000, axis=0)) for _ in range(3)]
         time.sleep(0.3)
         start = time.monotonic()
     assert time.monotonic() - start < 2
