@@ -47,7 +47,7 @@ class Probe(ABC):
         """The subject's study put together, with everybody's modules loaded anew."""
         forget_foreign()
         system = assemble(self.subject.study)
-        return replace(system, matrix=system.matrix[::max(len(system.matrix) // POINTS, 1)])
+        return replace(system, matrix=system.matrix[::max(len(system.matrix) // POINTS, 1)], rater=None)
 
     @abstractmethod
     def fresh(self) -> Any:

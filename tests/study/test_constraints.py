@@ -28,7 +28,7 @@ def spread(values):
 BOUND = """
 extends = "smoke"
 [search]
-algorithms = ["mocell", "nsga2", "rs", "safe_fuzzer", "spea2"]
+algorithms = ["map_elites", "mocell", "nsga2", "rs", "safe_fuzzer", "spea2"]
 runs = 1
 evaluations = 60
 population = 10
