@@ -101,5 +101,7 @@ def test_a_plateau_and_a_frequent_failure_are_left_to_monte_carlo() -> None:
 def test_auto_chooses_and_monte_carlo_stays_where_it_is_asked_for() -> None:
     assert rare(linear(beta_of(1e-4)), 2, rare=False).method == "subset_simulation"
     assert rare(linear(beta_of(1e-4)), 2, rare=False, method="monte_carlo").method == "monte_carlo"
+    many = rare(linear(beta_of(5e-3)), 2, rare=False, samples=100_000)
+    assert (many.method, many.samples) == ("monte_carlo", 100_000), "so many show 500 failures by themselves"
     with pytest.raises(InputError, match="method"):
         rare(linear(3.0), 2, method="subset")

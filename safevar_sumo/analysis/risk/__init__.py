@@ -35,7 +35,8 @@ class RiskOptions(Options):
         None, "Stop as soon as the interval of the probability is no wider.", kind=float, low=0, high=1, is_open=(True, False))
     unsafe: str | None = unsafe_option()
     method: str = option("auto", "How: monte_carlo, subset_simulation, cross_entropy, or auto, which draws 1,000 vehicles and takes "
-                                 "subset_simulation for a probability below 0.01 if OpenTURNS is installed.",
+                                 "subset_simulation for a probability below 0.01, of which --samples would see fewer than 100 "
+                                 "failures, if OpenTURNS is installed.",
                          metavar="METHOD", kind=str)
     rare: bool = option(False, "For rare failures, 1e-3 to 1e-8: as auto, but it needs OpenTURNS and leaves out what decides.", kind=bool)
 
@@ -72,8 +73,8 @@ def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, conf
         "collision", or a number X for a safety degree below X [m, or minus a collision's speed in m/s]; by default a collision if
         any of many settings all over the domain is one, else half of the original's safety degree.
     method
-        "monte_carlo", "subset_simulation", "cross_entropy", or "auto": subset simulation for a probability below 0.01, if OpenTURNS is
-        installed.
+        "monte_carlo", "subset_simulation", "cross_entropy", or "auto": subset simulation for a probability below 0.01, of which
+        `samples` would see fewer than 100 failures, if OpenTURNS is installed.
     rare
         For rare failures, 1e-3 to 1e-8: as "auto", but it needs OpenTURNS and leaves out which characteristic decides.
     pool

@@ -14,7 +14,17 @@ import scipy
 from safevar_sumo.analysis.criterion import Unsafe, clopper_pearson, criterion_of
 from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent
 from safevar_sumo.analysis.risk import RiskOptions
-from safevar_sumo.analysis.risk.rare import PILOT, RARE_BELOW, Estimate, PlateauError, Response, estimate_rare, is_plateau, openturns
+from safevar_sumo.analysis.risk.rare import (
+    ENOUGH,
+    PILOT,
+    RARE_BELOW,
+    Estimate,
+    PlateauError,
+    Response,
+    estimate_rare,
+    is_plateau,
+    openturns,
+)
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import SAFETY_DEGREE, Study
@@ -275,7 +285,8 @@ def _sampled(bench: Bench, model: VariationModel, unsafe: Unsafe, options: RiskO
         if probabilities is not None:
             chooses = False
             values = response.take(scipy.stats.norm.ppf(probabilities), evaluations)
-            if valid and found.failures < RARE_BELOW * valid:
+            shows_by_itself = not options.is_for_rare and found.failures * (most / number) >= ENOUGH
+            if valid and found.failures < RARE_BELOW * valid and not shows_by_itself:
                 estimate = _rare(response, values, options, found, bench.study.search.seed)
                 if estimate is not None:
                     return estimate

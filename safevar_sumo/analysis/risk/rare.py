@@ -24,6 +24,8 @@ RARE_BELOW = 1e-2
 """Probability above which plain Monte Carlo is as good."""
 PILOT = 1000
 """Vehicles drawn plainly, from which the method is chosen."""
+ENOUGH = 100
+"""Failures among the vehicles that are asked for, at the rate of the first, from which on plain Monte Carlo shows them as well."""
 SHARE = 0.1
 """p0: share of a level's vehicles that are nearest to failing, from which the next level starts."""
 LEVEL = 1000
