@@ -25,7 +25,7 @@ import msgspec
 import numpy as np
 import psutil
 from evaluation import bare
-from measuring import Record, clock_seconds, processor_seconds, told
+from measuring import Record, clock_seconds, print_records, processor_seconds
 
 from safevar_sumo.campaign import RunKey, all_runs, run_campaign
 from safevar_sumo.records import Evaluations, FloatArray
@@ -179,7 +179,7 @@ def main() -> None:
     arguments = parser.parse_args()
     study = load_study(arguments.study)
     search = msgspec.structs.replace(study.search, algorithms=["nsga2"], runs=arguments.runs, evaluations=arguments.evaluations)
-    told(records_of(msgspec.structs.replace(study, search=search), arguments.turns), as_json=arguments.json)
+    print_records(records_of(msgspec.structs.replace(study, search=search), arguments.turns), as_json=arguments.json)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from typing import Any
 import libsumo
 import numpy as np
 import traci
-from measuring import Record, clock_seconds, medians_in_turn, processor_seconds, told
+from measuring import Record, clock_seconds, medians_in_turn, print_records, processor_seconds
 
 from safevar_sumo.ads import PerVehicle, ScalarAds
 from safevar_sumo.plugins import Guard
@@ -63,10 +63,10 @@ class Replayed:
             return getattr(model, begins)(*given)
 
         def gone_on(*given: Any) -> Any:
-            known = next(self._next, None)
-            if known is None:
-                self._tape.append(known := getattr(model, goes_on)(*given))
-            return known
+            kept = next(self._next, None)
+            if kept is None:
+                self._tape.append(kept := getattr(model, goes_on)(*given))
+            return kept
 
         setattr(self, begins, begun)
         setattr(self, goes_on, gone_on)
@@ -165,4 +165,4 @@ if __name__ == "__main__":
     parser.add_argument("studies", nargs="*", default=["rain", "lgsvl"], metavar="STUDY")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    told((record for study in arguments.studies for record in records_of(study)), as_json=arguments.json)
+    print_records((record for study in arguments.studies for record in records_of(study)), as_json=arguments.json)

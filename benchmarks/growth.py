@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import psutil
 from campaign import drawn
-from measuring import Record, told
+from measuring import Record, print_records
 
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import LARGEST_BATCH
@@ -48,4 +48,4 @@ if __name__ == "__main__":
     parser.add_argument("--evaluations", type=int, default=100_000)
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    told(records_of(load_study(arguments.study), arguments.evaluations), as_json=arguments.json)
+    print_records(records_of(load_study(arguments.study), arguments.evaluations), as_json=arguments.json)

@@ -38,7 +38,7 @@ class Record(NamedTuple):
     ratio: float
 
 
-def told(records: Iterable[Record], *, as_json: bool) -> None:
+def print_records(records: Iterable[Record], *, as_json: bool) -> None:
     """Print records as they come, or all of them as JSON."""
     if as_json:
         print(json.dumps([record._asdict() for record in records], indent=2))

@@ -48,8 +48,8 @@ class Checks:
         """No finding of this check."""
         report = self.report()
         assert self.kind in ("", report.kind), f"{report.subject} is of the kind {report.kind}, not {self.kind}"
-        found = [one for one in report.findings if one.check == name]
-        assert not found, "\n".join(f"{one}\n  expected: {one.expected}\n  advice: {one.advice}" for one in found)
+        findings = [one for one in report.findings if one.check == name]
+        assert not findings, "\n".join(f"{one}\n  expected: {one.expected}\n  advice: {one.advice}" for one in findings)
 
 
 class AdsChecks(Checks):

@@ -81,10 +81,10 @@ def run(*arguments: str, expect: int = 0) -> Done:
     return Done(out.getvalue(), err.getvalue())
 
 
-def refused(*arguments: str, told: tuple[str, ...]) -> None:
-    """The command ends with exit code 2 and one or two lines that tell all of `told`, or a line for each of several mistakes."""
+def refused(*arguments: str, message: tuple[str, ...]) -> None:
+    """The command ends with exit code 2 and one or two lines that tell all of `message`, or a line for each of several mistakes."""
     done = run(*arguments, expect=2)
-    for part in told:
+    for part in message:
         assert part in done.stderr, done.stderr
     lines = done.stderr.strip().splitlines()
     assert len(lines) <= 2 or lines[0].startswith("Usage:") or lines[0].endswith("mistakes"), done.stderr

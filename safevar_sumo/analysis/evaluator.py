@@ -111,18 +111,18 @@ class Bench:
         inputs, pool = inputs_of(self.study, self._pool), RetryingPool(self._pool, self.study)
         self.progress(stage, 0, number)
         futures = {pool.submit(packed(self.study, inputs, cells=(k, parts)), settings): k for k in range(parts)}
-        found, done = dict[int, CellResults](), 0
-        while len(found) < parts:
-            for future in first_of([future for future, k in futures.items() if k not in found]):
+        parts_done, done = dict[int, CellResults](), 0
+        while len(parts_done) < parts:
+            for future in first_of([future for future, k in futures.items() if k not in parts_done]):
                 evaluations = future.result()
                 if evaluations.cells is None:
                     raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {evaluations.reason(0)}")
-                found[futures[future]] = evaluations.cells
+                parts_done[futures[future]] = evaluations.cells
                 done += evaluations.cells.impact.shape[1]
                 self.progress(stage, done, number)
         order = np.argsort(np.concatenate([part_of(rater.protocol, k, parts) for k in range(parts)]))
         self.simulated += len(settings)
-        columns = zip(*(found[k] for k in range(parts)), strict=True)
+        columns = zip(*(parts_done[k] for k in range(parts)), strict=True)
         return CellResults._make(np.concatenate(column, axis=1)[:, order] for column in columns)
 
     def original(self) -> Evaluations:

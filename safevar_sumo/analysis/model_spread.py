@@ -64,10 +64,10 @@ def model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[M
     InputError
         If the study has no spread, or one of parameters that it does not have.
     """
-    found = evaluations_of_sets(study, settings, point)
-    lower, upper = band(np.stack([one.f_safe for one in found]), study.repeatability.get(SAFETY_DEGREE, 0.0))
-    hits = np.stack([one.collided for one in found]).sum(axis=0)
-    return [ModelSpread(sets=len(found), lower=finite_or_none(low), upper=finite_or_none(high), collisions=int(hit))
+    evaluations = evaluations_of_sets(study, settings, point)
+    lower, upper = band(np.stack([one.f_safe for one in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0))
+    hits = np.stack([one.collided for one in evaluations]).sum(axis=0)
+    return [ModelSpread(sets=len(evaluations), lower=finite_or_none(low), upper=finite_or_none(high), collisions=int(hit))
             for low, high, hit in zip(lower.tolist(), upper.tolist(), hits.tolist(), strict=True)]
 
 
@@ -95,6 +95,6 @@ def studies_of_sets(study: Study) -> list[Study]:
     """
     if not study.spread:
         raise InputError(f"study {study.name!r}", "has no table [spread]", "a study that `calibrate` has fitted, such as sun or rain")
-    taken = {key: values for key, values in study.spread.items() if np.isclose(value_of(study, key), values[0], rtol=AS_GIVEN, atol=0)}
+    sets = {key: values for key, values in study.spread.items() if np.isclose(value_of(study, key), values[0], rtol=AS_GIVEN, atol=0)}
     count = len(next(iter(study.spread.values())))
-    return [study, *(with_values(study, {key: values[k] for key, values in taken.items()}) for k in range(1, count))]
+    return [study, *(with_values(study, {key: values[k] for key, values in sets.items()}) for k in range(1, count))]

@@ -89,8 +89,8 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     effects = effects_of(data, here, system.characteristics) if with_effects else []
     covered = covered_by_spread(data, chosen) if with_spread else None
     if as_json:
-        told = {one.name: {"reference": one.reference, "here": one.here, "agrees": one.agrees} for one in effects}
-        more = {**({"effects": told} if with_effects else {}), **({"spread": covered.to_dict()} if covered is not None else {})}
+        rows = {one.name: {"reference": one.reference, "here": one.here, "agrees": one.agrees} for one in effects}
+        more = {**({"effects": rows} if with_effects else {}), **({"spread": covered.to_dict()} if covered is not None else {})}
         click.echo(json.dumps({**result.to_dict(), **more}, indent=2, allow_nan=False))
     else:
         print_agreement(Console(), chosen, result)
@@ -159,8 +159,8 @@ def calibrate_command(study: str, others: tuple[str, ...], trials: int | None, s
     except KeyboardInterrupt:
         if tried:
             account = f"Best of {tried} of {count} trials, then interrupted (seed {chosen[0].fit.seed}). Cost {lowest:.4f}."
-            for one, found, target in zip(chosen, best, targets, strict=True):
-                write_study(target, fitted_as(one, found), account)
+            for one, fitted, target in zip(chosen, best, targets, strict=True):
+                write_study(target, fitted_as(one, fitted), account)
             click.echo(f"interrupted: the best of {tried} trials is in {', '.join(map(str, targets))}", err=True)
         raise
     if plot is not None and calibrations[0].profiles is not None:

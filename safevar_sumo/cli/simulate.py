@@ -86,8 +86,8 @@ def simulate_command(study: str, solution: str | None, choice: str | None, chang
     if showing.asked:
         showing.show(target.study, system, simulation.evaluation.settings[0])
     rows = np.stack([simulation.evaluation.settings[0], system.characteristics.original])
-    found = model_spreads(target.study, rows, point or "") if of_sets else []
-    _tell(target, system, simulation, found, as_json)
+    spreads = model_spreads(target.study, rows, point or "") if of_sets else []
+    _tell(target, system, simulation, spreads, as_json)
 
 
 def _check_outputs(study: str, trace: Path | None, showing: Shown) -> None:

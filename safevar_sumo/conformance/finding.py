@@ -151,13 +151,13 @@ class Source:
         """Innermost line of the author's that an exception passed through; else of what returned last."""
         one: BaseException | None = error
         while one is not None:
-            frame, found = one.__traceback__, None
+            frame, place = one.__traceback__, None
             while frame is not None:
                 if frame.tb_frame.f_code.co_filename.startswith(self._folder) and "site-packages" not in frame.tb_frame.f_code.co_filename:
-                    found = frame.tb_frame.f_code.co_filename, frame.tb_lineno
+                    place = frame.tb_frame.f_code.co_filename, frame.tb_lineno
                 frame = frame.tb_next
-            if found is not None and not isinstance(one, InputError):
-                return found
+            if place is not None and not isinstance(one, InputError):
+                return place
             one = one.__cause__ or one.__context__
         return self._last or self.definition()
 

@@ -196,8 +196,8 @@ class StudyProbe(Probe):
         return self.system()
 
     def run(self, model: System, rows: Rows) -> Outputs:
-        found = evaluate(model, self.settings[rows])
-        return {"outcome": found.outcome, "collision_speed": found.collision_speed, **found.metrics}
+        evaluations = evaluate(model, self.settings[rows])
+        return {"outcome": evaluations.outcome, "collision_speed": evaluations.collision_speed, **evaluations.metrics}
 
     def reactions(self, model: System, outputs: Outputs) -> Iterator[Reaction]:
         if self.subject.kind not in ("scenario", "traci"):

@@ -89,10 +89,10 @@ def timed(run: Callable[[], Any]) -> float:
     return (time.perf_counter() - start) / crowd()
 
 
-def cost_of(mine: float, ours: float, whose: str, vehicles: int, steps: int) -> tuple[float, str]:
+def cost_of(mine: float, ours: float, example: str, vehicles: int, steps: int) -> tuple[float, str]:
     """Time per vehicle and step [s], and a sentence that compares it."""
     mine, ours = mine / (vehicles * steps), ours / (vehicles * steps)
-    return mine, f"{mine * 1e6:.2g} microseconds per vehicle and step, {vehicles} at once; ours ({whose}) takes {ours * 1e6:.2g}"
+    return mine, f"{mine * 1e6:.2g} microseconds per vehicle and step, {vehicles} at once; ours ({example}) takes {ours * 1e6:.2g}"
 
 def corners(members: CharacteristicSet) -> FloatArray:
     """The original, the corners of all domains together, both ends of every domain alone, and corners drawn at random."""

@@ -221,12 +221,12 @@ def _characteristics(units: Mapping[str, str], study: Study) -> tuple[dict[str, 
     guessed = []
     shipped = [study, *map(load_study, study_names())]
     for name, unit in units.items():
-        known = next((one.vehicle.characteristics[name] for one in shipped
+        shipped_row = next((one.vehicle.characteristics[name] for one in shipped
                       if name in one.vehicle.characteristics and one.vehicle.characteristics[name].unit == unit), None)
-        if known is None:
+        if shipped_row is None:
             original, lower, upper = BY_UNIT.get(str(unit), (1.0, 0.8, 1.2))
             guessed.append(f"{name} {lower:g} to {upper:g} {unit}")
-        rows[str(name)] = known or CharacteristicTable(unit=str(unit), original=original, lower=lower, upper=upper)
+        rows[str(name)] = shipped_row or CharacteristicTable(unit=str(unit), original=original, lower=lower, upper=upper)
     note = f"no study gives domains: tried with {', '.join(guessed)}; --study STUDY names a study that does" if guessed else ""
     return rows, note
 

@@ -130,13 +130,13 @@ class _Suite:
                 with self._source.watched(), time_limit(LONGEST):
                     model = probe.fresh()
                     outputs = probe.run(model, np.arange(probe.number))
-                found = list(self._differences(probe, model, outputs))
-                if not found:
+                findings = list(self._differences(probe, model, outputs))
+                if not findings:
                     with self._source.watched(), time_limit(LONGEST):
-                        found = [self._finding("reaction", one.got, one.expected, self._source.definition(*one.methods))
+                        findings = [self._finding("reaction", one.got, one.expected, self._source.definition(*one.methods))
                                  for one in probe.reactions(model, outputs)]
-                    found += self._slow(probe, model)
-            yield from found
+                    findings += self._slow(probe, model)
+            yield from findings
         except ForeignError as error:
             yield self._of_error(error)
         except TakesTooLong as error:

@@ -92,16 +92,16 @@ class _Camera:
 
     def tracks(self) -> dict[str, Track]:
         """What was taken down, in alphabetical order."""
-        found: dict[str, Track] = {}
+        by_name: dict[str, Track] = {}
         for copied in sorted(self._measures):
             copy, name = copy_and_name(copied)
-            if name not in found:
-                found[name] = Track(*self._measures[copied], *(np.full((len(self._frames), self._n), np.nan) for _ in range(3)))
+            if name not in by_name:
+                by_name[name] = Track(*self._measures[copied], *(np.full((len(self._frames), self._n), np.nan) for _ in range(3)))
             for sample, frame in enumerate(self._frames):
                 if copied in frame:
-                    for row, value in zip(found[name][3:], frame[copied], strict=True):
+                    for row, value in zip(by_name[name][3:], frame[copied], strict=True):
                         row[sample, copy] = value
-        return found
+        return by_name
 
 
 def road_of(network: str) -> tuple[Lane, ...]:

@@ -148,10 +148,10 @@ TYPES = {"cyclist": "adult", "motorcyclist": "car"}
 
 def _nearest(corners: list[Coordinates], half: float) -> float:
     """The least place along a lane of a body between both sides of a vehicle, `half` from the middle; of all of it, if it is beside [m]."""
-    found = [x for x, y in corners if abs(y) <= half]
+    places = [x for x, y in corners if abs(y) <= half]
     for (x, y), (to_x, to_y) in pairwise([*corners, corners[0]]):
-        found += [x + (to_x - x) * (side - y) / (to_y - y) for side in (-half, half) if (y - side) * (to_y - side) < 0]
-    return min(found or [x for x, _ in corners])
+        places += [x + (to_x - x) * (side - y) / (to_y - y) for side in (-half, half) if (y - side) * (to_y - side) < 0]
+    return min(places or [x for x, _ in corners])
 
 
 class BehindSomebody(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -96,8 +96,8 @@ class Variation:
         with self.randomness():
             while population and len(children) < number:
                 for child in self._feasible([self._mutated(child) for child in self._crossed(*self._winners(population))]):
-                    known, drawn = tuple(child) in there, drawn + 1
-                    if not known or drawn > REDRAWS * number:
+                    repeated, drawn = tuple(child) in there, drawn + 1
+                    if not repeated or drawn > REDRAWS * number:
                         there.add(tuple(child))
                         children.append(child)
         return children[:number]
@@ -177,20 +177,20 @@ def fronts(individuals: Sequence[Individual]) -> list[list[Individual]]:
     if not individuals:
         return []
     ranks = moocore.pareto_rank([individual.fitness.wvalues for individual in individuals], maximise=True).tolist()
-    found: list[list[Individual]] = [[] for _ in range(max(ranks) + 1)]
+    ranked: list[list[Individual]] = [[] for _ in range(max(ranks) + 1)]
     for individual, rank in zip(individuals, ranks, strict=True):
-        found[rank].append(individual)
-    return found
+        ranked[rank].append(individual)
+    return ranked
 
 
 def stand_by_crowding(individuals: Sequence[Individual]) -> list[list[Individual]]:
     """The fronts of individuals, whose `standing` becomes their rank, from 0, and minus their crowding distance."""
-    found = fronts(individuals)
-    for rank, front in enumerate(found):
+    ranked = fronts(individuals)
+    for rank, front in enumerate(ranked):
         tools.emo.assignCrowdingDist(front)
         for individual in front:
             individual.standing = rank, -individual.fitness.crowding_dist
-    return found
+    return ranked
 
 
 def tournament(population: list[Individual], size: int = 2) -> Individual:

@@ -74,12 +74,12 @@ def constraint_mistakes(source: object, rows: Mapping[str, CharacteristicTable],
 
 def _unit_mistakes(source: object, key: str, one: Constraint, rows: Mapping[str, CharacteristicTable]) -> Iterator[InputError]:
     units = dict.fromkeys(rows[name].unit for name in one.sum if name in rows)
-    known = list(dict.fromkeys(["-", *(row.unit for row in rows.values())]))
+    legal = list(dict.fromkeys(["-", *(row.unit for row in rows.values())]))
     if one.unit is None and len(units) > 1:
         members = ", ".join(f"{name} [{rows[name].unit}]" for name in one.sum if name in rows)
         yield InputError(source, f"{key}.sum adds {members}", "characteristics of one unit; or weights that convert, and the sum's unit: "
-                         f"{one_of(known)}")
+                         f"{one_of(legal)}")
     elif one.unit is not None and len(units) == 1 and one.unit not in (*units, "-"):
         yield InputError(source, f"{key}.unit = {one.unit!r}", f"{next(iter(units))!r}, the unit of {' and '.join(one.sum)}, or '-'")
-    elif one.unit is not None and one.unit not in known:
-        yield unknown(source, f"{key}.unit = {one.unit!r} is no unit of this study", one.unit, known)
+    elif one.unit is not None and one.unit not in legal:
+        yield unknown(source, f"{key}.unit = {one.unit!r} is no unit of this study", one.unit, legal)

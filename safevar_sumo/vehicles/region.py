@@ -112,17 +112,17 @@ class FeasibleRegion:
 
         Where fewer than one in `rejections` is, mixtures of the region's vertices by `rng` follow; without it there are fewer settings.
         """
-        found, drawn = [np.zeros((0, len(self.characteristics)))], 0
-        while (lacking := number - sum(map(len, found))) and drawn < rejections * number:
+        batches, drawn = [np.zeros((0, len(self.characteristics)))], 0
+        while (lacking := number - sum(map(len, batches))) and drawn < rejections * number:
             settings = draw(max(lacking, min(drawn, 10_000)))
             drawn += len(settings)
-            found.append(settings[self._accepted(settings, filtered)][:lacking])
+            batches.append(settings[self._accepted(settings, filtered)][:lacking])
         if lacking and rng is not None:
             corners = np.concatenate([self.vertices, self.characteristics.original[np.newaxis]])
             mixtures = rng.dirichlet(np.full(len(corners), 0.5), lacking) @ corners
             mixtures = np.clip(mixtures, self.characteristics.lower, self.characteristics.upper)
-            found.append(self.repaired(mixtures, filtered=filtered))
-        return np.concatenate(found)
+            batches.append(self.repaired(mixtures, filtered=filtered))
+        return np.concatenate(batches)
 
     def _accepted(self, settings: FloatArray, filtered: bool) -> BoolArray:
         return self.feasible(self.characteristics.filter(settings) if filtered else settings)
@@ -207,15 +207,15 @@ def _vertices(linear: tuple[Any, ...], lower: tuple[float, ...], upper: tuple[fl
 
     rows = [(sign * np.array(weights), sign * bound) for weights, least, most in linear for sign, bound in ((-1, least), (1, most))
             if np.isfinite(bound)]
-    found = []
+    vertices = []
     for column in range(len(lower)):
         for sign in (1.0, -1.0):
             answer = linprog(sign * np.eye(len(lower))[column], A_ub=np.array([row for row, _ in rows]),
                              b_ub=np.array([bound for _, bound in rows]), bounds=list(zip(lower, upper, strict=True)), method="highs")
             if not answer.success:
                 return None
-            found.append(np.clip(answer.x, lower, upper))
-    return np.array(found)
+            vertices.append(np.clip(answer.x, lower, upper))
+    return np.array(vertices)
 
 
 def _leaves_a_change(region: FeasibleRegion) -> bool:

@@ -35,9 +35,9 @@ def observation(time: float, speed: np.ndarray, gap: np.ndarray, lateral: np.nda
     return Observation(time, speed, gap, speed, lateral, np.full_like(speed, 1.8), 1.0)
 
 
-def approach(ads: Ads, known: Nominal, speed: np.ndarray, gap: np.ndarray) -> np.ndarray:
+def approach(ads: Ads, nominal: Nominal, speed: np.ndarray, gap: np.ndarray) -> np.ndarray:
     """Pedals over time, shape (T, 2, N), of vehicles that go on at constant speed whatever they command."""
-    memory, pedals = ads.start(len(speed), known, STEP), []
+    memory, pedals = ads.start(len(speed), nominal, STEP), []
     for step in range(80):
         seen = observation(step * STEP, speed, gap - speed * step * STEP, np.zeros_like(speed))
         command, memory = ads.drive(seen, memory)
@@ -49,11 +49,11 @@ def approach(ads: Ads, known: Nominal, speed: np.ndarray, gap: np.ndarray) -> np
 @given(speed=arrays(float, 6, elements=st.floats(0, 15)), gap=arrays(float, 6, elements=st.floats(0.5, 80)))
 def test_pedals_stay_in_range_and_no_vehicle_knows_of_another(speed: np.ndarray, gap: np.ndarray) -> None:
     for system in SYSTEMS.values():
-        known = system.nominal
-        together = approach(system.ads, known, speed, gap)
+        nominal = system.nominal
+        together = approach(system.ads, nominal, speed, gap)
         assert np.all((together >= 0) & (together <= 1))
         assert not np.any((together[:, 0] > 0) & (together[:, 1] > 0)), "nobody drives and brakes at once"
-        assert approach(system.ads, known, speed[2:3], gap[2:3])[..., 0].tobytes() == together[..., 2].tobytes()
+        assert approach(system.ads, nominal, speed[2:3], gap[2:3])[..., 0].tobytes() == together[..., 2].tobytes()
 
 
 def test_a_standing_obstacle_close_ahead_makes_it_brake(name: str) -> None:

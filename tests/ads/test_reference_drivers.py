@@ -141,15 +141,15 @@ def test_fuzzy_metrics_are_those_worked_out_by_hand() -> None:
 def driven(driver: Any, seconds: float, speed: float, gap: float, leader: float = 0.0,
            lateral: Any = lambda time: (0.0, 0.0)) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Gaps, speeds and brake pedals of a point mass that obeys its pedals, behind somebody at a constant speed [m, m/s, -]."""
-    one, memory, told = np.ones(1), driver.start(1, KNOWN, STEP), []
+    one, memory, samples = np.ones(1), driver.start(1, KNOWN, STEP), []
     for k in range(round(seconds / STEP)):
         aside, moves = lateral(k * STEP)
         seen = Observation(k * STEP, speed * one, gap * one, (speed - leader) * one, aside * one, moves * one, 1.0, leader * one, 0 * one)
         command, memory = driver.drive(seen, memory)
-        told.append((gap, speed, float(command.brake[0])))
-        faster = max(speed + (3 * float(command.throttle[0]) - 10 * told[-1][2]) * STEP, 0.0)
+        samples.append((gap, speed, float(command.brake[0])))
+        faster = max(speed + (3 * float(command.throttle[0]) - 10 * samples[-1][2]) * STEP, 0.0)
         gap, speed = gap + (leader - (speed + faster) / 2) * STEP, faster
-    return tuple(np.array(told).T)  # type: ignore[return-value]
+    return tuple(np.array(samples).T)  # type: ignore[return-value]
 
 
 def test_who_has_stopped_for_a_pedestrian_waits_until_the_way_is_clear() -> None:

@@ -29,10 +29,10 @@ def test_the_sets_are_simulated_one_by_one() -> None:
     study = load_study("sun", spread={GAP: [OWN, OWN - 1, OWN + 1]}, repeatability={"safety_degree": 1e-9})
     setting = assemble(study).characteristics.setting({"tireFric": 1.3}, "a test")[np.newaxis]
     alone = [evaluate(assemble(load_study("sun", ads={"parameters": {"brake_gap": gap}})), setting) for gap in (OWN, OWN - 1, OWN + 1)]
-    (found,) = model_spreads(study, setting)
+    (band,) = model_spreads(study, setting)
     degrees = [float(one.f_safe[0]) for one in alone]
-    assert (found.lower, found.upper) == pytest.approx(np.quantile(degrees, [0.05, 0.95]).tolist(), abs=1e-6)
-    assert (found.sets, found.collisions) == (3, sum(int(one.collided[0]) for one in alone))
+    assert (band.lower, band.upper) == pytest.approx(np.quantile(degrees, [0.05, 0.95]).tolist(), abs=1e-6)
+    assert (band.sets, band.collisions) == (3, sum(int(one.collided[0]) for one in alone))
 
 
 def test_a_study_keeps_what_it_gives_another_value() -> None:
@@ -52,10 +52,10 @@ def test_another_vehicle_or_driver_has_no_spread_and_lists_are_of_one_length() -
 def test_simulate_tells_the_models_own_uncertainty(in_tmp: Path) -> None:
     Path("mine.toml").write_text(f'extends = "sun"\nname = "mine"\n[spread]\n"{GAP}" = [{OWN}, 8.0]\n')
     words = ("simulate", "mine.toml", "--set", "tireFric=1.1", "--spread")
-    told = json.loads(run(*words, "--json").stdout)["spread"]
-    assert told["sets"] == 2
-    assert told["lower"] < told["upper"]
-    assert set(told["original"]) == {"sets", "lower", "upper", "collisions"}
+    spread = json.loads(run(*words, "--json").stdout)["spread"]
+    assert spread["sets"] == 2
+    assert spread["lower"] < spread["upper"]
+    assert set(spread["original"]) == {"sets", "lower", "upper", "collisions"}
     assert "own uncertainty" in " ".join(run(*words).stdout.split())
-    refused("simulate", "native", "--spread", told=("native", "[spread]"))
-    refused("simulate", "mine.toml", "--set", "tireFric=1..2", "--spread", told=("--set", "--spread"))
+    refused("simulate", "native", "--spread", spread=("native", "[spread]"))
+    refused("simulate", "mine.toml", "--set", "tireFric=1..2", "--spread", spread=("--set", "--spread"))

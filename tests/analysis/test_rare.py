@@ -59,33 +59,33 @@ def radius_of(probability: float, n: int) -> float:
     ("subset_simulation", "curved", 4, 1e-6), ("cross_entropy", "linear", 8, 1e-6)])
 def test_analytic_probabilities_over_twenty_seeds(method: str, shape: str, n: int, probability: float) -> None:
     limit = linear(beta_of(probability)) if shape == "linear" else curved(radius_of(probability, n))
-    found = [rare(limit, n, seed, method=method) for seed in range(20)]
-    assert {one.method for one in found} == {method}
-    assert np.mean([one.probability for one in found]) == pytest.approx(probability, rel=0.1)
-    assert sum(one.interval[0] <= probability <= one.interval[1] for one in found) >= 18
+    estimates = [rare(limit, n, seed, method=method) for seed in range(20)]
+    assert {one.method for one in estimates} == {method}
+    assert np.mean([one.probability for one in estimates]) == pytest.approx(probability, rel=0.1)
+    assert sum(one.interval[0] <= probability <= one.interval[1] for one in estimates) >= 18
 
 
 def test_a_rare_failure_its_interval_and_its_most_probable_point() -> None:
     """The design point of a plane at the distance beta has components beta / sqrt(n)."""
-    found = rare(linear(beta_of(1e-5)), 3)
-    assert found.method == "subset_simulation"
-    assert found.interval[0] <= 1e-5 <= found.interval[1]
-    assert found.remark == ""
-    assert found.design_point is not None
-    point = of_normal(np.array([list(found.design_point.values())]))[0]
+    estimate = rare(linear(beta_of(1e-5)), 3)
+    assert estimate.method == "subset_simulation"
+    assert estimate.interval[0] <= 1e-5 <= estimate.interval[1]
+    assert estimate.remark == ""
+    assert estimate.design_point is not None
+    point = of_normal(np.array([list(estimate.design_point.values())]))[0]
     assert np.linalg.norm(point) == pytest.approx(beta_of(1e-5), rel=0.05)
     assert point == pytest.approx(beta_of(1e-5) / math.sqrt(3), rel=0.25)
-    record = found.to_dict()
+    record = estimate.to_dict()
     assert json.loads(json.dumps(record, allow_nan=False)) == record
     assert set(record) >= {"method", "simulations", "coefficient_of_variation", "design_point", "remark"}
-    assert found.of_fleet(1000) == pytest.approx(1 - (1 - found.probability) ** 1000)
+    assert estimate.of_fleet(1000) == pytest.approx(1 - (1 - estimate.probability) ** 1000)
     assert rare(linear(beta_of(1e-5)), 3).to_dict() == record
 
 
 def test_two_islands_are_told() -> None:
-    found = rare(islands(beta_of(5e-5)), 2)
-    assert found.interval[0] <= 1e-4 <= found.interval[1]
-    assert "2 islands" in found.remark
+    estimate = rare(islands(beta_of(5e-5)), 2)
+    assert estimate.interval[0] <= 1e-4 <= estimate.interval[1]
+    assert "2 islands" in estimate.remark
 
 
 def test_a_plateau_and_a_frequent_failure_are_left_to_monte_carlo() -> None:

@@ -77,11 +77,11 @@ def with_search(study: Study, **changes: object) -> Study:
 
 def carried_out(study: Study, path: Path, pool: FormulaPool | None = None, keys: Iterable[RunKey] | None = None,
                 batch: int | None = None) -> tuple[Campaign, Told]:
-    told = Told()
+    observer = Told()
     results = ResultsDirectory(path, study)
-    campaign = run_campaign(study, all_runs(study) if keys is None else keys, results, pool or FormulaPool(), told, batch)
+    campaign = run_campaign(study, all_runs(study) if keys is None else keys, results, pool or FormulaPool(), observer, batch)
     results.finish(campaign.solutions)
-    return campaign, told
+    return campaign, observer
 
 
 def solutions(path: Path) -> bytes:

@@ -43,8 +43,8 @@ def test_bar_status_and_campaign_count_the_same_collisions(study: Study, tmp_pat
         with CampaignProgress(console, study, all_runs(study), quiet=False) as progress:
             campaign = run_campaign(study, all_runs(study), results, FormulaPool(), progress)
         results.finish(campaign.solutions)
-        found = load(tmp_path).evaluations
-        expected = len(found[found["outcome"] == "collision"].drop_duplicates(["algorithm", "run", *SUN.names]))
+        evaluations = load(tmp_path).evaluations
+        expected = len(evaluations[evaluations["outcome"] == "collision"].drop_duplicates(["algorithm", "run", *SUN.names]))
         assert expected > 0
         assert sum(campaign.collisions.values()) == sum(run.collisions for run in status(tmp_path).runs) == expected
         assert f" {expected} collisions" in console.file.getvalue()  # type: ignore[attr-defined]
@@ -83,8 +83,8 @@ class Colliding(FormulaPool):
 
 
 def test_an_original_vehicle_that_collides_is_told(study: Study, tmp_path: Path) -> None:
-    _, told = carried_out(study, tmp_path / "unsafe", Colliding())
-    assert [line for line in told.warnings if "the original vehicle itself collides" in line] == told.warnings != []
+    _, observer = carried_out(study, tmp_path / "unsafe", Colliding())
+    assert [line for line in observer.warnings if "the original vehicle itself collides" in line] == observer.warnings != []
     assert carried_out(study, tmp_path / "safe")[1].warnings == []
 
 
@@ -103,13 +103,13 @@ def test_a_campaign_that_breaks_down_anywhere_is_resumed_where_it_was(study: Stu
 
 
 def test_a_finished_campaign_answers_without_simulating(study: Study, tmp_path: Path) -> None:
-    first, told = carried_out(study, tmp_path)
+    first, observer = carried_out(study, tmp_path)
     before = solutions(tmp_path)
-    again, told_again = carried_out(study, tmp_path, FormulaPool(lasts=0))
+    again, observer_again = carried_out(study, tmp_path, FormulaPool(lasts=0))
     assert solutions(tmp_path) == before
     assert again.failures == first.failures == []
-    assert told_again.simulated == 0
-    assert told_again.finished_runs == told.finished_runs == dict.fromkeys(all_runs(study), study.search.evaluations)
+    assert observer_again.simulated == 0
+    assert observer_again.finished_runs == observer.finished_runs == dict.fromkeys(all_runs(study), study.search.evaluations)
 
 
 def test_more_runs_extend_and_fewer_leave_out(study: Study, tmp_path: Path) -> None:
@@ -152,9 +152,9 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
     carried_out(second, tmp_path / "out", pools[1])
     carried_out(second, tmp_path / "fresh", pools[2])
     assert solutions(tmp_path / "out") == solutions(tmp_path / "fresh")
-    found, fresh = load(tmp_path / "out"), load(tmp_path / "fresh")
-    pd.testing.assert_frame_equal(found.evaluations, fresh.evaluations)
-    pd.testing.assert_frame_equal(found.solutions, fresh.solutions)
+    results, fresh = load(tmp_path / "out"), load(tmp_path / "fresh")
+    pd.testing.assert_frame_equal(results.evaluations, fresh.evaluations)
+    pd.testing.assert_frame_equal(results.solutions, fresh.solutions)
     assert len(set(pools[0].simulated)) + len(set(pools[1].simulated)) == len(set(pools[0].simulated) | set(pools[1].simulated))
     carried_out(first, tmp_path / "out", FormulaPool(lasts=0))
 
@@ -177,10 +177,10 @@ def test_every_evaluation_is_read_in_the_order_in_which_it_was_asked_for(study: 
 
 
 def test_a_forecast_counts_and_measures(study: Study) -> None:
-    told = forecast(study, 6, FormulaPool())
-    assert told.evaluations == 600
-    assert told.seconds == pytest.approx(600 / told.rate)
-    assert told.size >= 600 * 8 * (12 + len(METRICS))
+    ahead = forecast(study, 6, FormulaPool())
+    assert ahead.evaluations == 600
+    assert ahead.seconds == pytest.approx(600 / ahead.rate)
+    assert ahead.size >= 600 * 8 * (12 + len(METRICS))
 
 
 @pytest.mark.parametrize("workers", [1, 4])
@@ -198,10 +198,10 @@ def test_a_torn_tail_is_told_and_simulated_again(study: Study, tmp_path: Path) -
     torn = tmp_path / "runs" / "nsga2-01.journal"
     torn.write_bytes(torn.read_bytes()[:-700])
     pool = FormulaPool()
-    _, told = carried_out(study, tmp_path, pool)
+    _, observer = carried_out(study, tmp_path, pool)
     assert solutions(tmp_path) == before
-    assert len(told.warnings) == 1
-    assert str(torn) in told.warnings[0]
+    assert len(observer.warnings) == 1
+    assert str(torn) in observer.warnings[0]
     assert 0 < len(pool.simulated) <= 2 * study.search.population
 
 

@@ -57,17 +57,17 @@ def test_elsewhere_a_line_for_the_whole_study_every_30_seconds(study: Study, clo
     assert lines == ["rain: 10/s, 0:09:20 left, 400 collisions, runs 0/6, best SD -5.63"]
 
 
-@pytest.mark.parametrize(("width", "told"), [
+@pytest.mark.parametrize(("width", "ending"), [
     (120, "10/s, 0:08:00 left, 500 collisions, runs 1/6, best SD -5.63"),
     (80, "10/s, 0:08:00 left, 500 collisions, runs 1/6, best SD -5.63"),
     (55, "10/s, 0:08:00 left, 500 collisions"), (35, "10/s, 0:08:00 left"), (20, "10/s"),
 ])
 def test_on_a_terminal_what_matters_fits_in_its_line_and_no_word_is_cut(
-        width: int, told: str, study: Study, clock: list[float]) -> None:
+        width: int, ending: str, study: Study, clock: list[float]) -> None:
     """The run that ended early leaves 5300 evaluations in all, 500 of them done."""
     lines = [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", line).rstrip() for line in shown(study, clock, terminal_width=width).splitlines()]
     last = [line for line in lines if "rain" in line][-1]
-    assert last.endswith(told)
+    assert last.endswith(ending)
     assert ("━" in last) == (width >= 50)
     assert max(map(len, lines)) <= width
     assert not [line for line in lines if "…" in line]

@@ -158,11 +158,11 @@ def test_a_planted_defect_is_named_with_file_and_line(name: str, in_tmp: Path, m
     report = check("mine:Mine")
     assert report.kind == defect.kind
     assert report.seconds < 10
-    found = [(one.check, one.line) for one in report.findings]
+    places = [(one.check, one.line) for one in report.findings]
     lines = [number for number, line in enumerate(defect.module.splitlines(), 1) if defect.line in line]
-    assert found, "nothing is found"
-    assert found[0][0] == defect.check, [str(one) for one in report.findings]
-    assert found[0][1] in lines, [str(one) for one in report.findings]
+    assert places, "nothing is found"
+    assert places[0][0] == defect.check, [str(one) for one in report.findings]
+    assert places[0][1] in lines, [str(one) for one in report.findings]
     assert Path(report.findings[0].file).resolve() == (in_tmp / "mine.py").resolve()
     assert all((one.expected, one.got, one.advice) for one in report.findings)
 
@@ -199,10 +199,10 @@ def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) 
     (in_tmp / "mine.py").write_text(DEFECTS["ads out of range"].module)
     (in_tmp / "mine.toml").write_text('extends = "smoke"\n[ads]\nmodel = "mine:Mine"\n')
     for subject, kind in (("mine:Mine", "ads"), ("mine.toml", "study")):
-        found = json.loads(run("check", subject, "--json", expect=1).stdout)
-        assert list(found) == ["subject", "kind", "passed", "findings", "seconds"]
-        assert (found["subject"], found["kind"], found["passed"]) == (subject, kind, False)
-        assert list(found["findings"][0]) == ["check", "file", "line", "expected", "got", "advice"]
+        report = json.loads(run("check", subject, "--json", expect=1).stdout)
+        assert list(report) == ["subject", "kind", "passed", "findings", "seconds"]
+        assert (report["subject"], report["kind"], report["passed"]) == (subject, kind, False)
+        assert list(report["findings"][0]) == ["check", "file", "line", "expected", "got", "advice"]
     assert "mine.py:15: contract: returned brake = 100.0 from drive" in run("check", "mine:Mine", expect=1).stdout.replace("\n", "")
     (in_tmp / "mine.py").write_text(RIGHT["scalar ads"])
     assert json.loads(run("check", "mine:Mine", "--study", "mine.toml", "--json").stdout)["findings"] == []

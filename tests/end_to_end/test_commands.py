@@ -95,7 +95,7 @@ def test_a_users_scalar_ads_is_named_in_a_study(in_tmp: Path) -> None:
     (["simulate", "/"], ("/",)),
 ])
 def test_bad_input_ends_with_code_2_and_says_what_is_legal(arguments: list[str], expected: tuple[str, ...], in_tmp: Path) -> None:
-    refused(*arguments, told=expected)
+    refused(*arguments, message=expected)
     assert not list(in_tmp.rglob("*.csv"))
 
 
@@ -115,7 +115,7 @@ def test_a_bad_study_file_ends_with_code_2(old: str, new: str, expected: tuple[s
     text = (STUDIES / "sun.toml").read_text()
     assert old in text
     Path("mine.toml").write_text(text.replace(old, new))
-    refused("simulate", "mine.toml", told=expected)
+    refused("simulate", "mine.toml", message=expected)
 
 
 @pytest.mark.parametrize("where", ["__init__", "drive"])
@@ -126,7 +126,7 @@ def test_an_ads_that_exits_is_a_fault_and_no_success(where: str, in_tmp: Path) -
         "    def drive(self, seen):\n        return 0.5, 0.0\n\n"
         f"    def {where}({arguments}):\n        sys.exit(3)\n")
     Path("mine.toml").write_text('extends = "sun"\nname = "mine"\n[ads]\nmodel = "my_ads:Careful"\n')
-    refused("simulate", "mine.toml", told=("my_ads:Careful", "SystemExit", "my_ads.py:10"))
+    refused("simulate", "mine.toml", message=("my_ads:Careful", "SystemExit", "my_ads.py:10"))
 
 
 def test_a_title_is_no_markup(in_tmp: Path) -> None:

@@ -100,7 +100,7 @@ def test_torn_tails_are_cut_off_with_a_warning_and_damage_in_the_middle_names_it
     (["--cluster", ""], ("--cluster", "''")),
 ])
 def test_bad_options_are_refused(arguments: list[str], expected: tuple[str, ...]) -> None:
-    refused("study", "small.toml", "--out", "out", *arguments, told=expected)
+    refused("study", "small.toml", "--out", "out", *arguments, message=expected)
     assert not Path("out/runs").exists()
 
 
@@ -117,4 +117,4 @@ def test_an_ads_that_always_fails_ends_the_study_with_that_fault() -> None:
                                  "    def drive(self, seen):\n        return 1 / 0\n")
     Path("bad.toml").write_text('extends = "small.toml"\nname = "bad"\n[ads]\nmodel = "my_ads:Bad"\n')
     for options in ([], ["--dry-run"]):
-        refused("study", "bad.toml", "--out", "out", *options, told=("ZeroDivisionError", "simulate bad.toml"))
+        refused("study", "bad.toml", "--out", "out", *options, message=("ZeroDivisionError", "simulate bad.toml"))

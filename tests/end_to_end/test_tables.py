@@ -107,7 +107,7 @@ def test_imported_results_answer_what_needs_no_runs(imported: Path) -> None:
     output = run("tables", str(imported)).stdout
     assert "igd, igd_plus and hypervolume need runs" in output
     assert "sun: is imported" in output
-    refused("tables", str(imported), "--rq", "rq3.1", told=("sun", "imported"))
+    refused("tables", str(imported), "--rq", "rq3.1", message=("sun", "imported"))
     done = run("figures", str(imported), "--out", "pictures")
     assert len(done.stdout.split()) == 3
     assert "imported" in done.stderr
@@ -121,9 +121,9 @@ def test_a_csv_that_is_not_the_packages_is_refused(in_tmp: Path) -> None:
     Path("empty.csv").write_text("")
     for name, result in (("lacking.csv", "mass"), ("tet.csv", "TET"), ("letters.csv", "letters.csv"), ("empty.csv", "empty"),
                        ("nothing.csv", "nothing.csv"), (".", "is no regular file")):
-        refused("import", "sun", "--out", "out", "--nsga2", name, told=(result,))
-    refused("import", "native", "--out", "out", "--nsga2", "a.csv", told=("--original",))
-    refused("import", "lgsvl", "--out", "out", "--nsga2", "a.csv", told=("lacks the columns",))
+        refused("import", "sun", "--out", "out", "--nsga2", name, message=(result,))
+    refused("import", "native", "--out", "out", "--nsga2", "a.csv", message=("--original",))
+    refused("import", "lgsvl", "--out", "out", "--nsga2", "a.csv", message=("lacks the columns",))
     assert not Path("out").exists()
 
 
@@ -134,13 +134,13 @@ def test_what_is_no_result_is_refused(results: Path, in_tmp: Path) -> None:
     Path("other/manifest.json").write_text('{"study": {}, "versions": {}, "original": {}}')
     for name in ("nowhere", "empty", "file", "other"):
         for command in (("tables", name), ("figures", name, "--out", "pictures")):
-            refused(*command, told=(name,))
-    refused("tables", str(results), str(results), told=("given twice",))
-    refused("tables", str(results), "--rq", "rq4", told=("rq4", "rq3.1"))
-    refused("tables", str(results), "--format", "html", told=("html", "latex"))
-    refused("figures", str(results), "--out", "file", told=("--out", "file"))
-    refused("tables", str(results), "--out", "file", told=("--out", "file"))
-    refused("tables", str(results), "--rq", "weather", told=("weather",))
+            refused(*command, message=(name,))
+    refused("tables", str(results), str(results), message=("given twice",))
+    refused("tables", str(results), "--rq", "rq4", message=("rq4", "rq3.1"))
+    refused("tables", str(results), "--format", "html", message=("html", "latex"))
+    refused("figures", str(results), "--out", "file", message=("--out", "file"))
+    refused("tables", str(results), "--out", "file", message=("--out", "file"))
+    refused("tables", str(results), "--rq", "weather", message=("weather",))
     assert not Path("pictures").exists()
 
 
@@ -157,7 +157,7 @@ def test_an_edited_manifest_is_refused_in_one_line(command: str, table: str, key
 
 
 def test_results_are_no_published_data_of_themselves(results: Path) -> None:
-    refused("replicate", str(results), "--published", str(results), told=("--published", "given as results too"))
+    refused("replicate", str(results), "--published", str(results), message=("--published", "given as results too"))
 
 
 def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_tmp: Path) -> None:
@@ -169,11 +169,11 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     records = json.loads(run("tables", "part", "--rq", "rq2", "--format", "json").stdout)
     assert next(one for one in records if one["metric"] == "igd")["n2"] == 1
     Path("part/runs/rs-00.journal").unlink()
-    refused("tables", "part", "--rq", "rq2", told=("nsga2 alone",))
+    refused("tables", "part", "--rq", "rq2", message=("nsga2 alone",))
     for path in Path("part/runs").glob("nsga2-*"):
         path.write_bytes(path.read_bytes()[:-20])
-    refused("tables", "part", told=("no finished run",))
-    refused("figures", "part", "--out", "pictures", told=("no finished run",))
+    refused("tables", "part", message=("no finished run",))
+    refused("figures", "part", "--out", "pictures", message=("no finished run",))
 
 
 def test_sumo_is_not_needed(results: Path, in_tmp: Path) -> None:

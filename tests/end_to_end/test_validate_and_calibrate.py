@@ -92,7 +92,7 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
 def test_calibrate_touches_nothing_but_parameters(key: str, expected: tuple[str, ...], in_tmp: Path) -> None:
     Path("mine.toml").write_text(
         f'extends = "sun"\nname = "mine"\n[calibration]\n"{key}" = {{ lower = 1, upper = 2, unit = "-", meaning = "none" }}\n')
-    refused("calibrate", "mine.toml", "--trials", "1", "--out", "x.toml", told=expected)
+    refused("calibrate", "mine.toml", "--trials", "1", "--out", "x.toml", message=expected)
 
 
 @pytest.mark.parametrize(("key", "lower", "upper", "expected"), [
@@ -104,11 +104,11 @@ def test_calibrate_refuses_bounds_that_the_models_do_not_take(key: str, lower: f
                                                               in_tmp: Path) -> None:
     Path("mine.toml").write_text(f'extends = "sun"\nname = "mine"\n[calibration]\n'
                                  f'"{key}" = {{ lower = {lower}, upper = {upper}, unit = "-", meaning = "none" }}\n')
-    refused("calibrate", "mine.toml", "--trials", "13", "--out", "x.toml", told=expected)
+    refused("calibrate", "mine.toml", "--trials", "13", "--out", "x.toml", message=expected)
 
 
 def test_calibrate_does_not_write_over_what_it_starts_from(data: Path, in_tmp: Path) -> None:
-    refused("calibrate", "sun", str(data), "--trials", "1", "--out", str(data), told=("--out", data.name))
+    refused("calibrate", "sun", str(data), "--trials", "1", "--out", str(data), message=("--out", data.name))
     assert data.read_text().startswith("max_rpm")
 
 
@@ -136,18 +136,18 @@ def test_several_studies_are_fitted_together(data: Path, in_tmp: Path) -> None:
     Path("late.toml").write_text(f'extends = "sun"\nname = "late"\n[ads.parameters]\nhesitation = 0.1\n{free}')
     Path("late_rows.csv").write_bytes(data.read_bytes())
     words = ("calibrate", "mine.toml", "late.toml", f"mine={data}", "late_rows.csv", "--trials", "15")
-    refused(*words, "--out", "nowhere", told=("--out", "nowhere"))
+    refused(*words, "--out", "nowhere", message=("--out", "nowhere"))
     Path("fitted").mkdir()
     run(*words, "--out", "fitted")
-    found = [tomllib.loads(Path(f"fitted/{name}-calibrated.toml").read_text()) for name in ("mine", "late")]
-    assert found[0]["ads"]["parameters"]["brake_gap"] == found[1]["ads"]["parameters"]["brake_gap"]
-    assert "hesitation" not in found[0]["ads"]["parameters"]
+    fitted = [tomllib.loads(Path(f"fitted/{name}-calibrated.toml").read_text()) for name in ("mine", "late")]
+    assert fitted[0]["ads"]["parameters"]["brake_gap"] == fitted[1]["ads"]["parameters"]["brake_gap"]
+    assert "hesitation" not in fitted[0]["ads"]["parameters"]
     heads = [Path(f"fitted/{name}-calibrated.toml").read_text().split("\n\n")[0] for name in ("mine", "late")]
     assert "together with 'late'" in heads[0]
     assert "late_rows.csv, SHA-256" in heads[1]
     assert "late_rows.csv" not in heads[0]
     Path("rows.csv").write_bytes(data.read_bytes())
-    refused("calibrate", "mine.toml", "late.toml", "rows.csv", "--trials", "1", told=("rows.csv", "mine, late", "STUDY=FILE.csv"))
+    refused("calibrate", "mine.toml", "late.toml", "rows.csv", "--trials", "1", message=("rows.csv", "mine, late", "STUDY=FILE.csv"))
 
 
 def test_validate_tells_effects_when_asked(in_tmp: Path) -> None:
@@ -157,8 +157,8 @@ def test_validate_tells_effects_when_asked(in_tmp: Path) -> None:
     frame = pd.DataFrame(settings, columns=list(characteristics.names)).assign(
         SaftyDegree=evaluate(system, settings).f_safe + 0.3 * settings[:, 0] / 2800, TIT=0.0, TET=0.0)
     frame.to_csv("rows.csv", index=False)
-    told = json.loads(run("validate", "sun", "rows.csv", "--json", "--effects").stdout)["effects"]
-    assert list(told) == list(characteristics.names)
-    assert told["mass"]["agrees"] is True
-    assert told["max_rpm"]["reference"] - told["max_rpm"]["here"] == pytest.approx(0.3, abs=0.05)
+    effects = json.loads(run("validate", "sun", "rows.csv", "--json", "--effects").stdout)["effects"]
+    assert list(effects) == list(characteristics.names)
+    assert effects["mass"]["agrees"] is True
+    assert effects["max_rpm"]["reference"] - effects["max_rpm"]["here"] == pytest.approx(0.3, abs=0.05)
     assert "max_rpm" in run("validate", "sun", "rows.csv", "--effects").stdout

@@ -35,11 +35,11 @@ def checked(mine: Mine, module: str, folder: Path) -> None:
     refuse_defects(load_study(str(folder / "mine.toml")))
 
 
-@pytest.mark.parametrize(("module", "told"), [
+@pytest.mark.parametrize(("module", "message"), [
     (MEAN, "in two halves (|alone|in another order)"), (CLASS, "in a second run"), (SELF, "in a second run"),
     (RANDOM, "when the same is done once more"), (PLACE, "in another order")], ids=["mean", "class", "self", "random", "place"])
-def test_an_ads_that_mixes_settings_up_is_refused(module: str, told: str, mine: Mine, folder: Path) -> None:
-    with pytest.raises(ForeignError, match=rf"'mine:Mine' (throttle|brake) of vehicle \d+ is .* {told}") as caught:
+def test_an_ads_that_mixes_settings_up_is_refused(module: str, message: str, mine: Mine, folder: Path) -> None:
+    with pytest.raises(ForeignError, match=rf"'mine:Mine' (throttle|brake) of vehicle \d+ is .* {message}") as caught:
         checked(mine, module, folder)
     assert "mine.py:" in str(caught.value)
 

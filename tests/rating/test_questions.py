@@ -87,11 +87,11 @@ def test_explain_names_the_cells_that_turn_and_the_summary_the_points_that_are_l
     bench = Bench(STUDY, Here())
     members = bench.characteristics
     settings = np.array([members.setting({"brakeTorque": value, "payload": 200.0}, "it") for value in (0.5, 0.6)])
-    original, found = bench.original(), bench.evaluate(settings, "it")
-    case: Any = type("Case", (), {"study": STUDY, "solutions": solutions_frame(members.names, [(("nsga2", 0), found)]),
+    original, evaluations = bench.original(), bench.evaluate(settings, "it")
+    case: Any = type("Case", (), {"study": STUDY, "solutions": solutions_frame(members.names, [(("nsga2", 0), evaluations)]),
                                   "characteristics": members})()
     points = float(original.column("rating_points")[0])
-    lost = points - float(found.column("rating_points")[1])
+    lost = points - float(evaluations.column("rating_points")[1])
     assert lost > 0
     result = explain_failures(case, ExplainOptions(solutions=("nsga2:0:0",), unsafe=f"points={points - 1e-3}"), pool=Here())
     (failure,) = result.explanations

@@ -42,10 +42,10 @@ def mine(gap: float, **fit: object) -> Study:
 
 def test_a_fit_from_scratch_finds_the_truth_and_forgets_what_the_study_says(data: ReferenceData) -> None:
     truth = load_study("sun").ads.parameters["brake_gap"]
-    found = [calibrate(mine(gap, starts=1, trials=36), {"mine": data}, Here(), from_scratch=True) for gap in (0.4, 1.5)]
-    assert found[0].values == found[1].values == {GAP: pytest.approx(truth, rel=0.05)}
-    assert found[0].reached == [found[0].cost]
-    assert (found[0].used["mine"].rows, found[0].held_back["mine"].rows) == (12, 12)
+    fits = [calibrate(mine(gap, starts=1, trials=36), {"mine": data}, Here(), from_scratch=True) for gap in (0.4, 1.5)]
+    assert fits[0].values == fits[1].values == {GAP: pytest.approx(truth, rel=0.05)}
+    assert fits[0].reached == [fits[0].cost]
+    assert (fits[0].used["mine"].rows, fits[0].held_back["mine"].rows) == (12, 12)
 
 
 def test_what_counts_for_nothing_in_the_study_costs_nothing(data: ReferenceData) -> None:
@@ -114,9 +114,9 @@ def test_a_linear_response_has_the_effects_that_it_was_made_with() -> None:
     settings = rng.uniform(characteristics.lower, characteristics.upper, (200, 12))
     settings[:, 3] = characteristics.original[3]
     slopes = np.arange(12) - 5.0
-    found = linear_effects(settings, 1.0 + ((settings - characteristics.original) / width) @ slopes, characteristics)
-    assert np.delete(found, 3) == pytest.approx(np.delete(slopes, 3))
-    assert np.isnan(found[3]), "it does not vary"
+    effects = linear_effects(settings, 1.0 + ((settings - characteristics.original) / width) @ slopes, characteristics)
+    assert np.delete(effects, 3) == pytest.approx(np.delete(slopes, 3))
+    assert np.isnan(effects[3]), "it does not vary"
     assert np.isnan(linear_effects(settings[:20], np.ones(20), characteristics)).all(), "too few rows"
 
 
@@ -176,13 +176,13 @@ def test_the_worse_half_gives_up_after_every_round() -> None:
 
 @pytest.mark.parametrize(("starts", "trials"), [(1, 7), (3, 100), (6, 500), (40, 30)])
 def test_no_trial_is_lost_and_none_too_many(starts: int, trials: int) -> None:
-    bowl, told = Bowl(), list[float]()
-    search = Search(bowl, 6, trials, lambda cost, best: told.append(cost))
+    bowl, costs = Bowl(), list[float]()
+    search = Search(bowl, 6, trials, lambda cost, best: costs.append(cost))
     searches = [search.begun(np.full(2, 0.9), 0.3, seed) for seed in range(1, starts + 1)]
     search.race(searches)
-    assert bowl.tried == trials == len(told)
+    assert bowl.tried == trials == len(costs)
     assert search.left == 0
-    assert told == sorted(told, reverse=True)
+    assert costs == sorted(costs, reverse=True)
 
 
 def test_a_race_finds_the_bottom_from_whatever_half() -> None:

@@ -140,8 +140,8 @@ def at_the_edges() -> Iterator[Cell]:
 def check(cells: list[Cell]) -> None:
     points = tuple(Point(cell.scenario, WEATHERS["clear"], str(k)) for k, cell in enumerate(cells))
     system = replace(CARLA, ads=Hold(), matrix=points)
-    for cell, found in zip(cells, at_every_point(system, system.characteristics.original[np.newaxis]), strict=True):
-        run, scenario = found.drives, cell.scenario
+    for cell, there in zip(cells, at_every_point(system, system.characteristics.original[np.newaxis]), strict=True):
+        run, scenario = there.drives, cell.scenario
         assert run.outcome[0] == Outcome.COLLISION, scenario
         assert set(run.contact.side) == {"front"}, scenario
         late = at_contact(run, run.trace.time) - cell.arrival
@@ -229,13 +229,13 @@ class _Seen(Hold):
         return super().drive(seen, memory)
 
 
-@pytest.mark.parametrize(("kind", "parameters", "told"), [
+@pytest.mark.parametrize(("kind", "parameters", "message"), [
     (CarToCar, {"test": "CCRm", "heading": 10}, "a target that moves"),
     (Crossing, {"test": "CBFA", "target_speed": 90, "time_to_impact": 13}, "has no lane"),
     (Crossing, {"test": "CBNA", "acceleration_distance": 1.0}, "lateral_start"),
 ])
-def test_impossible_targets_are_refused(kind: type, parameters: dict[str, Any], told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_impossible_targets_are_refused(kind: type, parameters: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
         driven(kind(**parameters), system=NATIVE)
 
 

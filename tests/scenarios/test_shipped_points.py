@@ -44,18 +44,18 @@ def test_who_does_not_brake_is_where_the_protocol_says_at_every_point(study: str
     system = replace(clear(study), ads=Hold())
     domain = system.characteristics
     corners = np.where(np.random.default_rng(7).random((6, len(domain))) < 0.5, domain.lower, domain.upper)
-    for found in at_every_point(system, np.concatenate([domain.original[np.newaxis], corners])):
-        scenario, run = found.point.scenario, found.drives
-        assert found.evaluations.collided.all(), found.point.name
-        assert set(run.contact.side) == {"front"}, found.point.name
-        assert run.contact.place == pytest.approx(np.full(7, scenario.impact_location), abs=2), found.point.name
+    for there in at_every_point(system, np.concatenate([domain.original[np.newaxis], corners])):
+        scenario, run = there.point.scenario, there.drives
+        assert there.evaluations.collided.all(), there.point.name
+        assert set(run.contact.side) == {"front"}, there.point.name
+        assert run.contact.place == pytest.approx(np.full(7, scenario.impact_location), abs=2), there.point.name
         error = np.where(run.trace.active, run.trace.speed * 3.6 - scenario.speed, 0.0)
-        assert error.min() > -0.5, found.point.name
-        assert error.max() < 1.0, found.point.name
-        assert struck(run, scenario.vut_width) == pytest.approx(scenario.impact_location / 100, abs=0.02), found.point.name
+        assert error.min() > -0.5, there.point.name
+        assert error.max() < 1.0, there.point.name
+        assert struck(run, scenario.vut_width) == pytest.approx(scenario.impact_location / 100, abs=0.02), there.point.name
         if isinstance(scenario, Crossing | Along):
             late = abs(at_contact(run, run.trace.time) - 6.0)
-            assert late * scenario.speed / 3.6 < 0.05, found.point.name
+            assert late * scenario.speed / 3.6 < 0.05, there.point.name
 
 
 def struck(run: SimulationRuns, width: float) -> float:
@@ -82,13 +82,13 @@ def test_the_worn_cars_matrix_at_its_edges() -> None:
 PEDESTRIAN = "pedestrian crash without prior vehicle manoeuvre"
 
 
-@pytest.mark.parametrize(("study", "told"), [
+@pytest.mark.parametrize(("study", "types"), [
     ("sun", "pedestrian crash with prior vehicle manoeuvre; by day"), ("lgsvl", "lead vehicle stopped; by day"),
     ("euro_ncap_pedestrian", f"{PEDESTRIAN}; by day and by night"), ("wear", f"{PEDESTRIAN}; by day"),
     ("euro_ncap_car_to_car", "lead vehicle stopped; lead vehicle moving at lower constant speed; lead vehicle decelerating; by day"),
 ])
-def test_the_tags_of_the_shipped_studies(study: str, told: str) -> None:
-    assert tags(assemble(load_study(study)).points) == f"NHTSA's pre-crash types: {told}."
+def test_the_tags_of_the_shipped_studies(study: str, types: str) -> None:
+    assert tags(assemble(load_study(study)).points) == f"NHTSA's pre-crash types: {types}."
 
 
 KMH = 1 / 3.6
@@ -148,10 +148,10 @@ def test_sumo_reports_a_collision_just_when_the_gap_is_gone(scenario: CarToCar |
     assert 0 < np.count_nonzero(collided) < n
 
 
-@pytest.mark.parametrize(("kind", "parameters", "told"), [
+@pytest.mark.parametrize(("kind", "parameters", "message"), [
     (CarToCar, {"speed": -5}, "speed"), (CarToCar, {"test": "CCRm", "speed": 15}, "never reaches"), (CarToCar, {"headway": 0}, "headway"),
     (Along, {"speed": 4}, "inside the vehicle"), (Along, {"target_speed": -1}, "target_speed"),
 ])
-def test_impossible_parameters_are_refused(kind: type, parameters: dict[str, object], told: str) -> None:
-    with pytest.raises((InputError, msgspec.ValidationError), match=told):
+def test_impossible_parameters_are_refused(kind: type, parameters: dict[str, object], message: str) -> None:
+    with pytest.raises((InputError, msgspec.ValidationError), match=message):
         driven(msgspec.convert(parameters, kind), system=NATIVE)

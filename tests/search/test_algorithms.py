@@ -43,8 +43,8 @@ def test_the_budget_is_kept_to_the_evaluation(name: str, evaluations: int) -> No
 
 
 def test_what_is_asked_and_found_is_filtered_and_in_the_domains(name: str) -> None:
-    found, asked = searched(name, 2, 400)
-    for settings in (*asked, found.settings):
+    solutions, asked = searched(name, 2, 400)
+    for settings in (*asked, solutions.settings):
         assert np.all((settings >= SUN.lower) & (settings <= SUN.upper))
         assert np.array_equal(SUN.filter(settings), settings)
 
@@ -86,16 +86,16 @@ def test_a_setting_that_failed_never_gets_into_the_result(name: str) -> None:
         return Evaluations(settings=settings, outcome=outcome, collision_speed=good.collision_speed,
                            metrics={"safety_degree": safety}, f_diff=good.f_diff, f_num_diff=good.f_num_diff)
 
-    found = searched(name, 1, 400, evaluate=failing)[0]
-    assert len(found) > 0
-    assert found.valid.all()
+    solutions = searched(name, 1, 400, evaluate=failing)[0]
+    assert len(solutions) > 0
+    assert solutions.valid.all()
 
 
 @pytest.mark.parametrize("name", ["mocell", "nsga2", "rs", "spea2"])
 def test_the_result_is_non_dominated(name: str) -> None:
-    found = searched(name, 7, 600)[0]
-    assert len(found) > 0
-    assert moocore.is_nondominated(found.objectives, keep_weakly=True).all()
+    solutions = searched(name, 7, 600)[0]
+    assert len(solutions) > 0
+    assert moocore.is_nondominated(solutions.objectives, keep_weakly=True).all()
 
 
 def test_nsga2_finds_the_known_front_of_one_variable() -> None:
@@ -105,10 +105,10 @@ def test_nsga2_finds_the_known_front_of_one_variable() -> None:
     def linear(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluations:
         return evaluated(characteristics, settings, settings[:, 0].copy())
 
-    found = searched("nsga2", 1, 1000, single, linear)[0]
-    assert np.all(found.settings <= 5.0)
-    assert found.settings.min() == pytest.approx(1.0, abs=1e-3)
-    assert len(np.unique(found.settings)) > POPULATION / 2
+    solutions = searched("nsga2", 1, 1000, single, linear)[0]
+    assert np.all(solutions.settings <= 5.0)
+    assert solutions.settings.min() == pytest.approx(1.0, abs=1e-3)
+    assert len(np.unique(solutions.settings)) > POPULATION / 2
 
 
 class _Dtlz2(Evaluations):
@@ -145,8 +145,8 @@ def test_hypervolumes_are_those_of_jmetalpy_on_dtlz2() -> None:
     reference = np.full(3, 2.0)
     ours, theirs = [], []
     for seed in range(10):
-        found = _Dtlz2(**vars(searched("nsga2", seed, evaluations, unit, dtlz2)[0]))
-        ours.append(moocore.hypervolume(found.objectives, ref=reference))
+        solutions = _Dtlz2(**vars(searched("nsga2", seed, evaluations, unit, dtlz2)[0]))
+        ours.append(moocore.hypervolume(solutions.objectives, ref=reference))
         random.seed(seed)
         np.random.seed(seed)
         problem = DTLZ2(number_of_variables=variables)
@@ -200,11 +200,11 @@ def test_an_improvement_begins_the_count_of_generations_without_one_anew() -> No
 
 
 def test_the_result_is_the_fifty_best_scores() -> None:
-    found, asked = searched("safe_fuzzer", 6, 1000)
+    solutions, asked = searched("safe_fuzzer", 6, 1000)
     everything = sphere(SUN, np.concatenate(asked))
     safety = everything.f_safe
     scores = (6 * (safety - safety.min()) / np.ptp(safety) + everything.f_diff + (everything.f_num_diff - 1) / 11) / 8
-    assert np.array_equal(found.settings, everything.settings[np.argsort(scores, kind="stable")[:50]])
+    assert np.array_equal(solutions.settings, everything.settings[np.argsort(scores, kind="stable")[:50]])
 
 
 TWO = CharacteristicSet((Characteristic(name="a", unit="-", original=50.0, lower=0.0, upper=100.0),
@@ -212,12 +212,12 @@ TWO = CharacteristicSet((Characteristic(name="a", unit="-", original=50.0, lower
 
 
 def individuals(*objectives: tuple[float, float, float]) -> list[Individual]:
-    made = []
+    population = []
     for values in objectives:
         one = Individual(list(values))
         one.fitness = fitness_of(3)(values)
-        made.append(one)
-    return made
+        population.append(one)
+    return population
 
 
 @given(st.lists(st.tuples(*[st.integers(-2, 2)] * 3), max_size=40), st.integers(1, 40))
@@ -229,8 +229,8 @@ def test_survivors_are_those_of_deap(objectives: list[tuple[float, float, float]
     for front in fronts:
         tools.emo.assignCrowdingDist(front)
         expected += sorted(front, key=lambda one: one.fitness.crowding_dist, reverse=True)
-    found = [next(i for i, one in enumerate(ours) if one is survivor) for survivor in survivors(ours, number)]
-    assert found == [next(i for i, one in enumerate(deaps) if one is survivor) for survivor in expected[:number]]
+    places = [next(i for i, one in enumerate(ours) if one is survivor) for survivor in survivors(ours, number)]
+    assert places == [next(i for i, one in enumerate(deaps) if one is survivor) for survivor in expected[:number]]
 
 
 def test_a_tournament_is_won_by_rank_then_by_room() -> None:
@@ -245,11 +245,11 @@ def test_a_tournament_is_won_by_rank_then_by_room() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_nsga2_returns_of_its_population_what_nothing_dominates(seed: int) -> None:
     """After the first population alone most of it is dominated."""
-    found, asked = searched("nsga2", seed, POPULATION)
+    solutions, asked = searched("nsga2", seed, POPULATION)
     everything = sphere(SUN, asked[0])
     optimal = everything.take(moocore.is_nondominated(everything.objectives, keep_weakly=True))
     assert len(optimal) < POPULATION
-    assert sorted(map(tuple, found.objectives.tolist())) == sorted(map(tuple, optimal.objectives.tolist()))
+    assert sorted(map(tuple, solutions.objectives.tolist())) == sorted(map(tuple, optimal.objectives.tolist()))
 
 
 def test_random_search_keeps_all_of_equal_worth() -> None:
@@ -285,8 +285,8 @@ def test_the_number_of_changes_is_rounded_half_up(settings: list[list[float]], m
 
 def test_a_score_weighs_safety_six_times_and_the_others_once() -> None:
     """SD 1, 2, 3 by min-max 0, 0.5, 1; numbers 1, 2, 2 of 2 give 0, 1, 1; changes 0.2, 0.4, 1."""
-    told = _scores(window([[60, 50], [70, 60], [100, 0]], [1.0, 2.0, 3.0]))
-    assert told == pytest.approx([0.2 / 8, (3 + 0.4 + 1) / 8, (6 + 1 + 1) / 8])
+    scores = _scores(window([[60, 50], [70, 60], [100, 0]], [1.0, 2.0, 3.0]))
+    assert scores == pytest.approx([0.2 / 8, (3 + 0.4 + 1) / 8, (6 + 1 + 1) / 8])
 
 
 def test_a_generation_improves_if_its_best_beats_the_worst_of_the_fifty_best() -> None:
@@ -328,9 +328,9 @@ def test_options_that_cannot_be_used_are_refused(search: dict[str, object], prob
     ("map_elites", {"behaviour": "speed"})])
 def test_options_change_what_a_search_asks_for(name: str, options: dict[str, object]) -> None:
     algorithm = msgspec.convert(options, ALGORITHMS[name])
-    found, asked = searched(name, 1, 200, algorithm=algorithm)
+    solutions, asked = searched(name, 1, 200, algorithm=algorithm)
     assert not np.array_equal(asked[-1], searched(name, 1, 200)[1][-1])
-    assert len(found) <= options.get("archive", len(found))
+    assert len(solutions) <= options.get("archive", len(solutions))
 
 
 def test_an_atlas_has_the_smallest_collision_of_every_set_of_changes() -> None:
@@ -340,12 +340,12 @@ def test_an_atlas_has_the_smallest_collision_of_every_set_of_changes() -> None:
         outcome = np.where(good.f_num_diff > 3, Outcome.COLLISION.value, good.outcome).astype("U16")
         return dataclasses.replace(good, outcome=outcome)
 
-    found, asked = searched("map_elites", 1, 400, evaluate=colliding)
+    solutions, asked = searched("map_elites", 1, 400, evaluate=colliding)
     everything = colliding(SUN, np.concatenate(asked))
     smallest: dict[bytes, float] = {}
     for changed, size in zip(SUN.changed(everything.settings)[everything.collided], everything.f_diff[everything.collided], strict=True):
         smallest[changed.tobytes()] = min(size, smallest.get(changed.tobytes(), np.inf))
-    assert {changed.tobytes(): size for changed, size in zip(SUN.changed(found.settings), found.f_diff, strict=True)} == smallest
+    assert {changed.tobytes(): size for changed, size in zip(SUN.changed(solutions.settings), solutions.f_diff, strict=True)} == smallest
 
 
 def test_an_atlas_that_cannot_be_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

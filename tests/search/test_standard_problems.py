@@ -156,11 +156,11 @@ def test_hypervolumes_reach_those_of_the_second_implementation(problem: str, nam
 
 
 def individuals(objectives: np.ndarray) -> list[Individual]:
-    made = []
+    population = []
     for values in objectives.tolist():
-        made.append(Individual(values))
-        made[-1].fitness = fitness_of(len(values))(tuple(values))
-    return made
+        population.append(Individual(values))
+        population[-1].fitness = fitness_of(len(values))(tuple(values))
+    return population
 
 
 def random_front(seed: int) -> np.ndarray:

@@ -157,9 +157,9 @@ def test_constraints_that_cannot_be_used_are_refused(constraints: list[dict[str,
 
 def test_an_infeasible_original_ends_the_command_with_two_lines(in_tmp: Path) -> None:
     Path("heavy.toml").write_text('extends = "smoke"\n[[constraints]]\nsum = { mass = 1 }\nat_least = 2500\n')
-    told = run("study", "heavy.toml", expect=2)
-    assert len(told.stderr.splitlines()) == 2
-    assert "mass = 2404 kg" in told.stderr
+    output = run("study", "heavy.toml", expect=2)
+    assert len(output.stderr.splitlines()) == 2
+    assert "mass = 2404 kg" in output.stderr
 
 
 def test_an_equation_leaves_what_satisfies_it() -> None:

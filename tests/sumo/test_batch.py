@@ -76,8 +76,8 @@ def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool],
     verdict, active = _Verdict(1), []
     for i, (speed, over, crash) in enumerate(samples):
         collisions = {} if crash is None else {0: crash}
-        told = verdict.judge(np.array([speed]), np.array([over]), collisions, last=i == len(samples) - 1)
-        active.append(bool(told[0]))
+        verdicts = verdict.judge(np.array([speed]), np.array([over]), collisions, last=i == len(samples) - 1)
+        active.append(bool(verdicts[0]))
     assert not verdict.open.any()
     return str(verdict.outcome()[0]), active, float(verdict.collision_speed[0])
 
@@ -244,7 +244,7 @@ def test_with_another_driver_rain_is_sun_but_for_the_road_and_the_sensors(name: 
 
 
 def test_a_weather_that_changes_nothing_says_so() -> None:
-    told = "weather 'carla_hard_rain' changes nothing"
+    sentence = "weather 'carla_hard_rain' changes nothing"
     for driver, says in (({"model": "full_braking"}, True), ({}, False)):
-        assert any(told in remark for remark in assemble(load_study("rain", ads=driver)).remarks) is says
+        assert any(sentence in remark for remark in assemble(load_study("rain", ads=driver)).remarks) is says
     assert not any("changes nothing" in remark for remark in assemble(load_study("sun")).remarks)

@@ -49,18 +49,18 @@ def same(one: Evaluations, other: Evaluations) -> bool:
 
 def test_a_setting_is_worth_what_it_is_at_its_worst_point_and_each_point_is_as_if_alone() -> None:
     population = drawn(SYSTEM, 3)
-    found = at_every_point(SYSTEM, population)
-    assert [one.point.name for one in found][:3] == [
+    points = at_every_point(SYSTEM, population)
+    assert [one.point.name for one in points][:3] == [
         "CPNA, speed 20, impact_location 25, clear", "CPNA, speed 20, impact_location 25, carla_hard_rain",
         "CPNA, speed 20, impact_location 75, clear"]
-    assert len(found) == 10
-    for one in found[::3]:
+    assert len(points) == 10
+    for one in points[::3]:
         alone = evaluate(SYSTEM.at(one.point), population)
         assert same(alone, one.evaluations), one.point.name
     whole = evaluate(SYSTEM, population)
-    assert whole.f_safe.tolist() == np.min([one.evaluations.f_safe for one in found], axis=0).tolist()
+    assert whole.f_safe.tolist() == np.min([one.evaluations.f_safe for one in points], axis=0).tolist()
     assert same(whole, score(SYSTEM, population, simulate(SYSTEM, population)))
-    collided = [one.evaluations.collided for one in found]
+    collided = [one.evaluations.collided for one in points]
     assert whole.collided.tolist() == np.any(collided, axis=0).tolist()
 
 
@@ -84,15 +84,15 @@ def test_a_point_is_named() -> None:
         named_point(SYSTEM, "CPNCO", "--point")
 
 
-@pytest.mark.parametrize(("tests", "told"), [
+@pytest.mark.parametrize(("tests", "message"), [
     ([TESTS[2], TESTS[2]], "2 points are 'CPLA"),
     ([MatrixTest(name="x", over={"spede": [1]})], "spede"),
     ([MatrixTest(name="x", over={"speed": [-1]})], "speed"),
     ([MatrixTest(name="x", weathers=["sunny"])], "sunny"),
     ([MatrixTest(name="x", model="nothing")], "nothing"),
 ])
-def test_what_is_wrong_in_a_matrix_is_told(tests: list[MatrixTest], told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_what_is_wrong_in_a_matrix_is_told(tests: list[MatrixTest], message: str) -> None:
+    with pytest.raises(InputError, match=message):
         assemble(study(tests))
 
 
@@ -132,13 +132,13 @@ def with_max_rpm(*values: float) -> FloatArray:
     (Crossing(test="CPFA", speed=50.0), with_max_rpm(5800, 6567, 6570, 6575)),
     (CarToCar(test="CCRm", speed=70.0), with_max_rpm(4200, 5800, 7000))])
 def test_unbraked_a_vehicle_holds_the_tests_speed_in_one_gear_and_hits_with_its_front(scenario: Any, settings: FloatArray) -> None:
-    found = run(scenario, settings=settings)
-    speed = np.where(found.trace.active, found.trace.speed * 3.6, scenario.speed)
+    runs = run(scenario, settings=settings)
+    speed = np.where(runs.trace.active, runs.trace.speed * 3.6, scenario.speed)
     assert speed.max() < scenario.speed + 1.0
     assert speed.min() > scenario.speed - 0.5
-    assert (found.trace.gear == found.trace.gear[0]).all(where=found.trace.active)
-    assert set(found.contact.side) == {"front"}
-    assert found.contact.place == pytest.approx(np.full(len(settings), 50.0), abs=2.0)
+    assert (runs.trace.gear == runs.trace.gear[0]).all(where=runs.trace.active)
+    assert set(runs.contact.side) == {"front"}
+    assert runs.contact.place == pytest.approx(np.full(len(settings), 50.0), abs=2.0)
 
 
 @pytest.mark.parametrize("location", [0.0, 25.0, 75.0])
@@ -154,10 +154,10 @@ def test_the_place_of_an_unbraked_contact_is_the_tests_impact_location(location:
 def test_what_cannot_hold_the_speed_is_no_valid_test_and_one_that_brakes_before_is() -> None:
     """2404 kg g sin(atan 0.2) 0.355 m / (1.35 * 4), 304 N m, is more than the engine's 500 N m times 0.5."""
     steep = CarToCar(test="CCRs", speed=50.0, grade=20.0)
-    found = run(steep, system=WEAK)
-    assert found.outcome[0] == Outcome.INVALID_TEST
-    assert found.test_speed_error[0] * 3.6 < -0.5
-    assert np.isnan(found.collision_speed[0])
+    runs = run(steep, system=WEAK)
+    assert runs.outcome[0] == Outcome.INVALID_TEST
+    assert runs.test_speed_error[0] * 3.6 < -0.5
+    assert np.isnan(runs.collision_speed[0])
     assert run(steep, Pedals(brakes=(0.0, 99.0)), system=WEAK).outcome[0] == Outcome.STOPPED
 
 
@@ -167,11 +167,11 @@ def test_a_setting_with_an_invalid_test_is_neither_safe_nor_unsafe_but_a_collisi
     steep = replace(steep, vehicle=WEAK.vehicle)
     original = SUN.characteristics.original[np.newaxis]
     assert [str(one.evaluations.outcome[0]) for one in at_every_point(steep, original)] == ["stopped", "invalid-test"]
-    found = evaluate(steep, original)
-    assert found.outcome[0] == Outcome.INVALID_TEST
-    assert not found.valid[0]
-    assert not found.failed[0]
-    assert np.isnan(found.f_safe[0])
+    evaluations = evaluate(steep, original)
+    assert evaluations.outcome[0] == Outcome.INVALID_TEST
+    assert not evaluations.valid[0]
+    assert not evaluations.failed[0]
+    assert np.isnan(evaluations.f_safe[0])
     assert evaluate(replace(steep, ads=Pedals()), original).outcome[0] == Outcome.COLLISION, "at 10 km/h, where the speed is held"
 
 
@@ -185,7 +185,7 @@ def test_a_system_that_lets_go_of_the_accelerator_or_brakes_has_the_vehicle() ->
     assert faster.trace.speed.max() * 3.6 > 60
 
 
-@pytest.mark.parametrize(("middle", "along", "speed", "told"), [
+@pytest.mark.parametrize(("middle", "along", "speed", "contact"), [
     # own: 4 m by 2 m at the origin, east at 10 m/s; the other: 0.6 m by 0.4 m
     ((2.1, 0.0), (0.0, 1.0), 0.0, ("front", 0.01, 0.0)),  # reach 2 + 0.2; overlaps by 0.1
     ((2.1, -1.2), (0.0, 1.0), 1.0, ("front", 0.01, 0.0)),  # across since 0.1 s, along since 0.01 s
@@ -194,12 +194,12 @@ def test_a_system_that_lets_go_of_the_accelerator_or_brakes_has_the_vehicle() ->
     ((-2.2, 0.0), (1.0, 0.0), 12.0, ("rear", 0.05, None)),  # 2 m/s faster, reach 2 + 0.3
 ])
 def test_the_side_is_the_one_in_which_bodies_began_to_overlap_last(
-        middle: tuple[float, float], along: tuple[float, float], speed: float, told: tuple[str, float, float | None]) -> None:
+        middle: tuple[float, float], along: tuple[float, float], speed: float, contact: tuple[str, float, float | None]) -> None:
     touch = touch_of(Body(np.zeros(2), EAST, 4.0, 2.0, 10.0), Body(np.array(middle), np.array(along), 0.6, 0.4, speed))
-    assert touch.side == told[0]
-    assert touch.ago == pytest.approx(told[1])
-    if told[2] is not None:
-        assert touch.behind_front == pytest.approx(told[2] - 0.2)
+    assert touch.side == contact[0]
+    assert touch.ago == pytest.approx(contact[1])
+    if contact[2] is not None:
+        assert touch.behind_front == pytest.approx(contact[2] - 0.2)
 
 
 def test_who_tests_a_vehicle_faster_than_it_was_fitted_is_told() -> None:

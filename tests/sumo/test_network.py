@@ -67,11 +67,11 @@ def test_a_disk_that_is_full_while_a_network_is_built_leaves_nothing_behind(loss
 
     def full(command: list[str], **options: Any) -> Any:
         done = ran(command, **options)
-        made = Path(command[command.index("-o") + 1])
+        target = Path(command[command.index("-o") + 1])
         if loss == "error":
-            made.unlink()
-            return subprocess.CompletedProcess(command, 1, "", f"Error: Could not build output file '{made}' (No space left)")
-        made.write_bytes(made.read_bytes()[:len(made.read_bytes()) // 2 if loss == "half" else 0])
+            target.unlink()
+            return subprocess.CompletedProcess(command, 1, "", f"Error: Could not build output file '{target}' (No space left)")
+        target.write_bytes(target.read_bytes()[:len(target.read_bytes()) // 2 if loss == "half" else 0])
         return done
 
     monkeypatch.setattr(subprocess, "run", full)
@@ -174,21 +174,21 @@ BAD = {
 
 @pytest.mark.parametrize("what", sorted(BAD))
 def test_it_is_refused_by_name(mine: Path, what: str) -> None:
-    more, told = BAD[what]
+    more, message = BAD[what]
     with pytest.raises(InputError, match=r"traffic\.rou\.xml: ") as caught:
         check_network(with_traffic(mine, more))
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
-@pytest.mark.parametrize(("old", "new", "told"), [
+@pytest.mark.parametrize(("old", "new", "message"), [
     ('<vehicle id="vut"', '<vehicle id="ego"', "has no vehicle 'vut'"),
     ('id="vut" type="vut" depart="0"', 'id="vut" type="vut" depart="3"', "depart = '3'"),
     ('id="vut" type="vut" depart', 'id="vut" type="pedestrian" depart', "type = 'pedestrian'"),
     ('<route edges="approach departure"/>', '<route edges="approach departure"/><stop lane="departure_0" duration="9"/>', "has a stop")])
-def test_the_vehicle_under_test_is_there_from_the_beginning(mine: Path, old: str, new: str, told: str) -> None:
+def test_the_vehicle_under_test_is_there_from_the_beginning(mine: Path, old: str, new: str, message: str) -> None:
     file = mine / "traffic.rou.xml"
     assert old in file.read_text()
     file.write_text(file.read_text().replace(old, new))
     with pytest.raises(InputError) as caught:
         check_network(str(mine))
-    assert told in str(caught.value)
+    assert message in str(caught.value)

@@ -75,17 +75,17 @@ def test_traffic_lights_are_copied_with_their_programmes(mine: Path) -> None:
     assert all(one.attrib["tl"].partition(".")[0] == one.attrib["from"].removeprefix(":").partition(".")[0] for one in controlled)
 
 
-@pytest.mark.parametrize(("line", "told"), [
+@pytest.mark.parametrize(("line", "message"), [
     ('<plain-output-prefix value="/tmp/x"/>', "sets netconvert's option 'plain-output-prefix'"), ('<log value="x"/>', "option 'log'"),
     ('<junctions.join-output value="x"/>', "option 'junctions.join-output'"), ('<save-configuration value="x"/>', "save-configuration"),
     ('<keep-edges.input-file value="x"/>', "keep-edges.input-file"), ('<unheard-of value="1"/>', "option 'unheard-of'"),
     ('<type-files value="../types.xml"/>', "type-files = '../types.xml' is in another folder"), ('<no-turnarounds/>', "without value="),
     ('<type-files value="none.typ.xml"/>', "type-files: none.typ.xml is missing"), ('<precision value="2"/>', "sets 'precision' twice")])
-def test_a_recipe_that_writes_or_reads_elsewhere_is_refused(mine: Path, line: str, told: str) -> None:
+def test_a_recipe_that_writes_or_reads_elsewhere_is_refused(mine: Path, line: str, message: str) -> None:
     rewritten(mine / "network.netccfg", "</configuration>", f"{line}</configuration>")
     with pytest.raises(InputError, match=r"network\.netccfg: ") as caught:
         check_network(str(mine))
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_a_built_network_alone_is_simulated_as_its_sources_are(mine: Path) -> None:
@@ -109,14 +109,14 @@ def load_original(study: str) -> np.ndarray:
     return assemble(load_study(study)).characteristics.original[np.newaxis]
 
 
-@pytest.mark.parametrize(("file", "old", "new", "told"), [
+@pytest.mark.parametrize(("file", "old", "new", "message"), [
     ("network.nod.xml", 'x="80" y="0"', 'x="80" y="0" z="4"', "lane 'departure_0', which climbs"),
     ("network.edg.xml", 'id="approach"', 'id="approach" friction="0.3"', "lane 'approach_0' of friction 0.3")])
-def test_a_road_that_the_vehicle_would_not_feel_is_refused(mine: Path, file: str, old: str, new: str, told: str) -> None:
+def test_a_road_that_the_vehicle_would_not_feel_is_refused(mine: Path, file: str, old: str, new: str, message: str) -> None:
     rewritten(mine / file, old, new)
     with pytest.raises(InputError, match=r"traffic\.rou\.xml: vehicle 'vut' is to drive on ") as caught:
         check_network(str(mine))
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_what_a_network_says_of_the_vehicle_and_is_not_used_is_mentioned(mine: Path) -> None:

@@ -92,10 +92,10 @@ def changed(of: System, **values: float) -> np.ndarray:
 def test_a_module_that_imports_traci_talks_to_the_simulation_and_keeps_its_state_for_one_vehicle(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "helper.py").write_text(HELPER)
-    found = system("step", tmp_path, monkeypatch, USES_HELPER)
-    simulate(found, changed(found))
+    runs = system("step", tmp_path, monkeypatch, USES_HELPER)
+    simulate(runs, changed(runs))
     real = {name: sys.modules.get(name) for name in ("traci", "libsumo")}
-    run = simulate(found, np.repeat(changed(found), 3, axis=0))
+    run = simulate(runs, np.repeat(changed(runs), 3, axis=0))
     assert run.trace.speed.max() == pytest.approx(5, abs=0.7)
     assert {name: sys.modules.get(name) for name in real} == real, "the import is for controllers alone"
 
@@ -118,8 +118,8 @@ def step(traci, vehicle_id):
 def test_what_a_controller_reads_of_others_has_passed_the_sensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The leader that it is told of is the trace's gap, linear between two steps, a reaction time and a recognition delay ago."""
     weather = {"name": "haze", "road_friction": 1.0, "visibility": 0.5, "recognition_delay": 0.1, "light": "day"}
-    found = system("step", tmp_path, monkeypatch, LOOKS, weather=weather)
-    trace = simulate(found, changed(found, reactionTime=0.25, sensorRange=80)).trace
+    runs = system("step", tmp_path, monkeypatch, LOOKS, weather=weather)
+    trace = simulate(runs, changed(runs, reactionTime=0.25, sensorRange=80)).trace
     leader, x, number, listed = np.loadtxt(tmp_path / "looks.csv", delimiter=",")[:len(trace.time)].T
     gap = np.concatenate([np.repeat(trace.gap[0, :], 4), trace.gap[:, 0]])
     late = (gap[1:len(leader) + 1] + gap[:len(leader)]) / 2  # 3.5 steps
@@ -158,8 +158,8 @@ class Reads:
 
 
 def test_no_function_shows_that_there_are_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = system("Reads", tmp_path, monkeypatch, SUBSCRIBES)
-    simulate(found, np.repeat(changed(found, sensorRange=120, reactionTime=0.1), 3, axis=0))
+    runs = system("Reads", tmp_path, monkeypatch, SUBSCRIBES)
+    simulate(runs, np.repeat(changed(runs, sensorRange=120, reactionTime=0.1), 3, axis=0))
 
 
 REFUSED = [
@@ -185,44 +185,44 @@ REFUSED = [
 def test_calls_that_are_not_a_controllers_are_refused_even_if_it_goes_on(line: str, problem: str, tmp_path: Path,
                                                                       monkeypatch: pytest.MonkeyPatch) -> None:
     script = f"def step(traci, v):\n    try:\n        {line}\n    except Exception:\n        pass\n"
-    found = system("step", tmp_path, monkeypatch, script)
+    runs = system("step", tmp_path, monkeypatch, script)
     with pytest.raises(InputError) as caught:
-        simulate(found, changed(found))
+        simulate(runs, changed(runs))
     assert problem in str(caught.value)
     assert "my_controller.py:3" in str(caught.value)
 
 
 def test_a_script_stops_the_original_and_not_a_vehicle_that_has_lost_its_brakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = system("step", tmp_path, monkeypatch)
-    weak = found.characteristics.original.copy()
-    weak[found.characteristics.names.index("decel")] = 4.5
-    weak[found.characteristics.names.index("brakeGain")] = 0.6
-    both = np.stack([found.characteristics.original, weak])
-    run = simulate(found, both)
+    runs = system("step", tmp_path, monkeypatch)
+    weak = runs.characteristics.original.copy()
+    weak[runs.characteristics.names.index("decel")] = 4.5
+    weak[runs.characteristics.names.index("brakeGain")] = 0.6
+    both = np.stack([runs.characteristics.original, weak])
+    run = simulate(runs, both)
     assert run.outcome.tolist() == [Outcome.STOPPED, Outcome.COLLISION]
-    alone = simulate(found, both[1:])
+    alone = simulate(runs, both[1:])
     length = len(alone.trace.time)
     assert alone.trace.speed[:, 0].tobytes() == np.ascontiguousarray(run.trace.speed[:length, 1]).tobytes()
     assert run.trace.speed.max() == pytest.approx(12, abs=0.7)
 
 
 def test_a_wish_is_what_the_plant_makes_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = system("Harsh", tmp_path, monkeypatch)
-    run = simulate(found, found.characteristics.original[np.newaxis])
+    runs = system("Harsh", tmp_path, monkeypatch)
+    run = simulate(runs, runs.characteristics.original[np.newaxis])
     hardest = -np.diff(run.trace.speed[:, 0]).min() / run.trace.step
     assert 7 < hardest < 9.0
     assert run.outcome[0] == Outcome.STOPPED
 
 
-@pytest.mark.parametrize(("table", "told"), [
+@pytest.mark.parametrize(("table", "message"), [
     ({"model": "my_controller:Hrash", "kind": "traci"}, r"has no 'Hrash'\nexpected: package.module:Name$"),
     ({"model": "my_controller:Harsh", "kind": "traci", "parameters": {"margin": 2}}, r"^mine: ads.model = .* does not take ads.parameters"),
     ({"model": "my_controller:step", "kind": "traci", "parameters": {"margin": 2}}, r"^mine: ads.model = .* does not take ads.parameters"),
     ({"model": "my_controller:step"}, r'not a class\nexpected: .*; or with ads.kind = "traci" a function step\('),
 ])
 def test_a_table_that_cannot_be_used_is_told_before_anything_is_simulated(
-        table: dict[str, object], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        table: dict[str, object], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "my_controller.py").write_text(SCRIPT)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         assemble(msgspec.structs.replace(load_study("native"), ads=msgspec.convert(table, ModelTable)), "mine")

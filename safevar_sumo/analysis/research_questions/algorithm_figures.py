@@ -69,12 +69,12 @@ def _diagram(axis: Axes, algorithms: list[str], mean: FloatArray, difference: fl
 
 def cliques(mean: FloatArray, difference: float) -> list[tuple[int, int]]:
     """First and last of the largest groups of sorted mean ranks that differ by less than the critical difference."""
-    found: list[tuple[int, int]] = []
+    groups: list[tuple[int, int]] = []
     for first in range(len(mean)):
         last = int(np.flatnonzero(mean - mean[first] < difference)[-1])
-        if last > first and (not found or last > found[-1][1]):
-            found.append((first, last))
-    return found
+        if last > first and (not groups or last > groups[-1][1]):
+            groups.append((first, last))
+    return groups
 
 
 def attainment_surfaces(case: Case) -> Figure:

@@ -115,15 +115,15 @@ def _samples(case: Case, fewest: int) -> Mapping[str, tuple[bool, dict[str, pd.S
     if len(case.algorithms) < fewest:
         raise Unanswerable(case.name, f"has finished runs of {len(case.algorithms)} algorithms: {', '.join(case.algorithms) or 'none'}",
                            f"results of {fewest} algorithms or more")
-    found: dict[str, tuple[bool, dict[str, pd.Series[float]]]] = {}
+    samples: dict[str, tuple[bool, dict[str, pd.Series[float]]]] = {}
     if len(case.solutions):
         quality = indicators(case).set_index(["algorithm", "run"])
         for name, more_is_better in MORE_IS_BETTER.items():
-            found[name] = more_is_better, {one: quality.loc[quality.index.get_level_values(0) == one, name].droplevel(0)
+            samples[name] = more_is_better, {one: quality.loc[quality.index.get_level_values(0) == one, name].droplevel(0)
                                            for one in case.algorithms}
     for metric in case.scoring.metrics:
-        found[metric.name] = metric.more_is_unsafe, {one: series_of_means(case, one, metric) for one in case.algorithms}
-    return found
+        samples[metric.name] = metric.more_is_unsafe, {one: series_of_means(case, one, metric) for one in case.algorithms}
+    return samples
 
 
 def _friedman(values: FloatArray) -> tuple[float | None, float | None]:

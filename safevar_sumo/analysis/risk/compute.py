@@ -265,59 +265,59 @@ def _method(options: RiskOptions) -> str:
 
 def _sampled(bench: Bench, model: VariationModel, unsafe: Unsafe, options: RiskOptions, response: Response) -> Estimate | _Counts:
     """Draw vehicles plainly; where few of the first are unsafe, go on by a method for rare failures."""
-    found, rng = _Counts(), np.random.default_rng(bench.study.search.seed)
+    counts, rng = _Counts(), np.random.default_rng(bench.study.search.seed)
     chooses = _may_be_rare(options) and not bench.region
     if options.is_for_rare and bench.region:
-        found.remark = "the study has constraints, within which only plain Monte Carlo draws"
+        counts.remark = "the study has constraints, within which only plain Monte Carlo draws"
     if options.is_for_rare:
         openturns()  # whoever asks for it learns at once that it is missing
     most = max(options.samples, PILOT) if options.is_for_rare else options.samples
-    while found.count + found.errors < most:
+    while counts.count + counts.errors < most:
         chunk = PILOT if chooses else CHUNK if options.width is not None else LARGEST_CHUNK
-        drawn = found.count + found.errors
+        drawn = counts.count + counts.errors
         number = min(chunk, most - drawn)
         probabilities = rng.random((number, len(bench.characteristics))) if chooses else None
         settings = _feasible_vehicles(bench, model, number, rng) if probabilities is None else model.settings(probabilities)
         evaluations = bench.evaluate(settings, "vehicles as they vary", drawn, most)
         valid = int(np.count_nonzero(evaluations.valid))
-        found.count, found.errors = found.count + valid, found.errors + number - valid
-        found.failures += int(np.count_nonzero(unsafe.of(evaluations)))
+        counts.count, counts.errors = counts.count + valid, counts.errors + number - valid
+        counts.failures += int(np.count_nonzero(unsafe.of(evaluations)))
         if probabilities is not None:
             chooses = False
             values = response.take(scipy.stats.norm.ppf(probabilities), evaluations)
-            shows_by_itself = not options.is_for_rare and found.failures * (most / number) >= ENOUGH
-            if valid and found.failures < RARE_BELOW * valid and not shows_by_itself:
-                estimate = _rare(response, values, options, found, bench.study.search.seed)
+            shows_by_itself = not options.is_for_rare and counts.failures * (most / number) >= ENOUGH
+            if valid and counts.failures < RARE_BELOW * valid and not shows_by_itself:
+                estimate = _rare(response, values, options, counts, bench.study.search.seed)
                 if estimate is not None:
                     return estimate
             elif options.is_for_rare:
-                found.remark = f"more than {RARE_BELOW:g} of {valid} vehicles are unsafe: plain Monte Carlo"
-        low, high = clopper_pearson(found.failures, found.count, options.confidence) if found.count else (0.0, 1.0)
+                counts.remark = f"more than {RARE_BELOW:g} of {valid} vehicles are unsafe: plain Monte Carlo"
+        low, high = clopper_pearson(counts.failures, counts.count, options.confidence) if counts.count else (0.0, 1.0)
         if options.width is not None and high - low <= options.width:
             break
-    if not found.count:
-        raise SimulationError(f"study {bench.study.name!r}: not one of {found.errors} vehicles could be simulated")
-    return found
+    if not counts.count:
+        raise SimulationError(f"study {bench.study.name!r}: not one of {counts.errors} vehicles could be simulated")
+    return counts
 
 
 def _may_be_rare(options: RiskOptions) -> bool:
     return options.is_for_rare or (options.method == "auto" and options.width is None and options.samples >= 2 * PILOT)
 
 
-def _rare(response: Response, values: FloatArray, options: RiskOptions, found: _Counts, seed: int) -> Estimate | None:
+def _rare(response: Response, values: FloatArray, options: RiskOptions, counts: _Counts, seed: int) -> Estimate | None:
     """The estimate by a method for rare failures; None where plain Monte Carlo goes on, with the reason as a remark."""
     if is_plateau(values):
-        found.remark = ("the response is a plateau: most vehicles nearest to failing have the same safety degree, which leads no method "
+        counts.remark = ("the response is a plateau: most vehicles nearest to failing have the same safety degree, which leads no method "
                         "for rare failures to them; plain Monte Carlo")
         return None
     if not options.is_for_rare and find_spec("openturns") is None:
-        found.remark = ("fewer than 0.01 of the first vehicles are unsafe; pip install 'safevar_sumo[rare]' for a method that needs fewer "
+        counts.remark = ("fewer than 0.01 of the first vehicles are unsafe; pip install 'safevar_sumo[rare]' for a method that needs fewer "
                         "vehicles for rare failures")
         return None
     try:
         return estimate_rare(response, _method(options), options.confidence, seed)
     except PlateauError:
-        found.remark = "the response is a plateau on the way to failures: no method for rare failures gets across; plain Monte Carlo"
+        counts.remark = "the response is a plateau on the way to failures: no method for rare failures gets across; plain Monte Carlo"
         return None
 
 

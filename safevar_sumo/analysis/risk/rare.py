@@ -149,26 +149,26 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
         If the response does not tell what is nearer to failing.
     """
     run = _subset if method == "subset_simulation" else _cross_entropy
-    found, own, thresholds = [], [], list[float]()
+    probabilities, variations, thresholds = [], [], list[float]()
     repeats, number = REPEATS, 0
     response.expected = response.simulations + 4 * REPEATS * LEVEL
     with _own_random_numbers():
         while number < repeats:
             response.stage = f"rare failures, repeat {number + 1} of {repeats}"
             probability, variation, thresholds = run(response, (seed + 7919 * number) % 2**31)
-            found.append(probability)
-            own.append(variation)
+            probabilities.append(probability)
+            variations.append(variation)
             number += 1
             if number == 1 and method == "subset_simulation" and probability < RARER:
                 repeats = REPEATS_OF_RARER
                 response.expected = response.simulations * repeats
-    mean = float(np.mean(found))
+    mean = float(np.mean(probabilities))
     if mean <= 0:
         return Estimate(probability=0.0, variation=math.nan, interval=(0.0, SMALLEST), failures=response.failed, errors=response.errors,
                         simulations=response.simulations, design_point=None,
                         remark="no failure was found: either there is none, or no response leads to where they are")
-    spread = float(np.std(found, ddof=1)) / mean / math.sqrt(repeats)
-    variation = max(spread, INFLATION * math.sqrt(float(np.mean(np.square(own))) / repeats))
+    spread = float(np.std(probabilities, ddof=1)) / mean / math.sqrt(repeats)
+    variation = max(spread, INFLATION * math.sqrt(float(np.mean(np.square(variations))) / repeats))
     quantile = float(scipy.stats.t.ppf((1 + confidence) / 2, repeats + PRIOR))
     reach = math.exp(quantile * math.sqrt(math.log1p(variation**2)))
     rng = np.random.default_rng(seed)
