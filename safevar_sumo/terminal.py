@@ -68,7 +68,7 @@ def print_meanings(console: Console, members: Iterable[Characteristic]) -> None:
 
 
 def print_constraints(console: Console, study: Study) -> None:
-    """What the settings that were looked at satisfy, if the study says so."""
+    """Print the constraints that all settings satisfy, if the study has any."""
     rows = study.vehicle.characteristics
     if study.constraints:
         listed = "; ".join(f"{one.quantity} {one.legal(rows)}" for one in study.constraints)
@@ -92,17 +92,17 @@ StageProgress = Callable[[str, int, int], None]
 def stages(console: Console) -> Iterator[StageProgress]:
     """A bar on a terminal, a line every half minute elsewhere; yields the function that reports progress."""
     columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=20), MofNCompleteColumn(), TimeRemainingColumn())
-    spoke = time.monotonic()
+    last_line = time.monotonic()
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("starting", total=None)
 
         def done(stage: str, number: int, total: int) -> None:
-            nonlocal spoke
+            nonlocal last_line
             if number == 0:
                 bar.reset(task, description=stage, total=total)
             bar.update(task, description=stage, completed=number)
-            if not console.is_terminal and time.monotonic() - spoke >= SECONDS_BETWEEN_LINES:
-                spoke = time.monotonic()
+            if not console.is_terminal and time.monotonic() - last_line >= SECONDS_BETWEEN_LINES:
+                last_line = time.monotonic()
                 print_text(console, f"{stage}: {number} of {total}")
 
         yield done

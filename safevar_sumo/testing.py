@@ -34,6 +34,10 @@ class Checks:
     kind: ClassVar[str] = ""
     """Kind that the subject must be of; any by default."""
 
+    def __init_subclass__(cls, kind: str = "", **options: Any) -> None:
+        super().__init_subclass__(**options)
+        cls.kind = kind or cls.kind
+
     @classmethod
     def report(cls) -> Report:
         """What `check` finds, found once."""
@@ -52,49 +56,33 @@ class Checks:
         assert not findings, "\n".join(f"{one}\n  expected: {one.expected}\n  advice: {one.advice}" for one in findings)
 
 
-class AdsChecks(Checks):
+class AdsChecks(Checks, kind="ads"):
     """Every check of a driving system."""
 
-    kind = "ads"
 
-
-class VehicleChecks(Checks):
+class VehicleChecks(Checks, kind="vehicle"):
     """Every check of a vehicle model."""
 
-    kind = "vehicle"
 
-
-class ScenarioChecks(Checks):
+class ScenarioChecks(Checks, kind="scenario"):
     """Every check of a scenario."""
 
-    kind = "scenario"
 
-
-class MetricChecks(Checks):
+class MetricChecks(Checks, kind="metric"):
     """Every check of a metric."""
 
-    kind = "metric"
 
-
-class ObjectiveChecks(Checks):
+class ObjectiveChecks(Checks, kind="objective"):
     """Every check of a measure of change."""
 
-    kind = "objective"
 
-
-class AlgorithmChecks(Checks):
+class AlgorithmChecks(Checks, kind="algorithm"):
     """Every check of a search algorithm."""
 
-    kind = "algorithm"
 
-
-class TraciControllerChecks(Checks):
+class TraciControllerChecks(Checks, kind="traci"):
     """Every check of a TraCI controller."""
 
-    kind = "traci"
 
-
-class StudyChecks(Checks):
+class StudyChecks(Checks, kind="study"):
     """Every check of everything that a study names; `subject` is its name or path."""
-
-    kind = "study"

@@ -46,9 +46,10 @@ runs = 1
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_cache_and_pools_of_this_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Networks are built anew for every session of tests; commands start no worker processes, which take seconds to load."""
+    """Networks are built anew for every session of tests, once for all processes that share it; commands start no worker processes."""
+    session = tmp_path_factory.getbasetemp()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("XDG_CACHE_HOME", str((session.parent if "PYTEST_XDIST_WORKER" in os.environ else session) / "cache"))
         patch.setattr(local, "LocalPool", Here)
         yield
 

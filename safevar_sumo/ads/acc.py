@@ -49,7 +49,7 @@ class Acc(Following, frozen=True, kw_only=True):
 
 
 def _standing_distance(speed: FloatArray) -> FloatArray:
-    """Distance kept beside the headway [m] (Xiao et al. 2017): 2 m below 10.8 m/s, 75 / v - 5 up to 15 m/s, none above."""
+    """Distance kept in addition to the headway [m] (Xiao et al. 2017): 2 m below 10.8 m/s, 75 / v - 5 up to 15 m/s, none above."""
     return np.minimum(np.maximum(75 / np.maximum(speed, 1.0) - 5, 0.0), 2.0)
 
 

@@ -63,20 +63,20 @@ class FuzzySafety(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     def proactive(self, gap: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:
         """PFS in [0, 1] at a gap [m] and speeds [m/s], shape (N,): 0 above the safe distance, 1 below the unsafe one."""
-        theirs = u * u / (2 * self.leader_deceleration)
-        safe = v * self.reaction_time + v * v / (2 * self.comfortable) - theirs + self.margin
-        unsafe = v * self.reaction_time + v * v / (2 * self.hardest) - theirs
+        leader_stop = u * u / (2 * self.leader_deceleration)
+        safe = v * self.reaction_time + v * v / (2 * self.comfortable) - leader_stop + self.margin
+        unsafe = v * self.reaction_time + v * v / (2 * self.hardest) - leader_stop
         return _share(gap - self.margin, unsafe, safe)
 
     def critical(self, gap: FloatArray, v: FloatArray, u: FloatArray, a: FloatArray) -> FloatArray:
         """CFS in [0, 1], with the own acceleration a [m/s^2] too."""
-        held = np.maximum(a, -self.comfortable)
-        then = v + self.reaction_time * held
-        closing = (v + held * self.reaction_time / 2 - u) * self.reaction_time
-        left = (then - u) * (then - u)
-        fuzzy = _share(gap, closing + left / (2 * self.hardest), closing + left / (2 * self.comfortable))
-        slowing = np.where(gap < (v - u) * (v - u) / (2 * np.maximum(np.abs(held), LEAST)), 1.0, 0.0)
-        return np.where(v <= u, 0.0, np.where(then < u, slowing, fuzzy))
+        bounded = np.maximum(a, -self.comfortable)
+        later = v + self.reaction_time * bounded
+        closing = (v + bounded * self.reaction_time / 2 - u) * self.reaction_time
+        squared = (later - u) * (later - u)
+        fuzzy = _share(gap, closing + squared / (2 * self.hardest), closing + squared / (2 * self.comfortable))
+        slowing = np.where(gap < (v - u) * (v - u) / (2 * np.maximum(np.abs(bounded), LEAST)), 1.0, 0.0)
+        return np.where(v <= u, 0.0, np.where(later < u, slowing, fuzzy))
 
 
 def _share(value: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:

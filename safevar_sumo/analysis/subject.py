@@ -108,7 +108,7 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False) ->
         If it is neither, or something that the results were computed with has changed since.
     """
     if isinstance(source, str | Path) and str(source) not in study_names():
-        if os.path.isdir(source):  # whatever the text is, as no method of a path
+        if os.path.isdir(source):  # takes any text, which methods of a path do not
             source = load(source)
         elif not os.path.exists(source):
             legal = f"a directory that the command study has written, {one_of(study_names())}, or the path of a study file (TOML)"

@@ -184,10 +184,15 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
         If SUMO fails.
     """
     chosen, system = assembled(study)
-    asked = system.characteristics.setting(changes or {}, "changes", beyond=beyond)
+    return beside_the_original(chosen, system, changed(system, changes, filtered, beyond), filtered=filtered, gui=gui)
+
+
+def changed(system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool) -> FloatArray:
+    """The setting with these changes, shape (n,), not filtered; raises InputError for one that is illegal or, filtered, infeasible."""
+    setting = system.characteristics.setting(changes or {}, "changes", beyond=beyond)
     if not beyond:
-        system.check_feasible(asked[np.newaxis], "changes", filtered=filtered)
-    return beside_the_original(chosen, system, asked, filtered=filtered, gui=gui)
+        system.check_feasible(setting[np.newaxis], "changes", filtered=filtered)
+    return setting
 
 
 def beside_the_original(chosen: Study, system: System, asked: FloatArray, *, filtered: bool = True, gui: bool = False) -> Simulation:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.analysis.words import ENDS
-from safevar_sumo.api.simulation import assembled
+from safevar_sumo.api.simulation import assembled, changed
 from safevar_sumo.records import STANDSTILL, Evaluations, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.replay.film import Film, film
 from safevar_sumo.results import UNKNOWN
@@ -26,10 +26,10 @@ APART = 0.1
 
 
 class Moments(NamedTuple):
-    """Samples of a drive; None where there is no such moment.
+    """Numbers of a run's samples; None where there is no such moment.
 
-    `brake` is where the brake is first commanded while it moves, `nearest` where the obstacle is nearest (the impact on
-    a collision), `end` the drive's last sample.
+    `brake`: the first brake command while the vehicle moves; `nearest`: the obstacle is nearest (the impact, on a collision); `end`: the
+    run's last sample.
     """
 
     brake: int | None
@@ -38,7 +38,7 @@ class Moments(NamedTuple):
 
 
 def moments(drives: SimulationRuns, row: int) -> Moments:
-    """The moments of one of N drives."""
+    """The moments of one of N runs."""
     trace = drives.trace
     active = trace.active[:, row]
     end = int(np.flatnonzero(active)[-1])
@@ -52,7 +52,7 @@ def moments(drives: SimulationRuns, row: int) -> Moments:
 
 
 def divergence(drives: SimulationRuns, one: int = 0, other: int = 1) -> int | None:
-    """The first sample at which the speeds of two of N drives have parted, None if they never do."""
+    """The first sample at which the speeds of two of N runs have parted, None if they never do."""
     trace = drives.trace
     both = trace.active[:, one] & trace.active[:, other]
     apart = np.flatnonzero(both & (np.abs(trace.speed[:, one] - trace.speed[:, other]) > APART))
@@ -93,7 +93,7 @@ class Comparison:
         return changes_in_words(self.characteristics, self.evaluations.settings[CHANGED])
 
     def verdict(self, row: int) -> str:
-        """How a drive ended, in words: hits at 3.9 m/s, or stops with 2.22 m to spare."""
+        """How a run ended, in words: hits at 3.9 m/s, or stops with 2.22 m to spare."""
         drives = self.film.drives
         if not math.isnan(drives.collision_speed[row]):
             return f"hits at {drives.collision_speed[row]:.1f} m/s"
@@ -112,7 +112,7 @@ def changes_in_words(characteristics: CharacteristicSet, setting: FloatArray) ->
 
 
 def number(value: float) -> str:
-    """Four digits that matter, and all of a larger number's."""
+    """A number with four significant digits; a larger one with all digits before the point."""
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e15 else f"{value:.4g}"
 
 
@@ -148,9 +148,7 @@ def compare(study: StudyLike, changes: Mapping[str, float] | None = None, *, fil
         If SUMO fails.
     """
     chosen, system = assembled(study)
-    setting = system.characteristics.setting(changes or {}, "changes", beyond=beyond)
-    if not beyond:
-        system.check_feasible(setting[np.newaxis], "changes", filtered=filtered)
+    setting = changed(system, changes, filtered, beyond)
     return compare_setting(chosen, system, system.characteristics.filter(setting) if filtered else setting)
 
 
@@ -160,7 +158,7 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     Raises
     ------
     SimulationError, InputError
-        As `simulation.simulate`.
+        As `simulate`.
     """
     original = system.characteristics.original
     settings = np.stack([original]) if np.array_equal(original, setting) else np.stack([original, setting])

@@ -21,7 +21,7 @@ COLOURS = {ORIGINAL: "#0072b2", CHANGED: "#d55e00"}
 DASHES: Mapping[int, Literal["-", "--"]] = {ORIGINAL: "-", CHANGED: "--"}
 BRAKING, NEAREST, IMPACT = "v", "o", "X"
 SHOWN_TTC = 6.0
-"""Longer times to collision are not of interest [s]."""
+"""Longest time to collision that is drawn [s]."""
 FONT = 9
 LINE = 118
 """Letters in a line of the heading."""
@@ -52,7 +52,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
     axes[2].set_ylim(-1.08, 1.08)
     axes[2].set_yticks([-1, -0.5, 0, 0.5, 1], ["1", "0.5", "0", "0.5", "1"])
     axes[3].set_ylim(0, None)
-    axes[3].set_xlim(right=_over(comparison) * 1.25)
+    axes[3].set_xlim(right=_end_time(comparison) * 1.25)
     axes[3].axhline(comparison.ttc_threshold, color="0.4", linewidth=0.9, linestyle=":")
     for axis in axes[2:]:
         axis.set_xlabel("time [s]")
@@ -63,15 +63,15 @@ def draw_comparison(comparison: Comparison) -> Figure:
     return figure
 
 
-def _over(comparison: Comparison) -> float:
+def _end_time(comparison: Comparison) -> float:
     """Time at which the last vehicle is nearest or comes to rest [s]."""
     drives = comparison.film.drives
-    ends = [when for row in comparison.rows for when in (moments(drives, row).nearest, _comes_to_rest(drives, row)) if when is not None]
+    ends = [at for row in comparison.rows for at in (moments(drives, row).nearest, _comes_to_rest(drives, row)) if at is not None]
     return float(drives.trace.time[min(max(ends) + 1, len(drives.trace.time) - 1)])
 
 
 def _comes_to_rest(drives: SimulationRuns, row: int) -> int:
-    """The last sample of a drive at which its vehicle moves, its first one if it never does."""
+    """The last sample of a run in which the vehicle moves; 0 if it never does."""
     return int(np.flatnonzero(drives.trace.active[:, row] & (drives.trace.speed[:, row] > STANDSTILL)).max(initial=0))
 
 
@@ -98,7 +98,7 @@ def _line(axis: Axes, comparison: Comparison, row: int, values: FloatArray) -> N
 
 
 def _mark(axis: Axes, row: int, place: tuple[float, float], mark: str, text: str = "", *, is_speed: bool = False) -> None:
-    """A mark on a line, the original's larger, so that it is seen below the other's, its text below the other's."""
+    """A mark on a line; the original's is larger, so that it shows below the changed vehicle's, and has its text above."""
     axis.plot(*place, marker=mark, color=COLOURS[row], markersize=12 - 4 * row + 2 * (mark == IMPACT), linestyle="", zorder=6 + row,
               markeredgecolor="white")
     offset, side = ((3, 7), "left") if is_speed else ((0, 9 if row == ORIGINAL else -17), "center")
@@ -106,23 +106,23 @@ def _mark(axis: Axes, row: int, place: tuple[float, float], mark: str, text: str
 
 
 def _speed(axis: Axes, comparison: Comparison, row: int) -> None:
-    trace, when = comparison.film.drives.trace, moments(comparison.film.drives, row)
+    trace, at = comparison.film.drives.trace, moments(comparison.film.drives, row)
     _line(axis, comparison, row, trace.speed[:, row])
-    if when.brake is not None:
-        _mark(axis, row, (trace.time[when.brake], trace.speed[when.brake, row]), BRAKING)
+    if at.brake is not None:
+        _mark(axis, row, (trace.time[at.brake], trace.speed[at.brake, row]), BRAKING)
     hit = float(comparison.film.drives.collision_speed[row])
     if not np.isnan(hit):
-        _mark(axis, row, (trace.time[when.end], hit), IMPACT, f"{hit:.1f} m/s", is_speed=True)
+        _mark(axis, row, (trace.time[at.end], hit), IMPACT, f"{hit:.1f} m/s", is_speed=True)
 
 
 def _gap(axis: Axes, comparison: Comparison, row: int) -> None:
     drives = comparison.film.drives
-    gap, when = np.where(np.isfinite(drives.trace.gap[:, row]), drives.trace.gap[:, row], np.nan), moments(drives, row)
+    gap, at = np.where(np.isfinite(drives.trace.gap[:, row]), drives.trace.gap[:, row], np.nan), moments(drives, row)
     _line(axis, comparison, row, gap)
-    if when.nearest is not None and not np.isnan(gap[when.nearest]):
+    if at.nearest is not None and not np.isnan(gap[at.nearest]):
         hit = not np.isnan(drives.collision_speed[row])
-        text = "impact" if hit else f"{gap[when.nearest]:.2f} m"
-        _mark(axis, row, (drives.trace.time[when.nearest], gap[when.nearest]), IMPACT if hit else NEAREST, text)
+        text = "impact" if hit else f"{gap[at.nearest]:.2f} m"
+        _mark(axis, row, (drives.trace.time[at.nearest], gap[at.nearest]), IMPACT if hit else NEAREST, text)
 
 
 def _pedals(axis: Axes, comparison: Comparison, row: int) -> None:

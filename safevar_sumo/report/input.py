@@ -23,7 +23,6 @@ from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import changes_since
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.plugins import digest_of
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
 from safevar_sumo.replay.page import player_data
@@ -267,4 +266,5 @@ def _identity(material: ReportInput, name: str) -> str:
 def _package() -> str:
     """Identity of the package's code, between versions too: an answer depends on more code than results do."""
     files = sorted(PACKAGE.rglob("*.py"))
-    return repr([version("safevar_sumo"), RESULTS, [(file.relative_to(PACKAGE).as_posix(), digest_of(file)) for file in files]])
+    return repr([version("safevar_sumo"), RESULTS, [(file.relative_to(PACKAGE).as_posix(), sha256(file.read_bytes()).hexdigest())
+                                                    for file in files]])

@@ -47,7 +47,7 @@ def rules(material: ReportInput, jobs: int | None, progress: Progress) -> Sectio
     """Rules in words, with density and coverage on vehicles that were not used to find them."""
     def compute() -> Section:
         regions = find_rules(material.case.study, material.options["rules"], jobs=jobs, progress=progress)
-        sure = [rule for rule in regions.rules if rule.tells_more_than(regions.unsafe_share)]
+        sure = [rule for rule in regions.rules if rule.is_denser_than(regions.unsafe_share)]
         words = [raised(rule_in_words(rule, material.case.characteristics, regions.unsafe)) for rule in sure]
         dropped = number_of(len(regions.rules) - len(sure), "rule")
         remark = regions.remark if len(sure) == len(regions.rules) else (

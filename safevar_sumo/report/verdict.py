@@ -178,7 +178,7 @@ def _headline(result: Mapping[str, Any], material: ReportInput, explained: Failu
 
 
 def _enough(finding: Mapping[str, Any], what: str) -> str:
-    """Such as `10 changes lead to a collision (3 of them suffice)`; how few suffice is known of explained failures alone."""
+    """Such as `10 changes lead to a collision (3 of them suffice)`; only an explained failure has the number that suffices."""
     number, needed = len(finding["changes"]), finding["needed"]
     if number == needed:
         return f"{number_of(number, 'change')} suffice{'s' if number == 1 else ''} for {what}"
@@ -233,7 +233,7 @@ def _together(tolerance: Mapping[str, Any] | None) -> dict[str, str]:
 
 
 def agreement_with_published(material: ReportInput) -> dict[str, Any]:
-    """How well the study agrees with published data: a sentence, and the rows of a table; none where nothing is known."""
+    """How well the study agrees with published data: a sentence, and the rows of a table; no rows without such data."""
     totals = quoted(material.case.study)
     if not totals:
         return {"sentence": "This study was not compared with published data: how far another simulator or a real vehicle does the same "
@@ -286,13 +286,13 @@ def trust(material: ReportInput, explained: Failures | None) -> dict[str, Any]:
             remarks.append(f"{fragile} of {len(shares)} failures analysed are borderline: "
                         f"fewer than {BORDERLINE:.0%} of their neighbours are unsafe too.")
     if not rows:
-        remarks.append("No published values of the original vehicle are known to hold the study against.")
+        remarks.append("There are no published values of the original vehicle to compare the study with.")
     return {"published": rows, "remarks": remarks, "general": NOT_MODELLED, "agreement": agreement_with_published(material)["rows"],
             "spread": own_uncertainty(material)}
 
 
 def own_uncertainty(material: ReportInput) -> list[dict[str, Any]]:
-    """What other parameter sets make of the original vehicle and of the solutions that are shown first; nothing without such sets."""
+    """Results of the original vehicle and of the first solutions with the study's other parameter sets; empty without such sets."""
     case = material.case
     if not case.study.spread or material.system is None:
         return []

@@ -63,7 +63,7 @@ def fixed(study: Study) -> dict[str, Any]:
         for key in WORDS:
             del characteristic[key]
     if study.rating == RatingTable():
-        del everything["rating"]  # as results have it that were computed before there were ratings
+        del everything["rating"]  # results from before ratings existed have no such table
     if study.matrix is not None and not study.matrix.protocol:
         del everything["matrix"]["protocol"]
     search = {key: value for key, value in everything["search"].items() if key not in FREE_OF_SEARCH}
@@ -89,7 +89,7 @@ def difference(stored: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, 
 
 
 def differences_now(stored: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """All differences between a simulation now and the one that results were computed with.
+    """All differences between what is simulated now and what results were computed with.
 
     Other versions of search libraries, another machine, and versions of this package with the same `RESULTS` change no simulation.
     """
@@ -102,8 +102,8 @@ def differences_now(stored: Mapping[str, Any], new: Mapping[str, Any]) -> list[s
     return [*texts, *_differences("versions", there, here)]
 
 
-def counted(manifest: Mapping[str, Any]) -> Any:
-    """What solutions depend on beside the journals: algorithms, runs, evaluations of each run."""
+def extent_of(manifest: Mapping[str, Any]) -> Any:
+    """Algorithms, runs and evaluations of each run: the part of a study that decides which journals make the solutions."""
     search = manifest["study"]["search"]
     return [search["algorithms"], search["runs"], search["evaluations"]]
 
@@ -224,7 +224,7 @@ def begun_and_now(stored: Mapping[str, Any], now: Mapping[str, str], later: Mapp
                   ) -> tuple[dict[str, Any], Files]:
     """A stored manifest and the files that its study reads now, ready to be compared.
 
-    Of the files that were read later, those that have changed or are gone are in both, the others in neither.
+    Files that were read later are left out of both, unless they have changed or are gone: those are in both.
     """
     begun, here = dict(stored.get("sources", {})), dict(now)
     for name, digest in later.items():

@@ -21,9 +21,9 @@ from safevar_sumo.results.manifest import (
     MANIFEST,
     RUNS,
     begun_and_now,
-    counted,
     difference,
     digest_of_table,
+    extent_of,
     manifest_of,
     note_reading,
     owner,
@@ -108,7 +108,7 @@ class ResultsDirectory:
         """Write the manifest with the original vehicle's evaluation; remove solutions of other runs."""
         manifest = {**self.manifest, "original": record(original, 0)}
         earlier = read_manifest(self.path) if (self.path / MANIFEST).exists() else manifest
-        outdated = counted(earlier) != counted(manifest)
+        outdated = extent_of(earlier) != extent_of(manifest)
         if not outdated and DIGESTS in earlier:
             manifest[DIGESTS] = earlier[DIGESTS]
         write_manifest(self.path, manifest)

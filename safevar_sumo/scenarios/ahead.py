@@ -14,9 +14,9 @@ from safevar_sumo.records import BoolArray, Encounter, FloatArray, Trace
 from safevar_sumo.scenarios.base import VUT, Actors, Coordinates, Grade, Roads, Scene, World
 from safevar_sumo.scenarios.euro_ncap import (
     ACROSS_ON,
+    AHEAD,
     APPROACH,
     BODIES,
-    FORTH,
     INSIDE,
     KMH,
     TARGET,
@@ -65,7 +65,7 @@ class Ahead(NamedTuple):
     gap: float
     offset: float
     speed: Callable[[float], float]
-    direction: Direction = FORTH
+    direction: Direction = AHEAD
 
     def lanes(self, roads: Roads) -> Actors:
         """The lane across in the direction of a target that stands askew: its rear on the junction, its front on the lane beyond."""
@@ -124,7 +124,7 @@ class Ahead(NamedTuple):
 
     @property
     def _askew(self) -> bool:
-        return self.direction != FORTH
+        return self.direction != AHEAD
 
     @property
     def _body(self) -> Body:
@@ -200,7 +200,7 @@ class BehindSomebody(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """Speed that the vehicle holds until it brakes [m/s]."""
         return self.speed * KMH
 
-    def _ahead_of(self, target: str, gap: float, speed: Callable[[float], float], direction: Direction = FORTH) -> Ahead:
+    def _ahead_of(self, target: str, gap: float, speed: Callable[[float], float], direction: Direction = AHEAD) -> Ahead:
         """A target at the impact location."""
         vut = Body(self.vut_length, self.vut_width)
         return Ahead(target, vut, gap, lateral_of(self.impact_location, self.vut_width), speed, direction)

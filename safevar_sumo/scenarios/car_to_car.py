@@ -11,7 +11,7 @@ from msgspec.structs import force_setattr
 from safevar_sumo.errors import InputError
 from safevar_sumo.scenarios.ahead import Ahead, BehindSomebody
 from safevar_sumo.scenarios.base import PreCrash
-from safevar_sumo.scenarios.euro_ncap import FORTH, JUNCTION, KMH, Heading, Range
+from safevar_sumo.scenarios.euro_ncap import AHEAD, JUNCTION, KMH, Heading, Range
 
 CAR, MOTORCYCLIST = (50.0, 0.0, 25.0, 75.0, 100.0, -25.0, 125.0), (50.0, 10.0, 25.0, 75.0, 90.0)
 """Impact locations [%]."""
@@ -104,7 +104,7 @@ class CarToCar(BehindSomebody, frozen=True, kw_only=True):
     def _ahead(self) -> Ahead:
         if self.heading and self._speed_at(0.0):
             raise InputError("scenario.parameters", f"heading = {self.heading:g} with a target that moves", "a heading of one that stands")
-        return self._ahead_of(TESTS[self.test].target, self._gap, self._speed_at, FORTH.turned(self.heading))
+        return self._ahead_of(TESTS[self.test].target, self._gap, self._speed_at, AHEAD.turned(self.heading))
 
     @property
     def _brakes(self) -> bool:

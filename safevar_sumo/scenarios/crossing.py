@@ -28,7 +28,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     ImpactLocation,
     Range,
     Walk,
-    beside,
+    gap_beside,
     lateral_of,
 )
 from safevar_sumo.scenarios.frame import Frame
@@ -243,7 +243,7 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def encounter(self, trace: Trace) -> Encounter:
         """Between the vehicle's front and the target's body, along the way and across it; TTC by how fast that shrinks."""
-        ahead, across = np.maximum(trace.gap, 0.0), beside(trace.lateral, (self.vut_width + self._reach.width) / 2)
+        ahead, across = np.maximum(trace.gap, 0.0), gap_beside(trace.lateral, (self.vut_width + self._reach.width) / 2)
         distance = np.sqrt(ahead * ahead + across * across)
         nearing = (trace.speed - trace.obstacle_speed) * ahead - np.sign(trace.lateral) * trace.lateral_speed * across
         return Encounter(separation=distance, distance=distance, closing_speed=nearing / np.maximum(distance, 1e-9),

@@ -1,4 +1,4 @@
-"""What the scenarios of Euro NCAP's frontal crash avoidance tests share: targets, ranges and directions (protocol CA-FC, v1.2, July 2026).
+"""Parts of all scenarios of Euro NCAP's frontal crash avoidance tests: targets, ranges and directions (protocol CA-FC, v1.2, July 2026).
 
 Speeds are in km/h and impact locations in per cent of the vehicle's width, as in the protocol.
 """
@@ -39,7 +39,7 @@ BODIES = {"adult": Body(0.6, 0.5), "child": Body(0.711, 0.298), "cyclist": Body(
           "car": Body(4.023, 1.712)}
 """Bounding boxes of Euro NCAP's targets; those on two wheels with their riders."""
 SHAPES = {"adult": "pedestrian", "child": "pedestrian", "cyclist": "bicycle", "motorcyclist": "motorcycle", "car": "evehicle"}
-"""How sumo-gui draws them; of none of these SUMO cuts corners off."""
+"""Shapes that sumo-gui draws for them; SUMO cuts no corners off these."""
 
 
 FASTEST_TARGET = "70"
@@ -58,12 +58,12 @@ class Direction(NamedTuple):
         return Direction(self.along * cosine - self.left * sine, self.left * cosine + self.along * sine)
 
     def reach(self, body: Body) -> Body:
-        """What a body takes up along the lane and across it [m]."""
+        """Extent of a body along the lane and across it [m]."""
         along, left = abs(self.along), abs(self.left)
         return Body(body.length * along + body.width * left, body.length * left + body.width * along)
 
 
-FORTH, FROM_RIGHT, FROM_LEFT = Direction(1.0, 0.0), Direction(0.0, 1.0), Direction(0.0, -1.0)
+AHEAD, FROM_RIGHT, FROM_LEFT = Direction(1.0, 0.0), Direction(0.0, 1.0), Direction(0.0, -1.0)
 TARGET = "target"
 """Id of the target in every network where it is a vehicle."""
 JUNCTION = "junction"
@@ -147,10 +147,10 @@ class Walk(NamedTuple):
 
 
 def lateral_of(location: float, width: float) -> float:
-    """Offset of an impact location, 0 to 100 % of a vehicle's width from the left, from the middle of its front, to the right [m]."""
+    """Offset of an impact location, % of the vehicle's width from the left, to the right of the middle of its front [m]."""
     return (location / 100 - 0.5) * width
 
 
-def beside(distance: FloatArray, half_widths: float) -> FloatArray:
+def gap_beside(distance: FloatArray, half_widths: float) -> FloatArray:
     """Gap between two bodies whose middles are `distance` apart; 0 where they overlap [m]."""
     return np.maximum(np.abs(distance) - half_widths, 0.0)

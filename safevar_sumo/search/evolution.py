@@ -1,4 +1,4 @@
-"""What evolutionary algorithms share: individuals, constrained domination, SBX and polynomial mutation by DEAP."""
+"""The parts of evolutionary algorithms: individuals, constrained domination, SBX and polynomial mutation by DEAP."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ Index = Annotated[float, Meta(ge=0, le=1000)]
 Size = Annotated[int, Meta(ge=1, le=100_000)]
 TournamentSize = Annotated[int, Meta(ge=2, le=1000)]
 REDRAWS = 10
-"""How often a child that there is already is drawn anew, before it is taken all the same."""
+"""Times that a child equal to an individual that exists is drawn again, before it is accepted."""
 MISSES = 50
-"""How many litters without a feasible child are borne in a row."""
+"""Groups of children in a row without a feasible one, after which the next group is repaired."""
 
 
 @cache
@@ -90,7 +90,7 @@ class Variation:
         return children[:number]
 
     def distinct_offspring(self, population: list[Individual], number: int) -> list[Individual]:
-        """As `offspring`, but everybody is in as many tournaments as everybody else, and what there is already is drawn anew."""
+        """As `offspring`, but every individual is in as many tournaments, and children equal to individuals that exist are drawn again."""
         there, children, drawn = set(map(tuple, population)), list[Individual](), 0
         self._candidates = []
         with self.randomness():
@@ -102,23 +102,23 @@ class Variation:
                         children.append(child)
         return children[:number]
 
-    def child(self, mothers: list[Individual], fathers: list[Individual]) -> Individual:
-        """One new individual of the winners of two tournaments, none of their candidates; call it within `randomness`."""
+    def child(self, first: list[Individual], second: list[Individual]) -> Individual:
+        """A new individual, not in either group, whose parents win a tournament in each group; call it within `randomness`."""
         feasible: list[Individual] = []
         for _ in range(REDRAWS):
             while not feasible:
-                feasible = self._feasible([self._mutated(self._crossed(self.winner(mothers), self.winner(fathers))[0])])
+                feasible = self._feasible([self._mutated(self._crossed(self.winner(first), self.winner(second))[0])])
             child = feasible.pop()
-            if child not in mothers and child not in fathers:
+            if child not in first and child not in second:
                 break
         return child
 
     def _feasible(self, children: list[Individual]) -> list[Individual]:
         """The children that satisfy the study's constraints.
 
-        Constrained domination (Deb 2000) has whatever is feasible dominate whatever is not. The first population is feasible, so no
-        child that is not would survive: others are drawn in its place, and it is not simulated. After `MISSES` such children in a
-        row, the next are moved towards the original as far as it takes.
+        Under constrained domination (Deb 2000) a feasible individual dominates every infeasible one. The first population is feasible,
+        so an infeasible child would not survive: it is not simulated, and others are drawn in its place. After `MISSES` groups in a row
+        without a feasible child, the next children are moved towards the original until they are feasible.
         """
         if not self._problem.region:
             return children
@@ -130,7 +130,7 @@ class Variation:
         return [child for child, is_feasible in zip(children, feasible, strict=True) if is_feasible]
 
     def _winners(self, population: list[Individual]) -> tuple[Individual, Individual]:
-        """Of two tournaments, whose candidates are drawn without replacement until the population is used up."""
+        """The winners of two tournaments; candidates are drawn without replacement until the population is used up."""
         size, won = min(self._operators.tournament_size, len(population)), list[Individual]()
         for _ in range(2):
             if len(self._candidates) < size:
@@ -153,18 +153,18 @@ class Variation:
         return child
 
 
-def first_brood(problem: Problem, rng: np.random.Generator) -> list[Individual]:
+def initial_population(problem: Problem, rng: np.random.Generator) -> list[Individual]:
     """The first population, uniform in the domains."""
     return [Individual(values) for values in problem.uniform(min(problem.population, problem.evaluations), rng).tolist()]
 
 
-def simulated(brood: Sequence[Individual], problem: Problem) -> Generator[FloatArray, Evaluations, int]:
-    """Have a brood evaluated; returns how many evaluations that took."""
-    evaluated = yield problem.characteristics.filter(np.array(brood))
+def simulated(individuals: Sequence[Individual], problem: Problem) -> Generator[FloatArray, Evaluations, int]:
+    """Have individuals evaluated; returns how many evaluations that took."""
+    evaluated = yield problem.characteristics.filter(np.array(individuals))
     fitness, valid = fitness_of(len(problem.scoring.objectives)), problem.scoring.valid(evaluated).tolist()
-    for i, (individual, objectives) in enumerate(zip(brood, problem.scoring.values(evaluated).tolist(), strict=True)):
+    for i, (individual, objectives) in enumerate(zip(individuals, problem.scoring.values(evaluated).tolist(), strict=True)):
         individual.evaluation, individual.fitness, individual.failed = (evaluated, i), fitness(tuple(objectives)), not valid[i]
-    return len(brood)
+    return len(individuals)
 
 
 def objectives_of(individuals: Sequence[Individual]) -> FloatArray:

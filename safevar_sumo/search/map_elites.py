@@ -39,7 +39,7 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     speeds
         Cells over the speed of a collision, and one for none.
     tournament_size
-        Elites among which the best begets a child.
+        Elites in the tournament for a parent.
     """
 
     behaviour: Literal["changes", "speed"] = "changes"
@@ -127,5 +127,5 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def _quality(evaluated: Evaluations, problem: Problem) -> FloatArray:
-    """More is better: collisions by how small their largest change is, and all other settings, which are worse, by the first objective."""
+    """More is better: for a collision the smaller its largest change, for other settings, always worse, the smaller the first objective."""
     return np.where(evaluated.collided, NEVER_REACHED - evaluated.f_diff, -problem.scoring.values(evaluated)[:, 0])

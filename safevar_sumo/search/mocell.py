@@ -11,7 +11,16 @@ from msgspec import Meta
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.search.base import Problem, Search
-from safevar_sumo.search.evolution import Individual, Operators, Size, Variation, first_brood, result_of, simulated, stand_by_crowding
+from safevar_sumo.search.evolution import (
+    Individual,
+    Operators,
+    Size,
+    Variation,
+    initial_population,
+    result_of,
+    simulated,
+    stand_by_crowding,
+)
 
 Side = Annotated[int, Meta(ge=1, le=100_000)]
 CROSS = ((-1, 0), (1, 0), (0, 1), (0, -1))
@@ -20,9 +29,9 @@ NEIGHBOURHOODS = {"von_neumann": CROSS, "moore": (*CROSS, (-1, 1), (-1, -1), (1,
 
 
 class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Cells on a toroidal grid that mate with their neighbours and with an archive of what nothing dominates.
+    """Cells on a toroidal grid that mate with their neighbours and with an archive of non-dominated individuals.
 
-    All cells beget at once, from the grid as it was. A child takes its cell if it dominates what is there, or if neither does and it is
+    All cells reproduce at once, from the grid as it was. A child takes its cell if it dominates what is there, or if neither does and it is
     not the worst of the neighbourhood. The variables are the characteristics' unfiltered values; what is simulated and reported is
     filtered. The result is the archive.
 
@@ -65,7 +74,7 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         neighbours = self._neighbours(problem.population)
         variation, size = Variation(self, problem, rng), self.archive or problem.population
-        cells = first_brood(problem, rng)
+        cells = initial_population(problem, rng)
         asked = yield from simulated(cells, problem)
         archive = archived([], cells, size)
         while asked < problem.evaluations and archive:
@@ -73,10 +82,10 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
             stand_by_crowding(alive)
             around = [[cells[i] for i in place if not cells[i].failed] for place in neighbours]
             with variation.randomness():
-                brood = [variation.child(mates or archive, archive) for mates in around[:problem.evaluations - asked]]
-            asked += yield from simulated(brood, problem)
-            cells[:len(brood)] = [replaced(cell, child, mates) for cell, child, mates in zip(cells, brood, around, strict=False)]
-            archive = archived(archive, brood, size)
+                offspring = [variation.child(mates or archive, archive) for mates in around[:problem.evaluations - asked]]
+            asked += yield from simulated(offspring, problem)
+            cells[:len(offspring)] = [replaced(cell, child, mates) for cell, child, mates in zip(cells, offspring, around, strict=False)]
+            archive = archived(archive, offspring, size)
         return result_of(archive, problem)
 
     def _neighbours(self, population: int) -> list[list[int]]:
@@ -88,7 +97,7 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def replaced(cell: Individual, child: Individual, mates: list[Individual]) -> Individual:
-    """What is in a cell once its child is born; `mates` are the cell and its neighbours."""
+    """The individual in a cell after its child is evaluated; `mates` are the cell and its neighbours."""
     if child.failed or (not cell.failed and cell.fitness.dominates(child.fitness)):
         return cell
     if cell.failed or child.fitness.dominates(cell.fitness):
@@ -97,13 +106,13 @@ def replaced(cell: Individual, child: Individual, mates: list[Individual]) -> In
     return cell if all(mate.standing <= child.standing for mate in mates) else child
 
 
-def archived(archive: list[Individual], brood: list[Individual], size: int) -> list[Individual]:
-    """Of both what nothing dominates, equals once, without the most crowded; `standing` is by crowding distance.
+def archived(archive: list[Individual], offspring: list[Individual], size: int) -> list[Individual]:
+    """The non-dominated individuals of archive and offspring, equals once, without the most crowded; `standing` is by crowding distance.
 
-    What enters is copied: as a cell it stands elsewhere.
+    Offspring are copied into the archive: the same individual has another standing as a cell.
     """
     distinct = {one.fitness.values: one for one in archive}
-    for child in brood:
+    for child in offspring:
         if not child.failed and child.fitness.values not in distinct:
             distinct[child.fitness.values] = copy(child)
     left = next(iter(stand_by_crowding(list(distinct.values()))), [])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from safevar_sumo.search.base import Problem, Search
-from safevar_sumo.search.evolution import Individual, Operators, Variation, first_brood, result_of, simulated, stand_by_crowding
+from safevar_sumo.search.evolution import Individual, Operators, Variation, initial_population, result_of, simulated, stand_by_crowding
 
 
 class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -18,11 +18,11 @@ class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         variation = Variation(self, problem, rng)
-        brood, population, asked = first_brood(problem, rng), list[Individual](), 0
-        while brood:
-            asked += yield from simulated(brood, problem)
-            population = survivors(population + [individual for individual in brood if not individual.failed], problem.population)
-            brood = variation.offspring(population, min(problem.population, problem.evaluations - asked))
+        offspring, population, asked = initial_population(problem, rng), list[Individual](), 0
+        while offspring:
+            asked += yield from simulated(offspring, problem)
+            population = survivors(population + [individual for individual in offspring if not individual.failed], problem.population)
+            offspring = variation.offspring(population, min(problem.population, problem.evaluations - asked))
         return result_of([best for best in population if best.standing[0] == 0], problem)
 
 

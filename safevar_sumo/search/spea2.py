@@ -6,11 +6,11 @@ import numpy as np
 
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.search.base import Problem, Search
-from safevar_sumo.search.evolution import Individual, Operators, Size, Variation, first_brood, objectives_of, result_of, simulated
+from safevar_sumo.search.evolution import Individual, Operators, Size, Variation, initial_population, objectives_of, result_of, simulated
 
 
 class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Elitist search by strength and density; an archive, thinned where it is densest, begets the next population.
+    """Elitist search by strength and density; an archive, thinned where it is densest, produces the next population.
 
     The variables are the characteristics' unfiltered values; what is simulated and reported is filtered. The result is the
     non-dominated part of the last archive. A setting whose simulation failed does not survive.
@@ -35,17 +35,17 @@ class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         variation, size = Variation(self, problem, rng), self.archive or problem.population
-        brood, archive, asked = first_brood(problem, rng), list[Individual](), 0
-        while brood:
-            asked += yield from simulated(brood, problem)
-            good = [individual for individual in brood if not individual.failed]
+        offspring, archive, asked = initial_population(problem, rng), list[Individual](), 0
+        while offspring:
+            asked += yield from simulated(offspring, problem)
+            good = [individual for individual in offspring if not individual.failed]
             archive = survivors(archive + good, size, normalised=self.normalised)
-            brood = variation.distinct_offspring(archive, min(problem.population, problem.evaluations - asked))
+            offspring = variation.distinct_offspring(archive, min(problem.population, problem.evaluations - asked))
         return result_of([best for best in archive if best.standing[0] < 1], problem)
 
 
 def survivors(individuals: list[Individual], number: int, *, normalised: bool = False) -> list[Individual]:
-    """Environmental selection; `standing` becomes the fitness, which is below 1 where nothing dominates."""
+    """Environmental selection; `standing` becomes the fitness, below 1 for non-dominated individuals."""
     if not individuals:
         return []
     objectives = objectives_of(individuals)
@@ -54,9 +54,9 @@ def survivors(individuals: list[Individual], number: int, *, normalised: bool = 
     fitness = _raw(dominates) + _density(distances)
     for individual, value in zip(individuals, fitness.tolist(), strict=True):
         individual.standing = (value,)
-    free = ~dominates.any(axis=0)
-    chosen = _truncated(np.flatnonzero(free), distances, number)
-    rest = np.flatnonzero(~free)
+    nondominated = ~dominates.any(axis=0)
+    chosen = _truncated(np.flatnonzero(nondominated), distances, number)
+    rest = np.flatnonzero(~nondominated)
     chosen += rest[np.argsort(fitness[rest], kind="stable")][:number - len(chosen)].tolist()
     return [individuals[i] for i in chosen]
 
@@ -68,7 +68,7 @@ def domination(objectives: FloatArray) -> BoolArray:
 
 
 def _raw(dominates: BoolArray) -> FloatArray:
-    """Sum of the strengths of what dominates each; the strength is how many one dominates."""
+    """Raw fitness: the sum of the strengths of all that dominate an individual; a strength is the number of individuals dominated."""
     strength = np.count_nonzero(dominates, axis=1)
     return np.asarray(np.where(dominates, strength[:, np.newaxis], 0).sum(axis=0), dtype=float)
 

@@ -57,5 +57,5 @@ def test_simulate_tells_the_models_own_uncertainty(in_tmp: Path) -> None:
     assert spread["lower"] < spread["upper"]
     assert set(spread["original"]) == {"sets", "lower", "upper", "collisions"}
     assert "own uncertainty" in " ".join(run(*words).stdout.split())
-    refused("simulate", "native", "--spread", spread=("native", "[spread]"))
-    refused("simulate", "mine.toml", "--set", "tireFric=1..2", "--spread", spread=("--set", "--spread"))
+    refused("simulate", "native", "--spread", message=("native", "[spread]"))
+    refused("simulate", "mine.toml", "--set", "tireFric=1..2", "--spread", message=("--set", "--spread"))

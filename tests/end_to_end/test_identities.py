@@ -122,12 +122,12 @@ def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results
             assert CliRunner().invoke(commands, ["simulate", "../out", "--most-severe"]).exit_code == 0, "a comment is no difference"
             Path("..", name).write_text(f"{text}\nX = 1\n")
         assert f"{name} has changed since" in refused("study", "../mine.toml", "--out", "../out", "--runs", "3")
-        assert "--as-it-is-now" in (result := refused("tolerance", "../out")), result
-        assert result.startswith(f"{name} has changed since: ")
         Path("..", name).write_text(text)
     Path("../far.txt").write_text("another")
-    for words in ("simulate ../out", "simulate ../out --most-severe", "explain ../out", "risk ../out", "rules ../out", "report ../out"):
-        assert "far.txt has changed since" in refused(*words.split())
+    for words in ("simulate ../out --most-severe", "explain ../out", "tolerance ../out", "risk ../out", "rules ../out", "report ../out"):
+        result = refused(*words.split())
+        assert "far.txt has changed since" in result
+        assert "--as-it-is-now" in result
     with pytest.raises(InputError, match=r"far\.txt has changed since"):
         sv.risk(sv.load("../out"))
     done = CliRunner().invoke(commands, ["rules", "../out", "--samples", "8", "--json", "--as-it-is-now"])

@@ -55,6 +55,7 @@ def test_killed_a_hundred_times_at_random_moments_and_resumed() -> None:
     assert solutions("out") == solutions("whole")
 
 
+@SLOW
 def test_two_workers_that_are_killed_leave_the_same_bytes(whole: Path) -> None:
     moments, kills = random.Random(5), 0
     process = started("study", "small.toml", "--out", "out", "--jobs", "2", "--batch", "5", "--quiet")

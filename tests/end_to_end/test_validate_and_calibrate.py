@@ -78,9 +78,9 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
     for word in ("CMA-ES", "seed 3", "mine.csv, SHA-256", "Cost"):
         assert word in head
     assert load_study("found.toml").vehicle.characteristics == load_study("mine.toml").vehicle.characteristics
-    Path("again").mkdir()
-    run("calibrate", "mine.toml", str(data), "--trials", "37", "--seed", "3", "--out", "again/found.toml")
-    assert Path("again/found.toml").read_bytes() == Path("found.toml").read_bytes()
+    for out in ("once.toml", "again.toml"):
+        run("calibrate", "mine.toml", str(data), "--trials", "7", "--seed", "3", "--out", out)
+    assert Path("again.toml").read_bytes() == Path("once.toml").read_bytes()
 
 
 @pytest.mark.parametrize(("key", "expected"), [

@@ -66,6 +66,7 @@ def test_a_fit_is_refused_that_could_not_mean_anything(data: ReferenceData) -> N
 HESITATION = "ads.parameters.hesitation"
 
 
+@pytest.mark.slow
 def test_studies_that_are_fitted_together_share_what_is_not_their_own(data: ReferenceData) -> None:
     """Both find the gap that the rows of both were made with, and the one that hesitates how late it does."""
     truth = load_study("sun").ads.parameters["brake_gap"]

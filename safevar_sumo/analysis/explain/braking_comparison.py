@@ -23,7 +23,7 @@ from safevar_sumo.records import STANDSTILL, Outcome, SimulationRuns
 FULL = 0.9
 """Share of the command at which the brake pedal counts as having followed it [-]: 0.9 where full braking is commanded."""
 REMAINDER = 0.05
-"""Unexplained part of the distance lost that is small enough not to be mentioned [m]."""
+"""Largest unexplained part of the distance lost that a sentence leaves out [m]."""
 
 
 class Braking(NamedTuple):
@@ -97,32 +97,32 @@ def course(runs: SimulationRuns, column: int, safety_degree: float) -> Course:
     trace, encounter = runs.trace, runs.encounter
     active = np.flatnonzero(trace.active[:, column])
     counted = trace.active[:, column] & encounter.in_conflict[:, column]
-    speed_then, collided = float(runs.collision_speed[column]), bool(np.isfinite(runs.collision_speed[column]))
+    impact_speed, collided = float(runs.collision_speed[column]), bool(np.isfinite(runs.collision_speed[column]))
     if not active.size:
-        return Course(str(runs.outcome[column]), safety_degree, None, np.nan, speed_then)
+        return Course(str(runs.outcome[column]), safety_degree, None, np.nan, impact_speed)
     last, closest = int(active[-1]), np.nan
     if counted.any() and not collided:
         last = int(np.argmin(np.where(counted, encounter.separation[:, column], np.inf)))
         closest = float(trace.gap[last, column])
     braked = (trace.brake[:last + 1, column] > 0) & (trace.speed[:last + 1, column] > STANDSTILL) & trace.active[:last + 1, column]
     braking = _braking(runs, column, int(np.argmax(braked)), last) if braked.any() else None
-    return Course(str(runs.outcome[column]), safety_degree, braking, closest, speed_then)
+    return Course(str(runs.outcome[column]), safety_degree, braking, closest, impact_speed)
 
 
 def _braking(runs: SimulationRuns, column: int, first: int, last: int) -> Braking | None:
-    """The braking from sample `first` to `last`; None where the vehicle does not slow down once the pedal has followed."""
+    """The braking from sample `first` to `last`; None for a vehicle that does not slow down after the pedal was `pressed`."""
     trace = runs.trace
     speed, place = trace.speed[:last + 1, column], trace.position[:last + 1, column]
     followed = trace.pedal[first:last + 1, column] >= FULL * trace.brake[first:last + 1, column]
-    down = first + int(np.argmax(followed))
-    way, energy = float(place[last] - place[down]), float(speed[down]**2 - speed[last]**2) / 2
-    if not followed.any() or way <= 0 or energy <= 0:
+    pressed = first + int(np.argmax(followed))
+    distance, energy = float(place[last] - place[pressed]), float(speed[pressed]**2 - speed[last]**2) / 2
+    if not followed.any() or distance <= 0 or energy <= 0:
         return None
-    begins, delay = float(speed[first]), (down - first) * trace.step
+    initial, delay = float(speed[first]), (pressed - first) * trace.step
     return Braking(
-        time=float(trace.time[first]), gap=float(trace.gap[first, column]), speed=begins, delay=delay,
-        mean_speed_lost=begins - float(place[down] - place[first]) / delay if down > first else 0.0,
-        speed_lost=begins - float(speed[down]), deceleration=energy / way)
+        time=float(trace.time[first]), gap=float(trace.gap[first, column]), speed=initial, delay=delay,
+        mean_speed_lost=initial - float(place[pressed] - place[first]) / delay if pressed > first else 0.0,
+        speed_lost=initial - float(speed[pressed]), deceleration=energy / distance)
 
 
 def compare_braking(original: Course, changed: Course, place: str = "") -> BrakingComparison:
@@ -131,9 +131,9 @@ def compare_braking(original: Course, changed: Course, place: str = "") -> Braki
     if one is None or other is None:
         return BrakingComparison(original, changed, {}, place)
     parts, slowing = _parts(one, other)
-    left = original.closest - one.margin, changed.closest - other.margin
-    rest = [0.0 if np.isnan(value) else value for value in left]
-    return BrakingComparison(original, changed, {**parts, "remainder": rest[0] - rest[1]}, place, slowing)
+    unexplained = original.closest - one.margin, changed.closest - other.margin
+    remainders = [0.0 if np.isnan(value) else value for value in unexplained]
+    return BrakingComparison(original, changed, {**parts, "remainder": remainders[0] - remainders[1]}, place, slowing)
 
 
 def _braking_or_the_originals(changed: Course, original: Course) -> Braking | None:
@@ -165,11 +165,11 @@ PARTS = {
     "delay": ("its brake pedal follows later", "its brake pedal follows sooner"),
     "slowing": ("it slows less while the pedal moves", "it slows more while the pedal moves"),
     "deceleration": ("it brakes more weakly", "it brakes harder")}
-"""Words for a part that costs distance, and for one that gains some."""
+"""Words for a part that costs distance, and for the same part where it gains distance."""
 
 
-def how(course: Course) -> str:
-    """How a run ended."""
+def ending(course: Course) -> str:
+    """How a run ended, in words."""
     if course.outcome == Outcome.COLLISION:
         return f"hits at {course.collision_speed:.2f} m/s"
     end = ENDS.get(Outcome(course.outcome), course.outcome)
@@ -179,7 +179,7 @@ def how(course: Course) -> str:
 def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
     """Why the changed vehicle is less safe than the original, in one sentence or two; `full` says what the distance lost is."""
     at = f"At {comparison.place}: the" if comparison.place else "The"
-    ends = f"{at} original {how(comparison.original)}; this one {how(comparison.changed)}."
+    ends = f"{at} original {ending(comparison.original)}; this one {ending(comparison.changed)}."
     one, other = comparison.original.braking, comparison.changed.braking
     if one is None and other is None:
         return f"{ends} Neither of them brakes."

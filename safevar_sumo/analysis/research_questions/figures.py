@@ -60,7 +60,7 @@ def changed_characteristics(case: Case) -> Figure:
     """RQ3.2: in which share of the critical solutions with j changed each characteristic is changed, as a heat map."""
     import seaborn as sns
 
-    _some_critical(case)
+    _number_critical(case)
     shares = rq32(case)
     order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
     grid = shares.pivot(index="characteristic", columns="j", values="percent").astype(float)
@@ -82,7 +82,7 @@ def sizes_of_changes(case: Case) -> Figure:
     """How each characteristic is changed in the critical solutions: the distribution of its signed changes."""
     import seaborn as sns
 
-    total = _some_critical(case)
+    total = _number_critical(case)
     changes = effects(case)
     members = case.characteristics.members
     figure, axes = panels(f"{case.name}: changes in critical solutions", len(members), 4, (2.25, 1.85), least_width=9.0, above=1.0)
@@ -188,8 +188,8 @@ def legend_below(figure: Figure, axis: Axes) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3), frameon=False, fontsize=FONT)
 
 
-def _some_critical(case: Case) -> int:
-    """How many critical solutions there are; without any there is nothing to draw."""
+def _number_critical(case: Case) -> int:
+    """Number of critical solutions; raises Unanswerable if there are none."""
     number = len(critical(case))
     if not number:
         raise Unanswerable(case.name, "has no critical solution", "results with solutions that are more unsafe than the original")

@@ -241,7 +241,7 @@ def _rq33(case: str, group: pd.DataFrame) -> list[Table]:
 
 
 def _column(name: str, form: str) -> Callable[[Row], tuple[str]]:
-    """A cell of one column of a frame."""
+    """Cells that show one column of a frame."""
     return lambda row: (_number(row[name], form),)
 
 

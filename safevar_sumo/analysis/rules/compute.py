@@ -1,8 +1,8 @@
 """Finds rules in physical units that say where a study is unsafe, from an unbiased design, judged on another one.
 
-A classification tree (CART, by scikit-learn) cuts the domain into boxes. It is pruned to the smallest one that
-cross-validation does not tell from the best, its boxes that are more often unsafe than not become rules, and conditions
-that a rule does as well without are dropped.
+A classification tree (CART, by scikit-learn) cuts the domain into boxes. The tree is pruned to the smallest whose score in
+cross-validation is within a standard error of the best. Its boxes with more unsafe settings than safe ones become rules. A rule
+then loses the conditions that do not make it denser.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from safevar_sumo.workers.evaluation import Pool
 FEWEST = 10
 """Unsafe, and safe, settings that rules need at least."""
 FOLDS, DEEPEST, PRUNINGS = 5, 6, 24
-"""Of the cross-validation; conditions of a rule before any is dropped; sizes of trees that are compared."""
+"""Folds of the cross-validation; most conditions of a box; number of prunings that are compared."""
 LEAST_ADDED = 0.01
-"""Share of the unsafe settings that a rule must cover and those before it do not."""
+"""Share of the unsafe settings that a rule must cover in addition to the rules before it."""
 DIGITS = 3
 """Digits of a width to which limits are rounded."""
 Limits = dict[int, tuple[float | None, float | None]]
@@ -72,8 +72,8 @@ class Rule:
     def coverage_interval(self) -> tuple[float, float] | None:
         return clopper_pearson(self.unsafe_inside, self.unsafe_everywhere, self.confidence) if self.unsafe_everywhere else None
 
-    def tells_more_than(self, share: float) -> bool:
-        """Whether settings inside are significantly more often unsafe than that share; always, of a rule without limits."""
+    def is_denser_than(self, share: float) -> bool:
+        """Whether the density is significantly above a share; always true of a rule without limits."""
         return not self.limits or (self.density_interval is not None and self.density_interval[0] > share)
 
     def to_dict(self) -> dict[str, Any]:
@@ -128,7 +128,7 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
     with open_bench(study, pool, jobs, progress) as bench:
         unsafe = criterion_of(options.unsafe, bench)
         training, validation = (_design(bench, options.samples // 2, study.search.seed + half) for half in (1, 2))
-    is_unsafe, is_unsafe_there = unsafe.of(training), unsafe.of(validation)
+    is_unsafe, is_unsafe_validation = unsafe.of(training), unsafe.of(validation)
     number = int(np.count_nonzero(is_unsafe))
     remark, boxes = "", list[Limits]()
     if number == len(is_unsafe) > 0:
@@ -138,9 +138,9 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
                   "(run `rules --samples N` for more)")
     else:
         boxes = _boxes(training.settings, is_unsafe, members)
-    rules = [_judged(limits, validation.settings, is_unsafe_there, members) for limits in boxes]
+    rules = [_judged(limits, validation.settings, is_unsafe_validation, members) for limits in boxes]
     return Rules(study=study, unsafe=unsafe, rules=sorted(rules, key=lambda rule: -rule.unsafe_inside), remark=remark,
-                 samples=len(training) + len(validation), unsafe_share=float(np.mean(np.concatenate([is_unsafe, is_unsafe_there]))))
+                 samples=len(training) + len(validation), unsafe_share=float(np.mean(np.concatenate([is_unsafe, is_unsafe_validation]))))
 
 
 def _design(bench: Bench, number: int, seed: int) -> Evaluations:
@@ -155,7 +155,7 @@ def _boxes(settings: FloatArray, unsafe: BoolArray, members: CharacteristicSet) 
     leaves = [(_rounded(limits, members), density) for limits, density in _leaves(tree, members)]
     chosen = [limits for limits, density in leaves if density > 0.5] or [max(leaves, key=lambda leaf: leaf[1])[0]]
     simple = [_without_idle_conditions(limits, settings, unsafe) for limits in chosen]
-    return _that_add_something(simple, settings, unsafe)
+    return _covering_more(simple, settings, unsafe)
 
 
 def _pruned_tree(shares: FloatArray, unsafe: BoolArray) -> Any:
@@ -218,8 +218,8 @@ def _without_idle_conditions(limits: Limits, settings: FloatArray, unsafe: BoolA
     return limits
 
 
-def _that_add_something(boxes: list[Limits], settings: FloatArray, unsafe: BoolArray) -> list[Limits]:
-    """The boxes that cover unsafe settings which those that cover more do not; at least the first."""
+def _covering_more(boxes: list[Limits], settings: FloatArray, unsafe: BoolArray) -> list[Limits]:
+    """Boxes, those that cover most first, without those that cover few unsafe settings in addition; at least one."""
     kept: list[Limits] = []
     left = unsafe.copy()
     for limits in sorted(boxes, key=lambda box: -np.count_nonzero(unsafe & within(box, settings))):
@@ -239,7 +239,7 @@ def within(limits: Limits, settings: FloatArray) -> BoolArray:
 
 
 def _judged(limits: Limits, settings: FloatArray, unsafe: BoolArray, members: CharacteristicSet) -> Rule:
-    """A rule with its numbers on validation settings, which did not make it."""
+    """A rule with its numbers on the validation settings."""
     inside = within(limits, settings)
     return Rule({members.names[column]: ends for column, ends in limits.items()}, int(np.count_nonzero(inside)),
                 int(np.count_nonzero(inside & unsafe)), int(np.count_nonzero(unsafe)), CONFIDENCE)
