@@ -7,11 +7,11 @@ from itertools import pairwise
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import BoolArray, Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import VUT, Actors, Coordinates, Grade, Roads, Scene, World
+from safevar_sumo.records import Encounter, FloatArray, Trace
+from safevar_sumo.scenarios.base import Actors, Coordinates, Grade, Roads, World
 from safevar_sumo.scenarios.euro_ncap import (
     ACROSS_ON,
     AHEAD,
@@ -30,28 +30,13 @@ from safevar_sumo.scenarios.euro_ncap import (
     target_type,
 )
 from safevar_sumo.scenarios.frame import Frame
+from safevar_sumo.scenarios.target import Course, Target, TargetTest, Times, at
 
 ROAD = "road_0"
 START = 50.0
 """Place of the vehicle's front bumper on the lane at the start [m]."""
-CLOSED_IN = 0.5
-"""Closing speed [m/s] after which a vehicle that is no longer faster has avoided the target."""
 BEYOND = 0.5
 """How far the front of a target that stands askew is on the lane beyond the junction [m]: nobody departs on a junction itself."""
-
-
-class AheadMemory(NamedTuple):
-    """The lane; the target, and how far behind its front the vehicle reaches it [m]; step number; speed that the target was last given
-    [m/s]; whether the vehicle has closed in; lateral offset [m].
-    """
-
-    frame: Frame
-    ahead: Ahead
-    depth: float
-    sample: int
-    given: float
-    closed_in: BoolArray
-    lateral: FloatArray
 
 
 class Ahead(NamedTuple):
@@ -105,22 +90,9 @@ class Ahead(NamedTuple):
         return place, {**parked, "vType[@id='target']": target_type(self.target), "vehicle[@id='target']": {
             "type": self.target, "route": "beyond", "departPos": repr(BEYOND), "departPosLat": "0", "departSpeed": "0"}}
 
-    def begin(self, world: World) -> AheadMemory:
-        nothing = np.zeros(len(world.vehicle_positions(VUT)))
-        world.drive(TARGET, self.speed(0.0))
-        frame = Frame.of(world.lane(APPROACH if self._askew else ROAD))
-        return AheadMemory(frame, self, self._depth, 0, self.speed(0.0), nothing > 0, nothing + self.offset)
-
-    def observe(self, world: World, step: float, memory: AheadMemory, speed: FloatArray) -> tuple[Scene, AheadMemory]:
-        """The scene at the vehicles' speed, shape (N,) [m/s]; gives the target its next speed."""
-        frame, nothing = memory.frame, np.zeros_like(speed)
-        gap = frame.along(world.vehicle_positions(TARGET)) - memory.depth - frame.along(world.vehicle_positions(VUT))
-        now, then = self.speed(memory.sample * step), self.speed((memory.sample + 1) * step)
-        if then != memory.given:
-            world.drive(TARGET, then)
-        closed_in = memory.closed_in | (speed - now > CLOSED_IN)
-        scene = Scene(gap, memory.lateral, nothing, closed_in & (speed <= now), obstacle_speed=nothing + now)
-        return scene, memory._replace(sample=memory.sample + 1, given=then, closed_in=closed_in)
+    def meeting(self, world: World) -> _Meeting:
+        """The meeting of vehicles with it."""
+        return _Meeting(Frame.of(world.lane(APPROACH if self._askew else ROAD)), Course(follows=True), self, self._depth)
 
     @property
     def _askew(self) -> bool:
@@ -142,6 +114,33 @@ class Ahead(NamedTuple):
         return front[0] - _nearest([corners[0], corners[1], corners[3], corners[2]], self.vut.width / 2)
 
 
+class _Meeting(NamedTuple):
+    """A vehicle behind the target, which it reaches so far behind the target's front [m]; see `Meeting`."""
+
+    frame: Frame
+    course: Course
+    ahead: Ahead
+    depth: float
+
+    def begin(self, world: World) -> float:
+        pace = self.ahead.speed(0.0)
+        world.drive(TARGET, pace)
+        return pace
+
+    def positions(self, world: World) -> FloatArray:
+        return world.vehicle_positions(TARGET)
+
+    def target(self, positions: FloatArray, times: Times) -> Target:
+        along = self.frame.along(positions)
+        return Target(along - self.depth, np.full_like(along, self.ahead.offset), speed=at(times, self.ahead.speed))
+
+    def pace(self, sample: int, step: float) -> float:
+        return self.ahead.speed((sample + 1) * step)
+
+    def go(self, world: World, pace: float) -> None:
+        world.drive(TARGET, pace)
+
+
 TYPES = {"cyclist": "adult", "motorcyclist": "car"}
 """The traffic's types whose place those take that it does not have."""
 
@@ -154,7 +153,7 @@ def _nearest(corners: list[Coordinates], half: float) -> float:
     return min(places or [x for x, _ in corners])
 
 
-class BehindSomebody(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class BehindSomebody(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of a scenario with somebody ahead.
 
     Parameters
@@ -174,7 +173,6 @@ class BehindSomebody(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     vut_length: Annotated[float, Meta(gt=0.5, le=30)] = VUT_LENGTH
     vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
     grade: Grade = 0.0
-    reactive_actors = False
 
     def lanes(self, roads: Roads) -> Actors:
         """The lane across of a target that stands askew."""
@@ -184,11 +182,8 @@ class BehindSomebody(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """The vehicle at its speed, and the target."""
         return self._ahead.actors(self.test_speed, roads)
 
-    def begin(self, world: World) -> AheadMemory:
-        return self._ahead.begin(world)
-
-    def observe(self, world: World, step: float, memory: AheadMemory) -> tuple[Scene, AheadMemory]:
-        return memory.ahead.observe(world, step, memory, world.speeds())
+    def _meeting(self, world: World) -> _Meeting:
+        return self._ahead.meeting(world)
 
     def encounter(self, trace: Trace) -> Encounter:
         """Distances from bumper to body; TTC is that gap over the difference of speeds."""

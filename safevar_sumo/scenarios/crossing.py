@@ -6,12 +6,12 @@ import math
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 from msgspec.structs import force_setattr
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import BoolArray, Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import VUT, Actors, Grade, PreCrash, Roads, Scene, World
+from safevar_sumo.records import Encounter, FloatArray, Trace
+from safevar_sumo.scenarios.base import Actors, Grade, PreCrash, Roads, World
 from safevar_sumo.scenarios.crossing_target import NETWORK_ON_FOOT, OnFoot, OnWheels
 from safevar_sumo.scenarios.euro_ncap import (
     APPROACH,
@@ -32,10 +32,9 @@ from safevar_sumo.scenarios.euro_ncap import (
     lateral_of,
 )
 from safevar_sumo.scenarios.frame import Frame
+from safevar_sumo.scenarios.target import PARKED_GAP, Course, Target, TargetTest, Times, at
 
 KERB = "kerb_0"
-PARKED_GAP = 1.0
-"""From the vehicle's side to the parked cars, from the nearer one's front to the target's path, and between the two [m]."""
 PARKED_LENGTH = {"parked_small": 4.25, "parked_large": 4.5}
 """The middle of what the protocol allows, 4.1 to 4.4 and 4.3 to 4.7 m."""
 PARKED_WIDTH = 1.8
@@ -73,28 +72,40 @@ PRE_CRASH = {"adult": PreCrash.PEDESTRIAN, "child": PreCrash.PEDESTRIAN, "cyclis
              "motorcyclist": PreCrash.STRAIGHT_PATHS, "car": PreCrash.STRAIGHT_PATHS}
 
 
-class _Course(NamedTuple):
-    """What stays as it is in a run: the lane, the target's place along it at the impact [m], its walk, how it moves, what it takes up."""
+class _Meeting(NamedTuple):
+    """A vehicle before a target's path at a place along the lane [m]: its walk, how it moves, what it takes up; see `Meeting`."""
 
     frame: Frame
+    course: Course
     path: float
     walk: Walk
     mover: OnFoot | OnWheels
     reach: Body
     direction: Direction
-    hidden: bool
+    vut_width: float
+
+    def begin(self, world: World) -> float:
+        return self.mover.begin(world, self.walk)
+
+    def positions(self, world: World) -> FloatArray:
+        return self.mover.positions(world)
+
+    def target(self, positions: FloatArray, times: Times) -> Target:
+        along, left = self.mover.middle(self.frame, positions)
+        lateral = left if self.direction.left > 0 else -left
+        ahead = np.zeros_like(left) if along is None else along - self.path
+        forth = self.direction.along
+        return Target(self.path - self.reach.length / 2 + ahead, lateral, gone=lateral > (self.vut_width + self.reach.width) / 2,
+                      speed=at(times, lambda time: forth * self.walk.pace(time)) if forth else 0.0, ahead=ahead)
+
+    def pace(self, sample: int, step: float) -> float:
+        return self.mover.pace(self.walk, sample, step)
+
+    def go(self, world: World, pace: float) -> None:
+        self.mover.go(world, pace)
 
 
-class _Memory(NamedTuple):
-    """The course; where the target was; step number; speed that it was last given."""
-
-    course: _Course
-    place: FloatArray
-    sample: int
-    given: float
-
-
-class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Somebody crosses before a vehicle that is on its way, timed to be hit where it is meant to be if nobody brakes.
 
     Parameters
@@ -160,7 +171,6 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
     grade: Grade = 0.0
     network: str = ""
-    reactive_actors = False
 
     def __post_init__(self) -> None:
         if not self.network:
@@ -215,31 +225,12 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             end -= length + PARKED_GAP
         return changes
 
-    def begin(self, world: World) -> _Memory:
-        frame, mover, walk = Frame.of(world.lane(APPROACH)), self._mover, self._walk
-        path = mover.path(frame, world, self._sideways)
-        course = _Course(frame, path, walk, mover, self._reach, self._direction, self._of("hidden"))
-        return _Memory(course, self._sign * mover.middle(frame, world)[1], 0, mover.begin(world, walk))
-
-    def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
-        frame, path, walk, mover, reach, direction, hidden = memory.course
-        front = frame.along(world.vehicle_positions(VUT))
-        along, left = mover.middle(frame, world)
-        lateral = left if direction.left > 0 else -left
-        pace = mover.pace(walk, memory.sample, step)
-        if pace != memory.given:
-            mover.go(world, pace)
-        lateral_speed = (lateral - memory.place) / step
-        ahead = 0.0 if along is None else along - path
-        gap = path - reach.length / 2 + ahead - front
-        gone = lateral > (self.vut_width + reach.width) / 2
-        passed = gap < -reach.length - self.vut_length
-        scene = Scene(gap, lateral, lateral_speed, gone | passed)
-        if hidden:
-            scene = scene._replace(visible=self._visible(gap, lateral, ahead, reach))
-        if direction.along:
-            scene = scene._replace(obstacle_speed=np.full_like(gap, direction.along * walk.pace(memory.sample * step)))
-        return scene, _Memory(memory.course, lateral, memory.sample + 1, pace)
+    def _meeting(self, world: World) -> _Meeting:
+        frame, mover, reach = Frame.of(world.lane(APPROACH)), self._mover, self._reach
+        course = Course(past=-reach.length - self.vut_length)
+        if self._of("hidden"):
+            course = course._replace(hidden=True, to_middle=reach.length / 2, setback=self.sensor_setback, kerb=-self._kerb_side)
+        return _Meeting(frame, course, mover.path(frame, world, self._sideways), self._walk, mover, reach, self._direction, self.vut_width)
 
     def encounter(self, trace: Trace) -> Encounter:
         """Between the vehicle's front and the target's body, along the way and across it; TTC by how fast that shrinks."""
@@ -329,9 +320,3 @@ class Crossing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """A parameter, or what the protocol has for it."""
         given = getattr(self, name)
         return getattr(TESTS[self.test], name) if given is None else given
-
-    def _visible(self, gap: FloatArray, lateral: FloatArray, ahead: FloatArray | float, reach: Body) -> BoolArray:
-        """Where the line from the sensors to the target's middle passes the front corner of the nearer parked car."""
-        away = gap + reach.length / 2 + self.sensor_setback
-        corner = away - ahead - PARKED_GAP
-        return np.asarray((corner <= 0) | (-lateral * corner < -self._kerb_side * away))

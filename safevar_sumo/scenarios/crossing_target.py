@@ -60,9 +60,13 @@ class OnFoot(NamedTuple):
         world.walk(PEDESTRIAN, 0.0)
         return 0.0
 
-    def middle(self, frame: Frame, world: World) -> tuple[FloatArray | None, FloatArray]:
-        """Where its middle is along the lane, None where its path leads, and to its left [m]; SUMO says where its front is."""
-        return None, frame.left(world.person_positions(PEDESTRIAN)) - self.sign * BODIES[self.target].length / 2
+    def positions(self, world: World) -> FloatArray:
+        """Where SUMO has its front; shape (N, 2) [m]."""
+        return world.person_positions(PEDESTRIAN)
+
+    def middle(self, frame: Frame, positions: FloatArray) -> tuple[FloatArray | None, FloatArray]:
+        """Where its middle is along the lane, None where its path leads, and to its left [m], with its front at these positions."""
+        return None, frame.left(positions) - self.sign * BODIES[self.target].length / 2
 
     def pace(self, walk: Walk, sample: int, step: float) -> float:
         """Mean speed in the coming step [m/s]."""
@@ -117,10 +121,14 @@ class OnWheels(NamedTuple):
         world.drive(TARGET, walk.pace(0.0))
         return walk.pace(0.0)
 
-    def middle(self, frame: Frame, world: World) -> tuple[FloatArray | None, FloatArray]:
-        """Where its middle is along the lane and to its left [m]; SUMO says where its front is."""
-        fronts, behind = world.vehicle_positions(TARGET), BODIES[self.target].length / 2
-        return frame.along(fronts) - self.direction.along * behind, frame.left(fronts) - self.direction.left * behind
+    def positions(self, world: World) -> FloatArray:
+        """Where SUMO has its front; shape (N, 2) [m]."""
+        return world.vehicle_positions(TARGET)
+
+    def middle(self, frame: Frame, positions: FloatArray) -> tuple[FloatArray | None, FloatArray]:
+        """Where its middle is along the lane and to its left [m], with its front at these positions."""
+        behind = BODIES[self.target].length / 2
+        return frame.along(positions) - self.direction.along * behind, frame.left(positions) - self.direction.left * behind
 
     def pace(self, walk: Walk, sample: int, step: float) -> float:
         """Speed at the end of the coming step [m/s]."""

@@ -12,6 +12,7 @@ from safevar_sumo.records import EVERYWHERE, BoolArray, Encounter, FloatArray, O
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather
+from safevar_sumo.sumo.meetings import Meetings
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.world import begin
 
@@ -50,12 +51,16 @@ class Parts:
         self._perceptions = [(Perception(weather, self._step), np.repeat([one == weather for one in weathers], size).nonzero()[0])
                              for k, weather in enumerate(weathers) if weather not in weathers[:k]]
         self._order = np.argsort(np.concatenate([rows for _, rows in self._perceptions]))
-        self._memories = [begin(point.scenario, part) for point, part in zip(points, self._worlds, strict=True)]
-        self._rests, self._scenes = isinstance(world, RecordedWorld), list[Scene]()
+        self._rests, self._scenes, self._memories = isinstance(world, RecordedWorld), list[Scene](), list[Any]()
         self.last = np.repeat([round(point.scenario.duration / self._step) for point in points], size)
+        self._meetings = Meetings.of([point.scenario for point in points], self._worlds, world, size) if self._rests else None
+        if self._meetings is None:
+            self._memories = [begin(point.scenario, part) for point, part in zip(points, self._worlds, strict=True)]
 
     def scene(self, open_: BoolArray) -> Scene:
         """Where the obstacles of all vehicles are now; where they were in a recorded scene in which no run is open any more."""
+        if self._meetings is not None:
+            return self._meetings.scene(open_)
         goes_on = [bool(open_[rows].any()) for rows in self._rows]
         for k, (point, world) in enumerate(zip(self._points, self._worlds, strict=True)):
             if goes_on[k] or not self._rests or k >= len(self._scenes):

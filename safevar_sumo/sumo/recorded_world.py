@@ -8,7 +8,7 @@ the last bit: the operations are those of `MSVehicle::updateState`, `MSLane::int
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,29 @@ def distance(before: FloatArray, after: FloatArray, step: float) -> FloatArray:
     """Way in a step from one speed to another at a constant acceleration [m], in SUMO's operations (`MSVehicle::getDeltaPos`)."""
     acceleration = (after - before) / step
     return np.asarray((before + 0.5 * (acceleration * step)) * step)
+
+
+def not_on_the_road(actor: str, time: float) -> SimulationError:
+    """The error for somebody who has not departed, or has arrived, at a time [s]."""
+    return SimulationError(f"SUMO failed: {actor!r} is not on the road at {time:g} s")
+
+
+class Samples:
+    """A recorded scene in which everybody else is at all of the scene's samples, as if each were a copy of the network.
+
+    `absent`, shape (T,), is where somebody who was asked for is not on the road; there it is where it was last.
+    """
+
+    def __init__(self, tracks: Mapping[str, Track]) -> None:
+        self._tracks, self.actor, self.absent = tracks, "", np.zeros(0, dtype=bool)
+
+    def vehicle_positions(self, actor: str) -> FloatArray:
+        """Fronts; shape (T, 2) [m]."""
+        positions = self._tracks[actor].position
+        self.actor, self.absent = actor, np.isnan(positions[:, 0])
+        return positions[np.maximum.accumulate(np.where(self.absent, 0, np.arange(len(positions))))]
+
+    person_positions = vehicle_positions
 
 
 class RecordedWorld:
@@ -83,6 +106,10 @@ class RecordedWorld:
         """The world of the `n` vehicles from the `first`, in one of the scenes."""
         return RecordedWorld([self._recordings[first // self._size]], n, self, first)
 
+    def samples(self) -> Samples:
+        """The one scene with everybody else at all of its samples."""
+        return Samples(self._recordings[0].tracks)
+
     def advance(self, speeds: FloatArray) -> None:
         """One step in which the vehicles reach `speeds` [m/s], at a constant acceleration.
 
@@ -123,7 +150,7 @@ class RecordedWorld:
         positions = self._track(actor).position
         position = positions[min(self._now, len(positions) - 1)]  # of a batch in which other scenes last longer
         if math.isnan(position[0]):
-            raise SimulationError(f"SUMO failed: {actor!r} is not on the road at {self._now * self.step_length:g} s")
+            raise not_on_the_road(actor, self._now * self.step_length)
         found = np.empty((self.n, 2))
         found[:] = position
         return found
