@@ -14,6 +14,7 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.protocol import part_of
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import Study
+from safevar_sumo.sumo.rater import rater_of
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from safevar_sumo.workers.batches import evaluate_all, inputs_of
@@ -104,7 +105,7 @@ class Bench:
         SimulationError
             If a setting cannot be simulated.
         """
-        rater = assemble(self.study).rater
+        rater = rater_of(self.study, f"study {self.study.name!r}")
         assert rater is not None
         number = len(rater.protocol.cells)
         parts = min(PARTS * self._pool.workers, number)

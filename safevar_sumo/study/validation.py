@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin
 
@@ -51,7 +52,7 @@ def refuse(errors: Iterable[InputError]) -> None:
 def mistakes(source: object, raw: Any, kind: Any, where: str = "") -> Iterator[InputError]:
     """All mistakes in `raw`, which should be of type `kind`."""
     if isinstance(kind, type) and issubclass(kind, Struct) and isinstance(raw, Mapping):
-        fields = {field.name: field for field in msgspec.structs.fields(kind)}
+        fields = _fields(kind)
         for key in raw:
             if key not in fields:
                 yield unknown(source, f"{_inside(where, key)}: there is no such key", key, fields)
@@ -70,6 +71,12 @@ def mistakes(source: object, raw: Any, kind: Any, where: str = "") -> Iterator[I
             msgspec.convert(raw, kind)
         except msgspec.ValidationError as error:
             yield invalid(source, raw, error, where)
+
+
+@cache
+def _fields(kind: type[Struct]) -> dict[str, msgspec.structs.FieldInfo]:
+    """A record's fields by name; msgspec evaluates their annotations anew each time, which a matrix of a thousand cells feels."""
+    return {field.name: field for field in msgspec.structs.fields(kind)}
 
 
 def _tables(kind: Any) -> list[Any]:

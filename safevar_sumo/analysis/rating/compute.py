@@ -13,9 +13,9 @@ import pandas as pd
 from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, NOT_RED, RED, Block, Cell, Points, Protocol, points_of
 from safevar_sumo.records import CellResults, FloatArray
+from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.rater import by_night, rated_study
-from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.rater import by_night, rated_study, rater_of
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
@@ -188,7 +188,7 @@ def rate(study: Study, settings: Mapping[str, FloatArray], *, pool: Pool | None 
 
 def rate_on(bench: Bench, settings: Mapping[str, FloatArray]) -> Rating:
     """The same on a bench of the rated study."""
-    rater = assemble(bench.study).rater
+    rater = rater_of(bench.study, f"study {bench.study.name!r}")
     assert rater is not None
     names = CharacteristicSet.of(bench.study.vehicle.characteristics).names
     rows = {"original": bench.characteristics.original, **settings}
@@ -201,7 +201,7 @@ def rate_on(bench: Bench, settings: Mapping[str, FloatArray]) -> Rating:
 
 def remarks(rating: Rating) -> list[str]:
     """What a user should know of a rating."""
-    weather = assemble(rating.study).weather
+    weather = weather_of(rating.study.weather, f"study {rating.study.name!r}")
     found = []
     if weather.wet or weather.road_friction != 1:
         found.append(f"Euro NCAP tests on a dry road; this is rated in the weather {weather.name!r}, by night {by_night(weather).name!r}.")
