@@ -8,6 +8,7 @@ from safevar_sumo.ads.aeb import Aeb
 from safevar_sumo.ads.apollo import Apollo
 from safevar_sumo.ads.base import ADS_CONTRACT, REACTIONS, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.ads.competent_driver import CompetentDriver
+from safevar_sumo.ads.fmu import FmuAds
 from safevar_sumo.ads.full_braking import FullBraking
 from safevar_sumo.ads.fuzzy_safety import FuzzySafety
 from safevar_sumo.ads.idm import Idm
@@ -30,4 +31,4 @@ ADS: Mapping[str, type[Any]] = {
     "world_on_rails": WorldOnRails,
 }
 
-__all__ = ["ADS", "ADS_CONTRACT", "REACTIONS", "SCALAR_ADS_CONTRACT", "Ads", "GuardedAds", "PerVehicle", "ScalarAds"]
+__all__ = ["ADS", "ADS_CONTRACT", "REACTIONS", "SCALAR_ADS_CONTRACT", "Ads", "FmuAds", "GuardedAds", "PerVehicle", "ScalarAds"]

@@ -116,7 +116,7 @@ class Source:
 
     def __init__(self, member: Member) -> None:
         self._what = getattr(member.what, "function", member.what)
-        self.file = self._file()
+        self._is_fmu, self.file = bool(member.file), member.file or self._file()
         self._folder = str(Path(self.file).parent)
         self._last: tuple[str, int] | None = None
         self._mine: dict[CodeType, bool] = {}
@@ -149,6 +149,8 @@ class Source:
 
     def of_error(self, error: BaseException) -> tuple[str, int]:
         """Innermost line of the author's that an exception passed through; else of what returned last."""
+        if self._is_fmu:
+            return self.definition()
         one: BaseException | None = error
         while one is not None:
             frame, place = one.__traceback__, None
@@ -166,7 +168,9 @@ class Source:
         return self._last or self.definition()
 
     def definition(self, *methods: str) -> tuple[str, int]:
-        """Line of the first of these methods that there is, else of the subject itself."""
+        """Line of the first of these methods that there is, else of the subject itself; an FMU shows no lines."""
+        if self._is_fmu:
+            return self.file, 1
         for name in methods:
             function = inspect.unwrap(getattr(self._what, name, None) or object)
             code = getattr(function, "__code__", None)
@@ -184,6 +188,8 @@ class Source:
 
     def suspect(self, check: str) -> tuple[str, int] | None:
         """The line of the file that looks like the cause of a difference; None where nothing does."""
+        if self._is_fmu:
+            return None
         try:
             tree = _part_of(ast.parse(_text(self.file)), str(getattr(self._what, "__name__", "")))
         except (SyntaxError, ValueError):

@@ -72,7 +72,7 @@ class Probe(ABC):
 
 def loaded_again(subject: Subject) -> Any:
     """The class, function or record, from its module as it is loaded now."""
-    if subject.is_ours:
+    if subject.is_ours or subject.member.file:
         return subject.member.what
     with importable():
         return Lookup("check", subject.study.origin.places).find({}, subject.name, subject.key).what

@@ -12,15 +12,16 @@ from typing import Any, NamedTuple, get_args
 
 import msgspec
 
-from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, ScalarAds
+from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, FmuAds, ScalarAds
 from safevar_sumo.errors import InputError, SafevarError, unknown
+from safevar_sumo.fmu import file_of
 from safevar_sumo.metrics import METRICS, Metric
-from safevar_sumo.plugins import Contract, Lookup, Member
+from safevar_sumo.plugins import Contract, Guard, Lookup, Member
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS
-from safevar_sumo.study import CharacteristicTable, MatrixTest, ModelTable, Study, load_study, study_names
+from safevar_sumo.study import CharacteristicTable, MatrixTest, ModelTable, Study, fmus_of, load_study, study_names
 from safevar_sumo.sumo.traci_module import importable
-from safevar_sumo.vehicles import CHANGES, VEHICLE_CONTRACT, VEHICLES, Change
+from safevar_sumo.vehicles import CHANGES, VEHICLE_CONTRACT, VEHICLES, Change, FmuVehicle
 
 KINDS: Mapping[str, Mapping[str, Any]] = {
     "ads": ADS, "vehicle": VEHICLES, "scenario": SCENARIOS, "metric": METRICS, "objective": CHANGES, "algorithm": ALGORITHMS, "traci": {}}
@@ -79,6 +80,8 @@ def subject_of(name: str, study: str | None = None) -> Subject:
     if kinds:
         shipped = chosen or next((one for one in map(load_study, study_names()) if _named(one, kinds[0], name)), load_study("smoke"))
         return _tried(Subject(name, kinds[0], Member(KINDS[kinds[0]][name]), shipped))
+    if name.endswith(".fmu"):
+        return _fmu_of(name, chosen)
     if ":" not in name:
         everything = [*study_names(), *(one for members in KINDS.values() for one in members)]
         raise unknown("check", f"there is nothing called {name!r}", name, everything, ", package.module:Name, or the path of a study file")
@@ -95,6 +98,16 @@ def subject_of(name: str, study: str | None = None) -> Subject:
     return _tried(Subject(name, kind, member, study_of or load_study(USUAL.get(kind, "smoke")), {}, remarks))
 
 
+def _fmu_of(name: str, chosen: Study | None) -> Subject:
+    """An FMU in a study that maps its variables."""
+    for study in [chosen] if chosen else _studies_beside(Path(name).name, str(Path(name).absolute().parent)):
+        for key, model in fmus_of(study):
+            if file_of(model, study.origin.places) == str(Path(name).absolute()):
+                remarks = () if chosen else (f"tried in {study.origin.called}, which names it",)
+                return _fmu(study, key.partition(".")[0], model)._replace(remarks=remarks)
+    raise InputError("check", f"no study says what the variables of {name!r} stand for", "--study STUDY with [ads] or [vehicle] kind = \"fmu\"")
+
+
 def subjects_of(study: Study) -> Iterator[Subject]:
     """Everything that a study names, once."""
     lookup = Lookup(f"study {study.name!r}", study.origin.places)
@@ -104,6 +117,9 @@ def subjects_of(study: Study) -> Iterator[Subject]:
     seen = set[str]()
     for kind, names in named.items():
         for name in dict.fromkeys(names):
+            if (f"{kind}.model", name) in fmus_of(study):
+                yield _fmu(study, kind, name)
+                continue
             of_a_metric = kind == "objective" and ":" not in name and name not in CHANGES  # by the name of a metric's column
             if name in seen or of_a_metric:
                 continue
@@ -112,6 +128,11 @@ def subjects_of(study: Study) -> Iterator[Subject]:
                 member = lookup.find(CHANGES if kind == "objective" else KINDS[kind], name, KEYS.get(kind, f"{kind}.model"))
             what = "metric" if isinstance(member.what, Metric) else kind
             yield Subject(name, what, member, study, _parameters(study, what, name))
+
+
+def _fmu(study: Study, kind: str, name: str) -> Subject:
+    guard, file = Guard(f"study {study.name!r}", f"{kind}.model = {name!r}"), file_of(name, study.origin.places)
+    return Subject(name, kind, Member(FmuAds if kind == "ads" else FmuVehicle, guard, file=file), study, _parameters(study, kind, name))
 
 
 def kind_of(what: Any) -> str:
@@ -238,7 +259,7 @@ def _tests(study: Study) -> list[MatrixTest]:
 def _named(study: Study, kind: str, name: str) -> bool:
     """Whether a study names something as that kind."""
     return name in {
-        "ads": [study.ads.model] if not study.ads.kind else [], "traci": [study.ads.model] if study.ads.kind == "traci" else [],
+        "ads": [study.ads.model] if study.ads.kind != "traci" else [], "traci": [study.ads.model] if study.ads.kind == "traci" else [],
         "vehicle": [study.vehicle.model], "scenario": [study.scenario.model], "metric": study.metrics.also,
         "objective": [] if name in study.metrics.also else study.search.objectives, "algorithm": study.search.algorithms}[kind]
 

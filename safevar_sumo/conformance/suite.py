@@ -191,6 +191,8 @@ class _Suite:
 
     def _picklable(self) -> Iterator[Finding]:
         """What travels to worker processes; a class by its name, an instance by what it holds, a record with its function."""
+        if self._subject.member.file:
+            return  # it travels as a file
         what = loaded_again(self._subject)
         travels: Any = what
         if isinstance(what, type) and self._subject.kind != "traci":

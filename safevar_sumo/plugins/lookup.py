@@ -32,13 +32,14 @@ class Member(NamedTuple):
     """The class or record that a name in a study stands for.
 
     `guard` calls it (None for the package's own), `module` is the name of its module ("" for the package's own), `folder` the folder
-    of that module's top package.
+    of that module's top package. An FMU is a `file`, and what simulates it is the package's own.
     """
 
     what: Any
     guard: Guard | None = None
     module: str = ""
     folder: str = ""
+    file: str = ""
 
 
 class _Loaded(NamedTuple):

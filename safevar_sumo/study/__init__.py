@@ -21,6 +21,7 @@ from safevar_sumo.study.schema import (
     StudyLike,
     VehicleTable,
     Weather,
+    fmus_of,
     foreign_names,
     foreign_packages,
     label_of,
@@ -33,5 +34,5 @@ from safevar_sumo.study.validation import converted, invalid
 __all__ = [
     "OBJECTIVES", "SAFETY_DEGREE", "WORDS", "CharacteristicTable", "Constraint", "FitTable", "FreeParameter", "MatrixTable",
     "MatrixTest", "MetricsTable", "ModelTable", "Origin", "RatingTable", "SearchTable", "Study", "StudyLike", "VehicleTable", "Weather",
-    "check_writable", "converted", "foreign_names", "foreign_packages", "invalid", "label_of", "load_study", "of_today",
+    "check_writable", "converted", "fmus_of", "foreign_names", "foreign_packages", "invalid", "label_of", "load_study", "of_today",
     "refuse_other_than_file", "study_names", "study_path", "tables_of", "write_study"]

@@ -62,7 +62,7 @@ def _checked(raw: _Raw) -> Study:
     if "origin" in raw.tables:
         raise InputError(raw.source, "origin: there is no such key")
     refuse(unusable(raw.source, raw.tables))
-    tables = of_today(raw.tables)
+    tables = _with_fmu(raw, of_today(raw.tables))
     remarks = raw.origin.remarks
     if tables.get("ads") != raw.tables.get("ads"):
         remarks = (*remarks, f"{raw.source}: weather.hesitation is read as ads.parameters.hesitation")
@@ -81,6 +81,23 @@ def of_today(tables: dict[str, Any]) -> dict[str, Any]:
     if weather["hesitation"] and isinstance(parameters, dict):
         tables["ads"] = {**ads, "parameters": {**parameters, "hesitation": weather["hesitation"]}}
     return tables
+
+
+def _with_fmu(raw: _Raw, tables: dict[str, Any]) -> dict[str, Any]:
+    """A study's tables with the rows of characteristics completed by what the vehicle's FMU declares of its parameters."""
+    vehicle = tables.get("vehicle")
+    if not isinstance(vehicle, dict) or vehicle.get("kind") != "fmu" or not isinstance(model := vehicle.get("model"), str):
+        return tables
+    given, fixed = vehicle.get("characteristics", {}), vehicle.get("parameters", {})
+    if not isinstance(given, dict) or not isinstance(fixed, dict) or not all(isinstance(row, dict) for row in given.values()):
+        return tables
+    from safevar_sumo.fmu.description import description_of, file_of  # FMPy is for those who have an FMU
+
+    if given and all({"unit", "original", "lower", "upper"} <= row.keys() for row in given.values()) and not file_of(model, raw.origin.places):
+        return tables  # results without their FMU can be read
+    declared = description_of(model, raw.origin.places, str(raw.source), "vehicle.model")
+    rows = {**declared.rows(fixed), **{name: {**declared.row(name, str(row.get("unit", ""))), **row} for name, row in given.items()}}
+    return {**tables, "vehicle": {**vehicle, "characteristics": rows}}
 
 
 def _with_algorithms(raw: dict[str, Any]) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from safevar_sumo.study.variation import Correlation, Distribution
 
 Positive = Annotated[float, Meta(gt=0, le=1e6)]
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
+OwnStep = Annotated[float, Meta(ge=1e-6, le=10)]
 Weight = Annotated[float, Meta(ge=0, le=1e6)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
@@ -27,6 +28,8 @@ OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
 """Objectives of the published study."""
 LONGEST_WORDS = 200
 """Largest number of characters of a characteristic's description."""
+OF_FMUS = ("kind", "inputs", "outputs", "sensors", "sumo_type", "step")
+"""Keys of models that only FMUs have."""
 WORDS = ("meaning", "counterpart")
 """Keys of a characteristic for people to read; no result depends on them."""
 
@@ -50,20 +53,35 @@ class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A model by its name, or by `package.module:Name`, and its parameters.
 
-    An ADS of the kind `traci` is a controller written for SUMO's TraCI.
+    An ADS of the kind `traci` is a controller written for SUMO's TraCI, one of the kind `fmu` an FMU by its path: `inputs` are its
+    variables by what they are given, `outputs` by what they tell, `step` [s] is its own step, by default the one that it declares.
     """
 
     model: str
     parameters: Parameters = {}
-    kind: Literal["", "traci"] = ""
+    kind: Literal["", "traci", "fmu"] = ""
+    inputs: dict[str, str] = {}
+    outputs: dict[str, str] = {}
+    step: OwnStep | None = None
 
 
 class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The vehicle under test: its model, the model's parameters, and the characteristics that vary."""
+    """The vehicle under test: its model, the model's parameters, and the characteristics that vary.
+
+    One of the kind `fmu` is an FMU by its path, with `inputs`, `outputs` and `step` as an ADS has them. Its parameters are the
+    characteristics, whose rows need to say only what it does not declare; `sensors` and `sumo_type` are characteristics, its variables,
+    or numbers, by what they say of the sensors and of the vehicle.
+    """
 
     model: str
     characteristics: dict[str, CharacteristicTable]
     parameters: Parameters = {}
+    kind: Literal["", "fmu"] = ""
+    inputs: dict[str, str] = {}
+    outputs: dict[str, str] = {}
+    sensors: dict[str, str | float] = {}
+    sumo_type: dict[str, str | float] = {}
+    step: OwnStep | None = None
 
 
 class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -247,6 +265,10 @@ def tables_of(study: Study) -> dict[str, Any]:
     del tables["origin"]
     if not study.constraints:
         del tables["constraints"]  # results of studies from before there were any keep their bytes
+    for name in ("vehicle", "ads", "scenario"):
+        if tables[name].get("kind") != "fmu":
+            kept = () if name == "vehicle" else ("kind",)
+            tables[name] = {key: value for key, value in tables[name].items() if key not in OF_FMUS or key in kept}
     return tables
 
 
@@ -280,7 +302,12 @@ def study_path(study: str) -> Path:
 
 def foreign_names(study: Study) -> list[str]:
     """The parts of a study that code from outside computes, such as `ads.model = 'my_ads:Careful'`."""
-    return [f"{key} = {name!r}" for key, name in _foreign(study)]
+    return [f"{key} = {name!r}" for key, name in (*_foreign(study), *fmus_of(study))]
+
+
+def fmus_of(study: Study) -> list[tuple[str, str]]:
+    """Keys and paths of a study's FMUs."""
+    return [(f"{key}.model", table.model) for key, table in (("vehicle", study.vehicle), ("ads", study.ads)) if table.kind == "fmu"]
 
 
 def foreign_packages(study: Study) -> list[str]:
@@ -291,7 +318,9 @@ def foreign_packages(study: Study) -> list[str]:
 def _foreign(study: Study) -> list[tuple[str, str]]:
     """Keys and names of a study's code from outside."""
     tests = [] if study.matrix is None else [test.model for test in study.matrix.tests]
-    named = {"vehicle.model": [study.vehicle.model], "ads.model": [study.ads.model], "scenario.model": [study.scenario.model, *tests],
+    fmus = dict(fmus_of(study))
+    named = {**{f"{key}.model": [table.model] for key, table in (("vehicle", study.vehicle), ("ads", study.ads)) if f"{key}.model" not in fmus},
+             "scenario.model": [study.scenario.model, *tests],
              "metrics.also": study.metrics.also, "search.objectives": study.search.objectives}
     functions = [one.function for one in study.constraints]
     named["constraints.function"] = [name for name in functions if name]

@@ -133,15 +133,20 @@ def in_cells(system: System, settings: FloatArray, part: tuple[int, int], engine
 def settings_per_batch(system: System, engine: Engine) -> int:
     """How many settings a batch pays to have."""
     recorded = engine is Engine.RECORDED and not reason_for_sumo(system)
-    return max(LARGEST_BATCH // len(system.points), LARGEST_WORLD) if recorded else LARGEST_WORLD
+    return max(largest_batch(system) // len(system.points), LARGEST_WORLD) if recorded else LARGEST_WORLD
+
+
+def largest_batch(system: System) -> int:
+    """How many vehicles drive at once: fewer where each has an instance of an FMU."""
+    return min(LARGEST_BATCH, *(getattr(model, "most_vehicles", LARGEST_BATCH) for model in (system.vehicle, system.ads)))
 
 
 def _most_vehicles(system: System, engine: Engine) -> int:
     """How many vehicles one simulation may have: in a recorded scene, or in copies of the largest of the networks."""
     if engine is Engine.RECORDED and not reason_for_sumo(system):
-        return LARGEST_BATCH
+        return largest_batch(system)
     lanes = max(lanes_of(network) for network in {point.scenario.network for point in system.points})
-    return min(max(LARGEST_ROADS // max(lanes, 1), 1), LARGEST_WORLD)
+    return min(max(LARGEST_ROADS // max(lanes, 1), 1), LARGEST_WORLD, largest_batch(system))
 
 
 def aggregated(found: Sequence[AtPoint | Scored]) -> Evaluations:
@@ -184,7 +189,7 @@ def _groups(system: System, settings: FloatArray, engine: Engine, options: tuple
     """Settings at every point, group by group of the points that are simulated together."""
     n = len(settings)
     recorded = engine is Engine.RECORDED and not reason_for_sumo(system)
-    most, all_options = LARGEST_BATCH // max(n, 1), (*step_options(system), *options)
+    most, all_options = largest_batch(system) // max(n, 1), (*step_options(system), *options)
     for points in _together(system.points, most, all_options) if recorded else ((point,) for point in system.points):
         drives = drive_all(replace(system, matrix=points), settings, engine, options)
         evaluations = score(system, np.tile(settings, (len(points), 1)), drives)

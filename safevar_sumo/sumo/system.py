@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.ads import ADS, ADS_CONTRACT, REACTIONS, SCALAR_ADS_CONTRACT, Ads, GuardedAds, PerVehicle, ScalarAds
+from safevar_sumo.ads import ADS, ADS_CONTRACT, REACTIONS, SCALAR_ADS_CONTRACT, Ads, FmuAds, GuardedAds, PerVehicle, ScalarAds
 from safevar_sumo.errors import InputError, one_of, unknown
+from safevar_sumo.fmu import LONGEST, description_of
 from safevar_sumo.metrics import FURTHER, METRICS, RATING_POINTS, Metric, Objective, Scoring, foreign_metric
 from safevar_sumo.metrics import OBJECTIVES as BY_OBJECTIVE
 from safevar_sumo.plugins import Guard, Lookup, Member, OwnModules, check_parameters, guard_process_state, instance_of
@@ -35,6 +36,7 @@ from safevar_sumo.vehicles import (
     Change,
     CharacteristicSet,
     FeasibleRegion,
+    FmuVehicle,
     GuardedVehicle,
     Vehicle,
     calibration_drive,
@@ -164,8 +166,10 @@ class System:
     def remarks(self) -> list[str]:
         """What of the networks and the weathers is not used, or does nothing."""
         in_traci = isinstance(self.ads, TraciController)
+        fmus = [remark for model in (self.vehicle, self.ads) for remark in getattr(model, "remarks", ())]
         networks = dict.fromkeys(point.scenario.network for point in self.points)
         found = [remark for network in networks for remark in network_remarks(network, self.nominal.max_speed, sumo_drives=in_traci)]
+        found += fmus
         hazy = {point.weather.name: point.weather.visibility for point in self.points if point.weather.visibility != 1}
         if in_traci and not self._sees_a_limited_way():
             found += [f"weather {name!r}: visibility = {value:g} does nothing: the vehicle has no sensor range, and a controller written "
@@ -230,8 +234,8 @@ def _assembled(study: Study, source: str) -> System:
 
 def models_of(study: Study, source: str) -> Models:
     """The study's models with their parameters; raises as `assemble`."""
-    lookup = Lookup(source, study.origin.places)
-    vehicle, ads, scenario = _vehicle(study.vehicle, lookup), _ads(study.ads, lookup), _scenario(study.scenario, lookup)
+    lookup, limit = Lookup(source, study.origin.places), min(study.search.time_limit, LONGEST)
+    vehicle, ads, scenario = _vehicle(study.vehicle, lookup, limit), _ads(study.ads, lookup, limit), _scenario(study.scenario, lookup)
     return Models(vehicle[0], ads[0], scenario[0], weather_of(study.weather, source), (vehicle[1], ads[1], scenario[1]))
 
 
@@ -315,7 +319,14 @@ def _check_units(study: Study, vehicle: Vehicle, ours: bool, source: str) -> Non
             raise InputError(source, f"vehicle.characteristics.{name} is missing", f"all of {', '.join(known)}")
 
 
-def _vehicle(choice: VehicleTable, lookup: Lookup) -> tuple[Vehicle, Member]:
+def _vehicle(choice: VehicleTable, lookup: Lookup, limit: float) -> tuple[Vehicle, Member]:
+    if choice.kind == "fmu":
+        guard = Guard(lookup.source, f"vehicle.model = {choice.model!r}")
+        table = {**msgspec.structs.asdict(choice), "parameters": lookup.with_paths(Member(FmuVehicle, guard), choice.parameters,
+                                                                                   "vehicle.parameters")}
+        units = {name: row.unit for name, row in choice.characteristics.items()}
+        description = description_of(choice.model, lookup.places, lookup.source, "vehicle.model")
+        return FmuVehicle(description, units, table, guard, limit), Member(FmuVehicle, guard, file=description.path)
     member = lookup.class_of(VEHICLES, choice.model, "vehicle.model", VEHICLE_CONTRACT)
     parameters = lookup.with_paths(member, choice.parameters, "vehicle.parameters")
     vehicle = instance_of(member, parameters, f"vehicle.model = {choice.model!r}", "vehicle.parameters", lookup.source)
@@ -329,9 +340,15 @@ def _scenario(choice: ModelTable, lookup: Lookup) -> tuple[Scenario, Member]:
     return _with_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.places), member
 
 
-def _ads(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
+def _ads(choice: ModelTable, lookup: Lookup, limit: float) -> tuple[Ads, Member]:
     if choice.kind == "traci":
         return _traci(choice, lookup)
+    if choice.kind == "fmu":
+        guard = Guard(lookup.source, f"ads.model = {choice.model!r}")
+        parameters = lookup.with_paths(Member(FmuAds, guard), choice.parameters, "ads.parameters")
+        description = description_of(choice.model, lookup.places, lookup.source, "ads.model")
+        ads = FmuAds(description, choice.inputs, choice.outputs, parameters, choice.step, guard, limit)
+        return ads, Member(FmuAds, guard, file=description.path)
     member = lookup.class_of(ADS, choice.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT,
                              otherwise=f'with ads.kind = "traci" {STEP}')
     name = f"ads.model = {choice.model!r}"

@@ -17,6 +17,7 @@ from safevar_sumo.vehicles.base import (
 from safevar_sumo.vehicles.calibration_drive import calibration_drive
 from safevar_sumo.vehicles.carla import Carla
 from safevar_sumo.vehicles.characteristics import CHANGES, Change, Characteristic, CharacteristicSet, foreign_change
+from safevar_sumo.vehicles.fmu import FmuVehicle
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.region import FeasibleRegion, region_of
 from safevar_sumo.vehicles.sensors import Sensors
@@ -32,5 +33,5 @@ VEHICLES: Mapping[str, type[Any]] = {
 
 __all__ = [
     "CHANGES", "LEVEL", "VEHICLES", "VEHICLE_CONTRACT", "Carla", "Change", "Characteristic", "CharacteristicSet", "FeasibleRegion",
-    "GuardedVehicle", "Sensors", "Slope", "SumoType", "Vehicle", "VehicleState", "at_start", "calibration_drive", "foreign_change",
+    "FmuVehicle", "GuardedVehicle", "Sensors", "Slope", "SumoType", "Vehicle", "VehicleState", "at_start", "calibration_drive", "foreign_change",
     "region_of", "slope_of"]

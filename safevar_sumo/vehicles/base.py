@@ -103,6 +103,9 @@ class Vehicle(Protocol):
 
 def at_start(vehicle: Vehicle, prepared: Any, speed: FloatArray) -> Any:
     """The initial state at a speed [m/s], shape (N,): at rest, or steady."""
+    own = getattr(vehicle, "at_start", None)
+    if own is not None:
+        return own(prepared, speed)
     rest = vehicle.at_rest(prepared)
     rolls = speed > 0
     if not rolls.any():

@@ -12,7 +12,7 @@ import numpy as np
 
 from safevar_sumo.plugins import Files, digest_of, digests, located, named_files
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.study import Study, foreign_names
+from safevar_sumo.study import Study, fmus_of, foreign_names
 from safevar_sumo.sumo import Engine, assemble, reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.rater import driven_in_sumo
 from safevar_sumo.vehicles import CharacteristicSet
@@ -106,7 +106,7 @@ def sources_of(study: Study, pool: Pool) -> Files:
 
 
 def _parameters(study: Study) -> list[Any]:
-    """All parameters of a study's models and algorithms."""
+    """All parameters of a study's models and algorithms, and its FMUs."""
     tests = [] if study.matrix is None else study.matrix.tests
     return [study.vehicle.parameters, study.ads.parameters, study.scenario.parameters, study.search.parameters,
-            *(table for test in tests for table in (test.parameters, test.over))]
+            *(table for test in tests for table in (test.parameters, test.over)), [path for _, path in fmus_of(study)]]

@@ -1,0 +1,225 @@
+"""A vehicle that is an FMU: pedals are inputs, the speed is an output, and its parameters are the characteristics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safevar_sumo.errors import ForeignError, InputError, unknown
+from safevar_sumo.fmu import CONVERTIBLE, SI, USUAL, Description, Fault, Fleet, Instances, Past, Port, Unit, fixed_of, ports_of
+from safevar_sumo.plugins import Guard
+from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
+from safevar_sumo.vehicles.base import FASTEST, LEVEL, ROUNDING, Characteristics, Slope, SumoType
+from safevar_sumo.vehicles.sensors import Sensors, late_and_near
+
+PEDALS: Mapping[str, str] = {"throttle": "-", "brake": "-"}
+ROAD: Mapping[str, str] = {"road_friction": "-", "grade": "-", "wet": "-", "initial_speed": "m/s", "step": "s"}
+"""What stays the same during a run: inputs, or parameters that are set at the start. A grade is rise over run."""
+TOLD: Mapping[str, str] = {"speed": "m/s", "throttle": "-", "brake": "-", "gear": "-"}
+TYPE: Mapping[str, str] = {"mass": "kg", "accel": "m/s^2", "decel": "m/s^2", "max_speed": "m/s", "tau": "s"}
+USUAL_LAG = 0.1
+"""Actuator lag that a driving system reckons with where the study gives none [s]."""
+SENSED: Mapping[str, str] = {"latency": "s", "range": "m"}
+READABLE = ("output", "calculatedParameter", "parameter", "local")
+
+
+class _Prepared(NamedTuple):
+    """Constants of a run: what every vehicle is given, its type and sensors, and its instances."""
+
+    fleet: Fleet
+    given: Mapping[str, FloatArray]
+    characteristics: Characteristics
+    types: SumoType
+    sensors: Sensors
+    step: float
+
+
+class _State(NamedTuple):
+    """State of N vehicles; `seen` is what the sensors have under way, `past` how the instances got here."""
+
+    speed: FloatArray
+    throttle: FloatArray
+    brake: FloatArray
+    gear: FloatArray
+    seen: FloatArray | None
+    past: Past
+
+
+class FmuVehicle:
+    """N vehicles with an instance of an FMU each; see `Vehicle`.
+
+    Parameters
+    ----------
+    description
+        The FMU.
+    units
+        The characteristics of the study and their units.
+    table
+        Keys `inputs`, `outputs`, `parameters`, `sensors`, `sumo_type` and `step` of the study.
+    guard
+        Checks what comes of it.
+    limit
+        How long an instance may take for one step [s].
+
+    Raises
+    ------
+    InputError
+        If what the study says does not fit the FMU.
+    """
+
+    def __init__(self, description: Description, units: Mapping[str, str], table: Mapping[str, Any], guard: Guard, limit: float) -> None:
+        source = guard.source
+        self._guard, self._own_step = guard, table["step"] or description.step
+        self.UNITS = dict(units)
+        self._sensors, self._type = dict(table["sensors"]), {"tau": USUAL_LAG, **table["sumo_type"]}
+        for key, given, known in (("sensors", self._sensors, SENSED), ("sumo_type", self._type, TYPE)):
+            for name in given:
+                if name not in known:
+                    raise unknown(source, f"vehicle.{key}.{name}: there is no such quantity", name, known)
+        for name in TYPE:
+            if name not in self._type:
+                raise InputError(source, f"vehicle.sumo_type.{name} is missing", f"a number in {TYPE[name]}, or a characteristic or variable of the FMU")
+        inputs, outputs = table["inputs"], table["outputs"]
+        pedals = ports_of(description, {name: one for name, one in inputs.items() if name not in ROAD}, {**PEDALS, **ROAD}, ("input",), source,
+                          "vehicle.inputs")
+        road = ports_of(description, {name: one for name, one in inputs.items() if name in ROAD}, ROAD, ("input", "parameter"), source,
+                        "vehicle.inputs")
+        for name in PEDALS:
+            if name not in pedals:
+                raise InputError(source, f"vehicle.inputs.{name} is missing", "the input that takes that pedal")
+        told = ports_of(description, outputs, TOLD, ("output",), source, "vehicle.outputs")
+        if "speed" not in told:
+            raise InputError(source, "vehicle.outputs.speed is missing", "the output that tells the speed")
+        tuned = {name: self._characteristic(description, name, unit) for name, unit in units.items()
+                 if name in description.variables or name not in self._sensors.values()}
+        self._of_characteristics = {one: self._unit(description, one, units[one], unit, f"vehicle.{key}.{name}")
+                                    for key, given, known in (("sensors", self._sensors, SENSED), ("sumo_type", self._type, TYPE))
+                                    for name, unit in known.items() if isinstance(one := given.get(name), str) and one in units}
+        read = {name: one for name, one in self._type.items() if isinstance(one, str) and one not in units}
+        types = ports_of(description, read, TYPE, READABLE, source, "vehicle.sumo_type")
+        self._quantities, self._tuned, self._outputs = (*pedals, *road), tuple(tuned), (*told, *types)
+        self._reads_type = bool(types)
+        taken = [port.variable.name for port in (*road.values(), *tuned.values())]
+        fixed = list(fixed_of(description, table["parameters"], taken, source, "vehicle.parameters"))
+        self._instances = Instances(description, [*pedals.values(), *road.values(), *tuned.values()], [*told.values(), *types.values()],
+                                    fixed, limit)
+        self.most_vehicles = self._instances.most_vehicles
+        self.takes_slope, self.can_start_moving = "grade" in road, "initial_speed" in road
+        self._takes_friction = "road_friction" in road
+
+    def _characteristic(self, description: Description, name: str, unit: str) -> Port:
+        key = f"vehicle.characteristics.{name}"
+        variable = description.variable(name, ("parameter",), self._guard.source, key, CONVERTIBLE)
+        if unit == (variable.unit_name or unit) or (unit == "-" and variable.unit_name in ("", "1")):
+            return Port(variable, SI["-"], SI["-"])
+        ours = description.units.get(unit) or USUAL.get(unit)
+        if ours is None:
+            raise InputError(self._guard.source, f"{key}.unit = {unit!r}: nobody says what it stands for", repr(variable.unit_name))
+        return Port(variable, description.converted(variable, ours, unit, self._guard.source, f"{key}.unit"), ours)
+
+    def _unit(self, description: Description, name: str, unit: str, wanted: str, key: str) -> tuple[Unit, Unit]:
+        """The unit of a characteristic that stands for a quantity, and that of the quantity."""
+        theirs = description.units.get(unit) or USUAL.get(unit)
+        if theirs is None or not theirs.fits(SI[wanted]):
+            raise InputError(self._guard.source, f"{key} = {name!r}: the unit of that characteristic is {unit!r}", f"a unit of {wanted}")
+        return theirs, SI[wanted]
+
+    def prepare(self, characteristics: Characteristics, road_friction: float | FloatArray, step: float, slope: Slope = LEVEL,
+                wet: bool | BoolArray = False) -> _Prepared:
+        n = len(next(iter(characteristics.values())))
+        if slope is not LEVEL and not self.takes_slope:
+            raise ForeignError(self._guard.source, f"{self._guard.name} has no vehicle.inputs.grade, and the road has a grade",
+                               "a variable that takes it, or scenarios with grade 0")
+        nothing = np.zeros(n)
+        given = {"throttle": nothing, "brake": nothing, "road_friction": nothing + road_friction, "grade": nothing + slope.back / slope.down,
+                 "wet": nothing + wet, "step": nothing + step, "initial_speed": nothing}
+        fleet = Fleet(self._instances, n, step, self._own_step)
+        told = {}
+        if self._reads_type:
+            told = dict(zip(self._outputs, self._start(fleet, self._stacked(given, characteristics))[0], strict=True))
+
+        def value(one: str | float, name: str) -> FloatArray:
+            if not isinstance(one, str):
+                return nothing + one
+            if one not in characteristics:
+                return told[name]
+            theirs, ours = self._of_characteristics[one]
+            return np.asarray(theirs.to(ours, characteristics[one]))
+
+        types = SumoType(*(self._guard.numbers("sumo_type", name, value(self._type[name], name), (n,), 0.0, above=True) for name in TYPE))
+        sensors = Sensors.perfect(n)._replace(**{{"latency": "latency", "range": "reach"}[name]: value(one, name)
+                                                 for name, one in self._sensors.items()})
+        return _Prepared(fleet, given, characteristics, types, sensors, step)
+
+    def sumo_type(self, prepared: _Prepared) -> SumoType:
+        return prepared.types
+
+    def at_rest(self, prepared: _Prepared) -> _State:
+        return self.at_start(prepared, np.zeros_like(prepared.types.mass))
+
+    def at_speed(self, prepared: _Prepared, speed: FloatArray) -> _State:
+        return self.at_start(prepared, speed)
+
+    def at_start(self, prepared: _Prepared, speed: FloatArray) -> _State:
+        """The initial state at a speed [m/s], shape (N,)."""
+        if np.any(speed > 0) and not self.can_start_moving:
+            raise ForeignError(self._guard.source, f"{self._guard.name} has no vehicle.inputs.initial_speed, and the traffic puts it onto the "
+                               "road in motion", "a variable that takes it, or traffic that departs with speed 0")
+        given = self._stacked({**prepared.given, "initial_speed": speed}, prepared.characteristics)
+        outputs, past = self._start(prepared.fleet, given)
+        state = self._state(dict(zip(self._outputs, outputs, strict=True)), Command(np.zeros_like(speed), np.zeros_like(speed)), None, past)
+        for i in np.flatnonzero(np.abs(state.speed - speed) > 1e-6)[:1]:
+            raise self._guard.wrong("initialisation", "speed", float(state.speed[i]), f"{speed[i]:g} m/s, at which it begins")
+        return state._replace(speed=np.asarray(speed, dtype=float))
+
+    def sensors(self, prepared: _Prepared) -> Sensors:
+        return prepared.sensors
+
+    def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
+        """Sensors report what was their latency ago, and nothing beyond their range times the visibility."""
+        if not self._sensors:
+            return seen, state
+        late, past = late_and_near(seen, state.seen, prepared.sensors.latency, prepared.sensors.reach, prepared.step)
+        return late, state._replace(seen=past)
+
+    def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
+        inputs = self._stacked({**prepared.given, **command._asdict()}, prepared.characteristics)
+        try:
+            (now, smooth), past = prepared.fleet.advance(state.past, inputs)
+        except Fault as fault:
+            raise self._failed(fault) from None
+        told = dict(zip(self._outputs, now, strict=True))
+        told["speed"] = dict(zip(self._outputs, smooth, strict=True))["speed"]
+        after, most = self._state(told, command, state.seen, past), prepared.types.max_speed
+        for i in np.flatnonzero(after.speed > np.maximum(most, state.speed) * (1 + ROUNDING))[:1]:
+            raise self._guard.wrong("doStep", "speed", float(after.speed[i]), f"up to vehicle.sumo_type.max_speed = {most[i]:g}")
+        return after
+
+    @property
+    def remarks(self) -> list[str]:
+        """What a user should know of it."""
+        return [] if self._takes_friction else [
+            f"{self._guard.name} has no vehicle.inputs.road_friction: a weather changes nothing of how it accelerates and brakes"]
+
+    def _start(self, fleet: Fleet, inputs: FloatArray) -> tuple[FloatArray, Past]:
+        try:
+            return fleet.start(inputs)
+        except Fault as fault:
+            raise self._failed(fault) from None
+
+    def _failed(self, fault: Fault) -> ForeignError:
+        return ForeignError(self._guard.source, f"{self._guard.name} {fault}")
+
+    def _stacked(self, given: Mapping[str, FloatArray], characteristics: Characteristics) -> FloatArray:
+        return np.stack([*(given[name] for name in self._quantities), *(characteristics[name] for name in self._tuned)])
+
+    def _state(self, told: Mapping[str, FloatArray], command: Command, seen: FloatArray | None, past: Past) -> _State:
+        n = command.throttle.shape
+        check = self._guard.numbers
+        speed = np.where(np.abs(told["speed"]) < ROUNDING, 0.0, told["speed"])
+        return _State(
+            check("doStep", "speed", speed, n, 0.0, FASTEST), check("doStep", "throttle", told.get("throttle", command.throttle), n, 0.0, 1.0),
+            check("doStep", "brake", told.get("brake", command.brake), n, 0.0, 1.0),
+            check("doStep", "gear", told.get("gear", np.ones(n)), n), seen, past)
