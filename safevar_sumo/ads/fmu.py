@@ -21,6 +21,7 @@ KNOWN: Mapping[str, str] = {
     "nominal_mass": "kg", "nominal_accel": "m/s^2", "nominal_decel": "m/s^2", "nominal_max_speed": "m/s", "nominal_actuator_lag": "s",
     "step": "s"}
 """What it may know of the original vehicle, and the time between two calls: inputs, or parameters that are set at the start."""
+OF_NOMINAL = "nominal_"
 COMMANDED: Mapping[str, str] = {"throttle": "-", "brake": "-", "acceleration": "m/s^2", "warns": "-"}
 """Quantities that it tells; a warning is one above one half."""
 
@@ -29,7 +30,7 @@ class _Memory(NamedTuple):
     """Its instances and how they got here; the pedals that hold the initial speed; whether drivers are warned."""
 
     fleet: Fleet
-    known: tuple[float, ...]
+    known: Mapping[str, float]
     nominal: Nominal
     past: Past | None = None
     trim: Trim | None = None
@@ -60,26 +61,23 @@ class FmuAds:
                  step: float | None, guard: Guard, limit: float) -> None:
         source = guard.source
         self._guard, self._own_step = guard, step or description.step
-        given = ports_of(description, {name: one for name, one in inputs.items() if name not in KNOWN}, {**OBSERVED, **KNOWN}, ("input",),
-                         source, "ads.inputs")
-        known = ports_of(description, {name: one for name, one in inputs.items() if name in KNOWN}, KNOWN, ("input", "parameter"),
-                         source, "ads.inputs")
+        given = ports_of(description, inputs, {**OBSERVED, **KNOWN}, ("input",), source, "ads.inputs", constant=KNOWN)
         told = ports_of(description, outputs, COMMANDED, ("output",), source, "ads.outputs")
         if ("acceleration" in told) == bool({"throttle", "brake"} & told.keys()):
             raise InputError(source, f"ads.outputs = {sorted(outputs)}", "throttle, brake or both of them; or acceleration")
-        if not given:
+        if not given.keys() & OBSERVED.keys():
             raise InputError(source, "ads.inputs: nothing that it observes", f"some of {', '.join(OBSERVED)}")
-        self._observed, self._known, self._told = tuple(given), tuple(known), tuple(told)
-        taken = [port.variable.name for port in known.values()]
-        self._instances = Instances(description, [*given.values(), *known.values()], [*told.values()],
+        self._given, self._told = tuple(given), tuple(told)
+        taken = [port.variable.name for port in given.values()]
+        self._instances = Instances(description, [*given.values()], [*told.values()],
                                     list(fixed_of(description, parameters, taken, source, "ads.parameters")), limit)
         self.most_vehicles = self._instances.most_vehicles
         if "warns" in told:
             self.warns = self._warns
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        facts = {"step": step, **{f"nominal_{name}": getattr(nominal, name) for name in ("mass", "accel", "decel", "max_speed", "actuator_lag")}}
-        return _Memory(Fleet(self._instances, n, step, self._own_step), tuple(facts[name] for name in self._known), nominal)
+        known = {"step": step, **{name: getattr(nominal, name.removeprefix(OF_NOMINAL)) for name in KNOWN if name.startswith(OF_NOMINAL)}}
+        return _Memory(Fleet(self._instances, n, step, self._own_step), known, nominal)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         inputs = self._inputs(seen, memory.known)
@@ -99,11 +97,9 @@ class FmuAds:
         return Command(*(self._guard.numbers("doStep", name, told.get(name, nothing), seen.speed.shape, 0.0, 1.0)
                          for name in Command._fields)), memory
 
-    def _inputs(self, seen: Observation, known: tuple[float, ...]) -> FloatArray:
-        values = {**seen._asdict(), "detected": np.isfinite(seen.gap)}
-        n = len(seen.speed)
-        return np.stack([*(np.broadcast_to(np.asarray(values[name], dtype=float), (n,)) for name in self._observed),
-                         *(np.full(n, value) for value in known)])
+    def _inputs(self, seen: Observation, known: Mapping[str, float]) -> FloatArray:
+        values = {**seen._asdict(), "detected": np.isfinite(seen.gap), **known}
+        return np.stack([np.broadcast_to(np.asarray(values[name], dtype=float), seen.speed.shape) for name in self._given])
 
     def _warns(self, memory: _Memory) -> BoolArray:
         assert memory.warns is not None

@@ -105,7 +105,8 @@ def _fmu_of(name: str, chosen: Study | None) -> Subject:
             if file_of(model, study.origin.places) == str(Path(name).absolute()):
                 remarks = () if chosen else (f"tried in {study.origin.called}, which names it",)
                 return _fmu(study, key.partition(".")[0], model)._replace(remarks=remarks)
-    raise InputError("check", f"no study says what the variables of {name!r} stand for", "--study STUDY with [ads] or [vehicle] kind = \"fmu\"")
+    problem = f"no study says what the variables of {name!r} stand for"
+    raise InputError("check", problem, '--study STUDY, whose [ads] or [vehicle] has kind = "fmu" and that model')
 
 
 def subjects_of(study: Study) -> Iterator[Subject]:

@@ -6,5 +6,5 @@ from safevar_sumo.fmu.ports import Port, fixed_of, ports_of
 from safevar_sumo.fmu.units import SI, USUAL, Unit
 
 __all__ = [
-    "CONVERTIBLE", "LONGEST", "SI", "USUAL", "Description", "Fault", "Fleet", "Instances", "Past", "Port", "Unit", "Variable", "description_of",
-    "file_of", "fixed_of", "ports_of"]
+    "CONVERTIBLE", "LONGEST", "SI", "USUAL", "Description", "Fault", "Fleet", "Instances", "Past", "Port", "Unit", "Variable",
+    "description_of", "file_of", "fixed_of", "ports_of"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import xml.etree.ElementTree as ElementTree
 import zipfile
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -75,8 +76,8 @@ class Description:
             If there is none, or it is of another causality or type.
         """
         fitting = [one.name for one in self.variables.values() if one.causality in causalities and one.type in types]
-        wanted = " or ".join(causalities)
-        legal = f"{_article(wanted)} of the FMU: {', '.join(fitting[:MOST_LISTED]) or 'it has none'}{', ...' * (len(fitting) > MOST_LISTED)}"
+        listed = ", ".join(fitting[:MOST_LISTED]) + ", ..." * (len(fitting) > MOST_LISTED)
+        legal = f"{_article(' or '.join(causalities))} of the FMU: {listed or 'it has none'}"
         if name not in self.variables:
             raise InputError(source, f"{key} = {name!r}: {Path(self.path).name} has no such variable{did_you_mean(name, fitting)}", legal)
         found = self.variables[name]
@@ -159,11 +160,15 @@ def _read(path: str, *_: int) -> Description:
     try:
         with zipfile.ZipFile(path) as archive:
             files = set(archive.namelist())
+            version = ElementTree.fromstring(archive.read("modelDescription.xml")).get("fmiVersion", "")
+    except Exception as error:  # whatever is wrong with somebody's file
+        raise InputError("fmu", f"is no FMU that can be read: {first_line(error)}", LEGAL) from None
+    if not version.startswith(("2.", "3.")):
+        raise InputError("fmu", f"is of FMI {version}", LEGAL)
+    try:
         said = read_model_description(path, validate=False)
     except Exception as error:  # whatever FMPy stumbles over in somebody's file
         raise InputError("fmu", f"is no FMU that can be read: {first_line(error)}", LEGAL) from None
-    if said.fmiVersion.startswith("1"):
-        raise InputError("fmu", f"is of FMI {said.fmiVersion}", LEGAL)
     way = said.coSimulation
     if way is None:
         kind = "model exchange" if said.modelExchange is not None else "scheduled execution"

@@ -64,7 +64,7 @@ class Instances:
         self._library = (FMU3Slave if self._is_3 else FMU2Slave)(instanceName=setting.identifier, **known)
         self._callbacks = None if self._is_3 else self._callbacks_2()
         self._of: dict[int, Any] = {}
-        self._inputs, self._parameters, self._outputs = (self._grouped(ports) for ports in (setting.inputs, setting.parameters, setting.outputs))
+        self._inputs, self._parameters, self._outputs = map(self._grouped, (setting.inputs, setting.parameters, setting.outputs))
         self.busy: tuple[float, int, str] | None = None
         """Since when which instance has been doing what."""
 

@@ -23,7 +23,7 @@ from safevar_sumo.fmu.ports import FloatArray, Port
 
 LONGEST = 10.0
 """How long an instance may take for one step of a simulation before it counts as hung [s]."""
-MOST, MOST_ALONE = 200, 8
+MOST, MOST_ALONE = 200, 4
 """Vehicles of a simulation: in one process of an FMU, and in processes of their own."""
 EXACT = 1e-9
 """Share of a step by which a time may miss a communication point and be there."""
@@ -147,7 +147,7 @@ class Instances:
         once = [[*(float(given[k][i]) for k in self._set_once), *self._fixed] for i in range(len(numbers))]
         always = [[float(given[k][i]) for k in self._set_always] for i in range(len(numbers))]
         answers = self._asked("start", numbers, "is initialised", lambda rows: ([once[i] for i in rows], [always[i] for i in rows]))
-        return self._read(answers[:, np.newaxis])[-1]
+        return np.asarray(self._read(answers[:, np.newaxis])[-1])
 
     def step(self, numbers: Sequence[int], times: Sequence[tuple[float, float]], values: FloatArray) -> FloatArray:
         """Instances after steps that begin at times and are so long [s], one of them at least; outputs after the last two, or the one,
@@ -165,10 +165,8 @@ class Instances:
 
     def _asked(self, name: str, numbers: Sequence[int], doing: str, arguments: Any) -> FloatArray:
         """What instances answer, shape (N, ...): all in one process, or each in its own."""
-        if self.description.alone:
-            groups = {number: [place] for place, number in enumerate(numbers)}
-        else:
-            groups = {0: list(range(len(numbers)))}
+        places = range(len(numbers))
+        groups = {numbers[place]: [place] for place in places} if self.description.alone else {0: [*places]}
         hosts = {}
         try:
             for key, rows in groups.items():
@@ -258,5 +256,5 @@ class Fleet:
         own = self._own_step or self._step
         after = self._points(number + 1) - (number + 1) * self._step / own  # by how many own steps it is ahead
         if abs(after) <= EXACT:
-            return self._last[1]
-        return self._last[1] - (self._last[1] - self._last[0]) * after
+            return np.asarray(self._last[1])
+        return np.asarray(self._last[1] - (self._last[1] - self._last[0]) * after)

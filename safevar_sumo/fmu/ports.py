@@ -34,7 +34,7 @@ class Port(NamedTuple):
         """Values in the FMU's unit, within the bounds that an input declares: a gap to nobody is as large as it takes."""
         theirs = np.asarray(self.ours.to(self.theirs, values))
         lower, upper = (self.variable.lower, self.variable.upper) if self.is_input else (None, None)
-        return np.clip(theirs, -np.inf if lower is None else lower, np.inf if upper is None else upper)
+        return np.asarray(np.clip(theirs, -np.inf if lower is None else lower, np.inf if upper is None else upper))
 
     def told(self, values: FloatArray) -> FloatArray:
         """The FMU's values outside of it."""
@@ -42,7 +42,7 @@ class Port(NamedTuple):
 
 
 def ports_of(description: Description, named: Mapping[str, str], units: Mapping[str, str], causalities: Collection[str], source: str,
-             key: str) -> dict[str, Port]:
+             key: str, constant: Collection[str] = ()) -> dict[str, Port]:
     """The ports that a table of a study names, by quantity.
 
     Parameters
@@ -53,6 +53,8 @@ def ports_of(description: Description, named: Mapping[str, str], units: Mapping[
         The unit of every quantity that there is.
     key
         The table's key in the study.
+    constant
+        Quantities that stay the same during a run: parameters take them, too.
 
     Raises
     ------
@@ -63,7 +65,8 @@ def ports_of(description: Description, named: Mapping[str, str], units: Mapping[
     for quantity, name in named.items():
         if quantity not in units:
             raise unknown(source, f"{key}.{quantity}: there is no such quantity", quantity, units)
-        variable = description.variable(name, causalities, source, f"{key}.{quantity}")
+        fitting = (*causalities, "parameter") if quantity in constant else causalities
+        variable = description.variable(name, fitting, source, f"{key}.{quantity}")
         if any(port.variable.name == name for port in found.values()) and "input" in causalities:
             raise InputError(source, f"{key}.{quantity} = {name!r}: that variable already has another value", "each variable once")
         ours = SI[units[quantity]]

@@ -93,7 +93,8 @@ def _with_fmu(raw: _Raw, tables: dict[str, Any]) -> dict[str, Any]:
         return tables
     from safevar_sumo.fmu.description import description_of, file_of  # FMPy is for those who have an FMU
 
-    if given and all({"unit", "original", "lower", "upper"} <= row.keys() for row in given.values()) and not file_of(model, raw.origin.places):
+    complete = given and all({"unit", "original", "lower", "upper"} <= row.keys() for row in given.values())
+    if complete and not file_of(model, raw.origin.places):
         return tables  # results without their FMU can be read
     declared = description_of(model, raw.origin.places, str(raw.source), "vehicle.model")
     rows = {**declared.rows(fixed), **{name: {**declared.row(name, str(row.get("unit", ""))), **row} for name, row in given.items()}}

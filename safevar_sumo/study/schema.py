@@ -318,13 +318,12 @@ def foreign_packages(study: Study) -> list[str]:
 def _foreign(study: Study) -> list[tuple[str, str]]:
     """Keys and names of a study's code from outside."""
     tests = [] if study.matrix is None else [test.model for test in study.matrix.tests]
-    fmus = dict(fmus_of(study))
-    named = {**{f"{key}.model": [table.model] for key, table in (("vehicle", study.vehicle), ("ads", study.ads)) if f"{key}.model" not in fmus},
-             "scenario.model": [study.scenario.model, *tests],
+    named = {"vehicle.model": [study.vehicle.model], "ads.model": [study.ads.model], "scenario.model": [study.scenario.model, *tests],
              "metrics.also": study.metrics.also, "search.objectives": study.search.objectives}
     functions = [one.function for one in study.constraints]
     named["constraints.function"] = [name for name in functions if name]
-    return [(key, name) for key, names in named.items() for name in dict.fromkeys(names) if ":" in name]
+    fmus = fmus_of(study)
+    return [(key, name) for key, names in named.items() for name in dict.fromkeys(names) if ":" in name and (key, name) not in fmus]
 
 
 def is_file(path: Path) -> bool:

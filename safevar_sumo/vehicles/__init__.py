@@ -33,5 +33,5 @@ VEHICLES: Mapping[str, type[Any]] = {
 
 __all__ = [
     "CHANGES", "LEVEL", "VEHICLES", "VEHICLE_CONTRACT", "Carla", "Change", "Characteristic", "CharacteristicSet", "FeasibleRegion",
-    "FmuVehicle", "GuardedVehicle", "Sensors", "Slope", "SumoType", "Vehicle", "VehicleState", "at_start", "calibration_drive", "foreign_change",
-    "region_of", "slope_of"]
+    "FmuVehicle", "GuardedVehicle", "Sensors", "Slope", "SumoType", "Vehicle", "VehicleState", "at_start", "calibration_drive",
+    "foreign_change", "region_of", "slope_of"]

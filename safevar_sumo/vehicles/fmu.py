@@ -22,6 +22,9 @@ TYPE: Mapping[str, str] = {"mass": "kg", "accel": "m/s^2", "decel": "m/s^2", "ma
 USUAL_LAG = 0.1
 """Actuator lag that a driving system reckons with where the study gives none [s]."""
 SENSED: Mapping[str, str] = {"latency": "s", "range": "m"}
+NEEDED = {
+    "inputs": "the input that takes that pedal", "outputs": "the output that tells the speed",
+    "sumo_type": "a number in SI units; or a characteristic, or an output or parameter of the FMU"}
 READABLE = ("output", "calculatedParameter", "parameter", "local")
 
 
@@ -69,45 +72,37 @@ class FmuVehicle:
         If what the study says does not fit the FMU.
     """
 
+    UNITS: Mapping[str, str]
+
     def __init__(self, description: Description, units: Mapping[str, str], table: Mapping[str, Any], guard: Guard, limit: float) -> None:
-        source = guard.source
-        self._guard, self._own_step = guard, table["step"] or description.step
+        source, self._guard, self._own_step = guard.source, guard, table["step"] or description.step
         self.UNITS = dict(units)
         self._sensors, self._type = dict(table["sensors"]), {"tau": USUAL_LAG, **table["sumo_type"]}
-        for key, given, known in (("sensors", self._sensors, SENSED), ("sumo_type", self._type, TYPE)):
-            for name in given:
+        for key, tabled, known in (("sensors", self._sensors, SENSED), ("sumo_type", self._type, TYPE)):
+            for name in tabled:
                 if name not in known:
                     raise unknown(source, f"vehicle.{key}.{name}: there is no such quantity", name, known)
-        for name in TYPE:
-            if name not in self._type:
-                raise InputError(source, f"vehicle.sumo_type.{name} is missing", f"a number in {TYPE[name]}, or a characteristic or variable of the FMU")
-        inputs, outputs = table["inputs"], table["outputs"]
-        pedals = ports_of(description, {name: one for name, one in inputs.items() if name not in ROAD}, {**PEDALS, **ROAD}, ("input",), source,
-                          "vehicle.inputs")
-        road = ports_of(description, {name: one for name, one in inputs.items() if name in ROAD}, ROAD, ("input", "parameter"), source,
-                        "vehicle.inputs")
-        for name in PEDALS:
-            if name not in pedals:
-                raise InputError(source, f"vehicle.inputs.{name} is missing", "the input that takes that pedal")
-        told = ports_of(description, outputs, TOLD, ("output",), source, "vehicle.outputs")
-        if "speed" not in told:
-            raise InputError(source, "vehicle.outputs.speed is missing", "the output that tells the speed")
+        given = ports_of(description, table["inputs"], {**PEDALS, **ROAD}, ("input",), source, "vehicle.inputs", constant=ROAD)
+        told = ports_of(description, table["outputs"], TOLD, ("output",), source, "vehicle.outputs")
+        for key, there, needed in (("inputs", given, PEDALS), ("outputs", told, ("speed",)), ("sumo_type", self._type, TYPE)):
+            for name in needed:
+                if name not in there:
+                    raise InputError(source, f"vehicle.{key}.{name} is missing", NEEDED[key])
+        self._of_characteristics = {one: self._unit(description, one, units[one], unit, f"vehicle.{key}.{name}")
+                                    for key, tabled, known in (("sensors", self._sensors, SENSED), ("sumo_type", self._type, TYPE))
+                                    for name, unit in known.items() if isinstance(one := tabled.get(name), str) and one in units}
         tuned = {name: self._characteristic(description, name, unit) for name, unit in units.items()
                  if name in description.variables or name not in self._sensors.values()}
-        self._of_characteristics = {one: self._unit(description, one, units[one], unit, f"vehicle.{key}.{name}")
-                                    for key, given, known in (("sensors", self._sensors, SENSED), ("sumo_type", self._type, TYPE))
-                                    for name, unit in known.items() if isinstance(one := given.get(name), str) and one in units}
         read = {name: one for name, one in self._type.items() if isinstance(one, str) and one not in units}
         types = ports_of(description, read, TYPE, READABLE, source, "vehicle.sumo_type")
-        self._quantities, self._tuned, self._outputs = (*pedals, *road), tuple(tuned), (*told, *types)
+        self._quantities, self._tuned, self._outputs = tuple(given), tuple(tuned), (*told, *types)
         self._reads_type = bool(types)
-        taken = [port.variable.name for port in (*road.values(), *tuned.values())]
-        fixed = list(fixed_of(description, table["parameters"], taken, source, "vehicle.parameters"))
-        self._instances = Instances(description, [*pedals.values(), *road.values(), *tuned.values()], [*told.values(), *types.values()],
-                                    fixed, limit)
+        inputs = [*given.values(), *tuned.values()]
+        fixed = list(fixed_of(description, table["parameters"], [port.variable.name for port in inputs], source, "vehicle.parameters"))
+        self._instances = Instances(description, inputs, [*told.values(), *types.values()], fixed, limit)
         self.most_vehicles = self._instances.most_vehicles
-        self.takes_slope, self.can_start_moving = "grade" in road, "initial_speed" in road
-        self._takes_friction = "road_friction" in road
+        self.takes_slope, self.can_start_moving = "grade" in given, "initial_speed" in given
+        self._takes_friction = "road_friction" in given
 
     def _characteristic(self, description: Description, name: str, unit: str) -> Port:
         key = f"vehicle.characteristics.{name}"
@@ -133,8 +128,8 @@ class FmuVehicle:
             raise ForeignError(self._guard.source, f"{self._guard.name} has no vehicle.inputs.grade, and the road has a grade",
                                "a variable that takes it, or scenarios with grade 0")
         nothing = np.zeros(n)
-        given = {"throttle": nothing, "brake": nothing, "road_friction": nothing + road_friction, "grade": nothing + slope.back / slope.down,
-                 "wet": nothing + wet, "step": nothing + step, "initial_speed": nothing}
+        given = {"throttle": nothing, "brake": nothing, "road_friction": nothing + road_friction, "wet": nothing + wet,
+                 "grade": nothing + slope.back / slope.down, "step": nothing + step, "initial_speed": nothing}
         fleet = Fleet(self._instances, n, step, self._own_step)
         told = {}
         if self._reads_type:
@@ -144,7 +139,7 @@ class FmuVehicle:
             if not isinstance(one, str):
                 return nothing + one
             if one not in characteristics:
-                return told[name]
+                return np.asarray(told[name])
             theirs, ours = self._of_characteristics[one]
             return np.asarray(theirs.to(ours, characteristics[one]))
 
@@ -165,8 +160,8 @@ class FmuVehicle:
     def at_start(self, prepared: _Prepared, speed: FloatArray) -> _State:
         """The initial state at a speed [m/s], shape (N,)."""
         if np.any(speed > 0) and not self.can_start_moving:
-            raise ForeignError(self._guard.source, f"{self._guard.name} has no vehicle.inputs.initial_speed, and the traffic puts it onto the "
-                               "road in motion", "a variable that takes it, or traffic that departs with speed 0")
+            problem = f"{self._guard.name} has no vehicle.inputs.initial_speed, and the traffic puts it onto the road in motion"
+            raise ForeignError(self._guard.source, problem, "a variable that takes it, or traffic that departs with speed 0")
         given = self._stacked({**prepared.given, "initial_speed": speed}, prepared.characteristics)
         outputs, past = self._start(prepared.fleet, given)
         state = self._state(dict(zip(self._outputs, outputs, strict=True)), Command(np.zeros_like(speed), np.zeros_like(speed)), None, past)
@@ -217,9 +212,8 @@ class FmuVehicle:
 
     def _state(self, told: Mapping[str, FloatArray], command: Command, seen: FloatArray | None, past: Past) -> _State:
         n = command.throttle.shape
-        check = self._guard.numbers
         speed = np.where(np.abs(told["speed"]) < ROUNDING, 0.0, told["speed"])
-        return _State(
-            check("doStep", "speed", speed, n, 0.0, FASTEST), check("doStep", "throttle", told.get("throttle", command.throttle), n, 0.0, 1.0),
-            check("doStep", "brake", told.get("brake", command.brake), n, 0.0, 1.0),
-            check("doStep", "gear", told.get("gear", np.ones(n)), n), seen, past)
+        values = {"gear": np.ones(n), **command._asdict(), **told, "speed": speed}
+        bounds = {"speed": (0.0, FASTEST), "gear": (-np.inf, np.inf)}
+        columns = {name: self._guard.numbers("doStep", name, values[name], n, *bounds.get(name, (0.0, 1.0))) for name in _State._fields[:4]}
+        return _State(**columns, seen=seen, past=past)

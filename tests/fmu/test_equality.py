@@ -1,0 +1,31 @@
+"""FMUs of the shipped driving system and vehicle do what those do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import safevar_sumo as sv
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.system import assemble
+
+SETTINGS = 200
+
+
+@pytest.mark.parametrize("name", ["exported_aeb", "exported_vehicle"])
+def test_an_exported_model_drives_as_the_original(made: Path, name: str) -> None:
+    native, fmu = (assemble(load_study(str(made / f"{one}.toml"))) for one in ("native_aeb", name))
+    rng, members = np.random.default_rng(5), native.characteristics
+    drawn = rng.uniform(members.lower, members.upper, (SETTINGS, len(members)))
+    settings = members.filter(members.original + 0.6 * (drawn - members.original))
+    expected, found = evaluate(native, settings), evaluate(fmu, settings)
+    assert 20 < np.sum(expected.outcome == "collision") < 180
+    np.testing.assert_array_equal(found.outcome, expected.outcome)
+    for metric, values in expected.metrics.items():
+        np.testing.assert_allclose(found.metrics[metric], values, rtol=0, atol=1e-9, err_msg=metric)
+    traces = [sv.simulate(str(made / f"{one}.toml"), {"mass": 1900.0, "reactionTime": 0.2}).trace for one in ("native_aeb", name)]
+    assert list(traces[0]) == list(traces[1])
+    np.testing.assert_allclose(traces[1].to_numpy(), traces[0].to_numpy(), rtol=0, atol=1e-9)

@@ -1,0 +1,98 @@
+"""What is wrong with an FMU, or with how a study uses it, is told in one line; what it needs is given to it."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from safevar_sumo.errors import ForeignError, InputError
+from safevar_sumo.records import Nominal, Observation
+from safevar_sumo.sumo.system import System
+from tests.fmu.exported import changed
+
+Make = Callable[..., System]
+OUT = '''outputs = { brake = "pedal" }'''
+IN = '''inputs = { gap = "gap" }'''
+
+
+def edited(old: str, new: str) -> Callable[[Path], object]:
+    """Replaces text in a model description."""
+    def edit(fmu: Path) -> None:
+        copy = fmu.with_suffix(".copy")
+        changed(fmu, copy, lambda text: re.sub(old, new, text))
+        assert copy.read_bytes() != fmu.read_bytes()
+        copy.replace(fmu)
+
+    return edit
+
+
+def without_binaries(fmu: Path) -> None:
+    copy = fmu.with_suffix(".copy")
+    changed(fmu, copy, str, lambda name: not name.startswith("binaries/linux") and not name.startswith("binaries/darwin"))
+    copy.replace(fmu)
+
+
+@pytest.mark.parametrize(("edit", "table", "told"), [
+    (edited('fmiVersion="2.0"', 'fmiVersion="1.0"'), "", "is of FMI 1.0"),
+    (edited("CoSimulation", "ModelExchange"), "", "is for model exchange only"),
+    (without_binaries, "", "has no binary for this machine"),
+    (lambda fmu: fmu.write_text("no archive"), "", "is no FMU that can be read: BadZipFile"),
+    (Path.unlink, "", "there is no such file"),
+    (str, IN.replace('"gap" }', '"gsp" }') + "\n" + OUT, "ads.inputs.gap = 'gsp': Small.fmu has no such variable; did you mean 'gap'?"),
+    (str, IN.replace('"gap" }', '"pedal" }') + "\n" + OUT, "ads.inputs.gap = 'pedal': that variable is an output"),
+    (str, IN + '\noutputs = { brake = "where" }', "ads.outputs.brake = 'where': that variable is a parameter"),
+    (str, IN + '\noutputs = { gas = "pedal" }', "ads.outputs.gas: there is no such quantity"),
+    (str, IN + '\noutputs = { brake = "pedal", acceleration = "steps" }', "ads.outputs = ['acceleration', 'brake']"),
+    (str, IN + "\n" + OUT + "\nparameters = { wear = 1 }", "has no such variable"),
+    (str, IN + "\n" + OUT + '\nparameters = { where = "far" }', "ads.parameters.where = 'far'"),
+    (edited('(name="gap"[^>]*>\\s*<Real) ', '\\1 unit="kg" '), IN + "\n" + OUT, "ads.inputs.gap = 'gap': its unit is 'kg'"),
+    (edited('(name="gap"[^>]*>\\s*<Real) ', '\\1 unit="ell" '), IN + "\n" + OUT, "its unit 'ell' has no BaseUnit"),
+])
+def test_what_cannot_be_used_is_refused_in_one_line(small: Make, edit: Callable[[Path], object], table: str, told: str) -> None:
+    with pytest.raises(InputError) as error:
+        small(table=table, edit=edit)
+    assert told in error.value.problem
+    assert "\n" not in error.value.problem
+    assert error.value.exit_code == 2
+
+
+def test_without_fmpy_the_extra_is_named(small: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fmpy", None)
+    with pytest.raises(InputError, match="pip install 'safevar_sumo\\[fmu\\]'"):
+        small()
+
+
+NOMINAL = Nominal(1500.0, 3.0, 8.0, 40.0, 0.1, lambda: None)  # type: ignore[arg-type, return-value]
+
+
+def driven(system: System, gaps: list[float], step: float = 0.1) -> np.ndarray:
+    """Commands of one vehicle that sees gaps one after the other, shape (2, T)."""
+    memory, commands = system.ads.start(1, NOMINAL, step), []
+    for sample, gap in enumerate(gaps):
+        one = np.ones(1)
+        command, memory = system.ads.drive(Observation(sample * step, 10 * one, gap * one, 10 * one, one, one, 1.0), memory)
+        commands.append([command.throttle[0], command.brake[0]])
+    return np.array(commands).T
+
+
+@pytest.mark.parametrize(("then", "told"), [
+    ("os.kill(os.getpid(), 11)", "crashed (signal SIGSEGV) while it is at 0.2 s"),
+    ("os._exit(7)", "crashed (exit code 7) while it is at 0.2 s"),
+    ("time.sleep(1000)", "takes longer than 1 s while it is at 0.2 s"),
+    ("raise ValueError('the map is empty')", "while it is at 0.2 s"),
+    ("self.pedal = 3.0", "returned brake = 3.0 from doStep"),
+    ("self.pedal = float('nan')", "returned brake = nan from doStep"),
+])
+def test_what_it_does_wrong_is_told_and_when(small: Make, then: str, told: str) -> None:
+    system = small(then, time_limit=1)
+    with pytest.raises(ForeignError) as error:
+        driven(system, [100.0, 50.0, 20.0, 10.0])
+    assert error.value.problem.startswith("ads.model = 'Small.fmu'")
+    assert told in error.value.problem
+    assert "\n" not in error.value.problem
+    np.testing.assert_array_equal(driven(system, [100.0, 50.0]), 0, err_msg="afterwards it drives again")
