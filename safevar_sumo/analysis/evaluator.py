@@ -1,4 +1,4 @@
-"""Where every question evaluates the settings of a study, and designs that cover its domain."""
+"""The bench on which every question evaluates settings of a study, and designs that cover its domain."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Progress = Callable[[str, int, int], None]
 
 
 SPREAD = 64
-"""Points of a sequence that are looked at for each feasible one."""
+"""Most points of a sequence that are drawn for each feasible one."""
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -52,9 +52,9 @@ class Bench:
         self.simulated = 0
 
     def evaluate(self, settings: FloatArray, stage: str, before: int = 0, of: int | None = None, *, anywhere: bool = False) -> Evaluations:
-        """Evaluate settings, shape (M, n); `stage` is what the progress calls them, the part after the first `before` of that many.
+        """Evaluate settings, shape (M, n); `stage` is their name in the progress, where they follow the first `before` of all `of`.
 
-        What violates a constraint of the study is not simulated: its outcome is `infeasible`. With `anywhere`, it is.
+        Settings that violate a constraint of the study are not simulated, their outcome is `infeasible`, unless `anywhere` is true.
         """
         if self.region and not anywhere:
             feasible = self.region.feasible(settings)
@@ -84,13 +84,13 @@ class Bench:
             f_num_diff=self.characteristics.number_changed(settings))
 
     def spread(self, number: int, seed: int = 0, *, filtered: bool = False) -> FloatArray:
-        """Settings that cover the whole domain evenly, where they are feasible, once they are filtered if they are to be."""
+        """Settings that cover the feasible part of the domain evenly; with `filtered` they are feasible after the filter."""
         if not self.region:
             return spread(self.characteristics, number, seed)
         rng, drawn = np.random.default_rng(seed), 0
 
         def following(some: int) -> FloatArray:
-            """The next points of the sequence, which begins alike however long it is."""
+            """The next points of the sequence."""
             nonlocal drawn
             drawn += some
             return spread(self.characteristics, drawn, seed)[drawn - some:]
@@ -98,7 +98,7 @@ class Bench:
         return self.region.sampled(following, number, rng, filtered=filtered, rejections=SPREAD)
 
     def cells(self, settings: FloatArray, stage: str) -> CellResults:
-        """What settings, shape (M, n), do in every cell of a rated study: each worker has a part of the cells, not of the settings.
+        """Results of settings, shape (M, n), in every cell of a rated study; each worker has a part of the cells, not of the settings.
 
         Raises
         ------

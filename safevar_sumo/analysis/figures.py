@@ -26,7 +26,7 @@ CHANGED, INVOLVED, NECESSARY = "#bbbbbb", "#56b4e9", "#0072b2"
 
 
 def new_figure(title: str, rows: int, columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, np.ndarray]:
-    """A figure that no global state knows of, and its axes, shape (rows, columns); `size` in inches, `options` as of `Figure.subplots`."""
+    """A figure outside pyplot's state, and its axes, shape (rows, columns); `size` in inches, `options` of `Figure.subplots`."""
     import matplotlib.style
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""What a check finds, and the line of an author's file where it comes from."""
+"""Findings of a check, and the line of the author's file that causes them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ADVICE: Mapping[str, str] = {
 }
 """How to mend what a check finds."""
 REFUSED = ("contract", "units", "determinism", "state", "batch", "inputs", "finite")
-"""Checks without which results are wrong: a study does not begin. Of the others it warns."""
+"""Checks whose failure makes results wrong, so that a study does not begin. The failure of another check is a warning."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,7 @@ class TakesTooLong(BaseException):
 
 
 def crowd() -> float:
-    """How many processes want each core, at least 1: by so much everything takes longer."""
+    """Processes per core that want to run, at least 1: the factor by which everything takes longer."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 1.0
     return max(1.0, load / (os.cpu_count() or 1))
 
@@ -141,11 +141,13 @@ class Source:
         if event != "return":
             return
         code = frame.f_code
-        mine = self._mine.get(code)
-        if mine is None:
-            mine = self._mine[code] = code.co_filename.startswith(self._folder) and "site-packages" not in code.co_filename
-        if mine:
+        if self._is_mine(code):
             self._last = code.co_filename, frame.f_lineno
+
+    def _is_mine(self, code: CodeType) -> bool:
+        if code not in self._mine:
+            self._mine[code] = code.co_filename.startswith(self._folder) and "site-packages" not in code.co_filename
+        return self._mine[code]
 
     def of_error(self, error: BaseException) -> tuple[str, int]:
         """Innermost line of the author's that an exception passed through; else of what returned last."""
@@ -155,7 +157,7 @@ class Source:
         while one is not None:
             frame, place = one.__traceback__, None
             while frame is not None:
-                if frame.tb_frame.f_code.co_filename.startswith(self._folder) and "site-packages" not in frame.tb_frame.f_code.co_filename:
+                if self._is_mine(frame.tb_frame.f_code):
                     place = frame.tb_frame.f_code.co_filename, frame.tb_lineno
                 frame = frame.tb_next
             if place is not None and not isinstance(one, InputError):
@@ -232,22 +234,21 @@ def _functions(tree: ast.AST) -> Iterator[ast.FunctionDef]:
     yield from (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
 
 
+def _calls(function: ast.FunctionDef) -> Iterator[tuple[str, int]]:
+    """What is called, and the line."""
+    yield from ((ast.unparse(node.func), node.lineno) for node in ast.walk(function) if isinstance(node, ast.Call))
+
+
 def _random_lines(tree: ast.AST) -> Iterator[int]:
     """Calls of random numbers and clocks; `rng.something` is what an algorithm is given."""
-    for function in _functions(tree):
-        for node in ast.walk(function):
-            if isinstance(node, ast.Call):
-                name = ast.unparse(node.func)
-                if RANDOM.search(name) and not name.startswith(("rng.", "problem.", "self.rng.")):
-                    yield node.lineno
+    yield from (line for function in _functions(tree) for name, line in _calls(function)
+                if RANDOM.search(name) and not name.startswith(("rng.", "problem.", "self.rng.")))
 
 
 def _batch_lines(tree: ast.AST) -> Iterator[int]:
     """Reductions over vehicles, and what depends on how many there are."""
-    for function in _functions(tree):
-        for node in ast.walk(function) if function.name != "__init__" else ():
-            if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in OVER_VEHICLES:
-                yield node.lineno
+    yield from (line for function in _functions(tree) if function.name != "__init__" for name, line in _calls(function)
+                if name.rpartition(".")[2] in OVER_VEHICLES)
 
 
 def _state_lines(tree: ast.AST) -> Iterator[int]:
@@ -259,7 +260,7 @@ def _state_lines(tree: ast.AST) -> Iterator[int]:
               for target in (node.targets if isinstance(node, ast.Assign) else [node.target]) if isinstance(target, ast.Name)}
     scalar = {id(one) for one in classes if any("ScalarAds" in ast.unparse(base) for base in one.bases)}
     for function in _functions(tree):
-        yielded = set(name for node in ast.walk(function) if isinstance(node, ast.Global | ast.Nonlocal) for name in node.names)
+        outer = {name for node in ast.walk(function) if isinstance(node, ast.Global | ast.Nonlocal) for name in node.names}
         for default in [*function.args.defaults, *filter(None, function.args.kw_defaults)]:
             if isinstance(default, ast.List | ast.Dict | ast.Set):
                 yield function.lineno
@@ -271,7 +272,7 @@ def _state_lines(tree: ast.AST) -> Iterator[int]:
             for target in targets:
                 base: ast.expr = target.value if isinstance(target, ast.Attribute | ast.Subscript) else target
                 text = ast.unparse(base)
-                if text in owners or (isinstance(target, ast.Name) and target.id in yielded) \
+                if text in owners or (isinstance(target, ast.Name) and target.id in outer) \
                         or (isinstance(target, ast.Subscript) and text.rpartition(".")[2] in shared) \
                         or (isinstance(target, ast.Attribute) and text == "self" and not begins):
                     yield target.lineno

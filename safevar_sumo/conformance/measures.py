@@ -24,7 +24,7 @@ from safevar_sumo.vehicles import CharacteristicSet, foreign_change
 
 
 class MetricProbe(Probe):
-    """A metric of drives with and without collisions."""
+    """A metric of runs with and without collisions."""
 
     methods = ("function",)
     number = 24
@@ -58,7 +58,7 @@ class MetricProbe(Probe):
 
 
 def _runs_of(study: Study) -> SimulationRuns:
-    """Drives of 24 vehicles in a study, of which each fourth or so gives full throttle all the time."""
+    """Runs of 24 vehicles in a study, every fourth of them with full throttle all the time."""
     plain = msgspec.structs.replace(study, metrics=msgspec.structs.replace(study.metrics, also=[]),
                                     search=msgspec.structs.replace(study.search, objectives=["safety_degree", "f_diff"]))
     system = assemble(plain)
@@ -70,8 +70,6 @@ def _runs_of(study: Study) -> SimulationRuns:
 
 class _Reckless:
     """An ADS whose every fourth vehicle gives full throttle instead."""
-
-    own_reactions = True
 
     def __init__(self, ads: Ads) -> None:
         self._ads = ads
@@ -110,7 +108,7 @@ class ObjectiveProbe(Probe):
 
 
 class AlgorithmProbe(Probe):
-    """A search of a smooth function; the vehicles are those that it asks for, one after the other."""
+    """A search of a smooth function; the settings that it asks for stand for the vehicles."""
 
     methods = ("search",)
     number = 1
@@ -131,7 +129,7 @@ class AlgorithmProbe(Probe):
         return self._instance()
 
     def _instance(self) -> Any:
-        """One for a run of its own, as every run of a study has."""
+        """A new instance, as every run of a study has."""
         subject, study = self.subject, self.subject.study
         lookup = Lookup("check", study.origin.places)
         member = lookup.find(ALGORITHMS, subject.name, subject.key)

@@ -25,7 +25,7 @@ STEPS = 100
 
 
 class _Traffic(NamedTuple):
-    """How vehicles come upon somebody: shape (T, N)."""
+    """Encounters of N vehicles with somebody, arrays of shape (T, N)."""
 
     speed: FloatArray
     gap: FloatArray
@@ -43,7 +43,7 @@ ENCOUNTERS = np.array([
     (15.0, 30.0, 0.0, 0.0, 10.0, 0.0), (10.0, 40.0, 0.0, 0.0, -5.0, 0.0), (10.0, 30.0, 10.0, 0.0, 0.0, 0.0),
     (12.0, 30.0, 0.0, 0.0, 0.0, 1.5)])
 COURSE, FREE = slice(0, 6), 8
-"""Encounters on a collision course; and one without anybody, which else is the second of those."""
+"""Encounters on a collision course; and the one that is like the second of them, but without anybody."""
 
 
 def _traffic() -> _Traffic:
@@ -60,7 +60,7 @@ def _traffic() -> _Traffic:
 
 
 class AdsProbe(Probe):
-    """An ADS comes upon somebody in many ways."""
+    """An ADS in many encounters."""
 
     methods = ("drive", "start")
     number = len(ENCOUNTERS)
@@ -169,7 +169,7 @@ class VehicleProbe(Probe):
 
 
 def _drive_ours(n: int, steps: int) -> None:
-    """Drive so many of our plainest vehicle."""
+    """Drive n of the simplest vehicle of this package."""
     values = {"mass": 1500.0, "accel": 3.0, "decel": 8.0, "maxSpeed": 40.0, "tau": 0.1, "sensorRange": 100.0, "reactionTime": 0.1,
               "brakeDelay": 0.1, "brakeGain": 1.0}
     vehicle = SumoVehicle()
@@ -180,6 +180,7 @@ def _drive_ours(n: int, steps: int) -> None:
     for _ in range(steps):
         _, state = vehicle.sense(prepared, state, seen)
         state = vehicle.advance(prepared, state, command)
+
 
 class StudyProbe(Probe):
     """The subject's study simulated: the original vehicle and corners of the domains."""

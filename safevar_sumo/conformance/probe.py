@@ -1,4 +1,4 @@
-"""What a subject is given to do: a probe, and what probes share."""
+"""A probe: the situations that a subject is tried in; and the functions that all probes use."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ POINTS = 2
 
 
 class Reaction(NamedTuple):
-    """What a subject should have reacted to and did not; `methods` are where that belongs."""
+    """A missing reaction of a subject; `methods` are those that should react."""
 
     methods: tuple[str, ...]
     expected: str
@@ -44,7 +44,7 @@ class Probe(ABC):
         self.subject = subject
 
     def system(self) -> System:
-        """The subject's study put together, with everybody's modules loaded anew."""
+        """The system of the subject's study, with all foreign modules loaded anew."""
         forget_foreign()
         system = assemble(self.subject.study)
         return replace(system, matrix=system.matrix[::max(len(system.matrix) // POINTS, 1)], rater=None)
@@ -58,11 +58,11 @@ class Probe(ABC):
         """Results of some of the vehicles, in that order."""
 
     def again(self, model: Any, rows: Rows) -> Outputs:
-        """The same results once more, from a subject that has been used."""
+        """The same results again, from a subject that has run before."""
         return self.run(model, rows)
 
     def reactions(self, model: Any, outputs: Outputs) -> Iterator[Reaction]:
-        """What the subject does not react to."""
+        """The reactions that are missing."""
         yield from ()
 
     def cost(self, model: Any, seconds: float) -> tuple[float, str]:
@@ -93,6 +93,7 @@ def cost_of(mine: float, ours: float, example: str, vehicles: int, steps: int) -
     """Time per vehicle and step [s], and a sentence that compares it."""
     mine, ours = mine / (vehicles * steps), ours / (vehicles * steps)
     return mine, f"{mine * 1e6:.2g} microseconds per vehicle and step, {vehicles} at once; ours ({example}) takes {ours * 1e6:.2g}"
+
 
 def corners(members: CharacteristicSet) -> FloatArray:
     """The original, the corners of all domains together, both ends of every domain alone, and corners drawn at random."""

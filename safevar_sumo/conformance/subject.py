@@ -1,4 +1,4 @@
-"""What is checked: a class, function or record by name, its kind, and the study that it is tried in."""
+"""Subjects of the checks: a class, function or record by name, its kind, and the study that it is tried in."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ BY_UNIT = {"kg": (1500.0, 1000.0, 2500.0), "m/s^2": (5.0, 3.0, 8.0), "m/s": (30.
 
 
 class Subject(NamedTuple):
-    """What is checked, as `name` is typed or stands in a study; `study` names it, `remarks` are on what was assumed."""
+    """A class, function or record to check, by its `name` on the command line or in `study`; `remarks` tell what was assumed."""
 
     name: str
     kind: str
@@ -178,7 +178,7 @@ def violation(subject: Subject) -> tuple[str, str]:
 
 def _refused_arguments(function: Callable[..., Any], number: int, more: int) -> str:
     try:
-        parameters = [one for one in inspect.signature(function).parameters.values()]
+        parameters = list(inspect.signature(function).parameters.values())
     except (TypeError, ValueError):
         return ""
     many = any(one.kind is one.VAR_POSITIONAL for one in parameters)
@@ -244,7 +244,7 @@ def _characteristics(units: Mapping[str, str], study: Study) -> tuple[dict[str, 
     shipped = [study, *map(load_study, study_names())]
     for name, unit in units.items():
         shipped_row = next((one.vehicle.characteristics[name] for one in shipped
-                      if name in one.vehicle.characteristics and one.vehicle.characteristics[name].unit == unit), None)
+                            if name in one.vehicle.characteristics and one.vehicle.characteristics[name].unit == unit), None)
         if shipped_row is None:
             original, lower, upper = BY_UNIT.get(str(unit), (1.0, 0.8, 1.2))
             guessed.append(f"{name} {lower:g} to {upper:g} {unit}")

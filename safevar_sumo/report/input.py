@@ -1,4 +1,4 @@
-"""At which points of a matrix a setting fails, as a table: tests and weathers down, speeds across, impact locations in the cells."""
+"""The input of a report: one study's results, replays and stored answers; and the table of the points at which a setting fails."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ AVOIDED, FAILS = "–", "fails"  # noqa: RUF001
 
 
 def failing_places(matrix: Sequence[Point], failing: Collection[str]) -> dict[str, Any]:
-    """The table of the tests that fail somewhere.
+    """A table of the tests that fail: tests and weathers down, speeds across, impact locations in the cells.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def failing_places(matrix: Sequence[Point], failing: Collection[str]) -> dict[st
 
 
 SAMPLES = 4000
-"""Vehicles that risk is estimated from, and that rules are made of and judged by."""
+"""Samples of the report's risk and rules."""
 
 
 class Again(NamedTuple):
@@ -87,10 +87,9 @@ class Again(NamedTuple):
 class ReportInput:
     """One study of a report.
 
-    `place` is its results directory as it was given, `number` its place among the studies, from 1; `system` is None where
-    what the study names cannot be simulated here, and `lacking` says why. `point` is the one of its matrix that is asked
-    about, to which all of the case belongs then; nothing where it is the whole study. `changed` tells what that is simulated for
-    the page is not what the results were computed with.
+    `place` is its results directory as it was given, `number` its place among the studies, from 1. `system` is None where the study
+    cannot be simulated here, and `lacking` says why. `point` is the point of the matrix that the whole case then belongs to; empty for
+    the whole study. `changed` lists the differences between what is simulated for the page and what the results were computed with.
     """
 
     number: int
@@ -226,9 +225,9 @@ FOLDER = "answers"
 
 
 def stored(material: ReportInput, name: str, compute: Callable[[], Any]) -> Any:
-    """What `compute` gives as plain values; from the results directory if it was computed from the same results before.
+    """The result of `compute` as plain values; read from the results directory if the same was computed before.
 
-    Where the directory cannot be written, or nothing tells which code an answer comes from, nothing is kept.
+    Nothing is stored where the directory cannot be written, or the code that computes an answer has no identity.
     """
     if material.changed or ("imported" in material.manifest and foreign_names(material.case.study)):
         return json.loads(json.dumps(compute(), allow_nan=False))
@@ -251,7 +250,7 @@ def stored(material: ReportInput, name: str, compute: Callable[[], Any]) -> Any:
 
 
 def _identity(material: ReportInput, name: str) -> str:
-    """Results of other content, other options, another package or other files of the study give other answers."""
+    """Digest of all that an answer depends on: the results, the options, the package's code."""
     digest = sha256(_package().encode())
     for kept in (MANIFEST, SOLUTIONS):
         file = material.place / kept
@@ -264,7 +263,7 @@ def _identity(material: ReportInput, name: str) -> str:
 
 @cache
 def _package() -> str:
-    """Identity of the package's code, between versions too: an answer depends on more code than results do."""
+    """Identity of all of the package's code: an answer depends on more of it than results do."""
     files = sorted(PACKAGE.rglob("*.py"))
     return repr([version("safevar_sumo"), RESULTS, [(file.relative_to(PACKAGE).as_posix(), sha256(file.read_bytes()).hexdigest())
                                                     for file in files]])

@@ -38,14 +38,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DIGITS = re.compile(r"(\d\.\d\d)\d+")
-"""A number in a picture with digits that are too fine to be seen."""
+"""A number in a picture, with more digits than can be seen."""
 DOTS = 150
 """Points of a scatter chart, at the most."""
 TEXT = {"svg.fonttype": "none", "svg.hashsalt": "safevar_sumo", "font.family": ["sans-serif"]}
 
 
 def tables(cases: Sequence[Case]) -> list[dict[str, Any]]:
-    """Every table, as the template takes it; nothing where no question can be answered."""
+    """Every table for the template; a table with the reason where no question can be answered."""
     try:
         answers = answer(cases)
     except Unanswerable as error:
@@ -85,7 +85,7 @@ def _inline(figure: Figure) -> str:
 
 
 def front(material: ReportInput, shown: Sequence[str]) -> Markup:
-    """The solutions that no other one beats, by largest change and safety degree; those that are replayed lead there."""
+    """A chart of the non-dominated solutions by largest change and safety degree; replayed ones are links to their replays."""
     rows = [row for row in material.solutions.values() if not np.isnan([row["f_safe"], row["f_diff"]]).any()]
     best = best_of(rows)
     kept = [best[place] for place in evenly(len(best), DOTS)] + [row for row in rows if row["handle"] in shown]

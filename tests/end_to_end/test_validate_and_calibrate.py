@@ -78,9 +78,11 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
     for word in ("CMA-ES", "seed 3", "mine.csv, SHA-256", "Cost"):
         assert word in head
     assert load_study("found.toml").vehicle.characteristics == load_study("mine.toml").vehicle.characteristics
-    for out in ("once.toml", "again.toml"):
-        run("calibrate", "mine.toml", str(data), "--trials", "7", "--seed", "3", "--out", out)
-    assert Path("again.toml").read_bytes() == Path("once.toml").read_bytes()
+    contents = set()
+    for _ in range(2):
+        run("calibrate", "mine.toml", str(data), "--trials", "7", "--seed", "3", "--out", "again.toml")
+        contents.add(Path("again.toml").read_bytes())
+    assert len(contents) == 1
 
 
 @pytest.mark.parametrize(("key", "expected"), [

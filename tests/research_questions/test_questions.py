@@ -246,14 +246,6 @@ def test_no_share_of_an_original_that_is_zero() -> None:
     assert quantities["TIT"]["percent"] == 100
 
 
-def test_what_a_table_tells_of_exposure_in_collisions_does_not_count() -> None:
-    """Published rows have a TET and a TIT for collisions too."""
-    crash = {**row(values=HEAVIER, sd=-2.0), "tet": 9.0, "tit": 9.0}
-    result = rq33_safety(made_up(row(values=HEAVIER, tet=1.5, tit=0.75), crash))
-    overall = {one["quantity"]: (one["value"], one["n"]) for one in result[result["j"] == "any"].to_dict("records")}
-    assert (overall["TET"], overall["TIT"]) == ((0.5, 1), (0.25, 1))
-
-
 @pytest.mark.parametrize(("clear", "wet"), [("clear", "wet"), ("wet", "fog"), ("clear", "night")])
 def test_the_clearer_weather_comes_first(clear: str, wet: str) -> None:
     friction_first = [made_up(row(values=HEAVIER), study=made_up_study(name=name, weather=name)) for name in (wet, clear)]

@@ -1,8 +1,7 @@
 """Minimal causes: the smallest subsets of a setting's changes that are unsafe by themselves.
 
-Outcomes need not be monotone: a change may take back what another one does. So nothing is inferred, every subset of a
-size is simulated, all those smaller than the smallest unsafe one included; that none of these is unsafe is what makes
-a cause minimal.
+Outcomes need not be monotone: one change may undo the effect of another. So nothing is inferred: subsets are simulated size by
+size, all of a size, until some are unsafe. Those are minimal, as no smaller subset is unsafe.
 """
 
 from __future__ import annotations
@@ -96,7 +95,7 @@ def involved(causes: Sequence[MinimalCause]) -> frozenset[int]:
 GRID = 32
 """Places simulated on a line at first: an unsafe island as wide as their distance is not skipped."""
 FINER = 8
-"""Number of parts into which the last safe part is divided, `ROUNDS` times."""
+"""Number of parts into which the interval with the boundary is divided, `ROUNDS` times."""
 ROUNDS = 3
 RESOLUTION = 1 / (GRID * FINER**ROUNDS)
 """Accuracy of a boundary, as a share of the line."""
@@ -147,7 +146,7 @@ def boundaries(bench: Bench, causes: list[MinimalCause], unsafe: Unsafe) -> list
 
 
 class Line(NamedTuple):
-    """Settings from `start` to `end`, shape (n,) each; settings at the share `lowest` of the line and below are left out."""
+    """Settings from `start` to `end`, shape (n,) each; the search leaves out shares of the line up to `lowest`."""
 
     start: FloatArray
     end: FloatArray
@@ -157,16 +156,16 @@ class Line(NamedTuple):
     def moving(cls, bench: Bench, cause: MinimalCause, columns: tuple[int, ...]) -> Line:
         """The line on which some columns of a cause go from the original to their values."""
         members = bench.characteristics
-        which = list(columns)
+        indices = list(columns)
         start = cause.setting.copy()
-        start[which] = members.original[which]
-        ways = np.abs(cause.setting - members.original)[which]
-        return cls(start, cause.setting, float(np.max(members.threshold[which] / ways, initial=0.0)))
+        start[indices] = members.original[indices]
+        distances = np.abs(cause.setting - members.original)[indices]
+        return cls(start, cause.setting, float(np.max(members.threshold[indices] / distances, initial=0.0)))
 
     def first_filtered(self, threshold: FloatArray) -> int:
         """The column whose change first falls to the filter's threshold on the way back."""
-        way = np.abs(self.end - self.start)
-        return int(np.argmax(np.divide(threshold, way, out=np.zeros_like(way), where=way > 0)))
+        distance = np.abs(self.end - self.start)
+        return int(np.argmax(np.divide(threshold, distance, out=np.zeros_like(distance), where=distance > 0)))
 
     def at(self, shares: FloatArray) -> FloatArray:
         """Settings at shares of the line, shape (K, n)."""

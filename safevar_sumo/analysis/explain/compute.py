@@ -1,4 +1,4 @@
-"""Explains failures: which of the changes did it, how little of them is enough, why, and whether the failure is robust."""
+"""Explains failures: the changes that cause them, how little of these is enough, the reason, and robustness."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ class Failures(NamedTuple):
     unsafe
         The criterion.
     rows
-        Those to explain: the unsafe ones, or the ones asked for by name.
+        Rows to explain: the unsafe ones, or the solutions that the options name.
     otherwise
-        How many of them do not end as the results say.
+        Number of settings with another outcome than the results record.
     """
 
     evaluations: Evaluations
@@ -57,7 +57,7 @@ class Failures(NamedTuple):
     otherwise: int
 
     def least(self, choice: str) -> int:
-        """The row asked for by a name of `CHOICES`: fewest, smallest or most_severe."""
+        """The row that a choice of `CHOICES` selects: fewest, smallest or most_severe."""
         among = self.evaluations.take(self.rows)
         return self.rows[int(np.lexsort([getattr(among, name) for name in reversed(CHOICES[choice])])[0])]
 
@@ -75,23 +75,23 @@ def failures_of(source: Study | Case, bench: Bench, original: Evaluations, named
             raise InputError("solution", f"{source.name!r} is a study and has no solutions", "a results directory")
         number = RATED_LOOKED_AT if is_rated(source) else LOOKED_AT
         settings = bench.characteristics.filter(bench.spread(number, source.search.seed, filtered=True))
-        called: list[SolutionId | None] = [None] * len(settings)
+        solution_handles: list[SolutionId | None] = [None] * len(settings)
         recorded = None
         rows = None
     else:
         solutions = source.solutions
-        every, whole = handles(solutions), solutions[list(bench.characteristics.names)].to_numpy(dtype=float)
+        all_handles, all_settings = handles(solutions), solutions[list(bench.characteristics.names)].to_numpy(dtype=float)
         asked = list(dict.fromkeys(position_of(solutions, handle) for handle in named))
-        kept = [*asked, *(row for row in _each_once(whole) if row not in set(asked))]
-        settings, called = whole[kept], [every[row] for row in kept]
+        kept = [*asked, *(row for row in _each_once(all_settings) if row not in set(asked))]
+        settings, solution_handles = all_settings[kept], [all_handles[row] for row in kept]
         recorded = solutions["outcome"].to_numpy(dtype=str)[kept]
         rows = list(range(len(asked))) if named else None
     evaluations = bench.evaluate(settings, "settings to explain")
-    means = unsafe or Unsafe.usual(evaluations, original)
+    criterion = unsafe or Unsafe.usual(evaluations, original)
     if rows is None:
-        rows = np.flatnonzero(means.of(evaluations)).tolist()
+        rows = np.flatnonzero(criterion.of(evaluations)).tolist()
     otherwise = 0 if recorded is None else int(np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN)))
-    return Failures(evaluations, called, means, rows, otherwise)
+    return Failures(evaluations, solution_handles, criterion, rows, otherwise)
 
 
 def _each_once(settings: np.ndarray) -> list[int]:
@@ -131,7 +131,7 @@ def where(system: System, original: FloatArray, settings: FloatArray, unsafe: Un
 
 
 def turned(bench: Bench, original: FloatArray, settings: FloatArray) -> tuple[list[Where], float]:
-    """As `where` in a rated study: the cells that have another colour than the original's, and both at the one that turns most."""
+    """As `where`, of a rated study: the cells with another colour than the original's, and both vehicles in the cell that turns most."""
     system = assemble(bench.study)
     assert system.rater is not None
     colours = system.rater.points(bench.cells(np.concatenate([original, settings]), "cells that turn")).colours.astype(int)
@@ -139,16 +139,16 @@ def turned(bench: Bench, original: FloatArray, settings: FloatArray) -> tuple[li
     for row in range(1, len(colours)):
         worse = colours[row] - colours[0]
         point = system.matrix[int(np.argmax(worse))]
-        (there,) = at_every_point(system.at(point), np.concatenate([original, settings[row - 1:row]]))
-        first, other = (course(there.drives, column, float(there.evaluations.f_safe[column])) for column in (0, 1))
+        (at_point,) = at_every_point(system.at(point), np.concatenate([original, settings[row - 1:row]]))
+        first, other = (course(at_point.drives, column, float(at_point.evaluations.f_safe[column])) for column in (0, 1))
         names = tuple(system.matrix[k].name for k in np.flatnonzero(worse).tolist())
         places.append(Where(compare_braking(first, other, point.name), names))
-        step = there.drives.trace.step
+        step = at_point.drives.trace.step
     return places, step
 
 
 def points_of(system: System, at_points: list[AtPoint], unsafe: Unsafe) -> list[tuple[str, ...]]:
-    """For every setting the names of a matrix's points at which it is unsafe; none of a study without one."""
+    """For every setting the names of the matrix's points at which it is unsafe; empty without a matrix."""
     if not system.matrix:
         return [() for _ in at_points[0].evaluations.settings]
     at = np.stack([unsafe.of(one.evaluations) for one in at_points])
@@ -197,7 +197,7 @@ def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Poo
 
 
 def _avoidable(study: Study, evaluations: Evaluations) -> BoolArray:
-    """Collisions that another driver may avoid; of a rated study none, as every vehicle collides in some cell."""
+    """Collisions that another driver may avoid; none in a rated study, where every vehicle collides in some cell."""
     return np.asarray(evaluations.collided & (not is_rated(study)))
 
 
@@ -211,7 +211,7 @@ def _robust(failures: Failures, bench: Bench, original: Evaluations, limit: int)
 
 
 def _that_matter(failures: Failures, robust: int | None) -> dict[int, Reasons]:
-    """The smallest robust failure, the one of the fewest changes, the most severe and the one of the smallest changes, by row."""
+    """The reasons to explain a failure, by its row: smallest robust one, fewest changes, most severe, smallest changes."""
     reasons: dict[int, Reasons] = {} if robust is None else {robust: (ROBUST,)}
     for choice in ("fewest", "most_severe", "smallest"):
         if failures.rows:

@@ -29,9 +29,9 @@ from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
 LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smallest largest change"}
-"""Titles that say which quantity is small; others are titled by the reason itself."""
+"""Titles that name the quantity; for other reasons the reason is the title."""
 LIMIT = 4000
-"""About how many simulations the search for a robust failure takes at the end of a study; `explain` takes more."""
+"""Approximate limit of simulations for the robust failure at the end of a study; that of `explain` is higher."""
 
 
 def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Pool, place: str) -> list[str]:
@@ -46,7 +46,7 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
     original
         The original vehicle's evaluation.
     pool
-        Where subsets of their changes are simulated.
+        Simulates subsets of their changes.
     place
         The directory of the results.
     """
@@ -56,17 +56,17 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
         return ["The original vehicle itself collides: no change is needed."]
     bench, degree = Bench(study, pool), float(original.f_safe[0])
     unsafe = unsafe_rows(solutions, degree)
-    means = Unsafe.of_solutions(solutions, degree)
+    criterion = Unsafe.of_solutions(solutions, degree)
     if not unsafe.any():
         return [f"Nothing unsafe found in {number_of(len(solutions), 'solution')}: no collision, no SD below half of the original's.",
                 f"How far each characteristic may go: {ask('tolerance', place)}"]
     chosen = {reason: chosen_handle(solutions, degree, choice, study.name) for choice, reason in REASONS.items()}
     rows = solutions.iloc[[position_of(solutions, handle) for handle in chosen.values()]]
     settings = rows[list(bench.characteristics.names)].to_numpy(dtype=float)
-    causes_of, (places, worst) = minimal_causes(bench, settings, means), _places(study, settings, means)
+    causes_of, (places, worst) = minimal_causes(bench, settings, criterion), _places(study, settings, criterion)
     counted = f"{int(unsafe.sum())} of {number_of(len(solutions), 'vehicle')} found"
-    lines = [_paragraph(bench, solutions, unsafe, original, means, worst),
-             f"{counted} collide." if means.below is None else
+    lines = [_paragraph(bench, solutions, unsafe, original, criterion, worst),
+             f"{counted} collide." if criterion.below is None else
              f"No collision. {counted} keep less than half of the original's {degree:.2f} m."]
     for (reason, handle), row, causes, fails in zip(chosen.items(), rows.to_dict("records"), causes_of, places, strict=True):
         size = f"{number_of(int(row['f_num_diff']), 'change')} of up to {row['f_diff']:.0%}"
@@ -78,7 +78,7 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
 
 def _paragraph(bench: Bench, solutions: pd.DataFrame, is_unsafe: pd.Series[bool], original: Evaluations, unsafe: Unsafe, point: str) -> str:
     """The unsafe solutions in one paragraph; with `point` those that are unsafe at that point of a matrix."""
-    names, every = bench.characteristics.names, handles(solutions)
+    names, all_handles = bench.characteristics.names, handles(solutions)
     kept = np.flatnonzero(is_unsafe.to_numpy() & ~solutions.duplicated(list(names)).to_numpy())
     if point:
         bench = bench.of(study_at(bench.study, point, point))
@@ -99,8 +99,8 @@ def _paragraph(bench: Bench, solutions: pd.DataFrame, is_unsafe: pd.Series[bool]
     for i, row in enumerate(rows):
         changed = np.flatnonzero(bench.characteristics.changed(here.settings[i]))
         changes = {names[column]: float(here.settings[i, column]) for column in changed}
-        findings.append(Finding(str(every[kept[failing[row]]]), changes, str(here.outcome[i]), finite_or_none(here.f_safe[i]), shares[i],
-                            len(causes[i][0].columns)))
+        name, degree = str(all_handles[kept[failing[row]]]), finite_or_none(here.f_safe[i])
+        findings.append(Finding(name, changes, str(here.outcome[i]), degree, shares[i], len(causes[i][0].columns)))
     return in_short(system, original, findings[0], findings[1] if len(findings) > 1 else None, preventable)
 
 
@@ -126,7 +126,7 @@ def _in_words(bench: Bench, causes: list[MinimalCause]) -> str:
 
 NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 NAMED = 4
-"""Changes that are listed; of more the largest ones."""
+"""Most changes that are listed, the largest first."""
 CONDITIONS = {"clear": "In clear weather", "wet": "On a wet road", "fog": "In fog", "night": "At night"}
 """Weathers in words; others are named."""
 
@@ -145,7 +145,7 @@ class Finding(NamedTuple):
     robustness
         Of the failure.
     needed
-        How many of the changes are unsafe by themselves: the size of its minimal causes.
+        Number of changes that are enough: the size of its minimal causes.
     """
 
     name: str

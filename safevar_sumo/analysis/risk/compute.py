@@ -118,7 +118,7 @@ def _given(value: float | None, default: float) -> float:
 
 
 FLEET = 1000
-"""Vehicles of the fleet that examples speak of."""
+"""Vehicles of the fleet in examples."""
 
 
 def fleet_probability(probability: float, vehicles: int) -> float:
@@ -129,7 +129,7 @@ def fleet_probability(probability: float, vehicles: int) -> float:
 CHUNK = 1000
 """Samples between two checks of the interval's width."""
 LARGEST_CHUNK = 50_000
-"""Samples at once where no width is asked for: what a process keeps does not grow with their number."""
+"""Samples at once without an option `width`; bounds the memory of a process."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,13 +143,13 @@ class Risk:
     method
         "monte_carlo", "subset_simulation" or "cross_entropy".
     simulations
-        What the estimate took, without what decides.
+        Simulations of the estimate, without those of the sensitivity.
     coefficient_of_variation
         Standard error over the probability; NaN without a failure.
     design_point
         The most probable failure by characteristic, of rare ones.
     remark
-        What the estimate may have missed, or why it is by that method; "" if there is nothing to say.
+        What the estimate may have missed, or the reason for its method; may be empty.
     sensitivity, sensitivity_of_unsafe
         Frames of `sensitivities`, of the safety degree and of being unsafe; None where
         characteristics are correlated or bound by constraints, for which they are not defined.
@@ -173,7 +173,7 @@ class Risk:
 
     @property
     def of_domain(self) -> bool:
-        """Whether it is a share of the domain, no probability in the field: the study does not say how vehicles vary."""
+        """Whether the probability is a share of the domain, because the study does not say how vehicles vary."""
         return not self.study.variation
 
     def of_fleet(self, vehicles: int) -> float:
@@ -244,7 +244,7 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
 
 @dataclass(kw_only=True)
 class _Counts:
-    """What plain Monte Carlo has drawn."""
+    """Counts of plain Monte Carlo."""
 
     count: int = 0
     failures: int = 0
@@ -264,13 +264,13 @@ def _method(options: RiskOptions) -> str:
 
 
 def _sampled(bench: Bench, model: VariationModel, unsafe: Unsafe, options: RiskOptions, response: Response) -> Estimate | _Counts:
-    """Draw vehicles plainly; where few of the first are unsafe, go on by a method for rare failures."""
+    """Draw vehicles by plain Monte Carlo; if few of the first are unsafe, switch to a method for rare failures."""
     counts, rng = _Counts(), np.random.default_rng(bench.study.search.seed)
     chooses = _may_be_rare(options) and not bench.region
     if options.is_for_rare and bench.region:
         counts.remark = "the study has constraints, within which only plain Monte Carlo draws"
     if options.is_for_rare:
-        openturns()  # whoever asks for it learns at once that it is missing
+        openturns()  # raises at once if it is missing
     most = max(options.samples, PILOT) if options.is_for_rare else options.samples
     while counts.count + counts.errors < most:
         chunk = PILOT if chooses else CHUNK if options.width is not None else LARGEST_CHUNK
@@ -285,8 +285,8 @@ def _sampled(bench: Bench, model: VariationModel, unsafe: Unsafe, options: RiskO
         if probabilities is not None:
             chooses = False
             values = response.take(scipy.stats.norm.ppf(probabilities), evaluations)
-            shows_by_itself = not options.is_for_rare and counts.failures * (most / number) >= ENOUGH
-            if valid and counts.failures < RARE_BELOW * valid and not shows_by_itself:
+            is_frequent = not options.is_for_rare and counts.failures * (most / number) >= ENOUGH
+            if valid and counts.failures < RARE_BELOW * valid and not is_frequent:
                 estimate = _rare(response, values, options, counts, bench.study.search.seed)
                 if estimate is not None:
                     return estimate
@@ -333,7 +333,7 @@ def _feasible_vehicles(bench: Bench, model: VariationModel, number: int, rng: np
 BASE = 512
 """Base points of Saltelli's design; it has n + 2 times as many settings."""
 FEWEST = 100
-"""Unsafe, and safe, settings of the design that indices of being unsafe need at least."""
+"""Least number of unsafe, and of safe, settings in the design for indices of being unsafe."""
 RESAMPLES = 200
 """Bootstrap samples that the intervals come from."""
 
@@ -366,12 +366,12 @@ def _indices(problem: dict[str, Any], output: FloatArray, confidence: float, see
     from SALib.analyze import sobol
 
     blocks = output.reshape(BASE, -1)
-    whole = blocks[np.isfinite(blocks).all(axis=1)].ravel()
+    complete = blocks[np.isfinite(blocks).all(axis=1)].ravel()
     names = problem["names"]
-    if not whole.size or np.ptp(whole) == 0:
+    if not complete.size or np.ptp(complete) == 0:
         indices = {name: np.full(len(names), np.nan) for name in ("S1", "ST", "S1_conf", "ST_conf")}
     else:
-        indices = sobol.analyze(problem, whole, calc_second_order=False, num_resamples=RESAMPLES, conf_level=confidence, seed=seed)
+        indices = sobol.analyze(problem, complete, calc_second_order=False, num_resamples=RESAMPLES, conf_level=confidence, seed=seed)
     frame = pd.DataFrame({"characteristic": names, "first_order": indices["S1"], "total": indices["ST"]})
     for name, key in (("first_order", "S1"), ("total", "ST")):
         for end, sign in (("lower", -1), ("upper", 1)):

@@ -145,7 +145,7 @@ FOLLOWED = 16
 STEP_BACK = 0.999
 """Share at which the box ends before the nearest unsafe setting."""
 SMALLEST = 1e-6
-"""A box that would have to be smaller is none."""
+"""Smallest factor of a box; below it there is no safe box."""
 
 
 class SafeBox(NamedTuple):
@@ -186,9 +186,8 @@ def safe_box(bench: Bench, columns: Sequence[int], unsafe: Unsafe, beyond: Float
 
     Notes
     -----
-    A box is searched with Sobol points and, because it is there that all changes add up, with corners of the same number. The unsafe
-    ones are followed back towards the original, the box ends before them, and so on until there are none. These points chose the box:
-    they prove nothing about it.
+    A box is searched with Sobol points and with as many corners, where all changes add up. Unsafe points are followed back towards the
+    original, and the box shrinks to end before them, until it has none. These points chose the box: they prove nothing about it.
 
     The box is then tested with settings drawn independently and uniformly in it, by a random generator of their own. If one is unsafe,
     the box shrinks and is searched and tested again. Test k, k = 1, 2, ..., may be wrong with probability alpha_k = alpha / 2^k, alpha
@@ -228,7 +227,7 @@ def safe_box(bench: Bench, columns: Sequence[int], unsafe: Unsafe, beyond: Float
 
 
 def _in_box(bench: Bench, columns: Sequence[int], factor: float, points: FloatArray) -> FloatArray:
-    """Settings at points of the unit cube that stands for a box around the original; shape (K, n)."""
+    """Settings in a box around the original, from points of the unit cube; shape (K, n)."""
     members, which = bench.characteristics, list(columns)
     lower = members.original - factor * (members.original - members.lower)
     upper = members.original + factor * (members.upper - members.original)
@@ -243,13 +242,13 @@ def _drawn_in_box(bench: Bench, columns: Sequence[int], factor: float, number: i
 
 
 def _unsafe_of(bench: Bench, factor: float, settings: FloatArray, unsafe: Unsafe) -> tuple[FloatArray, int]:
-    """The unsafe ones of settings, shape (K, n), and how many could not be simulated; what is not feasible is neither."""
+    """The unsafe settings, shape (K, n), and the number of feasible ones that could not be simulated."""
     evaluations = bench.evaluate(settings, f"all characteristics within {factor:.0%} of the domain")
     return settings[unsafe.of(evaluations)], int(np.count_nonzero(~evaluations.valid & ~evaluations.infeasible))
 
 
 def _reach(bench: Bench, settings: FloatArray) -> FloatArray:
-    """By which factor a box must be smaller than the domain to have a setting on its surface, shape (K,)."""
+    """Factor of the box that has a setting on its surface, shape (K,)."""
     members = bench.characteristics
     change = settings - members.original
     room = np.where(change < 0, members.original - members.lower, members.upper - members.original)
