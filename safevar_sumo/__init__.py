@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from safevar_sumo.analysis.evaluator import Progress
     from safevar_sumo.analysis.explain import explain
     from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation
+    from safevar_sumo.analysis.opinion import opinion
+    from safevar_sumo.analysis.opinion.result import Opinion, Opinions
     from safevar_sumo.analysis.rating import rating
     from safevar_sumo.analysis.rating.compute import Rating
     from safevar_sumo.analysis.risk import risk
@@ -46,6 +48,8 @@ _ROOMS = {
     "study": ("load_study", "study_names", "Study", "StudyLike", "Weather"),
     "api": ("simulate", "Simulation", "evaluate", "run", "load", "Results", "tables", "Tables", "figures", "Figures"),
     "analysis.explain": ("explain",),
+    "analysis.opinion": ("opinion",),
+    "analysis.opinion.result": ("Opinion", "Opinions"),
     "analysis.tolerance": ("tolerance",),
     "analysis.risk": ("risk",),
     "analysis.rules": ("rules",),
@@ -72,11 +76,11 @@ _ROOMS = {
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = [
-    "Cause", "Comparison", "Criterion", "Explained", "Explanation", "Figures", "InputError", "Observer", "Outcome", "Pool", "Progress",
-    "Rating", "Results", "Risk", "Rule", "Rules", "SafevarError", "Simulation", "SimulationError", "Status", "Study", "StudyLike",
-    "Tables", "Tolerance", "Unsafe", "Weather", "__version__", "animate", "compare", "draw_comparison", "evaluate", "explain", "figures",
-    "load", "load_study", "make_report", "rating", "report", "risk", "rules", "run", "show_in_gui", "simulate", "status", "study_names",
-    "tables", "tolerance",
+    "Cause", "Comparison", "Criterion", "Explained", "Explanation", "Figures", "InputError", "Observer", "Opinion", "Opinions",
+    "Outcome", "Pool", "Progress", "Rating", "Results", "Risk", "Rule", "Rules", "SafevarError", "Simulation", "SimulationError",
+    "Status", "Study", "StudyLike", "Tables", "Tolerance", "Unsafe", "Weather", "__version__", "animate", "compare", "draw_comparison",
+    "evaluate", "explain", "figures", "load", "load_study", "make_report", "opinion", "rating", "report", "risk", "rules", "run",
+    "show_in_gui", "simulate", "status", "study_names", "tables", "tolerance",
 ]
 
 if not TYPE_CHECKING:  # a type checker is to know the names above, and no others

@@ -1,4 +1,4 @@
-"""Commands that simulate many settings to answer a question: explain, tolerance, risk, rules."""
+"""Commands that simulate many settings to answer a question: explain, opinion, tolerance, risk, rules."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import click
 from rich.console import Console
 
 from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
@@ -79,6 +80,22 @@ def explain(place: str, full: bool, point: str | None, jobs: int | None, as_json
         write_whole(out / "causes.csv", result.to_frame().to_csv(index=False, lineterminator="\n"))
         save(necessity_figure(result), out / "necessity.png")
         click.echo(f"Causes: {out}", err=as_json)
+
+
+@question(OpinionOptions, "DIR", click.argument("more", nargs=-1, metavar=""))
+def opinion(place: str, more: tuple[str, ...], point: str | None, jobs: int | None, as_json: bool, **given: Any) -> None:
+    """Ask another vehicle model about the minimal causes of failures of results in DIR: is each confirmed or contradicted?"""
+    from safevar_sumo.analysis.opinion.compute import ask_for_opinions
+    from safevar_sumo.analysis.opinion.render import print_opinions
+
+    options = OpinionOptions(**{**given, "solutions": (*given["solutions"], *more)})
+    result = _answer(ask_for_opinions, results_or_study(place, point), options, jobs)
+    if not as_json:
+        print_opinions(Console(), result)
+        return
+    for handle in result.without_cause:
+        click.echo(f"note: {handle} is not unsafe: it has no cause", err=True)
+    click.echo(_json(result))
 
 
 @question(ToleranceOptions, "STUDY|DIR",

@@ -111,10 +111,15 @@ def at_start(vehicle: Vehicle, prepared: Any, speed: FloatArray) -> Any:
     if not rolls.any():
         return rest
     steady = vehicle.at_speed(prepared, np.where(rolls, speed, 1.0))
-    if rolls.all():
-        return steady
-    return type(rest)(*(moving if moving is None else np.where(rolls, moving, standing)
-                        for moving, standing in zip(steady, rest, strict=True)))
+    return steady if rolls.all() else _joined(rolls, steady, rest)
+
+
+def _joined(rolls: BoolArray, steady: Any, rest: Any) -> Any:
+    """For every vehicle its part of one of two states, which may have states as parts."""
+    if isinstance(steady, tuple):
+        parts = [_joined(rolls, *pair) for pair in zip(steady, rest, strict=True)]
+        return type(steady)(*parts) if hasattr(steady, "_fields") else tuple(parts)
+    return steady if steady is None else np.where(rolls, steady, rest)
 
 
 VEHICLE_CONTRACT = Contract.of(Vehicle, "a vehicle", optional=("at_speed",))
@@ -149,7 +154,7 @@ class GuardedVehicle:
     UNITS: Mapping[str, str]
 
     def __init__(self, vehicle: Any, guard: Guard) -> None:
-        self._vehicle, self._guard = vehicle, guard
+        self.model, self._guard = vehicle, guard
         units = guard.field("__init__", vehicle, "UNITS")
         if not isinstance(units, Mapping) or not all(isinstance(word, str) for pair in units.items() for word in pair):
             raise guard.wrong("__init__", "UNITS", units, "a mapping from names of characteristics to their units")
@@ -159,7 +164,7 @@ class GuardedVehicle:
 
     def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
                 wet: bool | BoolArray = False) -> _Prepared:
-        n, method = len(next(iter(characteristics.values()))), self._vehicle.prepare
+        n, method = len(next(iter(characteristics.values()))), self.model.prepare
         if slope is not LEVEL and not self.takes_slope:
             problem = f"{self._guard.name} has no slope in prepare(characteristics, road_friction, step, slope), and the road has a grade"
             raise ForeignError(self._guard.source, problem, "a vehicle with it, or scenarios with grade 0")
@@ -169,7 +174,7 @@ class GuardedVehicle:
         elif slope is not LEVEL:
             arguments = (*arguments, read_only_copy(slope))
         theirs = self._guard.call("prepare", method, *arguments)
-        types = self._guard.call("sumo_type", self._vehicle.sumo_type, theirs)
+        types = self._guard.call("sumo_type", self.model.sumo_type, theirs)
         return _Prepared(n, theirs, SumoType(*(
             self._guard.numbers("sumo_type", name, self._guard.field("sumo_type", types, name), (n,), 0.0, above=True)
             for name in SumoType._fields)))
@@ -178,7 +183,7 @@ class GuardedVehicle:
         return prepared.types
 
     def at_rest(self, prepared: _Prepared) -> _State:
-        state = self._state("at_rest", prepared.n, self._guard.call("at_rest", self._vehicle.at_rest, prepared.theirs))
+        state = self._state("at_rest", prepared.n, self._guard.call("at_rest", self.model.at_rest, prepared.theirs))
         self._guard.numbers("at_rest", "speed", state.speed, (prepared.n,), 0.0, 0.0)
         return state
 
@@ -186,26 +191,26 @@ class GuardedVehicle:
         if not self.can_start_moving:
             problem = f"{self._guard.name} has no method at_speed(prepared, speed), and the traffic puts it onto the road in motion"
             raise ForeignError(self._guard.source, problem, "a vehicle with it, or traffic that departs with speed 0")
-        state = self._guard.call("at_speed", self._vehicle.at_speed, prepared.theirs, read_only_copy(speed))
+        state = self._guard.call("at_speed", self.model.at_speed, prepared.theirs, read_only_copy(speed))
         return self._state("at_speed", prepared.n, state)
 
     def hold_gear(self, prepared: _Prepared, state: _State, holds: BoolArray) -> _State:
-        if not hasattr(self._vehicle, "hold_gear"):
+        if not hasattr(self.model, "hold_gear"):
             return state
         return self._state("hold_gear", prepared.n,
-                           self._guard.call("hold_gear", self._vehicle.hold_gear, prepared.theirs, state.theirs, read_only_copy(holds)))
+                           self._guard.call("hold_gear", self.model.hold_gear, prepared.theirs, state.theirs, read_only_copy(holds)))
 
     def sensors(self, prepared: _Prepared) -> Sensors | None:
         """The model's sensors; None for a model without that method."""
-        if not hasattr(self._vehicle, "sensors"):
+        if not hasattr(self.model, "sensors"):
             return None
-        theirs = self._guard.call("sensors", self._vehicle.sensors, prepared.theirs)
+        theirs = self._guard.call("sensors", self.model.sensors, prepared.theirs)
         return Sensors(*(self._guard.numbers("sensors", name, self._guard.field("sensors", theirs, name), (prepared.n,), 0.0,
                                              above=name == "scale", infinite=name == "reach") for name in Sensors._fields))
 
     def refuse_unknown_sensors(self, characteristics: Characteristics) -> None:
         """Refuse a model without a method `sensors` whose `sense` changes observations: a TraCI controller does not go through `sense`."""
-        if hasattr(self._vehicle, "sensors"):
+        if hasattr(self.model, "sensors"):
             return
         prepared = self.prepare(characteristics, 1.0, PROBE_STEP)
         state, nothing = self.at_rest(prepared), np.zeros(prepared.n)
@@ -220,7 +225,7 @@ class GuardedVehicle:
                                        "latency, reach, scale); or an ADS that is given what is sensed, without ads.kind = \"traci\"")
 
     def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
-        result = self._guard.call("sense", self._vehicle.sense, prepared.theirs, state.theirs, read_only_copy(seen))
+        result = self._guard.call("sense", self.model.sense, prepared.theirs, state.theirs, read_only_copy(seen))
         sensed, after = self._guard.parts("sense", result, "(Observation, state)")
         values: dict[str, Any] = {}
         for name, value in seen._asdict().items():
@@ -230,7 +235,7 @@ class GuardedVehicle:
         return Observation(**values), self._state("sense", prepared.n, after)
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
-        result = self._guard.call("advance", self._vehicle.advance, prepared.theirs, state.theirs, read_only_copy(command))
+        result = self._guard.call("advance", self.model.advance, prepared.theirs, state.theirs, read_only_copy(command))
         state, most = self._state("advance", prepared.n, result), prepared.types.max_speed
         for i in np.flatnonzero(state.speed > most * (1 + ROUNDING))[:1]:  # SUMO itself accepts any speed that it is given
             raise self._guard.wrong("advance", "speed", float(state.speed[i]), f"up to max_speed = {most[i]:g} of its sumo_type")

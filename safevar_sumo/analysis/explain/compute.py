@@ -162,6 +162,44 @@ def points_in_words(points: tuple[str, ...], number: int, most: int = NAMED) -> 
     return f"Fails at {len(points)} of {number} points{': ' + first if points else ''}{others}."
 
 
+class Chosen(NamedTuple):
+    """The failures that matter among those of a study or of results, with their minimal causes.
+
+    Attributes
+    ----------
+    sample
+        The rows that were analysed: all failures, or a random sample of them.
+    causes
+        The minimal causes of these and of the chosen ones, by row.
+    reasons
+        The chosen rows, and why each was chosen.
+    """
+
+    original: Evaluations
+    failures: Failures
+    sample: list[int]
+    causes: Causes
+    reasons: Mapping[int, Reasons]
+
+
+def chosen_failures(source: Study | Case, options: ExplainOptions, bench: Bench) -> Chosen:
+    """Choose failures by name, or those that matter; raises as `explain_failures`."""
+    unsafe = None if options.unsafe is None else Unsafe.parse(options.unsafe)
+    named = [SolutionId.parse(text) for text in options.solutions]
+    limit = options.limit // len(assemble(bench.study).points)
+    original = bench.original()
+    failures = failures_of(source, bench, original, named, unsafe)
+    settings, rows = failures.evaluations.settings, failures.rows
+    sample = rows if named else [rows[i] for i in affordable(settings[rows], bench, limit)]
+    robust = None if named or is_rated(bench.study) else _robust(failures, bench, original, limit)
+    reasons = dict.fromkeys(rows[:len(named)], ("asked for",)) if named else _that_matter(failures, robust)
+    explained = sorted({*sample, *reasons})
+    causes = dict(zip(explained, minimal_causes(bench, settings[explained], failures.unsafe), strict=True))
+    if not named:
+        reasons = _with_one_of_each_cause(failures, bench, {row: causes[row] for row in sample}, reasons, causes, options.top)
+    return Chosen(original, failures, sample, causes, reasons)
+
+
 def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Pool | None = None, jobs: int | None = None,
                      progress: Progress = silent) -> Explained:
     """Explain the failures that matter among the solutions of results, or among settings all over a study's domain.
@@ -172,27 +210,16 @@ def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Poo
         If `unsafe` or a handle cannot be read, or the study cannot be assembled.
     """
     study = source if isinstance(source, Study) else source.study
-    unsafe = None if options.unsafe is None else Unsafe.parse(options.unsafe)
-    named = [SolutionId.parse(text) for text in options.solutions]
-    limit = options.limit // len(assemble(study).points)
     with open_bench(study, pool, jobs, progress) as bench:
-        original = bench.original()
-        failures = failures_of(source, bench, original, named, unsafe)
-        settings, rows = failures.evaluations.settings, failures.rows
-        sample = rows if named else [rows[i] for i in affordable(settings[rows], bench, limit)]
-        robust = None if named or is_rated(study) else _robust(failures, bench, original, limit)
-        reasons = dict.fromkeys(rows[:len(named)], ("asked for",)) if named else _that_matter(failures, robust)
-        explained = sorted({*sample, *reasons})
-        causes = dict(zip(explained, minimal_causes(bench, settings[explained], failures.unsafe), strict=True))
-        if not named:
-            reasons = _with_one_of_each_cause(failures, bench, {row: causes[row] for row in sample}, reasons, causes, options.top)
+        original, failures, sample, causes, reasons = chosen_failures(source, options, bench)
+        settings = failures.evaluations.settings
         explanations = _explained(failures, bench, original, causes, reasons)
         preventable = preventability(bench, settings[_avoidable(study, failures.evaluations)])
     of_sample = [causes[row] for row in sample]
     return Explained(
         study=study, unsafe=failures.unsafe, original=original, explanations=explanations,
-        necessity=necessity(bench.characteristics, bench.characteristics.changed(settings[sample]), of_sample, len(rows)),
-        distinct=distinct_causes(bench.characteristics, of_sample), looked_at=len(failures.evaluations), failures=len(rows),
+        necessity=necessity(bench.characteristics, bench.characteristics.changed(settings[sample]), of_sample, len(failures.rows)),
+        distinct=distinct_causes(bench.characteristics, of_sample), looked_at=len(failures.evaluations), failures=len(failures.rows),
         analysed=len(sample), otherwise=failures.otherwise, preventability=preventable)
 
 

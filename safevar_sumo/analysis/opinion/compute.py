@@ -1,0 +1,163 @@
+"""Drives the minimal causes of failures and their nearest safe neighbours again, with the second vehicle model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.analysis.criterion import Unsafe
+from safevar_sumo.analysis.evaluator import Progress, finite_or_none, open_bench, silent
+from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.explain.causes import RESOLUTION, boundaries
+from safevar_sumo.analysis.explain.compute import chosen_failures
+from safevar_sumo.analysis.opinion import OpinionOptions
+from safevar_sumo.analysis.opinion.mapping import Declared, declared_of
+from safevar_sumo.analysis.opinion.multi_body import commonroad
+from safevar_sumo.analysis.opinion.result import End, Opinion, Opinions, Verdict
+from safevar_sumo.analysis.opinion.second_vehicle import SecondVehicle
+from safevar_sumo.analysis.research_questions.case import Case
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.workers.evaluation import Pool
+
+LIMIT = 12_000
+"""Simulations, about, for the minimal causes: what a report takes."""
+BELOW = np.array([RESOLUTION, 2 * RESOLUTION, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0])
+"""Shares of a cause's changes, below its boundary, at which its nearest safe neighbour is looked for."""
+
+
+class Cause(NamedTuple):
+    """A minimal cause that the second model is asked about: its values, and its boundary as a share of its changes."""
+
+    solution: str | None
+    changes: Mapping[str, float]
+    fraction: float
+
+
+class Neighbour(NamedTuple):
+    """The nearest setting below a cause that is safe with our model, shape (n,), and which share of the changes it has."""
+
+    setting: FloatArray
+    share: float
+
+
+def second_system(study: Study) -> tuple[System, System, Declared]:
+    """A study's system, the same with the second vehicle model, and how that represents the vehicle.
+
+    The driving system is the same, with what it knows of our original vehicle.
+
+    Raises
+    ------
+    InputError
+        If commonroad-vehicle-models is not installed, or the second model cannot represent the vehicle at all.
+    """
+    commonroad()
+    system = assemble(study)
+    declared = declared_of(study, system.vehicle)
+    return system, replace(system, vehicle=SecondVehicle(system.vehicle, declared, study)), declared
+
+
+def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Pool | None = None, jobs: int | None = None,
+                     progress: Progress = silent) -> Opinions:
+    """Look for the minimal causes of the failures that a report explains, or of solutions that are named, and ask the second model.
+
+    Raises
+    ------
+    InputError
+        As `second_system` and `chosen_failures`, and for a study, which has no failures yet.
+    """
+    if isinstance(source, Study):
+        raise InputError("opinion", f"{source.name!r} is a study and has no solutions", "a directory that the command study has written")
+    second_system(source.study)
+    asked = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=LIMIT)
+    with open_bench(source.study, pool, jobs, progress) as bench:
+        chosen = chosen_failures(source, asked, bench)
+        minimal = [(str(chosen.failures.handles[row]), cause) for row in chosen.reasons for cause in chosen.causes[row]]
+        limits = boundaries(bench, [cause for _, cause in minimal], chosen.failures.unsafe)
+    names = bench.characteristics.names
+    causes = [Cause(handle, {names[column]: float(cause.setting[column]) for column in cause.columns}, limit.fraction)
+              for (handle, cause), limit in zip(minimal, limits, strict=True)]
+    opinions = opinions_of(source.study, causes, chosen.failures.unsafe, progress)
+    return replace(opinions, without_cause=tuple(str(chosen.failures.handles[row]) for row in chosen.reasons if not chosen.causes[row]))
+
+
+def opinions_of(study: Study, causes: Sequence[Cause], unsafe: Unsafe, progress: Progress = silent) -> Opinions:
+    """What the second model says of minimal causes; raises as `second_system`."""
+    system, second, declared = second_system(study)
+    members = system.characteristics
+    settings = np.stack([members.original, *(_setting(members, cause.changes) for cause in causes)])
+    stage, number = "second vehicle model", len(settings)
+    progress(stage, 0, number)
+    here = evaluate(system, settings)
+    neighbours = _neighbours(system, causes, settings[1:], unsafe)
+    there = evaluate(second, np.concatenate([settings, *(one.setting[np.newaxis] for one in neighbours)]))
+    progress(stage, number, number)
+    ends_here, ends_there = ([_end(found, row) for row in range(len(found))] for found in (here, there))
+    fails_here, fails_there = unsafe.of(here), unsafe.of(there)
+    original = _Original(ends_here[0], ends_there[0], bool(fails_here[0]), bool(fails_there[0] or not there.valid[0]))
+    opinions = []
+    for k, (cause, neighbour) in enumerate(zip(causes, neighbours, strict=True), 1):
+        beside = number + k - 1
+        words = f"Its nearest safe neighbour, {neighbour.share:.1%} of the changes, is {'unsafe' if fails_there[beside] else 'safe'} there."
+        opinions.append(_opinion(cause, declared, original, ends_here[k], ends_there[k],
+                                 bool(fails_there[k]) if there.valid[k] else None, words))
+    return Opinions(study=study, unsafe=unsafe, opinions=tuple(opinions), original_here=ends_here[0], original_there=ends_there[0])
+
+
+class _Original(NamedTuple):
+    """How the original vehicle ends with both models, and whether it is unsafe."""
+
+    here: End
+    there: End
+    fails_here: bool
+    fails_there: bool
+
+
+def _opinion(cause: Cause, declared: Declared, original: _Original, here: End, there: End, fails: bool | None, neighbour: str) -> Opinion:
+    """`fails` is whether the cause is unsafe there; None where it could not be simulated."""
+    def says(verdict: Verdict, because: str, there: End = there) -> Opinion:
+        return Opinion(solution=cause.solution, changes=dict(cause.changes), here=here, there=there, opinion=verdict, because=because)
+
+    if outside := declared.outside(cause.changes):
+        return says(Verdict.OUTSIDE, "; ".join(outside), End())
+    if original.fails_here:
+        return says(Verdict.OUTSIDE, "the original vehicle itself is unsafe: no change causes anything")
+    if original.fails_there:
+        return says(Verdict.OUTSIDE, f"the original vehicle itself is not safe there: {original.there}")
+    if fails is None:
+        return says(Verdict.OUTSIDE, f"it could not be simulated there: {there}")
+    if fails:
+        return says(Verdict.CONFIRMED, f"unsafe there too: {there}; the original vehicle is safe there: {original.there}. {neighbour}")
+    return says(Verdict.CONTRADICTED, f"safe there: {there}; the original vehicle: {original.there}")
+
+
+def _setting(members: CharacteristicSet, changes: Mapping[str, float]) -> FloatArray:
+    setting = members.original.copy()
+    for name, value in changes.items():
+        setting[members.names.index(name)] = value
+    return setting
+
+
+def _neighbours(system: System, causes: Sequence[Cause], settings: FloatArray, unsafe: Unsafe) -> list[Neighbour]:
+    """For each cause, with its setting, the first setting below its boundary that is safe with our model; at last the original."""
+    if not causes:
+        return []
+    original = system.characteristics.original
+    shares = np.array([cause.fraction * (1 - BELOW) for cause in causes])
+    tried = original + shares[..., np.newaxis] * (settings - original)[:, np.newaxis]
+    found = evaluate(system, tried.reshape(-1, len(original)))
+    safe = (found.valid & ~unsafe.of(found)).reshape(shares.shape)
+    safe[:, -1] = True
+    first = np.argmax(safe, axis=1)
+    return [Neighbour(tried[k, at], float(shares[k, at])) for k, at in enumerate(first.tolist())]
+
+
+def _end(found: Evaluations, row: int) -> End:
+    return End(str(found.outcome[row]), finite_or_none(found.f_safe[row]))

@@ -1,0 +1,221 @@
+"""Which characteristic of our vehicles is which parameter of the second model, with units and equations.
+
+Every shipped vehicle has a declared table; what it has no row for, the second model cannot represent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from safevar_sumo.analysis.opinion.multi_body import WHEELS, Plant, commonroad, plant_of
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import Study, load_study
+from safevar_sumo.vehicles import VEHICLES, Carla, GuardedVehicle, Slope
+from safevar_sumo.vehicles.base import Characteristics
+from safevar_sumo.vehicles.carla import AIR_DENSITY, FRONTAL_AREA, WHEEL_MASS
+from safevar_sumo.vehicles.lgsvl import FRICTION, Lgsvl
+from safevar_sumo.vehicles.sumo import SumoVehicle
+from safevar_sumo.vehicles.worn import WornVehicle
+
+CM = 0.01  # m
+SENSORS, SAME = "the same sensors before the driving system", "as here"
+
+
+class Row(NamedTuple):
+    """A characteristic with the parameter that it is in the second model, and how."""
+
+    characteristic: str
+    unit: str
+    parameter: str
+    parameter_unit: str
+    equation: str
+
+
+class Represented(NamedTuple):
+    """Vehicles as the second model has them.
+
+    `brake_delay` [s], `brake_rise`, `brake_fall` [1/s] and `brake_lag` [s] are the brake's way from command to torque: a dead time, rates,
+    a first-order lag. Resistances beside those of the original vehicle: `drag` [N s/m], `air_drag` [N s^2/m^2] and `wheel_damping` of all
+    wheels [N m s]. `drive` is the engine's torque over that of the original vehicle.
+    """
+
+    plant: Plant
+    brake_delay: FloatArray
+    brake_rise: FloatArray
+    brake_fall: FloatArray
+    brake_lag: FloatArray
+    drag: FloatArray
+    air_drag: FloatArray
+    wheel_damping: FloatArray
+    drive: FloatArray
+
+
+Surface = tuple[Any, Slope, bool | BoolArray]
+"""The road's factor on friction, its slope, whether it is wet."""
+
+
+def _represented(plant: Plant, **others: Any) -> Represented:
+    usual: dict[str, Any] = {"brake_delay": 0.0, "brake_rise": np.inf, "brake_fall": np.inf, "brake_lag": 0.0, "drag": 0.0, "air_drag": 0.0,
+                             "wheel_damping": 0.0, "drive": 1.0}
+    ones = np.ones_like(plant.mass)
+    return Represented(plant, **{name: np.asarray(value, dtype=float) * ones for name, value in {**usual, **others}.items()})
+
+
+def _worn(vehicle: WornVehicle, c: Characteristics, original: Mapping[str, float], surface: Surface) -> Represented:
+    p, (_, slope, _) = commonroad(), surface
+    prepared = vehicle.prepare(c, surface[0], 1.0, *surface[1:])
+    mass = vehicle.kerb_mass + original["payload"]
+    return _represented(
+        plant_of(prepared.mass, vehicle.kerb_mass, prepared.rear_load * vehicle.wheelbase, vehicle.wheelbase, vehicle.centre_height, slope,
+                 radius=p.R_w, wheel_inertia=p.I_y_w, friction=prepared.grip, brake_front=vehicle.front_share, drive_front=p.T_se,
+                 brake_torque=_torque(c["brakeTorque"] * vehicle.brake_force, mass)),
+        brake_delay=c["brakeResponse"])
+
+
+def _torque(force: FloatArray, mass: float) -> FloatArray:
+    """The torque at all wheels that brakes a vehicle of this mass as hard as a force on it does: it stops the wheels beside the body."""
+    p = commonroad()
+    return np.asarray(force * p.R_w * (1 + WHEELS * p.I_y_w / (mass * p.R_w**2)))
+
+
+def _carla(vehicle: Carla, c: Characteristics, original: Mapping[str, float], surface: Surface) -> Represented:
+    friction, slope, _ = surface
+    radius = CM * c["radius"]
+    return _represented(
+        plant_of(c["mass"], original["mass"], None, None, None, slope, radius=radius, wheel_inertia=0.5 * WHEEL_MASS * radius**2,
+                 friction=c["tireFric"] * vehicle.tyre_friction * friction, brake_torque=WHEELS * c["maxBrakeTorque"], brake_front=0.5,
+                 drive_front=0.5),
+        brake_rise=vehicle.brake_rise, brake_fall=vehicle.brake_fall,
+        air_drag=0.5 * AIR_DENSITY * FRONTAL_AREA * (c["dragCoeff"] - original["dragCoeff"]),
+        wheel_damping=WHEELS * (c["dampRate"] - original["dampRate"]))
+
+
+def _lgsvl(vehicle: Lgsvl, c: Characteristics, original: Mapping[str, float], surface: Surface) -> Represented:
+    friction, slope, _ = surface
+    wheels = WHEELS * vehicle.wheel_mass_share
+    return _represented(
+        plant_of(c["mass"] + wheels * c["wheelMass"], original["mass"] + wheels * original["wheelMass"], None, None, None, slope,
+                 radius=c["radius"], wheel_inertia=0.5 * c["wheelMass"] * c["radius"]**2, friction=FRICTION * friction,
+                 brake_torque=WHEELS * c["maxBrakeTorque"], brake_front=0.5, drive_front=0.5),
+        brake_lag=vehicle.pedal_lag, drag=c["tireDragCoeff"] - original["tireDragCoeff"],
+        wheel_damping=WHEELS * vehicle.wheel_damping_share * (c["wheelDamping"] - original["wheelDamping"]))
+
+
+def _sumo(vehicle: SumoVehicle, c: Characteristics, original: Mapping[str, float], surface: Surface) -> Represented:
+    p, (friction, slope, _) = commonroad(), surface
+    force = vehicle.reference_mass * c["decel"] * c["brakeGain"]
+    return _represented(
+        plant_of(c["mass"], original["mass"], None, None, None, slope, radius=p.R_w, wheel_inertia=p.I_y_w,
+                 friction=vehicle.tyre_friction * friction, brake_front=p.T_sb, drive_front=p.T_se,
+                 brake_torque=_torque(force, original["mass"])),
+        brake_delay=c["brakeDelay"], brake_lag=c["tau"], drive=c["accel"] / original["accel"])
+
+
+class Table(NamedTuple):
+    """The declared table of a shipped vehicle.
+
+    Attributes
+    ----------
+    study
+        A shipped study with it: what a vehicle of your own leaves open is as there.
+    rows
+        What the second model represents.
+    outside
+        What it does not, and why.
+    represent
+        The equations of the rows.
+    """
+
+    study: str
+    rows: tuple[Row, ...]
+    outside: Mapping[str, str]
+    represent: Callable[[Any, Characteristics, Mapping[str, float], Surface], Represented]
+
+    @property
+    def names(self) -> frozenset[str]:
+        """The characteristics that the second model represents."""
+        return frozenset(row.characteristic for row in self.rows)
+
+
+ENGINE = "the model takes a torque at the wheels: it has no engine, clutch or gearbox"
+DELAY = "dead time from command to brake torque"
+TABLES: Mapping[str, Table] = {
+    "worn": Table("wear", (
+        Row("treadDepth", "mm", "p_dx1", "-", "p_dx1 = mu, our friction coefficient of tyre, road and tread"),
+        Row("brakeTorque", "-", "T_B", "N m", "T_B = brakeTorque brake_force R_w (1 + 4 I_y_w / (m_0 R_w^2)), m_0 the original's m"),
+        Row("brakeResponse", "s", DELAY, "s", SAME),
+        Row("payload", "kg", "m, m_s", "kg", "m = kerb_mass + payload; m_s = m - m_uf - m_ur"),
+        Row("payloadCentre", "m", "a, b", "m", "a = (m x - m_ur L) / m_s, b = L - a; x common centre behind the front axle, L wheelbase"),
+        Row("sensorRange", "m", SENSORS, "m", SAME),
+        Row("sensorLatency", "s", SENSORS, "s", SAME)), {}, _worn),
+    "carla": Table("sun", (
+        Row("mass", "kg", "m, m_s", "kg", "m = mass; m_s = m - m_uf - m_ur"),
+        Row("tireFric", "-", "p_dx1", "-", "p_dx1 = tireFric tyre_friction f, f the road's factor"),
+        Row("radius", "cm", "R_w, I_y_w", "m, kg m^2", "R_w = radius / 100; I_y_w = 20 kg R_w^2 / 2; and the camera's height as here"),
+        Row("maxBrakeTorque", "N m", "T_B", "N m", "T_B = 4 maxBrakeTorque, T_sb = 0.5"),
+        Row("dampRate", "kg m^2/s", "torque on the wheels", "N m", "-4 (dampRate - original) omega"),
+        Row("dragCoeff", "-", "torque on the wheels", "N m", "-R_w (dragCoeff - original) rho A v^2 / 2, rho 1.2 kg/m^3, A 2.2 m^2")),
+        dict.fromkeys(("max_rpm", "dampRateFullT", "dampRateZeroT_CE", "dampRateZeroT_CD", "gearSwitchTime", "clutchStrength"), ENGINE),
+        _carla),
+    "lgsvl": Table("lgsvl", (
+        Row("mass", "kg", "m, m_s", "kg", "m = mass + 4 wheel_mass_share wheelMass; m_s = m - m_uf - m_ur"),
+        Row("wheelMass", "kg", "I_y_w, m", "kg m^2, kg", "I_y_w = wheelMass R_w^2 / 2; m as above"),
+        Row("radius", "m", "R_w, I_y_w", "m, kg m^2", "R_w = radius"),
+        Row("maxBrakeTorque", "N m", "T_B", "N m", "T_B = 4 maxBrakeTorque, T_sb = 0.5"),
+        Row("tireDragCoeff", "-", "torque on the wheels", "N m", "-R_w (tireDragCoeff - original) v"),
+        Row("wheelDamping", "kg m^2/s", "torque on the wheels", "N m", "-4 wheel_damping_share (wheelDamping - original) omega")),
+        {**dict.fromkeys(("maxRpm", "minRpm", "maxMotorTorque", "shiftTime", "tractionControlSlipLimit"), ENGINE),
+         "maxSteeringAngle": "the model drives straight here"}, _lgsvl),
+    "sumo": Table("native", (
+        Row("mass", "kg", "m, m_s", "kg", "m = mass; m_s = m - m_uf - m_ur"),
+        Row("accel", "m/s^2", "T_E", "N m", "T_E = the original's accel / original"),
+        Row("decel", "m/s^2", "T_B", "N m", "T_B = brakeGain decel reference_mass R_w (1 + 4 I_y_w / (m_0 R_w^2)), m_0 as above"),
+        Row("brakeGain", "-", "T_B", "N m", "as decel"),
+        Row("brakeDelay", "s", DELAY, "s", SAME),
+        Row("tau", "s", "first-order lag of the brake torque", "s", SAME),
+        Row("sensorRange", "m", SENSORS, "m", SAME),
+        Row("reactionTime", "s", SENSORS, "s", SAME)),
+        {"maxSpeed": "the model has no governor"}, _sumo),
+}
+"""By the vehicles' names."""
+
+
+class Declared(NamedTuple):
+    """How a study's vehicle is represented: its table, and the shipped vehicle that it is, or is one of, with its parameters."""
+
+    name: str
+    vehicle: Any
+    table: Table
+    foreign: tuple[str, ...]
+
+    def outside(self, changes: Mapping[str, float]) -> list[str]:
+        """Why changes cannot be represented, by the characteristics that cannot; empty if all can."""
+        return [f"{name}: {self.table.outside.get(name, 'no parameter of the second model is known for it')}" for name in changes
+                if name not in self.table.names or name in self.foreign]
+
+
+def declared_of(study: Study, vehicle: Any) -> Declared:
+    """The table that holds for a study's vehicle: a shipped one, one made from it, or one of yours with all of its characteristics.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    own = vehicle.model if isinstance(vehicle, GuardedVehicle) else vehicle
+    given = {name: row.unit for name, row in study.vehicle.characteristics.items()}
+    for name, kind in [*((name, kind) for name, kind in VEHICLES.items() if isinstance(own, kind)),
+                       *((name, kind) for name, kind in VEHICLES.items() if kind.UNITS.items() <= given.items())]:
+        table = TABLES[name]
+        shipped = load_study(table.study).vehicle.parameters
+        parameters = {one.name: getattr(own, one.name, study.vehicle.parameters.get(one.name, shipped.get(one.name, one.default)))
+                      for one in msgspec.structs.fields(kind)}
+        return Declared(name, kind(**parameters), table, tuple(key for key, unit in given.items() if kind.UNITS.get(key) != unit))
+    known = f"one of {', '.join(TABLES)}, a class made from one, or one with the same characteristics in the same units"
+    problem = f"vehicle.model = {study.vehicle.model!r} with {', '.join(given)} is no vehicle that the second model can represent"
+    raise InputError(f"study {study.name!r}", problem, known)

@@ -1,0 +1,35 @@
+"""What the second vehicle model says, as text on the terminal."""
+
+from __future__ import annotations
+
+from rich.console import Console
+
+from safevar_sumo.analysis.opinion.result import Opinions, Verdict
+from safevar_sumo.analysis.words import changes, joined, number_of
+from safevar_sumo.terminal import plain, print_text
+from safevar_sumo.vehicles import CharacteristicSet
+
+MODEL = "Driven again with CommonRoad's multi-body vehicle, Pacejka's tyres and anti-lock brakes"
+STYLES = {Verdict.CONFIRMED: "green", Verdict.CONTRADICTED: "red", Verdict.OUTSIDE: "yellow"}
+
+
+def print_opinions(console: Console, result: Opinions) -> None:
+    """How many causes are confirmed, then every cause with the reason."""
+    members = CharacteristicSet.of(result.study.vehicle.characteristics)
+    print_text(console, result.study.title)
+    print_text(console, f"Unsafe: {result.unsafe}. {MODEL}: {verdict(result)}")
+    print_text(console, f"The original vehicle here: {result.original_here}; there: {result.original_there}.")
+    for handle in result.without_cause:
+        print_text(console, f"note: {handle} is not unsafe: it has no cause")
+    for one in result.opinions:
+        line = plain(f"{one.solution}: " if one.solution else "").append(str(one.opinion), STYLES[one.opinion])
+        console.print(line.append(plain(f": {changes(members, one.changes)}")), soft_wrap=True, highlight=False)
+        print_text(console, f"  here {one.here}; {one.because}")
+
+
+def verdict(result: Opinions) -> str:
+    """How many causes have which opinion, in a sentence."""
+    if not result.opinions:
+        return "there is no cause to ask about."
+    parts = [f"{result.count(one)} {one}" for one in Verdict if result.count(one)]
+    return f"of {number_of(len(result.opinions), 'minimal cause')} {joined(parts)}."

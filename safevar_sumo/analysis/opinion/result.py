@@ -1,0 +1,108 @@
+"""Result records of `opinion`, with their JSON and a frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from safevar_sumo.analysis.criterion import Unsafe
+from safevar_sumo.analysis.words import ENDS
+from safevar_sumo.records import Outcome
+from safevar_sumo.study import SAFETY_DEGREE, Study
+
+
+class Verdict(StrEnum):
+    """What the second model says of a cause."""
+
+    CONFIRMED = "confirmed"
+    CONTRADICTED = "contradicted"
+    OUTSIDE = "outside"
+
+
+class End(NamedTuple):
+    """How a run ends: outcome and safety degree [m, or -m/s]; None where it was not driven, or has none."""
+
+    outcome: str | None = None
+    safety_degree: float | None = None
+
+    def __str__(self) -> str:
+        """Such as `a collision at 3.21 m/s`."""
+        if self.outcome == Outcome.COLLISION:
+            return "a collision" if self.safety_degree is None else f"a collision at {-self.safety_degree:.2f} m/s"
+        degree = "" if self.safety_degree is None else f", safety degree {self.safety_degree:.2f} m"
+        return "not driven" if self.outcome is None else f"{ENDS.get(Outcome(self.outcome), self.outcome)}{degree}"
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"outcome": self.outcome, SAFETY_DEGREE: self.safety_degree}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Opinion:
+    """What the second model says of one minimal cause.
+
+    Attributes
+    ----------
+    solution
+        The handle of the failure that has it; None where a cause was given without one.
+    changes
+        The cause: values by name, in their units.
+    here, there
+        How they end with our model and with the second one.
+    opinion, because
+        The verdict, and what it rests on in a sentence or two.
+    """
+
+    solution: str | None
+    changes: dict[str, float]
+    here: End
+    there: End
+    opinion: Verdict
+    because: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """An entry of `opinion --json`."""
+        return {"solution": self.solution, "changes": self.changes, "here": self.here.to_dict(), "there": self.there.to_dict(),
+                "opinion": str(self.opinion), "because": self.because}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Opinions:
+    """Opinions on the minimal causes of failures.
+
+    Attributes
+    ----------
+    opinions
+        One for each minimal cause of each failure.
+    original_here, original_there
+        How the original vehicle ends with both models.
+    without_cause
+        Solutions that were asked about and are not unsafe: they have no cause.
+    """
+
+    study: Study
+    unsafe: Unsafe
+    opinions: tuple[Opinion, ...]
+    original_here: End
+    original_there: End
+    without_cause: tuple[str, ...] = ()
+
+    def count(self, verdict: Verdict) -> int:
+        """How many causes have this verdict."""
+        return sum(one.opinion == verdict for one in self.opinions)
+
+    def to_dict(self) -> list[dict[str, Any]]:
+        """The JSON of `opinion`."""
+        return [one.to_dict() for one in self.opinions]
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row for each cause: `solution`, `changes`, outcome and safety degree `here` and `there`, `opinion`, `because`."""
+        rows = [(one.solution, one.changes, *one.here, *one.there, str(one.opinion), one.because) for one in self.opinions]
+        return pd.DataFrame(rows, columns=["solution", "changes", "outcome_here", "safety_degree_here", "outcome_there",
+                                           "safety_degree_there", "opinion", "because"])
+
+    def __repr__(self) -> str:
+        numbers = ", ".join(f"{self.count(verdict)} {verdict}" for verdict in Verdict)
+        return f"<Opinions on {self.study.name}, unsafe {self.unsafe}: {numbers}>"

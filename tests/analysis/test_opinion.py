@@ -1,0 +1,224 @@
+"""The second vehicle model against the package's equations and closed forms, its tables, and what it says of planted failures."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
+from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
+
+from safevar_sumo.analysis.criterion import Unsafe
+from safevar_sumo.analysis.opinion.compute import Cause, opinions_of, second_system
+from safevar_sumo.analysis.opinion.mapping import TABLES
+from safevar_sumo.analysis.opinion.multi_body import Body, Plant, advance, at_speed, plant_of, rates, tyre_forces
+from safevar_sumo.analysis.opinion.result import Verdict
+from safevar_sumo.cli.program import commands
+from safevar_sumo.errors import InputError
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.vehicles import LEVEL, VEHICLES
+from safevar_sumo.vehicles.base import GRAVITY
+from tests.in_process import refused
+
+ONE = np.ones(1)
+
+
+def bmw() -> Plant:
+    """The package's vehicle 2 with its own masses."""
+    p = parameters_vehicle2()
+    plant = plant_of(p.m * ONE, p.m, None, None, None, LEVEL, radius=p.R_w, wheel_inertia=p.I_y_w, friction=p.tire.p_dx1,
+                     brake_torque=9 * p.m * p.R_w, brake_front=p.T_sb, drive_front=p.T_se)
+    return plant._replace(sprung=p.m_s * ONE, unsprung=p.m_uf * ONE, height=p.h_s * ONE)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_right_hand_side_is_the_packages(seed: int) -> None:
+    p, rng = parameters_vehicle2(), np.random.default_rng(seed)
+    x = [0.0] * 29
+    x[3] = rng.uniform(0.5, 30)
+    for column, size in {8: 0.02, 9: 0.1, 11: 0.02, 12: 0.1, 17: 0.1, 22: 0.1}.items():
+        x[column] = size * rng.normal()
+    x[16], x[21] = 0.02 + 0.003 * rng.normal(size=2)
+    front, rear = x[3] / p.R_w * rng.uniform(0.4, 1.1, 2)
+    x[23:27] = [front, front, rear, rear]
+    acceleration = rng.uniform(-9, 3)
+    theirs = vehicle_dynamics_mb(list(x), [0.0, acceleration], p)
+    torque, share = p.m * p.R_w * acceleration * ONE, p.T_sb if acceleration < 0 else p.T_se
+    body = Body(*(value * ONE for value in (x[3], x[8], x[9], x[11], x[12])), (x[16] * ONE, x[21] * ONE), (x[17] * ONE, x[22] * ONE),
+                (front * ONE, rear * ONE), (ONE, ONE))
+    ours = rates(bmw(), body, (share * torque, (1 - share) * torque), tyre_forces(bmw(), body))
+    flat = [ours.speed, ours.pitch_rate, ours.heave_rate, *ours.height_rates, *ours.wheels]
+    assert np.concatenate(flat) == pytest.approx([theirs[column] for column in (3, 9, 12, 17, 22, 23, 25)], rel=1e-9)
+
+
+def stopping_distance(study: str, speed: float, road: float, **changes: float) -> float:
+    """Full braking of the second model's vehicle, from when the brake acts [m]."""
+    setting = {name: row.original * ONE for name, row in load_study(study).vehicle.characteristics.items()}
+    second = second_system(load_study(study))[1].vehicle
+    plant = second.prepare({**setting, **{name: value * ONE for name, value in changes.items()}}, road, 0.05).represented.plant
+    body, way = at_speed(plant, speed * ONE), 0.0
+    while body.speed[0] > 0:
+        before, body = body.speed[0], advance(plant, body, ONE, 0 * ONE, 1e-3)
+        way += (before + body.speed[0]) / 2 * 1e-3
+    return way
+
+
+@pytest.mark.parametrize("speed", [8.0, 25.0])
+@pytest.mark.parametrize(("study", "changes", "deceleration"), [
+    ("wear", {"brakeTorque": 0.3}, 0.3 * 16500 / 1575), ("wear", {"brakeTorque": 0.5, "payload": 525.0}, 0.5 * 16500 / 2025),
+    ("sun", {"mass": 2700.0, "radius": 37.0, "maxBrakeTorque": 1200.0}, 4 * 1200 / 0.37 / 2700),
+    ("native", {"decel": 4.0, "mass": 1800.0}, 4.0 * 1500 / 1800)])
+def test_below_the_tyres_limit_braking_is_the_closed_form(study: str, changes: dict[str, float], deceleration: float, speed: float) -> None:
+    """v^2 / 2a with a = F / m, within 3 %."""
+    assert stopping_distance(study, speed, 1.0, **changes) == pytest.approx(speed**2 / (2 * deceleration), rel=0.03)
+
+
+@pytest.mark.parametrize("friction", [0.9, 0.6, 0.2])
+def test_at_the_limit_the_anti_lock_controller_uses_the_friction(friction: float) -> None:
+    """UN Regulation 13-H, annex 6: at least 0.75 of what the friction would give; and never more than all of it."""
+    best = 20.0**2 / (2 * friction * GRAVITY)
+    assert best <= stopping_distance("wear", 20.0, friction / 0.9) < best / 0.75
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_every_characteristic_is_in_the_table_or_outside_and_acts_as_the_table_says(name: str) -> None:
+    study = load_study(TABLES[name].study)
+    system, second, declared = second_system(study)
+    assert declared.name == name
+    assert declared.table.names | set(declared.table.outside) == set(VEHICLES[name].UNITS)
+    original = {one.name: one.original * ONE for one in system.characteristics}
+
+    def constants(**changes: float) -> list[float]:
+        prepared = second.vehicle.prepare({**original, **{key: value * ONE for key, value in changes.items()}}, 0.8, 0.05, LEVEL, True)
+        sensors = second.vehicle.sensors(prepared) or ()
+        flat = [*prepared.represented.plant, *prepared.represented[1:], prepared.engine_mass, *sensors]
+        return [float(value[0]) for part in flat for value in (part if isinstance(part, tuple) else (part,))]
+
+    for member in system.characteristics:
+        value = member.lower if member.lower != member.original else member.upper
+        assert (constants(**{member.name: value}) != constants()) == (member.name in declared.table.names), member.name
+    rows = {row.characteristic: row.unit for row in declared.table.rows}
+    assert rows.items() <= VEHICLES[name].UNITS.items()
+
+
+@pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
+def test_the_original_vehicle_meets_the_same_encounter(study: str) -> None:
+    """The second model starts as ours does, and stops within half a metre of where ours does."""
+    system, second, _ = second_system(load_study(study))
+    here, there = (simulate(one, system.characteristics.original[np.newaxis]) for one in (system, second))
+    assert [str(run.outcome[0]) for run in (here, there)] == ["stopped", "stopped"]
+    apart = np.abs(here.trace.speed[:40, 0] - there.trace.speed[:40, 0])
+    assert apart.max() < 0.35
+    assert here.trace.gap[:, 0].min() == pytest.approx(there.trace.gap[:, 0].min(), abs=0.5)
+
+
+GLITCHY = """
+import numpy as np
+from safevar_sumo.vehicles import LEVEL
+from safevar_sumo.vehicles.worn import WornVehicle
+
+
+class Made(WornVehicle, frozen=True, kw_only=True):
+    def prepare(self, c, road_friction, step, slope=LEVEL, wet=False):
+        p = super().prepare(c, road_friction, step, slope, wet)
+        return p._replace(brake=np.where(np.abs(c["payload"] - 300) < 60, 0.3 * p.brake, p.brake))
+
+
+class Wrapping:
+    UNITS = WornVehicle.UNITS
+
+    def __init__(self):
+        self.car = WornVehicle()
+
+    def prepare(self, c, road_friction, step, slope=LEVEL, wet=False):
+        return self.car.prepare(c, road_friction, step, slope, wet), np.abs(c["payload"] - 300) < 60
+
+    def advance(self, p, state, command):
+        after = self.car.advance(p[0], state, command)
+        return after._replace(speed=np.where(p[1], np.maximum(after.speed, state.speed - 0.05), after.speed))
+
+    def sumo_type(self, p):
+        return self.car.sumo_type(p[0])
+
+    def at_rest(self, p):
+        return self.car.at_rest(p[0])
+
+    def at_speed(self, p, speed):
+        return self.car.at_speed(p[0], speed)
+
+    def sense(self, p, state, seen):
+        return self.car.sense(p[0], state, seen)
+
+
+class Boat(Wrapping):
+    UNITS = {"sails": "m^2"}
+
+    def prepare(self, c, road_friction, step, slope=LEVEL, wet=False):
+        values = {"treadDepth": 8.0, "brakeTorque": 1.0, "brakeResponse": 0.1, "payload": 75.0, "payloadCentre": 1.4, "sensorRange": 80.0,
+                  "sensorLatency": 0.05}
+        return super().prepare({name: value + 0 * c["sails"] for name, value in values.items()}, road_friction, step, slope, wet)
+"""
+ONE_TEST = {"tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 40}}]}
+
+
+@pytest.mark.parametrize("made", ["Made", "Wrapping"])
+def test_a_failure_that_our_model_alone_has_is_contradicted(made: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A vehicle of a user's whose brakes fail for payloads around 300 kg; without brakes at all it fails there too."""
+    (tmp_path / f"glitch_{made.lower()}.py").write_text(GLITCHY)
+    monkeypatch.syspath_prepend(tmp_path)
+    rows = {name: {"unit": row.unit, "original": row.original, "lower": row.lower, "upper": row.upper}
+            for name, row in load_study("wear").vehicle.characteristics.items()}
+    study = load_study({"extends": "wear", "name": "glitch", "matrix": ONE_TEST,
+                        "vehicle": {"model": f"glitch_{made.lower()}:{made}", "characteristics": rows}})
+    causes = [Cause("nsga2:0:0", {"payload": 300.0}, 0.9), Cause("nsga2:0:1", {"brakeResponse": 0.4}, 0.9)]
+    planted, true = opinions_of(study, causes, Unsafe()).opinions
+    assert planted.to_dict() | {"because": ""} == {
+        "solution": "nsga2:0:0", "changes": {"payload": 300.0},
+        "here": {"outcome": "collision", "safety_degree": planted.here.safety_degree},
+        "there": {"outcome": "passed", "safety_degree": planted.there.safety_degree}, "opinion": "contradicted", "because": ""}
+    assert true.opinion == Verdict.CONFIRMED
+    assert opinions_of(study, causes, Unsafe()).opinions == (planted, true)
+
+
+def test_what_cannot_be_represented_at_all_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "glitch_boat.py").write_text(GLITCHY)
+    monkeypatch.syspath_prepend(tmp_path)
+    rows = {"sails": {"unit": "m^2", "original": 3.0, "lower": 1.0, "upper": 4.0}}
+    study = load_study({"extends": "wear", "name": "boat", "matrix": ONE_TEST,
+                        "vehicle": {"model": "glitch_boat:Boat", "characteristics": rows}})
+    with pytest.raises(InputError, match=r"glitch_boat:Boat.*sails"):
+        second_system(study)
+
+
+def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path) -> None:
+    """Changes of the engine are outside, with their names."""
+    done = CliRunner().invoke(commands, ["opinion", str(slippery), "--json"])
+    every = json.loads(done.stdout)
+    assert {one["opinion"] for one in every} <= {str(verdict) for verdict in Verdict}
+    assert all(list(one) == ["solution", "changes", "here", "there", "opinion", "because"] for one in every)
+    outside = set(TABLES["carla"].outside)
+    for one in every:
+        assert (one["opinion"] == "outside") == bool(outside & set(one["changes"]))
+        assert (one["there"]["outcome"] is None) == (one["opinion"] == "outside")
+        assert all(name in one["because"] for name in outside & set(one["changes"]))
+    first, *others = dict.fromkeys(one["solution"] for one in every)
+    for named in (["--solutions", first, "--solutions", others[0]], ["--solutions", first, others[0]]):
+        some = json.loads(CliRunner().invoke(commands, ["opinion", str(slippery), "--json", *named]).stdout)
+        assert some == [one for one in every if one["solution"] in (first, others[0])]
+
+
+@pytest.mark.parametrize(("typed", "told"), [
+    (("smoke",), "is a study and has no solutions"), (("nowhere",), "is no results directory"),
+    (("{}", "--solutions", "nsga2:0:999"), "nsga2:0:999"), (("{}", "--solutions", "first"), "'first'")])
+def test_bad_input_is_refused(typed: tuple[str, ...], told: str, slippery: Path) -> None:
+    refused("opinion", *(part.format(slippery) for part in typed), told=(told,))
+
+
+def test_without_the_extra_it_says_how_to_install_it(slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "vehiclemodels.parameters_vehicle2", None)
+    refused("opinion", str(slippery), told=("is not installed", "pip install 'safevar_sumo[opinion]'"))
