@@ -11,6 +11,7 @@ import msgspec
 from msgspec.inspect import type_info
 
 from safevar_sumo.ads import ADS
+from safevar_sumo.analysis.opinion.mapping import TABLES as REPRESENTED
 from safevar_sumo.metrics import FURTHER, METRICS, SAFEVAR
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study
@@ -113,6 +114,17 @@ def metric_columns() -> str:
     return _table(("column", "unit", "content"), [*objectives, *metrics])
 
 
+def second_model() -> str:
+    """Which characteristic is which parameter of the second vehicle model."""
+    parts = []
+    for name, table in REPRESENTED.items():
+        outside = [f"`{key}`: {why}" for key, why in table.outside.items()]
+        rows = [(f"`{row.characteristic}`", row.unit, row.parameter, row.parameter_unit, f"`{row.equation}`") for row in table.rows]
+        listed = f"\nOutside: {'; '.join(outside)}.\n" if outside else ""
+        parts.append(f"### {name}\n\n{_table(('characteristic', 'unit', 'parameter', 'unit', 'equation'), rows)}{listed}")
+    return "\n".join(parts)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "study_keys": study_keys, "vehicles": models(VEHICLES), "ads": models(ADS), "algorithms": models(ALGORITHMS),
-    "metric_columns": metric_columns}
+    "metric_columns": metric_columns, "second_model": second_model}

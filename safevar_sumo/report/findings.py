@@ -10,7 +10,9 @@ from markupsafe import Markup
 from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.explain.compute import explain_failures as explain
 from safevar_sumo.analysis.explain.necessity import is_borderline
+from safevar_sumo.analysis.opinion.compute import Cause, opinions_of, second_system
 from safevar_sumo.analysis.research_questions.indicators import nondominated
+from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import differences, number, raised, spaced
 from safevar_sumo.report.input import ReportInput, stored
 from safevar_sumo.report.svg import Bar, rows
@@ -66,7 +68,23 @@ def causes(explained: Failures, material: ReportInput) -> list[dict[str, Any]]:
     ordered = sorted(distinct.values(), key=lambda one: _size(material, one["cause"]))[:CAUSES]
     if ordered:
         material.again([material.setting_with(one["cause"]["changes"]) for one in ordered])
-    return [_shown(material, place, one) for place, one in enumerate(ordered, 1)]
+    opinions = _opinions(material, ordered) if ordered and not no_opinion(material) else [None] * len(ordered)
+    return [{**_shown(material, place, one), "opinion": opinions[place - 1]} for place, one in enumerate(ordered, 1)]
+
+
+def no_opinion(material: ReportInput) -> str:
+    """Why there is no second opinion on causes, in a sentence; empty if there is one."""
+    try:
+        second_system(material.case.study)
+    except InputError as error:
+        return f"No second opinion on these causes: {error.problem}; expected: {error.legal}."
+    return ""
+
+
+def _opinions(material: ReportInput, ordered: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What the second vehicle model says of each cause; computed once for these results."""
+    causes = [Cause(one["handle"] or None, one["cause"]["changes"], one["cause"]["fraction"]) for one in ordered]
+    return list(stored(material, "opinion", lambda: opinions_of(material.case.study, causes, material.unsafe).to_dict()))
 
 
 def _with_changes(failure: dict[str, Any]) -> list[dict[str, Any]]:

@@ -16,6 +16,7 @@ import numpy as np
 from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import points_of
+from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.analysis.risk import RiskOptions
@@ -157,8 +158,8 @@ class ReportInput:
         """With which options each question is asked for the page: smaller samples than the commands' own, one criterion for all."""
         unsafe = None if self.case.solutions.empty else str(self.unsafe)
         asked: tuple[Options, ...] = (
-            ExplainOptions(unsafe=unsafe, limit=12_000), ToleranceOptions(unsafe=unsafe), RiskOptions(unsafe=unsafe, samples=SAMPLES),
-            RulesOptions(unsafe=unsafe, samples=SAMPLES))
+            ExplainOptions(unsafe=unsafe, limit=12_000), OpinionOptions(unsafe=unsafe), ToleranceOptions(unsafe=unsafe),
+            RiskOptions(unsafe=unsafe, samples=SAMPLES), RulesOptions(unsafe=unsafe, samples=SAMPLES))
         return {one.question: one for one in asked}
 
     @property

@@ -24,7 +24,7 @@ from safevar_sumo.analysis.research_questions.layout import Bold, Table, lay_out
 from safevar_sumo.errors import InputError, did_you_mean
 from safevar_sumo.replay.comparison import raised
 from safevar_sumo.replay.page import environment, player_parts
-from safevar_sumo.report.findings import best_of, causes, evenly, explanations, necessity_chart, replays
+from safevar_sumo.report.findings import best_of, causes, evenly, explanations, necessity_chart, no_opinion, replays
 from safevar_sumo.report.input import ReportInput, gather
 from safevar_sumo.report.limits import LIMITS
 from safevar_sumo.report.rated import rated_study_page
@@ -111,8 +111,9 @@ def reproduce(materials: Sequence[ReportInput], parts: Sequence[str]) -> list[di
         if material.case.has_runs:
             commands.append({"what": f"The study {study.name}, as its manifest.json records it whole, into another directory",
                              "command": _again(study, f"{material.place}-again", material.place)})
+        asked = [*parts, *(["opinion"] if "explain" in parts and material.system is not None and not no_opinion(material) else [])]
         commands += [{"what": f"The part {part}", "command": material.options[part].command_line(str(material.place), material.point) + now}
-                     for part in parts]
+                     for part in asked]
         if material.point:
             continue
         commands.append({"what": "A replay, with figure and animation",
@@ -206,6 +207,7 @@ def _study(material: ReportInput, wanted: Sequence[str], jobs: int | None, show:
         "tested": lambda: tested(material),
         "verdict": lambda: verdict(material, explained, limits.get("tolerance")),
         "causes": lambda: causes(explained or [], material),
+        "no_opinion": lambda: "" if material.system is None else no_opinion(material),
         "necessity": lambda: necessity_chart(explained or [], material),
         "trust": lambda: trust(material, explained)}
     otherwise = [one["handle"] for one in shown if one.get("differences")]
@@ -216,7 +218,8 @@ def _study(material: ReportInput, wanted: Sequence[str], jobs: int | None, show:
             "otherwise": otherwise,
             "lacking": material.lacking, "changed": material.changed, "original_fails": material.original_fails,
             "front": front(material, [one["handle"] for one in shown]) if shown else None,
-            **limits, **{name: make() for name, make in sections.items() if name in wanted or (name == "necessity" and "causes" in wanted)}}
+            **limits, **{name: make() for name, make in sections.items()
+                         if name in wanted or (name in ("necessity", "no_opinion") and "causes" in wanted)}}
 
 
 def _part(name: str) -> Markup:

@@ -31,7 +31,7 @@ ONE = np.ones(1)
 def bmw() -> Plant:
     """The package's vehicle 2 with its own masses."""
     p = parameters_vehicle2()
-    plant = plant_of(p.m * ONE, p.m, None, None, None, LEVEL, radius=p.R_w, wheel_inertia=p.I_y_w, friction=p.tire.p_dx1,
+    plant = plant_of(p.m * ONE, p.m, LEVEL, radius=p.R_w, wheel_inertia=p.I_y_w, friction=p.tire.p_dx1,
                      brake_torque=9 * p.m * p.R_w, brake_front=p.T_sb, drive_front=p.T_se)
     return plant._replace(sprung=p.m_s * ONE, unsprung=p.m_uf * ONE, height=p.h_s * ONE)
 
@@ -49,9 +49,9 @@ def test_the_right_hand_side_is_the_packages(seed: int) -> None:
     acceleration = rng.uniform(-9, 3)
     theirs = vehicle_dynamics_mb(list(x), [0.0, acceleration], p)
     torque, share = p.m * p.R_w * acceleration * ONE, p.T_sb if acceleration < 0 else p.T_se
-    body = Body(*(value * ONE for value in (x[3], x[8], x[9], x[11], x[12])), (x[16] * ONE, x[21] * ONE), (x[17] * ONE, x[22] * ONE),
-                (front * ONE, rear * ONE), (ONE, ONE))
-    ours = rates(bmw(), body, (share * torque, (1 - share) * torque), tyre_forces(bmw(), body))
+    body = Body(*(value * ONE for value in (x[3], x[8], x[9], x[11], x[12])), *(np.array([pair]).T for pair in (
+        (x[16], x[21]), (x[17], x[22]), (front, rear), (1.0, 1.0))))
+    ours = rates(bmw(), body, np.stack([share * torque, (1 - share) * torque]), tyre_forces(bmw(), body))
     flat = [ours.speed, ours.pitch_rate, ours.heave_rate, *ours.height_rates, *ours.wheels]
     assert np.concatenate(flat) == pytest.approx([theirs[column] for column in (3, 9, 12, 17, 22, 23, 25)], rel=1e-9)
 
@@ -97,7 +97,7 @@ def test_every_characteristic_is_in_the_table_or_outside_and_acts_as_the_table_s
         prepared = second.vehicle.prepare({**original, **{key: value * ONE for key, value in changes.items()}}, 0.8, 0.05, LEVEL, True)
         sensors = second.vehicle.sensors(prepared) or ()
         flat = [*prepared.represented.plant, *prepared.represented[1:], prepared.engine_mass, *sensors]
-        return [float(value[0]) for part in flat for value in (part if isinstance(part, tuple) else (part,))]
+        return [float(value) for part in flat for value in part.ravel()]
 
     for member in system.characteristics:
         value = member.lower if member.lower != member.original else member.upper
@@ -216,9 +216,9 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
     (("smoke",), "is a study and has no solutions"), (("nowhere",), "is no results directory"),
     (("{}", "--solutions", "nsga2:0:999"), "nsga2:0:999"), (("{}", "--solutions", "first"), "'first'")])
 def test_bad_input_is_refused(typed: tuple[str, ...], told: str, slippery: Path) -> None:
-    refused("opinion", *(part.format(slippery) for part in typed), told=(told,))
+    refused("opinion", *(part.format(slippery) for part in typed), message=(told,))
 
 
 def test_without_the_extra_it_says_how_to_install_it(slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "vehiclemodels.parameters_vehicle2", None)
-    refused("opinion", str(slippery), told=("is not installed", "pip install 'safevar_sumo[opinion]'"))
+    refused("opinion", str(slippery), message=("is not installed", "pip install 'safevar_sumo[opinion]'"))

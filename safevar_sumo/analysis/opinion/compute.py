@@ -20,17 +20,19 @@ from safevar_sumo.analysis.opinion.result import End, Opinion, Opinions, Verdict
 from safevar_sumo.analysis.opinion.second_vehicle import SecondVehicle
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
 LIMIT = 12_000
 """Simulations, about, for the minimal causes: what a report takes."""
 BELOW = np.array([RESOLUTION, 2 * RESOLUTION, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0])
 """Shares of a cause's changes, below its boundary, at which its nearest safe neighbour is looked for."""
+
+LADDER = np.arange(1, 10) / 10
+"""Shares of a cause's changes at which it is looked for where it begins to be unsafe with the second model."""
 
 
 class Cause(NamedTuple):
@@ -92,23 +94,34 @@ def opinions_of(study: Study, causes: Sequence[Cause], unsafe: Unsafe, progress:
     """What the second model says of minimal causes; raises as `second_system`."""
     system, second, declared = second_system(study)
     members = system.characteristics
-    settings = np.stack([members.original, *(_setting(members, cause.changes) for cause in causes)])
+    settings = np.stack([members.original, *(members.setting(cause.changes, "cause", beyond=True) for cause in causes)])
     stage, number = "second vehicle model", len(settings)
     progress(stage, 0, number)
     here = evaluate(system, settings)
     neighbours = _neighbours(system, causes, settings[1:], unsafe)
-    there = evaluate(second, np.concatenate([settings, *(one.setting[np.newaxis] for one in neighbours)]))
+    less = members.original + LADDER[:, np.newaxis, np.newaxis] * (settings[1:] - members.original)
+    beside = np.stack([one.setting for one in neighbours]) if neighbours else settings[1:]
+    there = evaluate(second, np.concatenate([settings, beside, less.reshape(-1, len(members))]))
     progress(stage, number, number)
-    ends_here, ends_there = ([_end(found, row) for row in range(len(found))] for found in (here, there))
+    ends_here, ends_there = ([_end(found, row) for row in range(number)] for found in (here, there))
     fails_here, fails_there = unsafe.of(here), unsafe.of(there)
     original = _Original(ends_here[0], ends_there[0], bool(fails_here[0]), bool(fails_there[0] or not there.valid[0]))
+    fails_beside = fails_there[number:number + len(causes)]
+    fails_less = fails_there[number + len(causes):].reshape(len(LADDER), len(causes))
     opinions = []
-    for k, (cause, neighbour) in enumerate(zip(causes, neighbours, strict=True), 1):
-        beside = number + k - 1
-        words = f"Its nearest safe neighbour, {neighbour.share:.1%} of the changes, is {'unsafe' if fails_there[beside] else 'safe'} there."
-        opinions.append(_opinion(cause, declared, original, ends_here[k], ends_there[k],
-                                 bool(fails_there[k]) if there.valid[k] else None, words))
+    for k, (cause, neighbour) in enumerate(zip(causes, neighbours, strict=True)):
+        words = (f"Its nearest safe neighbour, {neighbour.share:.1%} of the changes, is {'unsafe' if fails_beside[k] else 'safe'} there: "
+                 f"{_first(fails_less[:, k])} of the changes are enough there, {cause.fraction:.1%} here.")
+        fails = bool(fails_there[k + 1]) if there.valid[k + 1] else None
+        opinions.append(_opinion(cause, declared, original, ends_here[k + 1], ends_there[k + 1], fails, words))
     return Opinions(study=study, unsafe=unsafe, opinions=tuple(opinions), original_here=ends_here[0], original_there=ends_there[0])
+
+
+def _first(fails: BoolArray) -> str:
+    """From where on it is unsafe: the steps of the ladder that this lies between."""
+    safe = np.flatnonzero(~fails)
+    below = LADDER[safe[-1]] if len(safe) else 0.0
+    return f"{below:.0%} to {below + LADDER[0]:.0%}"
 
 
 class _Original(NamedTuple):
@@ -136,13 +149,6 @@ def _opinion(cause: Cause, declared: Declared, original: _Original, here: End, t
     if fails:
         return says(Verdict.CONFIRMED, f"unsafe there too: {there}; the original vehicle is safe there: {original.there}. {neighbour}")
     return says(Verdict.CONTRADICTED, f"safe there: {there}; the original vehicle: {original.there}")
-
-
-def _setting(members: CharacteristicSet, changes: Mapping[str, float]) -> FloatArray:
-    setting = members.original.copy()
-    for name, value in changes.items():
-        setting[members.names.index(name)] = value
-    return setting
 
 
 def _neighbours(system: System, causes: Sequence[Cause], settings: FloatArray, unsafe: Unsafe) -> list[Neighbour]:

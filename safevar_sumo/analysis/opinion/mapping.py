@@ -71,9 +71,9 @@ def _worn(vehicle: WornVehicle, c: Characteristics, original: Mapping[str, float
     prepared = vehicle.prepare(c, surface[0], 1.0, *surface[1:])
     mass = vehicle.kerb_mass + original["payload"]
     return _represented(
-        plant_of(prepared.mass, vehicle.kerb_mass, prepared.rear_load * vehicle.wheelbase, vehicle.wheelbase, vehicle.centre_height, slope,
-                 radius=p.R_w, wheel_inertia=p.I_y_w, friction=prepared.grip, brake_front=vehicle.front_share, drive_front=p.T_se,
-                 brake_torque=_torque(c["brakeTorque"] * vehicle.brake_force, mass)),
+        plant_of(prepared.mass, vehicle.kerb_mass, slope, centre=prepared.rear_load * vehicle.wheelbase, wheelbase=vehicle.wheelbase,
+                 height=vehicle.centre_height, radius=p.R_w, wheel_inertia=p.I_y_w, friction=prepared.grip,
+                 brake_front=vehicle.front_share, drive_front=p.T_se, brake_torque=_torque(c["brakeTorque"] * vehicle.brake_force, mass)),
         brake_delay=c["brakeResponse"])
 
 
@@ -87,7 +87,7 @@ def _carla(vehicle: Carla, c: Characteristics, original: Mapping[str, float], su
     friction, slope, _ = surface
     radius = CM * c["radius"]
     return _represented(
-        plant_of(c["mass"], original["mass"], None, None, None, slope, radius=radius, wheel_inertia=0.5 * WHEEL_MASS * radius**2,
+        plant_of(c["mass"], original["mass"], slope, radius=radius, wheel_inertia=0.5 * WHEEL_MASS * radius**2,
                  friction=c["tireFric"] * vehicle.tyre_friction * friction, brake_torque=WHEELS * c["maxBrakeTorque"], brake_front=0.5,
                  drive_front=0.5),
         brake_rise=vehicle.brake_rise, brake_fall=vehicle.brake_fall,
@@ -99,7 +99,7 @@ def _lgsvl(vehicle: Lgsvl, c: Characteristics, original: Mapping[str, float], su
     friction, slope, _ = surface
     wheels = WHEELS * vehicle.wheel_mass_share
     return _represented(
-        plant_of(c["mass"] + wheels * c["wheelMass"], original["mass"] + wheels * original["wheelMass"], None, None, None, slope,
+        plant_of(c["mass"] + wheels * c["wheelMass"], original["mass"] + wheels * original["wheelMass"], slope,
                  radius=c["radius"], wheel_inertia=0.5 * c["wheelMass"] * c["radius"]**2, friction=FRICTION * friction,
                  brake_torque=WHEELS * c["maxBrakeTorque"], brake_front=0.5, drive_front=0.5),
         brake_lag=vehicle.pedal_lag, drag=c["tireDragCoeff"] - original["tireDragCoeff"],
@@ -110,7 +110,7 @@ def _sumo(vehicle: SumoVehicle, c: Characteristics, original: Mapping[str, float
     p, (friction, slope, _) = commonroad(), surface
     force = vehicle.reference_mass * c["decel"] * c["brakeGain"]
     return _represented(
-        plant_of(c["mass"], original["mass"], None, None, None, slope, radius=p.R_w, wheel_inertia=p.I_y_w,
+        plant_of(c["mass"], original["mass"], slope, radius=p.R_w, wheel_inertia=p.I_y_w,
                  friction=vehicle.tyre_friction * friction, brake_front=p.T_sb, drive_front=p.T_se,
                  brake_torque=_torque(force, original["mass"])),
         brake_delay=c["brakeDelay"], brake_lag=c["tau"], drive=c["accel"] / original["accel"])

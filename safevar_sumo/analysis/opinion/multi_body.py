@@ -44,7 +44,7 @@ def commonroad() -> Any:
     try:
         from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
     except ImportError:
-        raise InputError("opinion", "needs commonroad-vehicle-models, which is not installed",
+        raise InputError("opinion", "commonroad-vehicle-models, the second vehicle model, is not installed",
                          "pip install 'safevar_sumo[opinion]'") from None
     return _parameters(parameters_vehicle2)
 
@@ -54,39 +54,46 @@ def _parameters(read: Any) -> Any:
     return read()
 
 
-class Plant(NamedTuple):
-    """Constants of N vehicles, SI, shape (N,), named after the package's: m, m_s, m_uf, a, b, h_s, I_y_s, K_sf, K_sdf, ...
+@cache
+def _tyre() -> Any:
+    return commonroad().tire
 
-    `friction` is Pacejka's p_dx1. `brake_torque` is that of all wheels at full pedal, `brake_front` and `drive_front` the shares T_sb and
-    T_se of the front axle.
+
+class Plant(NamedTuple):
+    """Constants of N vehicles, SI, after the package's m, m_s, m_uf, m_ur, a, b, h_s, I_y_s, K_sf, K_sdf, K_zt, R_w, I_y_w.
+
+    Of shape (N,); what the axles have each, front before rear, of shape (2, N): `arms`, a and -b; `static`, shares of the sprung mass;
+    `springs` and `dampers` of each wheel; `brake_shares`, T_sb and the rest, and `drive_shares`, T_se and the rest. `unsprung` is an axle's
+    mass, `friction` Pacejka's p_dx1, `brake_torque` that of all wheels at full pedal; `back` and `down` are the slope's.
     """
 
     mass: FloatArray
     sprung: FloatArray
     unsprung: FloatArray
-    front: FloatArray
-    rear: FloatArray
+    arms: FloatArray
+    static: FloatArray
     height: FloatArray
     pitch_inertia: FloatArray
-    springs: tuple[FloatArray, FloatArray]
-    dampers: tuple[FloatArray, FloatArray]
+    springs: FloatArray
+    dampers: FloatArray
     tyre_spring: FloatArray
     radius: FloatArray
     wheel_inertia: FloatArray
     friction: FloatArray
     brake_torque: FloatArray
-    brake_front: FloatArray
-    drive_front: FloatArray
+    brake_shares: FloatArray
+    drive_shares: FloatArray
     back: FloatArray
     down: FloatArray
 
 
-def plant_of(mass: FloatArray, empty: float, centre: FloatArray | None, wheelbase: float | None, height: float | None, slope: Slope,
-             **others: Any) -> Plant:
+def plant_of(mass: FloatArray, empty: float, slope: Slope, *, brake_front: float, drive_front: float, centre: FloatArray | None = None,
+             wheelbase: float | None = None, height: float | None = None, **others: Any) -> Plant:
     """A vehicle of another mass than the package's.
 
     Unsprung masses, springs, dampers, tyres and inertia grow with the `empty` vehicle's mass, so that all frequencies stay the package's;
-    what is loaded rests on the springs. `centre` is the whole vehicle's behind the front axle [m]; what is None is the package's.
+    what is loaded rests on the springs. `centre` is the whole vehicle's behind the front axle [m], `height` above the road; what is None
+    is the package's.
     """
     p = commonroad()
     ones, scale = np.ones_like(mass), empty / p.m
@@ -95,16 +102,18 @@ def plant_of(mass: FloatArray, empty: float, centre: FloatArray | None, wheelbas
     front = (p.a / (p.a + p.b)) * length * ones if centre is None else (mass * centre - unsprung * length) / sprung
     values = {name: np.asarray(value, dtype=float) * ones for name, value in others.items()}
     plant = Plant(
-        mass=mass, sprung=sprung, unsprung=unsprung, front=front, rear=length - front, height=(p.h_s if height is None else height) * ones,
-        pitch_inertia=scale * p.I_y_s * ones * (length / (p.a + p.b)) ** 2, springs=(scale * p.K_sf * ones, scale * p.K_sr * ones),
-        dampers=(scale * p.K_sdf * ones, scale * p.K_sdr * ones), tyre_spring=scale * p.K_zt * ones, back=slope.back * ones,
-        down=slope.down * ones, **values)
+        mass=mass, sprung=sprung, unsprung=unsprung, arms=np.stack([front, front - length]),
+        static=np.stack([length - front, front]) / length, height=(p.h_s if height is None else height) * ones,
+        pitch_inertia=scale * p.I_y_s * ones * (length / (p.a + p.b)) ** 2, springs=scale * np.stack([p.K_sf * ones, p.K_sr * ones]),
+        dampers=scale * np.stack([p.K_sdf * ones, p.K_sdr * ones]), tyre_spring=scale * p.K_zt * ones,
+        brake_shares=np.stack([brake_front * ones, (1 - brake_front) * ones]),
+        drive_shares=np.stack([drive_front * ones, (1 - drive_front) * ones]), back=slope.back * ones, down=slope.down * ones, **values)
     return plant._replace(height=plant.height + at_speed(plant, ones).heave)  # the body's own is counted from unloaded tyres
 
 
 class Body(NamedTuple):
-    """State of N vehicles, shape (N,), SI: speed; pitch and heave of the body, and their rates; of the axles height, rate and wheel
-    speed, front and rear; and the share of the full pressure that the anti-lock controller allows each axle.
+    """State of N vehicles, SI: speed, pitch and heave of the body with their rates, shape (N,); of the axles, front before rear, height,
+    its rate and the wheels' speed, and the share of full pressure that the anti-lock controller allows, shape (2, N).
 
     Heights count downwards, as in the package.
     """
@@ -114,79 +123,67 @@ class Body(NamedTuple):
     pitch_rate: FloatArray
     heave: FloatArray
     heave_rate: FloatArray
-    heights: tuple[FloatArray, FloatArray]
-    height_rates: tuple[FloatArray, FloatArray]
-    wheels: tuple[FloatArray, FloatArray]
-    allowed: tuple[FloatArray, FloatArray]
+    heights: FloatArray
+    height_rates: FloatArray
+    wheels: FloatArray
+    allowed: FloatArray
 
 
 def at_speed(plant: Plant, speed: FloatArray) -> Body:
-    """At rest on its springs, wheels rolling."""
-    nothing, length = np.zeros_like(plant.mass), plant.front + plant.rear
-    loads = (plant.sprung * plant.rear / length + plant.unsprung, plant.sprung * plant.front / length + plant.unsprung)
-    heights = (loads[0] * plant.down / (2 * plant.tyre_spring), loads[1] * plant.down / (2 * plant.tyre_spring))
-    # The springs carry their loads unbent where body and axles are level: the body stands where its axles do.
-    heave = (heights[0] * plant.rear + heights[1] * plant.front) / length
-    pitch = (heights[1] - heights[0]) / length
-    one = nothing + 1
-    return Body(speed, pitch, nothing, heave, nothing, heights, (nothing, nothing), (speed / plant.radius,) * 2, (one, one))
+    """On its springs as it stands, with the wheels rolling."""
+    nothing, both = np.zeros_like(plant.mass), np.zeros_like(plant.arms)
+    heights = (plant.sprung * plant.static + plant.unsprung) * plant.down / (2 * plant.tyre_spring)
+    # The springs carry their loads unbent where the body is as high as its axles, there where these are.
+    heave, pitch = (heights * plant.static).sum(axis=0), (heights[1] - heights[0]) / (plant.arms[0] - plant.arms[1])
+    return Body(speed, pitch, nothing, heave, nothing, heights, both, both + speed / plant.radius, both + 1)
 
 
 class Forces(NamedTuple):
-    """Along the road for one tyre of the front and of the rear axle [N], how they grow with the wheel's speed [N s/rad], and its slip
+    """Of one tyre of each axle, shape (2, N): the force along the road [N], how it grows with the wheel's speed [N s/rad], and the slip
     [-], positive where it brakes.
     """
 
-    force: tuple[FloatArray, FloatArray]
-    growth: tuple[FloatArray, FloatArray]
-    slip: tuple[FloatArray, FloatArray]
+    force: FloatArray
+    growth: FloatArray
+    slip: FloatArray
 
 
 def tyre_forces(plant: Plant, body: Body) -> Forces:
     """Pacejka's formula for pure longitudinal slip, as the package's `formula_longitudinal` has it, and its derivative."""
-    tyre, relative_to = commonroad().tire, np.maximum(body.speed, LEAST_SPEED)
-    forces, growths, slips = [], [], []
-    for height, wheel in zip(body.heights, body.wheels, strict=True):
-        load = np.maximum(height * plant.tyre_spring, 1.0)
-        slip = (body.speed - plant.radius * wheel) / relative_to
-        largest = plant.friction * load
-        steep = tyre.p_kx1 / (tyre.p_cx1 * plant.friction)
-        bent = steep * (tyre.p_hx1 - slip)
-        turned = (1 - tyre.p_ex1) * bent + tyre.p_ex1 * np.arctan(bent)
-        angle = tyre.p_cx1 * np.arctan(turned) + load * tyre.p_vx1
-        by_slip = (largest * np.cos(angle) * tyre.p_cx1 / (1 + turned * turned)
-                   * steep * (1 - tyre.p_ex1 + tyre.p_ex1 / (1 + bent * bent)))
-        forces.append(largest * np.sin(angle))
-        growths.append(by_slip * plant.radius / relative_to)
-        slips.append(slip)
-    return Forces(tuple(forces), tuple(growths), tuple(slips))  # type: ignore[arg-type]
+    tyre, relative_to = _tyre(), np.maximum(body.speed, LEAST_SPEED)
+    load = np.maximum(body.heights * plant.tyre_spring, 1.0)
+    slip = (body.speed - plant.radius * body.wheels) / relative_to
+    largest, steep = plant.friction * load, tyre.p_kx1 / (tyre.p_cx1 * plant.friction)
+    bent = steep * (tyre.p_hx1 - slip)
+    turned = (1 - tyre.p_ex1) * bent + tyre.p_ex1 * np.arctan(bent)
+    angle = tyre.p_cx1 * np.arctan(turned) + load * tyre.p_vx1
+    by_bend = largest * np.cos(angle) * (tyre.p_cx1 / (1 + turned * turned)) * (1 - tyre.p_ex1 + tyre.p_ex1 / (1 + bent * bent))
+    return Forces(largest * np.sin(angle), by_bend * (steep * plant.radius / relative_to), slip)
 
 
 class Rates(NamedTuple):
-    """Rates of change of the rates in a body, SI, shape (N,)."""
+    """How fast the rates in a body and its wheels' speeds change, SI; shapes as there."""
 
     speed: FloatArray
     pitch_rate: FloatArray
     heave_rate: FloatArray
-    height_rates: tuple[FloatArray, FloatArray]
-    wheels: tuple[FloatArray, FloatArray]
+    height_rates: FloatArray
+    wheels: FloatArray
 
 
-def rates(plant: Plant, body: Body, torques: tuple[FloatArray, FloatArray], forces: Forces) -> Rates:
-    """The package's right-hand side; `torques` turn both wheels of the front and of the rear axle forward [N m]."""
-    p, (front, rear) = plant, forces.force
-    length, along = p.front + p.rear, 2 * (front + rear)
-    springs = []
-    for k, (arm, other) in enumerate(((p.front, p.rear), (-p.rear, p.front))):
-        bend = body.heights[k] - body.heave + arm * body.pitch
-        bend_rate = body.height_rates[k] - body.heave_rate + arm * body.pitch_rate
-        springs.append(p.sprung * p.down * other / (2 * length) - bend * p.springs[k] - bend_rate * p.dampers[k])
-    axles = [p.down - 2 * (height * p.tyre_spring - spring) / p.unsprung for height, spring in zip(body.heights, springs, strict=True)]
-    wheels = [(torque / 2 - p.radius * force) / p.wheel_inertia for torque, force in zip(torques, forces.force, strict=True)]
+def rates(plant: Plant, body: Body, torques: FloatArray, forces: Forces) -> Rates:
+    """The package's right-hand side; `torques`, shape (2, N), turn both wheels of an axle forward [N m]."""
+    p, along = plant, 2 * (forces.force[0] + forces.force[1])
+    bend = body.heights - body.heave + p.arms * body.pitch
+    bend_rate = body.height_rates - body.heave_rate + p.arms * body.pitch_rate
+    springs = p.sprung * p.down * p.static / 2 - bend * p.springs - bend_rate * p.dampers
+    levered = p.arms * springs
     return Rates(
         speed=along / p.mass - p.back,
-        pitch_rate=(2 * (p.front * springs[0] - p.rear * springs[1]) + along * (p.height - body.heave)) / p.pitch_inertia,
-        heave_rate=p.down - 2 * (springs[0] + springs[1]) / p.sprung, height_rates=(axles[0], axles[1]), wheels=(wheels[0], wheels[1]))
+        pitch_rate=(2 * (levered[0] + levered[1]) + along * (p.height - body.heave)) / p.pitch_inertia,
+        heave_rate=p.down - 2 * (springs[0] + springs[1]) / p.sprung,
+        height_rates=p.down - 2 * (body.heights * p.tyre_spring - springs) / p.unsprung,
+        wheels=(torques / 2 - p.radius * forces.force) / p.wheel_inertia)
 
 
 def advance(plant: Plant, body: Body, pedal: FloatArray, driving: FloatArray, step: float) -> Body:
@@ -195,29 +192,23 @@ def advance(plant: Plant, body: Body, pedal: FloatArray, driving: FloatArray, st
     Wheels, which are stiff, go implicitly, linearised; the others rate first, height after.
     """
     p, forces = plant, tyre_forces(plant, body)
-    shares = ((p.brake_front, p.drive_front), (1 - p.brake_front, 1 - p.drive_front))
-    allowed = [_anti_lock(body, forces.slip[k], body.allowed[k], pedal, step) for k in range(2)]
-    torques = [driving * drive - np.minimum(pedal, allowed[k]) * p.brake_torque * brake for k, (brake, drive) in enumerate(shares)]
-    change = rates(plant, body, (torques[0], torques[1]), forces)
-    wheels, along = [], change.speed
-    for k in range(2):
-        stiff = np.maximum(forces.growth[k], 0.0)
-        wheel = np.maximum(body.wheels[k] + step * change.wheels[k] / (1 + step * stiff * p.radius / p.wheel_inertia), 0.0)
-        along = along + 2 * stiff * (wheel - body.wheels[k]) / p.mass
-        wheels.append(wheel)
-    pitch_rate, heave_rate = body.pitch_rate + step * change.pitch_rate, body.heave_rate + step * change.heave_rate
-    height_rates = tuple(before + step * by for before, by in zip(body.height_rates, change.height_rates, strict=True))
+    allowed = _anti_lock(body, forces.slip, pedal, step)
+    change = rates(p, body, driving * p.drive_shares - np.minimum(pedal, allowed) * (p.brake_torque * p.brake_shares), forces)
+    stiff = np.maximum(forces.growth, 0.0)
+    wheels = np.maximum(body.wheels + step * change.wheels / (1 + step * stiff * p.radius / p.wheel_inertia), 0.0)
+    gained = stiff * (wheels - body.wheels)
+    speed = np.maximum(body.speed + step * (change.speed + 2 * (gained[0] + gained[1]) / p.mass), 0.0)
     stands = (body.speed <= 0) & (driving <= 0) & (p.back >= 0)  # tyres of Pacejka's push a little where they do not slip at all
-    speed = np.where(stands, 0.0, np.maximum(body.speed + step * along, 0.0))
+    pitch_rate, heave_rate = body.pitch_rate + step * change.pitch_rate, body.heave_rate + step * change.heave_rate
+    height_rates = body.height_rates + step * change.height_rates
     return Body(
-        speed=speed, pitch=body.pitch + step * pitch_rate, pitch_rate=pitch_rate, heave=body.heave + step * heave_rate,
-        heave_rate=heave_rate,
-        heights=tuple(before + step * by for before, by in zip(body.heights, height_rates, strict=True)),  # type: ignore[arg-type]
-        height_rates=height_rates, wheels=(wheels[0], wheels[1]), allowed=(allowed[0], allowed[1]))  # type: ignore[arg-type]
+        speed=np.where(stands, 0.0, speed), pitch=body.pitch + step * pitch_rate, pitch_rate=pitch_rate,
+        heave=body.heave + step * heave_rate, heave_rate=heave_rate, heights=body.heights + step * height_rates, height_rates=height_rates,
+        wheels=wheels, allowed=allowed)
 
 
-def _anti_lock(body: Body, slip: FloatArray, allowed: FloatArray, pedal: FloatArray, step: float) -> FloatArray:
-    """The share of full pressure that an axle may have: less while its slip is too large, then more again, up to any pedal."""
+def _anti_lock(body: Body, slip: FloatArray, pedal: FloatArray, step: float) -> FloatArray:
+    """The share of full pressure that each axle may have: less while its slip is too large, then more again, up to any pedal."""
     locks = (slip > SLIP) & (body.speed > LEAST_CONTROLLED)
-    less = np.maximum(np.minimum(allowed, pedal) - RELEASE * step, 0.0)
-    return np.where(locks, less, np.minimum(allowed + BUILD_UP * step, 1.0))
+    less = np.maximum(np.minimum(body.allowed, pedal) - RELEASE * step, 0.0)
+    return np.where(locks, less, np.minimum(body.allowed + BUILD_UP * step, 1.0))
