@@ -28,7 +28,7 @@ COMMANDS = {
     "check": ("check", "Check your own driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller."),
     "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms and metrics."),
     "explain": ("questions", "Explain failures: which changes cause them, how small a change is enough, and why."),
-    "opinion": ("questions", "Ask another vehicle model about failures: is each cause confirmed, contradicted, or outside it?"),
+    "opinion": ("questions", "Have another vehicle model confirm or contradict the causes of failures."),
     "tolerance": ("questions", "Find how far each characteristic may go: alone, in pairs, and all together."),
     "risk": ("questions", "Estimate the probability of an unsafe outcome, and which characteristics decide it."),
     "rules": ("questions", "Find rules that describe where it is unsafe, in physical units."),
