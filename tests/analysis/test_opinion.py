@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -13,12 +14,14 @@ from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
 from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
 from safevar_sumo.analysis.criterion import Unsafe
+from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.opinion.compute import Cause, opinions_of, second_system
 from safevar_sumo.analysis.opinion.mapping import TABLES
 from safevar_sumo.analysis.opinion.multi_body import Body, Plant, advance, at_speed, plant_of, rates, tyre_forces
 from safevar_sumo.analysis.opinion.result import Verdict
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
+from safevar_sumo.report import make_report
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.vehicles import LEVEL, VEHICLES
@@ -207,9 +210,21 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
         assert (one["there"]["outcome"] is None) == (one["opinion"] == "outside")
         assert all(name in one["because"] for name in outside & set(one["changes"]))
     first, *others = dict.fromkeys(one["solution"] for one in every)
-    for named in (["--solutions", first, "--solutions", others[0]], ["--solutions", first, others[0]]):
-        some = json.loads(CliRunner().invoke(commands, ["opinion", str(slippery), "--json", *named]).stdout)
-        assert some == [one for one in every if one["solution"] in (first, others[0])]
+    assert OpinionOptions(solutions=(f"{first},{others[0]}",)) == OpinionOptions(solutions=(first, others[0]))
+    some = CliRunner().invoke(commands, ["opinion", str(slippery), "--json", "--solutions", first, others[0]]).stdout
+    assert json.loads(some) == [one for one in every if one["solution"] in (first, others[0])]
+
+
+def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = make_report([slippery], only=["causes", "reproduce"], jobs=1)
+    verdicts = re.findall(r"second vehicle model: (\w+)", page)
+    assert len(verdicts) == len(re.findall(r"<h4[^>]*>Cause \d", page)) > 0
+    assert set(verdicts) <= {str(verdict) for verdict in Verdict}
+    assert f"opinion {slippery}" in page
+    monkeypatch.setitem(sys.modules, "vehiclemodels.parameters_vehicle2", None)
+    without = make_report([slippery], only=["causes"], jobs=1)
+    assert "second vehicle model:" not in without
+    assert "pip install &#39;safevar_sumo[opinion]&#39;" in without
 
 
 @pytest.mark.parametrize(("typed", "told"), [
