@@ -215,6 +215,7 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
     assert json.loads(some) == [one for one in every if one["solution"] in (first, others[0])]
 
 
+@pytest.mark.slow
 def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = make_report([slippery], only=["causes", "reproduce"], jobs=1)
     verdicts = re.findall(r"second vehicle model: (\w+)", page)
