@@ -102,6 +102,13 @@ def checked(subject: Subject, *, simulated: bool = True) -> Report:
     return report
 
 
+ADVICE_ON_FMUS = {
+    "determinism": "let the FMU draw nothing at random and ask no clock", "state": "let its reset bring everything back to its start",
+    "batch": "let its instances share nothing", "finite": "limit what the FMU divides by; a max of an input limits gaps to nobody",
+    "reaction": "look at the table of inputs and outputs, and at units and signs"}
+"""How to mend what a check finds in an FMU, in place of advice on code."""
+
+
 class _Suite:
     def __init__(self, subject: Subject, simulated: bool) -> None:
         self._subject, self._source = subject, Source(subject.member)
@@ -222,7 +229,9 @@ class _Suite:
 
     def _finding(self, check: str, got: str, expected: str, place: tuple[str, int]) -> Finding:
         advice = ADVICE[check].format(room=ROOMS[self._subject.kind])
-        if check == "contract" and self._subject.kind == "ads" and isinstance(self._subject.member.what, type) \
+        if self._subject.member.file:
+            advice = ADVICE_ON_FMUS.get(check, "see the tutorial on FMUs")
+        elif check == "contract" and self._subject.kind == "ads" and isinstance(self._subject.member.what, type) \
                 and not issubclass(self._subject.member.what, ScalarAds):
             advice += "; an ADS for one vehicle derives from safevar_sumo.ads.ScalarAds"
         return Finding(check=check, file=place[0], line=place[1], expected=expected, got=got, advice=advice)

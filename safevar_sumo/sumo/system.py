@@ -234,7 +234,7 @@ def _assembled(study: Study, source: str) -> System:
 
 def models_of(study: Study, source: str) -> Models:
     """The study's models with their parameters; raises as `assemble`."""
-    lookup, limit = Lookup(source, study.origin.places), min(study.search.time_limit, LONGEST)
+    lookup, limit = Lookup(source, study.origin.places), min(study.search.time_limit / 2, LONGEST)  # before a pool gives the batch up
     vehicle, ads, scenario = _vehicle(study.vehicle, lookup, limit), _ads(study.ads, lookup, limit), _scenario(study.scenario, lookup)
     return Models(vehicle[0], ads[0], scenario[0], weather_of(study.weather, source), (vehicle[1], ads[1], scenario[1]))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 import safevar_sumo as sv
@@ -13,6 +14,15 @@ from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 
 SETTINGS = 200
+SIMULATIONS = 10_000
+MOST_MEMORY = 20e6
+"""By so much may what the processes hold grow over that many simulations [bytes]."""
+
+
+def memory() -> int:
+    """What this process and those beside it hold [bytes]."""
+    me = psutil.Process()
+    return sum(one.memory_info().rss for one in (me, *me.children(recursive=True)))
 
 
 @pytest.mark.parametrize("name", ["exported_aeb", "exported_vehicle"])
@@ -29,3 +39,20 @@ def test_an_exported_model_drives_as_the_original(made: Path, name: str) -> None
     traces = [sv.simulate(str(made / f"{one}.toml"), {"mass": 1900.0, "reactionTime": 0.2}).trace for one in ("native_aeb", name)]
     assert list(traces[0]) == list(traces[1])
     np.testing.assert_allclose(traces[1].to_numpy(), traces[0].to_numpy(), rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["small", "cart"])
+def test_ten_thousand_simulations_leave_nothing_behind(made: Path, name: str) -> None:
+    system = assemble(load_study(str(made / f"{name}.toml")))
+    members = system.characteristics
+    settings = members.filter(np.random.default_rng(6).uniform(members.lower, members.upper, (SETTINGS, len(members))))
+    first = evaluate(system, settings).f_safe
+    for _ in range(2):  # what is made once and kept
+        evaluate(system, settings)
+    before = memory()
+    for _ in range(SIMULATIONS // SETTINGS):
+        last = evaluate(system, settings).f_safe
+    print(f"{name}: {(memory() - before) / 1e6:.1f} MB")
+    assert memory() - before < MOST_MEMORY
+    np.testing.assert_array_equal(last, first)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from safevar_sumo.conformance import check
 from safevar_sumo.errors import ForeignError, InputError
 from safevar_sumo.records import Nominal, Observation
 from safevar_sumo.sumo.system import System
@@ -61,6 +62,15 @@ def test_what_cannot_be_used_is_refused_in_one_line(small: Make, edit: Callable[
     assert error.value.exit_code == 2
 
 
+@pytest.mark.parametrize(("then", "finding"), [
+    ("self.pedal = 1.0", None), ("self.pedal = 0.0", "reaction"), ("self.pedal = time.time() % 1", "determinism"),
+    ("Small.all = getattr(Small, 'all', 0) + 1; self.pedal = 1 / Small.all", "state")])
+def test_check_names_the_fmu_and_what_it_should_not_do(small: Make, then: str, finding: str | None) -> None:
+    small(then)
+    report = check("Small.fmu")
+    assert [(one.check, Path(one.file).name) for one in report.findings] == ([(finding, "Small.fmu")] if finding else [])
+
+
 def test_without_fmpy_the_extra_is_named(small: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fmpy", None)
     with pytest.raises(InputError, match="pip install 'safevar_sumo\\[fmu\\]'"):
@@ -89,7 +99,7 @@ def driven(system: System, gaps: list[float], step: float = 0.1) -> np.ndarray:
     ("self.pedal = float('nan')", "returned brake = nan from doStep"),
 ])
 def test_what_it_does_wrong_is_told_and_when(small: Make, then: str, told: str) -> None:
-    system = small(then, time_limit=1)
+    system = small(then, time_limit=2)
     with pytest.raises(ForeignError) as error:
         driven(system, [100.0, 50.0, 20.0, 10.0])
     assert error.value.problem.startswith("ads.model = 'Small.fmu'")
