@@ -80,6 +80,9 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     assert holds_the_first(BATCHES, content)
     assert content.result(BUDGET) == Result(positions=RESULT, asked=99, budget=BUDGET)
     assert content.result(BUDGET + 1) is None
+    first = content.within(ROWS)
+    assert first is not None
+    assert same(first, batch(0)), "positions count from 0: the first three"
 
 
 @in_one_folder
