@@ -84,7 +84,7 @@ def explain(place: str, full: bool, point: str | None, jobs: int | None, as_json
 
 @question(OpinionOptions, "DIR", click.argument("more", nargs=-1, metavar=""))
 def opinion(place: str, more: tuple[str, ...], point: str | None, jobs: int | None, as_json: bool, **given: Any) -> None:
-    """Ask another vehicle model about the minimal causes of failures of results in DIR: is each confirmed or contradicted?"""
+    """Have another vehicle model confirm or contradict the minimal causes of failures of results in DIR."""
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
     from safevar_sumo.analysis.opinion.render import print_opinions
 
