@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.matrix import evaluate, named_point
 from safevar_sumo.sumo.parameters import value_of, with_values
 from safevar_sumo.sumo.system import assemble
+from safevar_sumo.vehicles import CharacteristicSet
 
 BAND = 0.9
 """Share of the predictions that lie in a band."""
@@ -32,7 +34,8 @@ class ModelSpread:
     sets
         How many sets there are.
     lower, upper
-        The band that 90 % of their safety degrees and of repeats of one simulation lie in [m, or -m/s]; None where none has one.
+        The band that 90 % of their safety degrees and of repeats of one simulation lie in, wider by the model's error where the study
+        tells it [m, or -m/s]; None where none has one.
     collisions
         With how many of the sets the setting collides.
     """
@@ -52,7 +55,7 @@ class ModelSpread:
             return f"no safety degree with any of {self.sets} parameter sets that fit the published data as well"
         hits = "none of them" if not self.collisions else f"{self.collisions} of them"
         return (f"safety degree {self.lower:.2f} to {self.upper:.2f} ({BAND:.0%} band of {self.sets} parameter sets that fit the published "
-                f"data as well, and of repeats); a collision with {hits}")
+                f"data as well, of repeats and of the model's error); a collision with {hits}")
 
 
 def model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[ModelSpread]:
@@ -65,18 +68,30 @@ def model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[M
         If the study has no spread, or one of parameters that it does not have.
     """
     evaluations = evaluations_of_sets(study, settings, point)
-    lower, upper = band(np.stack([one.f_safe for one in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0))
+    lower, upper = band_of(study, evaluations)
     hits = np.stack([one.collided for one in evaluations]).sum(axis=0)
     return [ModelSpread(sets=len(evaluations), lower=finite_or_none(low), upper=finite_or_none(high), collisions=int(hit))
             for low, high, hit in zip(lower.tolist(), upper.tolist(), hits.tolist(), strict=True)]
 
 
-def band(safety_degrees: FloatArray, repeatability: float) -> tuple[FloatArray, FloatArray]:
-    """Ends of the band of predictions, shape (sets, M), and of repeats of one simulation; each of shape (M,)."""
+def band_of(study: Study, evaluations: Sequence[Evaluations]) -> tuple[FloatArray, FloatArray]:
+    """Ends of the band of what the parameter sets make of settings, repeats and the model's error with it; each of shape (M,)."""
+    error = study.model_error.get(SAFETY_DEGREE, 0.0) * distance(study, evaluations[0].settings)
+    return band(np.stack([one.f_safe for one in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0), error)
+
+
+def distance(study: Study, settings: FloatArray) -> FloatArray:
+    """How far settings are from the original vehicle, each characteristic in widths of its domain (Euclidean); shape (M,)."""
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    return np.asarray(np.linalg.norm((settings - characteristics.original) / (characteristics.upper - characteristics.lower), axis=1))
+
+
+def band(safety_degrees: FloatArray, repeatability: float, error: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
+    """Ends of the band of predictions, shape (sets, M), and of repeats of one simulation, `error` wider on each side; of shape (M,)."""
     lower, upper = np.full(safety_degrees.shape[1], np.nan), np.full(safety_degrees.shape[1], np.nan)
     defined = np.isfinite(safety_degrees).any(axis=0)
     lower[defined], upper[defined] = np.nanquantile(safety_degrees[:, defined], [(1 - BAND) / 2, (1 + BAND) / 2], axis=0)
-    return lower - DEVIATIONS * repeatability, upper + DEVIATIONS * repeatability
+    return lower - DEVIATIONS * repeatability - error, upper + DEVIATIONS * repeatability + error
 
 
 def evaluations_of_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:

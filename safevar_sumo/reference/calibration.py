@@ -14,6 +14,7 @@ import numpy as np
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.reference.effects import error_beyond_spread
 from safevar_sumo.reference.fit import LARGEST, Search, Together, original_cost, reference_cost
 from safevar_sumo.reference.parameters import Free, free_parameters
 from safevar_sumo.reference.profiles import Profiles
@@ -77,8 +78,12 @@ def _rho(result: Agreement) -> str:
     return "undefined" if rho is None else f"{rho:.3f}"
 
 
-NEAR, WIDE = 0.02, 0.3
-"""Standard deviation of the first trials around known values, and around a random place, as a share of a parameter's bounds."""
+NEAR = 0.02
+"""Standard deviation of the first trials around known values, as a share of a parameter's bounds."""
+
+
+MILLIMETRES = 3
+"""Decimals of a study's model error."""
 
 
 class Subject(NamedTuple):
@@ -156,7 +161,8 @@ def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[
         names = " and ".join(f"study {study.name!r}" for study in studies)
         raise SimulationError(f"{names} cannot be simulated with {'its' if len(studies) == 1 else 'their'} own values")
     rng = np.random.default_rng(fit.seed)
-    searches = [search.begun(rng.random(len(free)), WIDE, int(rng.integers(1, 2**31))) for _ in range(fit.starts)]
+    keys = [one.key for one in free]  # what several studies have of their own begins at one place: it is one model in other conditions
+    searches = search.from_random_places([keys.index(key) for key in keys], fit.starts, fit.screened, fit.width, rng)
     if not from_scratch:
         searches.append(search.begun(trial.shares(studies), NEAR, fit.seed + 1))
     search.race(searches)
@@ -166,9 +172,11 @@ def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[
     for k, best in enumerate(search.best):
         mine = [one for one in free if k in one.studies]
         best = msgspec.structs.replace(best, spread=profiles.spread(k))
+        beyond = {SAFETY_DEGREE: round(error_beyond_spread(best, used[k]), MILLIMETRES)} if used[k] else {}
+        best = msgspec.structs.replace(best, model_error=beyond)
         results.append(Calibration(
-            {one.key: value_of(best, one.key) for one in mine}, best, search.cost, reached, _told(best, used[k], pool),
-            _told(best, held_back[k], pool), {one.key: one.bounds for one in mine}, fit,
+            {one.key: value_of(best, one.key) for one in mine}, best, search.cost, reached, _agreements(best, used[k], pool),
+            _agreements(best, held_back[k], pool), {one.key: one.bounds for one in mine}, fit,
             tuple(study.name for study in studies if study is not studies[k]),
             frozenset(one.key for one in mine if len(one.studies) > 1),
             {one.key: profiles.interval(i) for i, one in enumerate(free) if k in one.studies}, profiles))
@@ -221,7 +229,7 @@ class _Fitted:
         self._inputs, self._pool = inputs_of(study, pool), RetryingPool(pool, study)
         settings = [self._characteristics.original[np.newaxis], *(data.settings for data in references.values())]
         self._settings, self._row_of = np.unique(np.concatenate(settings), axis=0, return_inverse=True)
-        batches = math.ceil(len(self._settings) / settings_per_batch(assemble(study), Engine.RECORDED))
+        batches = max(1, round(len(self._settings) / settings_per_batch(assemble(study), Engine.RECORDED)))  # few rows more cost less
         self._size = math.ceil(len(self._settings) / batches)
 
     def submit(self, study: Study) -> list[Future[Evaluations]]:
@@ -242,7 +250,7 @@ class _Fitted:
         return cost
 
 
-def _told(study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> dict[str, Agreement]:
+def _agreements(study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> dict[str, Agreement]:
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     parts = {}
     for name, data in references.items():

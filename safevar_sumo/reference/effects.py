@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
-from safevar_sumo.analysis.model_spread import BAND, band, evaluations_of_sets
+from safevar_sumo.analysis.model_spread import BAND, band_of, distance, evaluations_of_sets
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.study import SAFETY_DEGREE, Study
@@ -82,9 +84,9 @@ class Coverage(NamedTuple):
         return self._asdict()
 
     def __str__(self) -> str:
-        return (f"The {BAND:.0%} band of {self.sets} parameter sets and of repeats is {self.width:.2f} m wide (median) and covers "
-                f"{self.all_rows:.0%} of {self.rows} rows, {self.held_back:.0%} of those held back; {self.needed:.2f} m more on each side "
-                f"would cover {BAND:.0%} of these.")
+        return (f"The {BAND:.0%} band of {self.sets} parameter sets, of repeats and of the model's error is {self.width:.2f} m wide "
+                f"(median) and covers {self.all_rows:.0%} of {self.rows} rows, {self.held_back:.0%} of those held back; {self.needed:.2f} "
+                f"m more on each side would cover {BAND:.0%} of these.")
 
 
 def covered_by_spread(data: ReferenceData, study: Study) -> Coverage:
@@ -95,11 +97,37 @@ def covered_by_spread(data: ReferenceData, study: Study) -> Coverage:
     InputError
         If the study has no spread.
     """
-    found = evaluations_of_sets(study, data.settings)
-    lower, upper = band(np.stack([one.f_safe for one in found]), study.repeatability.get(SAFETY_DEGREE, 0.0))
+    evaluations = evaluations_of_sets(study, data.settings)
+    lower, upper = band_of(study, evaluations)
     there = data.metrics[SAFETY_DEGREE]
-    outside = np.maximum(np.maximum(lower - there, there - upper), 0.0)
+    outside = _outside(there, lower, upper)
     held_back = np.arange(len(there)) % study.fit.hold_out == study.fit.hold_out - 1
     of = held_back if held_back.any() else np.ones(len(there), dtype=bool)
-    return Coverage(len(found), len(there), float(np.mean(outside == 0)), float(np.mean(outside[of] == 0)), float(np.median(upper - lower)),
-                    float(np.quantile(outside[of], BAND)))
+    return Coverage(len(evaluations), len(there), float(np.mean(outside == 0)), float(np.mean(outside[of] == 0)),
+                    float(np.median(upper - lower)), float(np.quantile(outside[of], BAND)))
+
+
+def _outside(there: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
+    """By how much values miss a band; zero inside it."""
+    return np.asarray(np.maximum(np.maximum(lower - there, there - upper), 0.0))
+
+
+def error_beyond_spread(study: Study, references: Mapping[str, ReferenceData]) -> float:
+    """By how much a band is to be wider on each side for `BAND` of new rows to lie in it [m per domain's width from the original].
+
+    Split conformal prediction (Lei et al. 2018), the score being what a row misses the band by over its distance; each file counts alike.
+    """
+    bare = msgspec.structs.replace(study, model_error={})
+    scores, weights = [], []
+    for data in references.values():
+        away, there = distance(study, data.settings), data.metrics[SAFETY_DEGREE]
+        counts = (away > 0) & np.isfinite(there)
+        if counts.any():
+            lower, upper = band_of(bare, evaluations_of_sets(bare, data.settings[counts]))
+            scores.append(_outside(there[counts], lower, upper) / away[counts])
+            weights.append(np.full(len(scores[-1]), 1 / len(scores[-1])))
+    if not scores:
+        return 0.0
+    every = np.concatenate(scores)
+    share = min(1.0, BAND * (1 + 1 / len(every)))  # a new row is one more among them
+    return float(np.quantile(every, share, weights=np.concatenate(weights), method="inverted_cdf"))

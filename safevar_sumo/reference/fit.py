@@ -75,6 +75,10 @@ NOTED = 1.25
 """Times the lowest cost up to which a trial is kept: what profiles and the spread are made of."""
 
 
+SCREENING = 4
+"""Screening takes one trial in so many at most."""
+
+
 class Search:
     """Keeps the best of all that are tried, and count of the trials that are left.
 
@@ -110,13 +114,27 @@ class Search:
         """A search from a place in the unit cube, `spread` wide at first (standard deviation)."""
         return OneSearch(self, place, spread, seed)
 
+    def from_random_places(self, same: Sequence[int], starts: int, screened: int, spread: float,
+                           rng: np.random.Generator) -> list[OneSearch]:
+        """Searches from random places, or from the best of `screened` ones, on which a share of the trials at most is spent.
+
+        Each parameter begins at the same share of its bounds as the one whose number `same` says.
+        """
+        screened = min(screened, self.left // SCREENING) if starts else 0
+        if screened < max(starts, 1):
+            return [self.begun(rng.random(len(same))[same], spread, int(rng.integers(1, 2**31))) for _ in range(starts)]
+        places = rng.random((screened, len(same)))[:, same]
+        costs = [cost for k in range(0, screened, self.population)
+                 for cost in self.tried([self.trial.at(place) for place in places[k:k + self.population]])]
+        return [self.begun(places[k], spread, int(rng.integers(1, 2**31))) for k in np.argsort(costs, kind="stable")[:starts]]
+
     def race(self, searches: Sequence[OneSearch]) -> None:
         """Successive halving (Jamieson and Talwalkar 2016) of all trials that are left.
 
-        Rounds have as many trials each, shared by half as many searches each time; the last has two, and the winner what is left over.
+        Rounds have as many trials each, shared by half as many searches each time; the last has one, and what is left over.
         """
         racing = list(searches)
-        rounds = max(1, (len(racing) - 1).bit_length())
+        rounds = 1 + (len(racing) - 1).bit_length()
         share = self.left // rounds
         for _ in range(rounds):
             each = share // len(racing)

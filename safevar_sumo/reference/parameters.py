@@ -34,10 +34,10 @@ def free_parameters(studies: Sequence[Study]) -> list[Free]:
     InputError
         If a study declares something that cannot be fitted, or its value is outside its bounds.
     """
-    found: list[Free] = []
+    free: list[Free] = []
     for number, study in enumerate(studies):
         for key, bounds in study.calibration.items():
-            if any(key == free.key and number in free.studies for free in found):
+            if any(key == one.key and number in one.studies for one in free):
                 continue
             value = value_of(study, key)
             if not bounds.lower <= value <= bounds.upper:
@@ -45,8 +45,8 @@ def free_parameters(studies: Sequence[Study]) -> list[Free]:
                 raise InputError(f"study {study.name!r}", f"{key} = {value}", legal)
             check_bounds(study, key, bounds)
             others = () if bounds.own else (k for k, other in enumerate(studies) if k > number and _shares(other, key, value))
-            found.append(Free(key, (number, *others), bounds))
-    return found
+            free.append(Free(key, (number, *others), bounds))
+    return free
 
 
 def _shares(study: Study, key: str, value: float) -> bool:

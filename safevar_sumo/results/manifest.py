@@ -23,7 +23,7 @@ READABLE = (2, FORMAT)
 RESULTS = 2
 """Number of the package's results, raised whenever they change (enforced by tests/golden)."""
 VERSIONED = ("safevar_sumo", "libsumo", "eclipse-sumo", "deap", "numpy")
-FREE = ("title", "published", "repeatability", "fit", "calibration", "spread", "variation", "correlations")
+FREE = ("title", "published", "repeatability", "fit", "calibration", "spread", "model_error", "variation", "correlations")
 """Keys of a study that change no result of a campaign."""
 FREE_OF_SEARCH = ("runs", "algorithms", "evaluations", "time_limit")
 """Keys of its search table that change no evaluation."""

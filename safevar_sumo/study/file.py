@@ -16,7 +16,7 @@ from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study.schema import NAME, Origin, SearchTable, Study, StudyLike, is_file, study_path, tables_of
 from safevar_sumo.study.validation import converted, implausible, refuse, unusable
 
-REPLACED = ("calibration", "published", "repeatability", "spread")
+REPLACED = ("calibration", "published", "repeatability", "spread", "model_error")
 """Tables that a study inherits as a whole or not at all."""
 OF_ONE_SYSTEM = ("title", "published", "repeatability")
 """Keys that hold for one vehicle, ADS, scenario, network, weather and matrix; a study with another one does not inherit them."""
@@ -159,8 +159,8 @@ def _overridden(base: _Raw, over: Mapping[str, Any], source: object) -> _Raw:
         lost = [key for key in OF_ONE_SYSTEM[:2] if key in base.tables and key not in over]
         tables = {**{key: value for key, value in tables.items() if key not in OF_ONE_SYSTEM}, "title": tables.get("name", ""),
                   **{key: over[key] for key in OF_ONE_SYSTEM if key in over}}
-        if "spread" not in over and ("vehicle" in other or "ads" in other):  # it is one of their parameters
-            tables.pop("spread", None)
+        if "vehicle" in other or "ads" in other:  # they are of their parameters
+            tables = {key: value for key, value in tables.items() if key in over or key not in ("spread", "model_error")}
         if lost:
             remarks = (*remarks, f"{source}: has another {' and another '.join(other)} than study {base.tables.get('name')!r}, whose "
                                  f"{' and '.join(lost)} it does not inherit")

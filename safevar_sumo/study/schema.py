@@ -205,12 +205,16 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     are fitted together have the mean of their losses. Of every `hold_out` rows one is used for nothing but to be reported.
     Sets of parameters whose loss is within the share `alike` of the lowest one fit as well: they become the study's `spread`.
     `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own values and from
-    `starts` random places in the bounds, of which the worse half gives up after every round. `seed` is the seed of all that.
+    `starts` random places in the bounds, of which the worse half gives up after every round. With `screened` these are the best of so
+    many random places, but no more than a quarter of the trials is spent on that. A search from a random place is `width` of the bounds
+    wide at first (standard deviation). `seed` is the seed of all that.
     """
 
     trials: PositiveInt = 1200
     seed: Annotated[int, Meta(ge=0, le=2**31)] = 1
     starts: Annotated[int, Meta(ge=0, le=1000)] = 0
+    screened: Annotated[int, Meta(ge=0, le=100_000)] = 0
+    width: Annotated[float, Meta(gt=0, le=1)] = 0.3
     population: Annotated[int, Meta(ge=4, le=1000)] = 14
     hold_out: Annotated[int, Meta(ge=2, le=1000)] = 2
     tolerance: Annotated[float, Meta(gt=0, le=1)] = 0.05
@@ -233,6 +237,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `repeatability` are standard deviations of repeats of one setting there;
     `calibration` tells which parameters are free, by their keys in the file, such as `ads.parameters.corridor`, `fit` how they are found,
     `spread` sets of their values that fit the published data as well, a list for each parameter, the study's own set first;
+    `model_error` by how much the model errs beyond these, by metric, for a vehicle that is a whole domain away from the original;
     `variation` and `correlations` tell how characteristics vary in the world, by name: uniformly where nothing is said;
     `constraints` tell what the characteristics of one vehicle satisfy together.
     """
@@ -253,6 +258,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     fit: FitTable = msgspec.field(default_factory=FitTable)
     calibration: dict[str, FreeParameter] = {}
     spread: dict[str, list[float]] = {}
+    model_error: dict[str, Annotated[float, Meta(ge=0, le=1e6)]] = {}
     variation: dict[str, Distribution] = {}
     correlations: list[Correlation] = []
     constraints: list[Constraint] = []

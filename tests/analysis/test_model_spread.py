@@ -25,8 +25,23 @@ def test_a_band_holds_nine_tenths_of_the_sets_and_of_the_repeats() -> None:
     assert np.isnan([lower[1], upper[1]]).all()
 
 
+def test_the_models_error_makes_the_band_wider_with_the_distance_from_the_original_vehicle() -> None:
+    """Three quarters of one domain and half of another: sqrt(13/16) domains away, by Pythagoras."""
+    sets = {"spread": {GAP: [OWN, OWN]}, "repeatability": {"safety_degree": 1e-9}}
+    bare, study = (load_study("sun", **sets, model_error=error) for error in ({}, {"safety_degree": 0.4}))
+    ch = assemble(study).characteristics
+    settings = np.stack([ch.original, ch.original])
+    for name, share in (("tireFric", -0.75), ("dampRateZeroT_CE", -0.5)):
+        i = list(ch.names).index(name)
+        settings[1, i] += share * (ch.upper[i] - ch.lower[i])
+    for here, wide, more in zip(model_spreads(bare, settings), model_spreads(study, settings), (0.0, 0.4 * 0.8125**0.5), strict=True):
+        assert here.lower is not None
+        assert here.upper is not None
+        assert (wide.lower, wide.upper) == pytest.approx((here.lower - more, here.upper + more), abs=1e-9)
+
+
 def test_the_sets_are_simulated_one_by_one() -> None:
-    study = load_study("sun", spread={GAP: [OWN, OWN - 1, OWN + 1]}, repeatability={"safety_degree": 1e-9})
+    study = load_study("sun", spread={GAP: [OWN, OWN - 1, OWN + 1]}, repeatability={"safety_degree": 1e-9}, model_error={})
     setting = assemble(study).characteristics.setting({"tireFric": 1.3}, "a test")[np.newaxis]
     alone = [evaluate(assemble(load_study("sun", ads={"parameters": {"brake_gap": gap}})), setting) for gap in (OWN, OWN - 1, OWN + 1)]
     (band,) = model_spreads(study, setting)
@@ -42,7 +57,9 @@ def test_a_study_keeps_what_it_gives_another_value() -> None:
 
 
 def test_another_vehicle_or_driver_has_no_spread_and_lists_are_of_one_length() -> None:
-    assert not load_study(load_study("sun", spread={GAP: [OWN, 5.0]}), ads={"model": "full_braking"}).spread
+    other = load_study(load_study("sun", spread={GAP: [OWN, 5.0]}), ads={"model": "full_braking"})
+    assert not other.spread
+    assert not other.model_error
     with pytest.raises(InputError, match="spread"):
         load_study("sun", spread={GAP: [OWN], "ads.parameters.corridor": [2.5, 2.0]})
     with pytest.raises(InputError, match="spread"):

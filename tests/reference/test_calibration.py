@@ -12,9 +12,9 @@ import pytest
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.reference import ReferenceData, Subject, agreement, calibrate, calibrate_together, with_values
-from safevar_sumo.reference.effects import linear_effects
+from safevar_sumo.reference.effects import covered_by_spread, error_beyond_spread, linear_effects
 from safevar_sumo.reference.fit import Search, original_cost, reference_cost
-from safevar_sumo.reference.parameters import Free, free_parameters
+from safevar_sumo.reference.parameters import Free, free_parameters, value_of
 from safevar_sumo.reference.profiles import Profiles
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
@@ -171,8 +171,43 @@ def silent(cost: float, best: Any) -> None:
 def test_the_worse_half_gives_up_after_every_round() -> None:
     runners = [Runner(lowest) for lowest in (5.0, 1.0, 4.0, 2.0, 3.0)]
     Search(Bowl(), 1, 300, silent).race(runners)  # type: ignore[arg-type]
-    # Rounds of 5, 3 and 2 searches with 100 trials each; the winner gets what remains, which these runners never take.
-    assert [runner.rounds for runner in runners] == [[20], [20, 33, 50, 300], [20], [20, 33, 50], [20, 33]]
+    # Rounds of 5, 3, 2 and 1 searches with 75 trials each; the winner gets what remains, which these runners never take.
+    assert [runner.rounds for runner in runners] == [[15], [15, 25, 37, 75, 300], [15], [15, 25, 37], [15, 25]]
+
+
+def test_searches_begin_at_the_best_of_many_places_with_what_is_the_same_at_one_place() -> None:
+    class Noted(Bowl):
+        def __init__(self) -> None:
+            super().__init__()
+            self.places: list[FloatArray] = []
+
+        def costs(self, studies: Sequence[Any]) -> list[float]:
+            self.places.extend(studies)
+            return super().costs(studies)
+
+    bowl = Noted()
+    search = Search(bowl, 7, 200, silent)
+    search.from_random_places([0, 1, 0], 2, 80, 1e-9, np.random.default_rng(4))[1].go_on(1)
+    screened = bowl.places[:-1]
+    assert len(screened) == 50, "a quarter of the trials at most"
+    assert all(place[2] == place[0] for place in screened)
+    second = sorted(screened, key=lambda place: float(((place - 0.2) ** 2).sum() + (place[0] > 0.5)))[1]
+    assert bowl.places[-1] == pytest.approx(second, abs=1e-6)
+    assert search.left == 149
+
+
+def test_the_models_error_covers_nine_tenths_of_rows_each_file_counted_alike(data: ReferenceData) -> None:
+    """Rows of one file lie in the middle of the band, those of the other 1 to 24 times their distance from the original beyond it."""
+    study = msgspec.structs.replace(mine(1.0), spread={GAP: [value_of(mine(1.0), GAP)] * 2}, repeatability={"safety_degree": 1e-9})
+    ch = assemble(study).characteristics
+    away = np.sqrt((((data.settings - ch.original) / (ch.upper - ch.lower)) ** 2).sum(axis=1))
+    far = data._replace(metrics={"safety_degree": data.metrics["safety_degree"] + away * np.arange(1, 25)})
+    # Of 24 rows alone the 23rd: ceil(0.9 * 25). Beside 24 rows without a miss, 0.9 * 49 / 48 of the weight: the 21st (20.1 of 24 misses).
+    assert error_beyond_spread(study, {"far": far}) == pytest.approx(23, abs=1e-6)
+    assert error_beyond_spread(study, {"near": data, "far": far}) == pytest.approx(21, abs=1e-6)
+    # A file of 8 rows without a miss counts as much as one of 24: again the 21st (20.6 of 24); row by row it would be the 22nd.
+    assert error_beyond_spread(study, {"near": data.take(np.arange(24) < 8), "far": far}) == pytest.approx(21, abs=1e-6)
+    assert covered_by_spread(far, msgspec.structs.replace(study, model_error={"safety_degree": 21.000001})).all_rows == 21 / 24
 
 
 @pytest.mark.parametrize(("starts", "trials"), [(1, 7), (3, 100), (6, 500), (40, 30)])

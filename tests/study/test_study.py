@@ -30,7 +30,8 @@ def test_rain_differs_from_sun_in_weather_and_in_how_late_its_driver_reacts_alon
     assert {name: value for name, value in rain.ads.parameters.items() if sun.ads.parameters.get(name) != value}.keys() == REACTS
     assert msgspec.structs.replace(rain.ads, parameters=sun.ads.parameters) == sun.ads
     same = {"name": sun.name, "title": sun.title, "published": sun.published, "calibration": sun.calibration,
-            "repeatability": sun.repeatability, "fit": sun.fit, "spread": sun.spread}
+            "repeatability": sun.repeatability, "fit": sun.fit, "spread": sun.spread,
+            "model_error": sun.model_error}
     assert msgspec.structs.replace(rain, weather=sun.weather, ads=sun.ads, **same) == sun
     assert set(rain.calibration) == {f"ads.parameters.{name}" for name in REACTS}
     assert all(row.own for row in rain.calibration.values())
