@@ -104,15 +104,19 @@ class TargetTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return Memory(meeting, lateral, 0, given, np.zeros(len(lateral), dtype=bool))
 
     def observe(self, world: World, step: float, memory: Memory) -> tuple[Scene, Memory]:
-        meeting, sample = memory.meeting, memory.sample
-        target = meeting.target(meeting.positions(world), sample * step)
+        meeting = memory.meeting
+        target = meeting.target(meeting.positions(world), memory.sample * step)
         target = target._replace(lateral_speed=(target.lateral - memory.lateral) / step)
-        pace = meeting.pace(sample, step)
-        if pace != memory.given:
-            meeting.go(world, pace)
         front = meeting.frame.along(world.vehicle_positions(VUT))
         scene, closed_in = scene_of(meeting.course, target, front, world.speeds(), memory.closed_in)
-        return scene, Memory(meeting, target.lateral, sample + 1, pace, closed_in)
+        return scene, self.move(world, step, memory)._replace(lateral=target.lateral, closed_in=closed_in)
+
+    def move(self, world: World, step: float, memory: Memory) -> Memory:
+        """Have the target move on, as `observe` does, without a look at the scene."""
+        pace = memory.meeting.pace(memory.sample, step)
+        if pace != memory.given:
+            memory.meeting.go(world, pace)
+        return memory._replace(sample=memory.sample + 1, given=pace)
 
     def at_all_samples(self, world: World, samples: World, step: float) -> tuple[Meeting, Target]:
         """The meeting in a recorded scene, and its target at all samples; the scene as `samples` has its T samples for N copies."""

@@ -8,7 +8,8 @@ the last bit: the operations are those of `MSVehicle::updateState`, `MSLane::int
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -78,7 +79,7 @@ class RecordedWorld:
         if whole is None:
             self._front_before, self._speeds_before = self.vehicle_positions(VUT), self._speeds
             self._ahead_before = self._front_before @ recordings[0].along
-            self._extents = _joined_extents(recordings)
+            self._extents, self._others = _joined_extents(recordings), [[*one.tracks.values()] for one in recordings]
 
     def set_types(self, types: SumoType) -> None:
         """SUMO obeys every speed that it is given: types have no part in how vehicles move."""
@@ -198,16 +199,48 @@ class RecordedWorld:
         moved too (`MSNet::simulationStep`: `STAGE_EVENTS`, `STAGE_MOVEMENTS`).
         """
         self._struck, found = {}, dict[int, float]()
+        near = self._near(open_)
+        if not len(near):
+            return found
+        tracks = [self._others[k][number] for k, number in near.tolist()]
+        others = Body.columns([_body(track, self._sample) for track in tracks])
+        persons = np.array([track.is_person for track in tracks])
         moved, still = (self.vehicle_positions(VUT), self._speeds), (self._front_before, self._speeds_before)
-        for k, number in self._near(open_).tolist():
-            recording, rows = self._recordings[k], slice(k * self._size, (k + 1) * self._size)
-            track = [*recording.tracks.values()][number]
-            other = _body(track, self._sample)
-            for fronts, speeds in (still, moved) if track.is_person else (moved,):
-                for row in (rows.start + _overlaps(fronts[rows], open_[rows], recording, other, track.is_person)).tolist():
-                    if row not in found:
-                        found[row], self._struck[row] = float(speeds[row]), other
+        hits = [(pair, row, phase) for phase, (fronts, _) in enumerate((still, moved)) if phase or persons.any()
+                for pair, row in self._overlaps(fronts, open_, near[:, 0], others, persons, still=not phase)]
+        for pair, row, phase in sorted(hits, key=itemgetter(0, 2)):
+            if row not in found:
+                found[row] = float((moved if phase else still)[1][row])
+                self._struck[row] = Body._make(column[pair] for column in others)
         return dict(sorted(found.items()))
+
+    def _overlaps(self, fronts: FloatArray, open_: BoolArray, scenes: Any, others: Body, persons: BoolArray, *,
+                  still: bool) -> Iterator[tuple[int, int]]:
+        """Pairs of a body, by its number, and a vehicle, by its row, whose rectangles overlap: no side of either parts them.
+
+        Two vehicles in one direction overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
+        """
+        own, length, width = self._recordings[0].along, self._recordings[0].length, self._recordings[0].width
+        across, other_across = _left(own), np.stack([-others.along[:, 1], others.along[:, 0]], axis=1)
+        cosine, sine = np.abs(others.along @ own), np.abs(other_across @ own)
+        least = np.where(persons | (cosine < PARALLEL), 0.0, NUMERICAL_EPS)
+        reach = (length + others.length * cosine + others.width * sine) / 2 - least
+        offset = others.middle + own * (length / 2)
+        candidates = open_.reshape(-1, self._size)[scenes]
+        if still:
+            candidates = candidates & persons[:, np.newaxis]
+        ahead = np.abs((offset[:, np.newaxis] - fronts.reshape(-1, self._size, 2)[scenes]) @ own)
+        pair, place = np.nonzero(candidates & (ahead < reach[:, np.newaxis]))
+        if not len(pair):
+            return
+        row = scenes[pair] * self._size + place
+        to_other, cosine, sine, least = offset[pair] - fronts[row], cosine[pair], sine[pair], least[pair]
+        other_length, other_width = others.length[pair], others.width[pair]
+        apart = np.abs(to_other @ across) >= (width + other_length * sine + other_width * cosine) / 2 - least
+        for axis, reach in ((others.along, other_length + length * cosine + width * sine),
+                            (other_across, other_width + length * sine + width * cosine)):
+            apart |= np.abs((to_other * axis[pair]).sum(axis=1)) >= reach / 2 - least
+        yield from zip(pair[~apart].tolist(), row[~apart].tolist(), strict=True)
 
     def _near(self, open_: BoolArray) -> Any:
         """Scenes, and somebody in each by number, beside whom a vehicle of an open run is or was a step ago; shape (M, 2)."""
@@ -220,12 +253,12 @@ class RecordedWorld:
         rears, fronts = self._extents[:, self._sample]
         return np.argwhere((rears < foremost[:, np.newaxis]) & (fronts > rearmost[:, np.newaxis]))
 
-    def bodies(self, copy: int) -> tuple[Body, Body]:
-        """A vehicle under test that collides in this step, and whom it collides with."""
-        recording = self._recordings[copy // self._size]
-        own = Body.behind(self.vehicle_positions(VUT)[copy], recording.along, recording.length, recording.width,
-                          float(self._speeds[copy]))
-        return own, self._struck[copy]
+    def bodies(self, copies: Sequence[int]) -> tuple[Body, Body]:
+        """Vehicles under test that collide in this step, and whom they collide with; in columns."""
+        road, n = self._recordings[0], len(copies)
+        own = Body.behind(self.vehicle_positions(VUT)[copies], road.along, road.length, road.width, self._speeds[copies])
+        return (own._replace(along=np.tile(road.along, (n, 1)), length=np.full(n, road.length), width=np.full(n, road.width)),
+                Body.columns([self._struck[copy] for copy in copies]))
 
 
 def _joined_extents(recordings: Sequence[Recording]) -> FloatArray:
@@ -240,29 +273,6 @@ def _joined_extents(recordings: Sequence[Recording]) -> FloatArray:
 def _body(track: Track, sample: int) -> Body:
     return Body.behind(track.position[sample], direction_of(float(track.angle[sample])), track.length, track.width,
                        float(track.speed[sample]))
-
-
-def _overlaps(front: FloatArray, of_open: BoolArray, recording: Recording, other: Body, is_person: bool) -> Any:
-    """Rows of vehicles whose rectangles overlap another: no side of either parts them.
-
-    Two vehicles in one direction overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
-    """
-    own, along = recording.along, other.along
-    across, other_across = _left(own), _left(along)
-    cosine, sine = abs(along @ own), abs(other_across @ own)
-    least = 0.0 if is_person or cosine < PARALLEL else NUMERICAL_EPS
-    axes = (
-        (own, recording.length + other.length * cosine + other.width * sine),
-        (across, recording.width + other.length * sine + other.width * cosine),
-        (along, other.length + recording.length * cosine + recording.width * sine),
-        (other_across, other.width + recording.length * sine + recording.width * cosine))
-    offset = other.middle + own * (recording.length / 2)
-    rows = np.flatnonzero(of_open & (np.abs((offset - front) @ own) < axes[0][1] / 2 - least))
-    if len(rows):
-        to_other = offset - front[rows]
-        apart = [np.abs(to_other @ axis) >= reach / 2 - least for axis, reach in axes[1:]]
-        rows = rows[~np.logical_or.reduce(apart)]
-    return rows
 
 
 def _left(direction: FloatArray) -> FloatArray:

@@ -17,6 +17,7 @@ from msgspec import msgpack, to_builtins
 
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import VUT, GuardedScenario, Scenario
+from safevar_sumo.scenarios.target import TargetTest
 from safevar_sumo.sumo.cache import cached
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.sumo.engine import Engine, open_world
@@ -193,7 +194,7 @@ def _played(scenario: Scenario, world: SumoWorld) -> Recording:
                     sizes[name] = kind is api.person, float(kind.getLength(one)), float(kind.getWidth(one))
                 states[name][sample] = *kind.getPosition(one), kind.getAngle(one), kind.getSpeed(one)
         if sample < length - 1:
-            _, memory = scenario.observe(world, step, memory)
+            memory = scenario.move(world, step, memory) if isinstance(scenario, TargetTest) else scenario.observe(world, step, memory)[1]
             world.advance(np.zeros(1))
     tracks = {name: Track(rows[:, :2].copy(), rows[:, 2].copy(), rows[:, 3].copy(), *sizes[name]) for name, rows in states.items()}
     own_length = world.vehicle_length(VUT)

@@ -28,18 +28,23 @@ KEEP_LANE = 0
 
 
 class Body(NamedTuple):
-    """A vehicle or a person as a rectangle: its middle and direction, a unit vector, shape (2,); m, m, m/s."""
+    """A vehicle or a person as a rectangle: its middle and direction, a unit vector, shape (2,); m, m, m/s. Or M of them, in columns."""
 
     middle: FloatArray
     along: FloatArray
-    length: float
-    width: float
-    speed: float
+    length: Any
+    width: Any
+    speed: Any
 
     @classmethod
-    def behind(cls, front: FloatArray, along: FloatArray, length: float, width: float, speed: float) -> Body:
+    def behind(cls, front: FloatArray, along: FloatArray, length: float, width: float, speed: Any) -> Body:
         """From the middle of its front."""
         return cls(front - along * (length / 2), along, length, width, speed)
+
+    @classmethod
+    def columns(cls, bodies: Sequence[Body]) -> Body:
+        """M bodies, their positions and directions of shape (M, 2), all else of shape (M,)."""
+        return cls._make(np.array(column) for column in zip(*bodies, strict=True))
 
 
 class SumoWorld:
@@ -141,9 +146,10 @@ class SumoWorld:
                     found[copy], self._struck[copy] = speed, other
         return found
 
-    def bodies(self, copy: int) -> tuple[Body, Body]:
-        """A vehicle under test that collides in this step, and whom it collides with."""
-        return self._body_of(self.ids(VUT)[copy]), self._body_of(self._struck[copy])
+    def bodies(self, copies: Sequence[int]) -> tuple[Body, Body]:
+        """Vehicles under test that collide in this step, and whom they collide with; in columns."""
+        return (Body.columns([self._body_of(self.ids(VUT)[copy]) for copy in copies]),
+                Body.columns([self._body_of(self._struck[copy]) for copy in copies]))
 
     def _body_of(self, name: str) -> Body:
         kind = self._api.person if name in self._api.person.getIDList() else self._api.vehicle

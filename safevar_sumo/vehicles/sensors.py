@@ -37,11 +37,12 @@ def delayed(past: FloatArray, delay: FloatArray, step: float) -> FloatArray:
     age = delay / step
     newer = np.floor(age)
     share = age - newer
-    row, column = newer.astype(np.intp), np.arange(len(delay))
-    after, before = np.moveaxis(past[row, ..., column], 0, -1), np.moveaxis(past[row + 1, ..., column], 0, -1)
+    signals = past[0].size
+    place = newer.astype(np.intp) * signals + np.arange(signals).reshape(past.shape[1:])
+    after, before = past.take(place), past.take(place + signals)
     with np.errstate(invalid="ignore"):  # infinite when out of sight, finite a step later
         between = after * (1 - share) + before * share
-    return np.where(np.isnan(between), after, between)
+    return np.asarray(np.where(np.isnan(between), after, between))
 
 
 class Sensors(NamedTuple):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -39,7 +41,7 @@ def test_wear_never_gains_points_in_a_monotone_matrix() -> None:
                 setting[column] = MEMBERS.original[column] + step * (worst - MEMBERS.original[column])
                 names.append(f"vehicle {number}, {name} {setting[column]:.2f}")
                 settings[names[-1]] = setting
-            ladders += list(zip(names, names[1:], strict=False))
+            ladders += pairwise(names)
     rating = rate(STUDY, settings)
     rated = {one.name: one for one in rating.variants}
     cells = {block.name: [number for number, cell in enumerate(rating.protocol.cells) if cell.block is block and cell.range in MATRIX]

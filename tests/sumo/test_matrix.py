@@ -16,7 +16,7 @@ from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, Study, load_study
 from safevar_sumo.sumo import matrix
 from safevar_sumo.sumo.batch import score
-from safevar_sumo.sumo.contact import touch_of
+from safevar_sumo.sumo.contact import touches
 from safevar_sumo.sumo.matrix import at_every_point, evaluate, named_point, simulate, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.world import Body
@@ -195,7 +195,8 @@ def test_a_system_that_lets_go_of_the_accelerator_or_brakes_has_the_vehicle() ->
 ])
 def test_the_side_is_the_one_in_which_bodies_began_to_overlap_last(
         middle: tuple[float, float], along: tuple[float, float], speed: float, contact: tuple[str, float, float | None]) -> None:
-    touch = touch_of(Body(np.zeros(2), EAST, 4.0, 2.0, 10.0), Body(np.array(middle), np.array(along), 0.6, 0.4, speed))
+    own, other = Body(np.zeros(2), EAST, 4.0, 2.0, 10.0), Body(np.array(middle), np.array(along), 0.6, 0.4, speed)
+    touch = touches(Body.columns([own]), Body.columns([other]))
     assert touch.side == contact[0]
     assert touch.ago == pytest.approx(contact[1])
     if contact[2] is not None:
