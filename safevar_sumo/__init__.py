@@ -11,7 +11,6 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from safevar_sumo.analysis.criterion import Criterion, Unsafe
     from safevar_sumo.analysis.evaluator import Progress
     from safevar_sumo.analysis.explain import explain
     from safevar_sumo.analysis.explain.result import Cause, Explained, Explanation
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from safevar_sumo.api.simulation import Simulation, evaluate, simulate
     from safevar_sumo.campaign import Observer
     from safevar_sumo.errors import InputError, SafevarError, SimulationError
+    from safevar_sumo.metrics import Criterion, Unsafe
     from safevar_sumo.records import Outcome
     from safevar_sumo.replay.animation import animate
     from safevar_sumo.replay.comparison import Comparison, compare
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     __version__: str
 
 _ROOMS = {
+    "metrics": ("Criterion", "Unsafe"),
     "study": ("load_study", "study_names", "Study", "StudyLike", "Weather"),
     "api": ("simulate", "Simulation", "evaluate", "run", "load", "Results", "tables", "Tables", "figures", "Figures"),
     "analysis.explain": ("explain",),
@@ -55,7 +56,6 @@ _ROOMS = {
     "analysis.rules": ("rules",),
     "analysis.rating": ("rating",),
     "analysis.rating.compute": ("Rating",),
-    "analysis.criterion": ("Criterion", "Unsafe"),
     "analysis.evaluator": ("Progress",),
     "analysis.explain.result": ("Cause", "Explained", "Explanation"),
     "analysis.tolerance.compute": ("Tolerance",),

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.errors import SimulationError
-from safevar_sumo.metrics import METRICS
+from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.protocol import part_of
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import Study
@@ -24,6 +24,10 @@ from safevar_sumo.workers.retrying import RetryingPool
 
 PARTS = 2
 """Parts of a rating's cells for each worker."""
+CONFIDENCE = 0.95
+"""Of the intervals of shares, where no option says otherwise."""
+PROBED = 1024
+"""Settings over the whole domain that decide whether a study has collisions at all."""
 Progress = Callable[[str, int, int], None]
 """Called with the stage, how many of its settings are done, and how many there are."""
 
@@ -139,6 +143,15 @@ class Bench:
             raise SimulationError(f"study {self.study.name!r} cannot be simulated with the original vehicle: {evaluations.outcome[0]}")
         return evaluations
 
+    def criterion(self, stated: str | None, original: Evaluations | None = None) -> Unsafe:
+        """The criterion that an option states, by default the usual one; raises as `Unsafe.parse` and `Unsafe.default_among`."""
+        if stated is not None:
+            return Unsafe.parse(stated)
+        original = self.original() if original is None else original
+        if RATING_POINTS.name in original.metrics:
+            return Unsafe.default_among(original, original)
+        return Unsafe.default_among(self.evaluate(self.spread(PROBED), "settings over the whole domain"), original)
+
     def with_step(self, step: float) -> Bench:
         """A bench of the same study with another time step [s]."""
         metrics = msgspec.structs.replace(self.study.metrics, sampling_interval=None)  # it need not be a multiple of this step
@@ -178,6 +191,14 @@ def spread(characteristics: CharacteristicSet, number: int, seed: int = 0) -> Fl
     """Settings that cover the whole domain evenly, shape (number, n)."""
     lower, upper = characteristics.lower, characteristics.upper
     return np.asarray(lower + sobol_points(number, len(characteristics), seed) * (upper - lower))
+
+
+def clopper_pearson(count: int, total: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """Clopper and Pearson's exact interval of the share count / total."""
+    import scipy
+
+    interval = scipy.stats.binomtest(count, total).proportion_ci(confidence, method="exact")
+    return float(interval.low), float(interval.high)
 
 
 def finite_or_none(value: float) -> float | None:

@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec.structs import replace
 
-from safevar_sumo.analysis.criterion import clopper_pearson
-from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.evaluator import Bench, clopper_pearson
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import ModelTable, Study

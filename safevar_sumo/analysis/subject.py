@@ -19,9 +19,9 @@ from safevar_sumo.terminal import shown
 if TYPE_CHECKING:
     import pandas as pd
 
-    from safevar_sumo.analysis.criterion import Criterion
     from safevar_sumo.analysis.evaluator import Progress
     from safevar_sumo.analysis.research_questions.case import Case
+    from safevar_sumo.metrics import Criterion
     from safevar_sumo.workers.evaluation import Pool
 
 MOST = 3
@@ -168,6 +168,6 @@ def answered(compute: Callable[..., T], subject: Study | Case, options: Options,
 
 def criterion_text(unsafe: Criterion | None) -> str | None:
     """A criterion as options hold it and a command takes it."""
-    from safevar_sumo.analysis.criterion import Unsafe
+    from safevar_sumo.metrics import Unsafe
 
     return None if unsafe is None else str(Unsafe.parse(unsafe))

@@ -14,7 +14,7 @@ from safevar_sumo.analysis.options import Option, Options
 from safevar_sumo.cli.options import Within
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
-from safevar_sumo.results import UNKNOWN, SolutionId, chosen_handle, degree_of, position_of
+from safevar_sumo.results import UNKNOWN, SolutionId, chosen_handle, position_of
 from safevar_sumo.study import Study, study_names
 
 if TYPE_CHECKING:
@@ -65,10 +65,8 @@ def target_of(place: str, solution: str | None, choice: str | None) -> Target:
     case = results_or_study(place)
     if isinstance(case, Study):
         (case,) = load_cases([place])
-    if solution is not None:
-        handle = SolutionId.parse(solution)
-    else:
-        handle = chosen_handle(case.solutions, degree_of(case.original), str(choice), place)
+    named = None if solution is None else SolutionId.parse(solution)
+    handle = named or chosen_handle(case.solutions, case.unsafe, str(choice), place)
     row = case.solutions.iloc[position_of(case.solutions, handle)]
     setting = row[list(case.characteristics.names)].to_numpy(dtype=float)
     return Target(case.study, place, handle, setting, {str(name): value for name, value in row.items()})

@@ -6,6 +6,7 @@ from safevar_sumo.metrics.deceleration import AVE_DECE
 from safevar_sumo.metrics.rating_points import RATING_POINTS
 from safevar_sumo.metrics.safety_degree import SAFETY_DEGREE_METRIC
 from safevar_sumo.metrics.time_to_collision import TET, TIT, time_to_collision
+from safevar_sumo.metrics.unsafe import Criterion, Unsafe
 
 METRICS = {metric.name: metric for metric in (
     SAFETY_DEGREE_METRIC,
@@ -25,5 +26,5 @@ SAFEVAR = Scoring(metrics=tuple(metric.facts for metric in METRICS.values()), ob
 """Metrics and objectives of the published study (method sections 3 and 4)."""
 
 __all__ = [
-    "FURTHER", "F_DIFF", "F_NUM_DIFF", "F_SAFE", "METRICS", "OBJECTIVES", "RATING_POINTS", "SAFEVAR", "Metric", "MetricFacts", "Objective",
-    "Scoring", "foreign_metric", "time_to_collision"]
+    "FURTHER", "F_DIFF", "F_NUM_DIFF", "F_SAFE", "METRICS", "OBJECTIVES", "RATING_POINTS", "SAFEVAR", "Criterion", "Metric", "MetricFacts",
+    "Objective", "Scoring", "Unsafe", "foreign_metric", "time_to_collision"]

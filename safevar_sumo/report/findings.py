@@ -16,7 +16,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import differences, number, raised, spaced
 from safevar_sumo.report.input import ReportInput, stored
 from safevar_sumo.report.svg import Bar, rows
-from safevar_sumo.results import SolutionId, chosen_handle, degree_of, unsafe_rows
+from safevar_sumo.results import SolutionId, chosen_handle
 
 Failures = list[dict[str, Any]]
 """What `explain --json` prints."""
@@ -84,7 +84,7 @@ def no_opinion(material: ReportInput) -> str:
 def _opinions(material: ReportInput, ordered: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """What the second vehicle model says of each cause; computed once for these results."""
     causes = [Cause(one["handle"] or None, one["cause"]["changes"], one["cause"]["fraction"]) for one in ordered]
-    return list(stored(material, "opinion", lambda: opinions_of(material.case.study, causes, material.unsafe).to_dict()))
+    return list(stored(material, "opinion", lambda: opinions_of(material.case.study, causes, material.case.unsafe).to_dict()))
 
 
 def _with_changes(failure: dict[str, Any]) -> list[dict[str, Any]]:
@@ -137,12 +137,12 @@ def replays(material: ReportInput, explained: Failures | None) -> list[dict[str,
 
 def _chosen(material: ReportInput, explained: Failures | None) -> list[str]:
     """Their handles, each once."""
-    solutions, degree = material.case.solutions, degree_of(material.case.original)
+    solutions, criterion = material.case.solutions, material.case.unsafe
     if solutions.empty:
         return []
-    unsafe = unsafe_rows(solutions, degree).tolist()
+    unsafe = criterion.rows(solutions).tolist()
     choices = FIRST if any(unsafe) else FIRST[-1:]
-    chosen = [str(chosen_handle(solutions, degree, choice, material.place)) for choice in choices]
+    chosen = [str(chosen_handle(solutions, criterion, choice, material.place)) for choice in choices]
     chosen += [handle_of(failure) for failure in explained or [] if failure.get("algorithm") is not None]
     best = best_of([row for row, is_unsafe in zip(material.solutions.values(), unsafe, strict=True) if is_unsafe])
     chosen += [best[place]["handle"] for place in evenly(len(best), REPLAYS)]

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import points_of
 from safevar_sumo.analysis.opinion import OpinionOptions
@@ -28,7 +27,7 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
 from safevar_sumo.replay.page import player_data
 from safevar_sumo.replay.scene import scene_of
-from safevar_sumo.results import RESULTS, SolutionId, degree_of, handles, write_whole
+from safevar_sumo.results import RESULTS, SolutionId, handles, write_whole
 from safevar_sumo.results.manifest import MANIFEST, read_manifest
 from safevar_sumo.results.store import SOLUTIONS
 from safevar_sumo.scenarios import Point
@@ -142,21 +141,15 @@ class ReportInput:
         new = {setting.tobytes(): setting for setting in settings if setting.tobytes() not in self._again}
         if new:
             at_points = at_every_point(self.system, np.stack(list(new.values())))
-            evaluations, points = aggregated(at_points), points_of(self.system, at_points, self.unsafe)
+            evaluations, points = aggregated(at_points), points_of(self.system, at_points, self.case.unsafe)
             for row, key in enumerate(new):
                 self._again[key] = Again(evaluations.take([row]), points[row])
         return [self._again[setting.tobytes()] for setting in settings]
 
-    @property
-    def unsafe(self) -> Unsafe:
-        """What counts as unsafe: a collision if a solution is one, else half of the original's safety degree."""
-        degree = degree_of(self.case.original)
-        return Unsafe.of_solutions(self.case.solutions, degree)
-
     @cached_property
     def options(self) -> dict[str, Any]:
         """With which options each question is asked for the page: smaller samples than the commands' own, one criterion for all."""
-        unsafe = None if self.case.solutions.empty else str(self.unsafe)
+        unsafe = None if self.case.solutions.empty else str(self.case.unsafe)
         asked: tuple[Options, ...] = (
             ExplainOptions(unsafe=unsafe, limit=12_000), OpinionOptions(unsafe=unsafe), ToleranceOptions(unsafe=unsafe),
             RiskOptions(unsafe=unsafe, samples=SAMPLES), RulesOptions(unsafe=unsafe, samples=SAMPLES))
@@ -217,8 +210,10 @@ def _at_point(case: Case, point: str) -> Case:
     settings = np.concatenate([case.characteristics.original[np.newaxis], case.solutions[list(case.characteristics.names)].to_numpy(float)])
     now = evaluate(system, settings)
     measured = {"f_safe": now.f_safe, **now.metrics, "outcome": now.outcome}
-    return replace(case, study=study, original={name: float(now.metrics[name][0]) for name in case.original if name in now.metrics},
-                   solutions=case.solutions.assign(**{name: values[1:] for name, values in measured.items() if name in case.solutions}))
+    scoring = system.measuring.scoring
+    solutions = case.solutions.drop(columns=[one.name for one in case.scoring.metrics if one.name not in now.metrics])
+    return replace(case, study=study, scoring=scoring, original={one.name: float(now.metrics[one.name][0]) for one in scoring.metrics},
+                   solutions=solutions.assign(**{name: values[1:] for name, values in measured.items()}))
 
 
 FOLDER = "answers"

@@ -15,7 +15,7 @@ from safevar_sumo.analysis.rating.compute import Rating, rate, remarks
 from safevar_sumo.analysis.rating.render import lost_by_test, matrices_figure, not_simulated, test_in_words, verdict
 from safevar_sumo.analysis.words import ask
 from safevar_sumo.report.input import ReportInput
-from safevar_sumo.results import chosen_handle, degree_of, position_of, unsafe_rows
+from safevar_sumo.results import chosen_handle, position_of
 from safevar_sumo.vehicles import CharacteristicSet
 
 CHOICE = "fewest"
@@ -25,8 +25,8 @@ CHOICE = "fewest"
 def rated_study_page(material: ReportInput, jobs: int | None, progress: Progress) -> dict[str, Any]:
     """What the page says of one study; its vehicles are simulated in all cells."""
     case, variants, handle = material.case, dict[str, np.ndarray](), None
-    if unsafe_rows(case.solutions, degree_of(case.original)).any():
-        handle = chosen_handle(case.solutions, degree_of(case.original), CHOICE, material.place)
+    if case.unsafe.rows(case.solutions).any():
+        handle = chosen_handle(case.solutions, case.unsafe, CHOICE, material.place)
         row = case.solutions.iloc[position_of(case.solutions, handle)]
         names = CharacteristicSet.of(case.study.vehicle.characteristics).names
         variants[str(handle)] = row[list(names)].to_numpy(dtype=float)

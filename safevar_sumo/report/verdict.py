@@ -15,13 +15,13 @@ from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.model_spread import model_spreads
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, collided
 from safevar_sumo.analysis.words import number_of
-from safevar_sumo.metrics import METRICS
+from safevar_sumo.metrics import METRICS, Unsafe
 from safevar_sumo.records import KMH, FloatArray, Outcome
 from safevar_sumo.reference import Totals, quoted
 from safevar_sumo.replay.comparison import number, raised
 from safevar_sumo.report.findings import FIRST, Failures, handle_of
 from safevar_sumo.report.input import ReportInput, stored
-from safevar_sumo.results import SolutionId, chosen_handle, degree_of, unsafe_rows
+from safevar_sumo.results import SolutionId, chosen_handle
 from safevar_sumo.scenarios import SCENARIOS, Point, tags
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.sumo.matrix import vehicle_remarks
@@ -97,10 +97,9 @@ def verdict(material: ReportInput, explained: Failures | None, tolerance: Mappin
     All values of a failure are those of its solution, not scaled back.
     """
     case = material.case
-    degree = degree_of(case.original)
-    unsafe = case.solutions[unsafe_rows(case.solutions, degree)]
+    unsafe = case.solutions[case.unsafe.rows(case.solutions)]
     hits = bool(collided(case.solutions).any())
-    result: dict[str, Any] = {"unsafe": len(unsafe), "solutions": len(case.solutions), "rule": _rule(hits, degree), "findings": [],
+    result: dict[str, Any] = {"unsafe": len(unsafe), "solutions": len(case.solutions), "rule": _rule(case.unsafe), "findings": [],
                               "original": _original(material), "hits": hits, "figures": [], "agreement": agreement_with_published(material)}
     if unsafe.empty and case.solutions.empty:
         result["headline"] = "No solution was found."
@@ -111,10 +110,10 @@ def verdict(material: ReportInput, explained: Failures | None, tolerance: Mappin
     return result
 
 
-def _rule(hits: bool, degree: float) -> str:
-    if hits:
+def _rule(unsafe: Unsafe) -> str:
+    if unsafe.below is None:
         return "a collision"
-    return f"a safety degree below {degree / 2:.2f} m, half of the original's (nothing collides)"
+    return f"a safety degree below {unsafe.below:.2f} m, half of the original's (nothing collides)"
 
 
 def _original(material: ReportInput) -> str:
@@ -133,9 +132,8 @@ def _findings(material: ReportInput, explained: Failures, *, any_unsafe: bool) -
                 reasons.setdefault(handle_of(failure), []).append(reason)
                 shares[handle_of(failure)] = failure["robustness"]
     if not reasons:
-        degree = degree_of(material.case.original)
         for choice in REASONS if any_unsafe else ("most_severe",):
-            handle = chosen_handle(material.case.solutions, degree, choice, material.place)
+            handle = chosen_handle(material.case.solutions, material.case.unsafe, choice, material.place)
             reasons.setdefault(str(handle), []).append(REASONS[choice])
     order = list(TITLES)
     needed = {handle_of(failure): len(failure["minimal_causes"][0]["changes"]) for failure in explained if failure.get("minimal_causes")}
@@ -296,15 +294,14 @@ def own_uncertainty(material: ReportInput) -> list[dict[str, Any]]:
     case = material.case
     if not case.study.spread or material.system is None:
         return []
-    degree = case.original[SAFETY_DEGREE]
-    unsafe = not case.solutions.empty and unsafe_rows(case.solutions, degree).any()
-    chosen = [str(chosen_handle(case.solutions, degree, choice, material.place)) for choice in FIRST] if unsafe else []
+    unsafe = not case.solutions.empty and case.unsafe.rows(case.solutions).any()
+    chosen = [str(chosen_handle(case.solutions, case.unsafe, choice, material.place)) for choice in FIRST] if unsafe else []
     handles = list(dict.fromkeys(chosen))
     settings = [case.characteristics.original, *(material.setting_of(SolutionId.parse(handle)) for handle in handles)]
 
     def compute() -> list[dict[str, Any]]:
         return [one.to_dict() for one in model_spreads(case.study, np.stack(settings), material.point)]
 
-    here = [degree, *(material.solutions[handle]["f_safe"] for handle in handles)]
+    here = [case.original[SAFETY_DEGREE], *(material.solutions[handle]["f_safe"] for handle in handles)]
     return [{"name": name, "here": value, **one} for name, value, one in zip(
         ("original vehicle", *handles), here, stored(material, "spread", compute), strict=True)]

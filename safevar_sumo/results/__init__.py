@@ -15,7 +15,7 @@ from safevar_sumo.results.manifest import (
     read_later,
     read_manifest,
 )
-from safevar_sumo.results.solution_id import CHOICES, SolutionId, chosen_handle, degree_of, half_of, handles, position_of, unsafe_rows
+from safevar_sumo.results.solution_id import CHOICES, SolutionId, chosen_handle, handles, position_of
 from safevar_sumo.results.store import ORIGINAL, SOLUTIONS, ResultsDirectory, evaluations_frame, record, solutions_frame
 
 __all__ = [
@@ -36,12 +36,10 @@ __all__ = [
     "StoredResults",
     "begun_and_now",
     "chosen_handle",
-    "degree_of",
     "differences_now",
     "evaluations_frame",
     "failure_lines",
     "fixed",
-    "half_of",
     "handles",
     "load",
     "make_directory",
@@ -53,7 +51,6 @@ __all__ = [
     "record",
     "solutions_frame",
     "status",
-    "unsafe_rows",
     "write_imported",
     "write_whole",
 ]

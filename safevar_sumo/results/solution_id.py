@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Outcome
-from safevar_sumo.study import SAFETY_DEGREE
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
 
 if TYPE_CHECKING:
     import pandas as pd
 
 LEGAL = "ALGORITHM:RUN:N, the N-th row of that run in solutions.csv, from 0"
-HALF = 0.5
-"""Share of the original's safety degree below which a solution counts as unsafe where none collides."""
 
 
 class SolutionId(NamedTuple):
@@ -76,47 +72,22 @@ def position_of(solutions: pd.DataFrame, handle: SolutionId, source: object = "s
     raise InputError(source, f"there is no solution {handle}", legal)
 
 
-RATED = "rating_points"
-"""Column of the points of a rated study."""
-
-
-def degree_of(original: Mapping[str, Any]) -> float:
-    """What `unsafe_rows` takes of an original vehicle: its safety degree, or its points in a rated study."""
-    return float(original[RATED if original.get(RATED) is not None else SAFETY_DEGREE])
-
-
-def half_of(degree: float) -> float:
-    """The limit below which a safety degree is unsafe where nothing collides [m]: half of the original's, to six digits as printed."""
-    return float(f"{HALF * degree:.6g}")
-
-
-def unsafe_rows(solutions: pd.DataFrame, original: float) -> pd.Series[bool]:
-    """Which solutions are unsafe: collisions, or if none collides, those below half of the original's safety degree [m].
-
-    In a rated study `original` are the original's points: those that have lost the first of them.
-    """
-    if RATED in solutions:
-        return solutions[RATED] <= original - 1.0
-    collisions = solutions["outcome"] == str(Outcome.COLLISION)
-    return collisions if collisions.any() else solutions["f_safe"] < half_of(original)
-
-
 CHOICES = {
     "most_severe": ["f_safe", "f_num_diff", "f_diff"],
     "fewest": ["f_num_diff", "f_safe", "f_diff"],
     "smallest": ["f_diff", "f_safe", "f_num_diff"],
-    "most_points": [RATED, "f_num_diff", "f_diff"],
+    "most_points": [RATING_POINTS.name, "f_num_diff", "f_diff"],
 }
 """Objectives that decide a choice, in order; smaller values first."""
 
 
-def chosen_handle(solutions: pd.DataFrame, original: float, choice: str, source: object) -> SolutionId:
+def chosen_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str, source: object) -> SolutionId:
     """The most severe of all solutions, or the unsafe one with the fewest or the smallest changes.
 
     Parameters
     ----------
-    original
-        The original vehicle's safety degree [m].
+    unsafe
+        The criterion.
     choice
         A name of `CHOICES`.
 
@@ -126,7 +97,7 @@ def chosen_handle(solutions: pd.DataFrame, original: float, choice: str, source:
         If there is none.
     """
     named = solutions.assign(handle=list(map(str, handles(solutions))))
-    candidates = named if choice == "most_severe" else named[unsafe_rows(named, original)]
+    candidates = named if choice == "most_severe" else named[unsafe.rows(named)]
     if candidates.empty:
         if named.empty:
             raise InputError(source, "these results hold no solution", "results with a solution")

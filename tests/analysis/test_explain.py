@@ -16,7 +16,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.evaluator import Bench
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, course, sentence
@@ -29,6 +28,7 @@ from safevar_sumo.analysis.explain.summary import NUMBERS, lead
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Encounter, FloatArray, Outcome, SimulationRuns, Trace
 from safevar_sumo.results import handles
 from safevar_sumo.vehicles import CharacteristicSet

@@ -13,7 +13,6 @@ from click.testing import CliRunner
 from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
 from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
-from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.opinion.compute import Cause, opinions_of, second_system
 from safevar_sumo.analysis.opinion.mapping import TABLES
@@ -21,6 +20,7 @@ from safevar_sumo.analysis.opinion.multi_body import Body, Plant, advance, at_sp
 from safevar_sumo.analysis.opinion.result import Verdict
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.report import make_report
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate

@@ -10,12 +10,12 @@ import pytest
 import scipy
 
 from safevar_sumo.ads.competent_driver import CompetentDriver
-from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.evaluator import Bench
 from safevar_sumo.analysis.explain.braking_comparison import sentence
 from safevar_sumo.analysis.explain.compute import Where, points_in_words, where
 from safevar_sumo.analysis.explain.summary import lead
 from safevar_sumo.analysis.preventability import PreventableBy, approach, preventability, preventable_by
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import solutions_frame
 from safevar_sumo.study import ModelTable, load_study

@@ -12,7 +12,6 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.evaluator import Bench
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import explain_failures
@@ -20,15 +19,20 @@ from safevar_sumo.analysis.explain.render import print_explained
 from safevar_sumo.analysis.explain.summary import lead
 from safevar_sumo.analysis.rating import compute
 from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating
+from safevar_sumo.analysis.research_questions.case import case_of
+from safevar_sumo.analysis.risk.rare import Response
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.tolerance.render import print_tolerance, profiles_figure
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of
 from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.report.input import _at_point as at_point
 from safevar_sumo.report.rated import picture
-from safevar_sumo.results import solutions_frame
+from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import rater
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers.evaluation import evaluate_batch
 
 STUDY = load_study("euro_ncap_rating")
@@ -111,7 +115,6 @@ def test_a_rating_prints_draws_and_stands_in_a_page() -> None:
     result = compute.rate(STUDY, {"variant": worn}, pool=Here())
     assert result.lost > 0
     assert result.turned()
-    assert Unsafe.first_point(result.original.points).points == pytest.approx(result.original.points - 1)
     console = Console(record=True, width=80, file=StringIO())
     print_rating(console, result)
     print_matrices(console, result)
@@ -122,3 +125,24 @@ def test_a_rating_prints_draws_and_stands_in_a_page() -> None:
     assert picture(result) == picture(result)
     assert str(picture(result)).startswith("<svg")
     assert result.to_frame().groupby("vehicle")["total"].sum().loc["variant"] == pytest.approx(result.variant.points)  # type: ignore[union-attr]
+
+
+def test_at_one_cell_a_collision_is_unsafe_and_points_are_no_column() -> None:
+    """One cell has no rating: metres would be compared with points of the whole study."""
+    bench = Bench(STUDY, Here())
+    settings = np.array([bench.characteristics.setting({"brakeTorque": value}, "it") for value in (0.5, 0.99)])
+    evaluations = bench.evaluate(settings, "it")
+    solutions = solutions_frame(bench.characteristics.names, [(("nsga2", 0), evaluations)])
+    case = case_of(STUDY, record(bench.original(), 0), solutions, pd.DataFrame(), [("nsga2", 0)], scoring=assemble(STUDY).measuring.scoring)
+    assert case.unsafe.points is not None
+    here = at_point(case, "CCRs, 80 km/h, 100 %, wet")
+    assert here.unsafe == Unsafe()
+    assert here.unsafe.rows(here.solutions).tolist() == [True, False]
+    assert "rating_points" not in {*here.solutions, *here.original, *(one.name for one in here.scoring.metrics)}
+
+
+def test_rare_failures_are_approached_by_points_where_points_are_the_criterion() -> None:
+    bench = Bench(STUDY, Here())
+    evaluations = bench.evaluate(bench.characteristics.original[np.newaxis], "it")
+    points = float(evaluations.column("rating_points")[0])
+    assert Response(bench, lambda where: where, Unsafe(points=points - 2)).take(evaluations.settings, evaluations) == pytest.approx([2.0])

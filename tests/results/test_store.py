@@ -17,6 +17,7 @@ import safevar_sumo as sv
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import (
     JournalBusy,
@@ -210,17 +211,26 @@ def test_a_solution_that_is_not_there_is_told_with_what_is(handle: str, legal: s
 
 
 def test_chosen_by_what_they_are_among_the_unsafe() -> None:
-    assert str(chosen_handle(FRAME, 2.7, "most_severe", "x")) == "nsga2:0:0"
-    assert str(chosen_handle(FRAME, 2.7, "fewest", "x")) == "nsga2:0:1"
-    assert str(chosen_handle(FRAME, 2.7, "smallest", "x")) == "nsga2:3:0"
+    assert str(chosen_handle(FRAME, Unsafe(), "most_severe", "x")) == "nsga2:0:0"
+    assert str(chosen_handle(FRAME, Unsafe(), "fewest", "x")) == "nsga2:0:1"
+    assert str(chosen_handle(FRAME, Unsafe(), "smallest", "x")) == "nsga2:3:0"
 
 
 def test_without_a_collision_half_the_distance_is_unsafe() -> None:
     safe = FRAME[FRAME["outcome"] == "stopped"]
-    assert str(chosen_handle(safe, 4.1, "smallest", "x")) == "rs:0:0"
+    wide, narrow = (Unsafe.default({"safety_degree": degree}, safe["outcome"]) for degree in (4.1, 4.0))
+    assert str(chosen_handle(safe, wide, "smallest", "x")) == "rs:0:0"
     with pytest.raises(InputError, match="no unsafe solution"):
-        chosen_handle(safe, 4.0, "smallest", "x")
-    assert str(chosen_handle(safe, 4.0, "most_severe", "x")) == "rs:0:0"
+        chosen_handle(safe, narrow, "smallest", "x")
+    assert str(chosen_handle(safe, narrow, "most_severe", "x")) == "rs:0:0"
+
+
+def test_a_point_is_lost_to_six_decimals() -> None:
+    """34.899405 - 1 is 33.899404999999994 in floating point."""
+    unsafe = Unsafe.default({"rating_points": 34.899405, "safety_degree": -14.2}, FRAME["outcome"])
+    rated = FRAME.head(2).assign(rating_points=[33.899405, 33.899406])
+    assert unsafe.rows(rated).tolist() == [True, False]
+    assert str(unsafe) == "points=33.899405"
 
 
 STORED = Path(__file__).with_name("stored")

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.evaluator import Bench, finite_or_none
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray
 
 CHUNK = 20_000

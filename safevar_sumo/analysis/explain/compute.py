@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, course
@@ -17,6 +16,7 @@ from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explain
 from safevar_sumo.analysis.preventability import preventability, preventable_by
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles, position_of
 from safevar_sumo.study import Study
@@ -87,7 +87,7 @@ def failures_of(source: Study | Case, bench: Bench, original: Evaluations, named
         recorded = solutions["outcome"].to_numpy(dtype=str)[kept]
         rows = list(range(len(asked))) if named else None
     evaluations = bench.evaluate(settings, "settings to explain")
-    criterion = unsafe or Unsafe.usual(evaluations, original)
+    criterion = unsafe or Unsafe.default_among(evaluations, original)
     if rows is None:
         rows = np.flatnonzero(criterion.of(evaluations)).tolist()
     otherwise = 0 if recorded is None else int(np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN)))

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.criterion import Unsafe, clopper_pearson
-from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.evaluator import Bench, clopper_pearson
 from safevar_sumo.analysis.explain.causes import MinimalCause, involved, necessary
 from safevar_sumo.analysis.words import direction
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 

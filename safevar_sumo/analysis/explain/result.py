@@ -7,11 +7,11 @@ from typing import Any
 
 import pandas as pd
 
-from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
 from safevar_sumo.analysis.explain.causes import End
 from safevar_sumo.analysis.explain.necessity import Robustness
 from safevar_sumo.analysis.preventability import Preventability
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import SolutionId
 from safevar_sumo.study import SAFETY_DEGREE, Study

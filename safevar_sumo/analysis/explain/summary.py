@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.evaluator import Bench, finite_or_none
 from safevar_sumo.analysis.explain.causes import MinimalCause, minimal_causes
 from safevar_sumo.analysis.explain.compute import points_in_words, points_of, where
@@ -17,9 +16,9 @@ from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, preventability
 from safevar_sumo.analysis.rating.summary import rated_lead
 from safevar_sumo.analysis.words import ENDS, ask, changes, joined, number_of
-from safevar_sumo.metrics import RATING_POINTS
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import KMH, Evaluations, FloatArray, Outcome
-from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, unsafe_rows
+from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, record
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.base import pre_crash_of
 from safevar_sumo.study import Study
@@ -37,7 +36,7 @@ LIMIT = 4000
 def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Pool, place: str) -> list[str]:
     """Summarise a study's solutions in lines: first a paragraph for a manager, last the command to go on with.
 
-    The criterion of unsafe is that of `safevar_sumo.results.unsafe_rows`.
+    What is unsafe is `Unsafe.default`.
 
     Parameters
     ----------
@@ -55,12 +54,12 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
     if original.collided[0]:
         return ["The original vehicle itself collides: no change is needed."]
     bench, degree = Bench(study, pool), float(original.f_safe[0])
-    unsafe = unsafe_rows(solutions, degree)
-    criterion = Unsafe.of_solutions(solutions, degree)
+    criterion = Unsafe.default(record(original, 0), solutions["outcome"])
+    unsafe = criterion.rows(solutions)
     if not unsafe.any():
         return [f"Nothing unsafe found in {number_of(len(solutions), 'solution')}: no collision, no SD below half of the original's.",
                 f"How far each characteristic may go: {ask('tolerance', place)}"]
-    chosen = {reason: chosen_handle(solutions, degree, choice, study.name) for choice, reason in REASONS.items()}
+    chosen = {reason: chosen_handle(solutions, criterion, choice, study.name) for choice, reason in REASONS.items()}
     rows = solutions.iloc[[position_of(solutions, handle) for handle in chosen.values()]]
     settings = rows[list(bench.characteristics.names)].to_numpy(dtype=float)
     causes_of, (places, worst) = minimal_causes(bench, settings, criterion), _places(study, settings, criterion)

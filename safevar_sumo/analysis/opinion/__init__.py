@@ -14,9 +14,9 @@ from safevar_sumo.analysis.options import Options, option, unsafe_option
 from safevar_sumo.analysis.subject import Results, answered, criterion_text, study_or_case
 
 if TYPE_CHECKING:
-    from safevar_sumo.analysis.criterion import Criterion
     from safevar_sumo.analysis.evaluator import Progress
     from safevar_sumo.analysis.opinion.result import Opinions
+    from safevar_sumo.metrics import Criterion
     from safevar_sumo.workers.evaluation import Pool
 
 

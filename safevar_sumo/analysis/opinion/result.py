@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.words import ENDS
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Outcome
 from safevar_sumo.study import SAFETY_DEGREE, Study
 

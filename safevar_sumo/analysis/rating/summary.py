@@ -7,9 +7,9 @@ from shlex import quote
 import pandas as pd
 
 from safevar_sumo.analysis.words import ask, changes, number_of
-from safevar_sumo.metrics import RATING_POINTS
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import chosen_handle, position_of, unsafe_rows
+from safevar_sumo.results import chosen_handle, position_of, record
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -30,7 +30,8 @@ def rated_lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pla
         The directory of the results.
     """
     points, name = float(original.column(RATING_POINTS.name)[0]), RATING_POINTS.name
-    losing = unsafe_rows(solutions, points)
+    unsafe = Unsafe.default(record(original, 0), solutions["outcome"])
+    losing = unsafe.rows(solutions)
     if not losing.any():
         return [f"No solution loses a point of the original's {points:.2f}.",
                 f"Points against each characteristic: {ask('tolerance', place)}"]
@@ -39,7 +40,7 @@ def rated_lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pla
              "least one of them."]
     handle = None
     for choice, title in TITLES.items():
-        handle = chosen_handle(solutions, points, choice, study.name)
+        handle = chosen_handle(solutions, unsafe, choice, study.name)
         row = solutions.iloc[position_of(solutions, handle)]
         setting = {one: float(row[one]) for one in characteristics.names}
         lines.append(f"{title}: {handle} loses {points - row[name]:.2f} points with {changes(characteristics, setting)}.")

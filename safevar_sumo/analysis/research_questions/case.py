@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.errors import InputError, first_line
-from safevar_sumo.metrics import SAFEVAR, MetricFacts, Scoring
+from safevar_sumo.metrics import SAFEVAR, MetricFacts, Scoring, Unsafe
 from safevar_sumo.records import FloatArray, Outcome
 from safevar_sumo.results import Failure, failure_lines, load, places_of
 from safevar_sumo.scenarios import weather_of
@@ -71,6 +71,11 @@ class Case:
     @property
     def weather(self) -> Weather:
         return weather_of(self.study.weather, self.name)
+
+    @property
+    def unsafe(self) -> Unsafe:
+        """What is unsafe among the solutions where nobody states a criterion."""
+        return Unsafe.default(self.original, self.solutions["outcome"])
 
     @property
     def algorithms(self) -> tuple[str, ...]:

@@ -11,8 +11,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.criterion import Unsafe, clopper_pearson, criterion_of
-from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent
+from safevar_sumo.analysis.evaluator import Bench, Progress, clopper_pearson, finite_or_none, open_bench, silent
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.risk.rare import (
     ENOUGH,
@@ -26,6 +25,7 @@ from safevar_sumo.analysis.risk.rare import (
     openturns,
 )
 from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.study.variation import Correlation, Distribution, Fixed, Lognormal, Normal, Triangular, Uniform
@@ -223,7 +223,7 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
     """
     model = VariationModel(study)
     with open_bench(study, pool, jobs, progress) as bench:
-        unsafe = criterion_of(options.unsafe, bench)
+        unsafe = bench.criterion(options.unsafe)
         beginning = bench.simulated
         response = Response(bench, model.of_normal, unsafe)
         counts = _sampled(bench, model, unsafe, options, response)

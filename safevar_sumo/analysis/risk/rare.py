@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import scipy
 
-from safevar_sumo.analysis.criterion import Unsafe
 from safevar_sumo.analysis.evaluator import Bench
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 
 RARE_BELOW = 1e-2
@@ -103,7 +103,8 @@ class Response:
     def take(self, where: FloatArray, evaluations: Evaluations) -> FloatArray:
         """The response of evaluations, which are counted and remembered."""
         unsafe = self._unsafe.of(evaluations)
-        margin = np.where(evaluations.valid & ~np.isnan(evaluations.f_safe), evaluations.f_safe - (self._unsafe.below or 0.0), SAFE)
+        margin = self._unsafe.margin(evaluations)
+        margin = np.where(evaluations.valid & ~np.isnan(margin), margin, SAFE)
         self.simulations += len(where)
         self.errors += int(np.count_nonzero(~evaluations.valid))
         self.failed += int(np.count_nonzero(unsafe))

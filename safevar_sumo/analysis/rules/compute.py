@@ -16,10 +16,10 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
-from safevar_sumo.analysis.criterion import CONFIDENCE, Unsafe, clopper_pearson, criterion_of
-from safevar_sumo.analysis.evaluator import Bench, Progress, open_bench, silent
+from safevar_sumo.analysis.evaluator import CONFIDENCE, Bench, Progress, clopper_pearson, open_bench, silent
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.words import joined
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.terminal import print_constraints, print_meanings, print_text
@@ -126,7 +126,7 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
     """
     members = CharacteristicSet.of(study.vehicle.characteristics)
     with open_bench(study, pool, jobs, progress) as bench:
-        unsafe = criterion_of(options.unsafe, bench)
+        unsafe = bench.criterion(options.unsafe)
         training, validation = (_design(bench, options.samples // 2, study.search.seed + half) for half in (1, 2))
     is_unsafe, is_unsafe_validation = unsafe.of(training), unsafe.of(validation)
     number = int(np.count_nonzero(is_unsafe))
@@ -265,9 +265,8 @@ def print_rules(console: Console, result: Rules) -> None:
 def rule_in_words(rule: Rule, characteristics: CharacteristicSet, unsafe: Unsafe) -> str:
     """A rule with its density and coverage: `tireFric below 1.35 and gearSwitchTime above 0.55 s: collides in 92% (..), covers 61%`."""
     conditions = [_condition(member, *rule.limits[member.name]) for member in characteristics if member.name in rule.limits]
-    what = "collides" if unsafe.below is None else f"SD is below {unsafe.below:g}"
     shares = [f"{word} {share:.0%} ({interval[0]:.0%} to {interval[1]:.0%})" if share is not None and interval is not None else f"{word} -"
-              for word, share, interval in ((f"{what} in", rule.density, rule.density_interval),
+              for word, share, interval in ((f"{unsafe.in_words} in", rule.density, rule.density_interval),
                                             ("covers", rule.coverage, rule.coverage_interval))]
     return f"{joined(conditions) if conditions else 'everywhere'}: {', '.join(shares)}"
 

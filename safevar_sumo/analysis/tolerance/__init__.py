@@ -14,9 +14,9 @@ from safevar_sumo.analysis.subject import Results, answered, criterion_text, stu
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
-    from safevar_sumo.analysis.criterion import Criterion
     from safevar_sumo.analysis.evaluator import Progress
     from safevar_sumo.analysis.tolerance.compute import Tolerance
+    from safevar_sumo.metrics import Criterion
     from safevar_sumo.workers.evaluation import Pool
 
 

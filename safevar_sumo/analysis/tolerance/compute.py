@@ -12,12 +12,11 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from safevar_sumo.analysis.criterion import Unsafe, criterion_of
 from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.joint import Pair, SafeBox, no_box, planes, safe_box
 from safevar_sumo.errors import unknown
-from safevar_sumo.metrics import RATING_POINTS
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.rater import is_rated
@@ -220,7 +219,7 @@ def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | Non
     columns = _columns(study, options.characteristics)
     with open_bench(study, pool, jobs, progress) as bench:
         original = bench.original()
-        unsafe = criterion_of(options.unsafe, bench, original)
+        unsafe = bench.criterion(options.unsafe, original)
         alone = scan(bench, columns, unsafe)
         pairs = planes(bench, columns, unsafe) if options.pairs else None
         is_safe = not unsafe.of(original)[0]

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from safevar_sumo.analysis.criterion import CONFIDENCE, Unsafe
-from safevar_sumo.analysis.evaluator import Bench, sobol_points
+from safevar_sumo.analysis.evaluator import CONFIDENCE, Bench, sobol_points
 from safevar_sumo.analysis.explain.causes import Line, first_unsafe
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import Characteristic
 

@@ -1,0 +1,129 @@
+"""What counts as unsafe: a collision, a safety degree below a limit, or points of a rating that are lost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics.base import F_SAFE
+from safevar_sumo.metrics.rating_points import RATING_POINTS
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome
+from safevar_sumo.study import SAFETY_DEGREE
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+EXPECTED = "collision, points=X with X points of a rating, or below=X with a safety degree X [m, or minus a collision's speed in m/s]"
+COLLISION = str(Outcome.COLLISION)
+HALF, DIGITS = 0.5, 6
+"""Share of the original's safety degree below which a vehicle is unsafe where nothing collides, and significant digits of that limit."""
+LOSS, DECIMALS = 1.0, 6
+"""Loss of points that is unsafe in a rated study, and decimals of points."""
+
+
+@dataclass(frozen=True)
+class Unsafe:
+    """A collision; or, with `below`, a safety degree below that limit [m, or -m/s]; or, with `points`, no more points of a rating."""
+
+    below: float | None = None
+    points: float | None = None
+
+    def __str__(self) -> str:
+        if self.points is not None:
+            return f"points={self.points!r}"
+        return "collision" if self.below is None else f"below={self.below!r}"
+
+    @property
+    def in_words(self) -> str:
+        """What an unsafe vehicle does: `collides`, `SD is below 1.4`."""
+        if self.points is not None:
+            return f"keeps at most {self.points:g} points"
+        return "collides" if self.below is None else f"SD is below {self.below:g}"
+
+    def of(self, evaluations: Evaluations) -> BoolArray:
+        """Which evaluations are unsafe; shape (M,). An undefined safety degree is not unsafe."""
+        return np.asarray(self._holds(evaluations.outcome, evaluations.column))
+
+    def rows(self, solutions: pd.DataFrame) -> pd.Series[bool]:
+        """Which rows are unsafe of a frame of solutions, as `safevar_sumo.results.load` gives it."""
+        return self._holds(solutions["outcome"], solutions.__getitem__)  # type: ignore[no-any-return]
+
+    def _holds(self, outcome: Any, column: Callable[[str], Any]) -> Any:
+        if self.points is not None:
+            return column(RATING_POINTS.name) <= self.points
+        return outcome == COLLISION if self.below is None else column(F_SAFE.name) < self.below
+
+    def margin(self, evaluations: Evaluations) -> FloatArray:
+        """By how much evaluations are above the limit, in its unit, shape (M,); a collision's limit is a safety degree of 0."""
+        if self.points is not None:
+            return evaluations.column(RATING_POINTS.name) - self.points
+        return evaluations.f_safe - (self.below or 0.0)
+
+    @classmethod
+    def parse(cls, criterion: Criterion) -> Unsafe:
+        """The criterion that `--unsafe` or an argument `unsafe` states: a text, or a number X for `below=X`.
+
+        Raises
+        ------
+        InputError
+            If it is neither.
+        """
+        if isinstance(criterion, Unsafe):
+            return criterion
+        if criterion == COLLISION:
+            return cls()
+        kind, _, text = criterion.partition("=") if isinstance(criterion, str) else ("below", "", criterion)
+        try:
+            limit = float(text) if kind in ("below", "points") else math.nan
+        except (TypeError, ValueError):
+            limit = math.nan
+        if not math.isfinite(limit):
+            raise InputError("unsafe", repr(criterion), EXPECTED)
+        return cls(points=limit) if kind == "points" else cls(limit)
+
+    @classmethod
+    def default(cls, original: Mapping[str, Any], outcomes: Any) -> Unsafe:
+        """What is unsafe where nobody states a criterion.
+
+        In a rated study a vehicle is unsafe that has lost the first of the original's points. Otherwise a collision is, if any vehicle
+        collides or the original has no safety degree to halve; else a safety degree below half of the original's.
+
+        Parameters
+        ----------
+        original
+            The original vehicle's metrics by name; an undefined one is NaN or None.
+        outcomes
+            How the other vehicles end, as an array or a column of `Outcome`.
+        """
+        points, degree = original.get(RATING_POINTS.name), original.get(SAFETY_DEGREE) or 0.0
+        if points is not None:
+            return cls(points=round(points - LOSS, DECIMALS))
+        if (outcomes == COLLISION).any() or not degree > 0:
+            return cls()
+        return cls(float(f"{HALF * degree:.{DIGITS}g}"))
+
+    @classmethod
+    def default_among(cls, evaluations: Evaluations, original: Evaluations) -> Unsafe:
+        """The default among evaluated vehicles, the original one included.
+
+        Raises
+        ------
+        InputError
+            If by that nothing can be unsafe.
+        """
+        outcomes = np.concatenate([original.outcome, evaluations.outcome])
+        unsafe = cls.default({name: float(values[0]) for name, values in original.metrics.items()}, outcomes)
+        if unsafe.points is not None and unsafe.points < 0:
+            raise InputError("unsafe", f"the original vehicle earns {unsafe.points + LOSS:g} points and has none to lose", EXPECTED)
+        if unsafe == cls() and not (outcomes == COLLISION).any():
+            raise InputError("unsafe", "nothing collides, and the original vehicle has no safety degree to halve", EXPECTED)
+        return unsafe
+
+
+Criterion = Unsafe | float | str
+"""What an argument `unsafe` takes: `Unsafe`, a number X for a safety degree below X, "collision" or "below=X"."""
