@@ -12,7 +12,7 @@ from markupsafe import Markup
 from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.rating.compute import Rating, rate, remarks
-from safevar_sumo.analysis.rating.render import lost_by_test, matrices_figure, not_simulated, test_in_words, verdict
+from safevar_sumo.analysis.rating.render import lost_by_test, matrices_figure, not_simulated, test_in_words, turned_in_words, verdict
 from safevar_sumo.analysis.words import ask
 from safevar_sumo.report.input import ReportInput
 from safevar_sumo.results import chosen_handle, position_of
@@ -32,9 +32,8 @@ def rated_study_page(material: ReportInput, jobs: int | None, progress: Progress
         variants[str(handle)] = row[list(names)].to_numpy(dtype=float)
     rating = rate(case.study, variants, jobs=jobs, progress=progress)
     asked = RatingOptions(solution=None if handle is None else str(handle)).command_line(str(material.place))
-    turned = [(cell.name, before or "unknown", after or "unknown") for cell, before, after in rating.turned() if not cell.is_varied]
     return {"title": case.study.title, "sentence": verdict(rating), "notes": remarks(rating), "points": _points(rating),
-            "lost": [(test_in_words(test), f"{lost:.2f}") for test, lost in lost_by_test(rating)], "turned": turned,
+            "lost": [(test_in_words(test), f"{lost:.2f}") for test, lost in lost_by_test(rating)], "turned": turned_in_words(rating),
             "picture": picture(rating), "names": [one.name for one in rating.variants], "open": not_simulated(rating),
             "commands": [asked, ask("tolerance", str(material.place)), ask("explain", str(material.place))]}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from concurrent.futures import Future
 from io import StringIO
 from typing import Any
@@ -18,7 +19,7 @@ from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.render import print_explained
 from safevar_sumo.analysis.explain.summary import lead
 from safevar_sumo.analysis.rating import compute
-from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating
+from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating, turned_in_words
 from safevar_sumo.analysis.research_questions.case import case_of
 from safevar_sumo.analysis.risk.rare import Response
 from safevar_sumo.analysis.tolerance import ToleranceOptions
@@ -114,7 +115,9 @@ def test_a_rating_prints_draws_and_stands_in_a_page() -> None:
     worn = Bench(STUDY, Here()).characteristics.setting({"brakeTorque": 0.5}, "it")
     result = compute.rate(STUDY, {"variant": worn}, pool=Here())
     assert result.lost > 0
-    assert result.turned()
+    turned = dict(turned_in_words(result))
+    assert set(turned) <= {block.name for block in result.protocol.blocks}
+    assert re.search(r"green to \w+ at (\d+ and )?80 km/h \(\d+ cells\)", turned["CCRs"])
     console = Console(record=True, width=80, file=StringIO())
     print_rating(console, result)
     print_matrices(console, result)

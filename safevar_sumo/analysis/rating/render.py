@@ -10,7 +10,7 @@ from rich.text import Text
 
 from safevar_sumo.analysis.figures import FONT, literal, new_figure
 from safevar_sumo.analysis.rating.compute import Rated, RatedTest, Rating, possible
-from safevar_sumo.analysis.words import joined
+from safevar_sumo.analysis.words import joined, number_of
 from safevar_sumo.protocol import COLOURS, Block
 from safevar_sumo.terminal import WholeTable, print_text
 from safevar_sumo.vehicles import CharacteristicSet
@@ -63,6 +63,17 @@ def lost_by_test(result: Rating) -> list[tuple[RatedTest, float]]:
     return sorted((pair for pair in losses if pair[1] > 0), key=lambda pair: -pair[1])
 
 
+def turned_in_words(result: Rating) -> list[tuple[str, str]]:
+    """Tests in which cells of the matrices have another colour than the original's, and at which speeds."""
+    tests: dict[str, dict[tuple[str, str], list[str]]] = {}
+    for cell, before, after in result.turned():
+        if not cell.is_varied:
+            colours = before or "unknown", after or "unknown"
+            tests.setdefault(cell.block.name, {}).setdefault(colours, []).append(f"{cell.vut:g}")
+    return [(test, "; ".join(f"{before} to {after} at {joined(dict.fromkeys(speeds))} km/h ({number_of(len(speeds), 'cell')})"
+                             for (before, after), speeds in groups.items())) for test, groups in tests.items()]
+
+
 def not_simulated(result: Rating) -> str:
     """What the points leave open."""
     tests = result.protocol.not_simulated
@@ -79,7 +90,7 @@ def test_in_words(test: RatedTest) -> str:
 
 def _changed(result: Rating, variant: Rated) -> str:
     members = CharacteristicSet.of(result.study.vehicle.characteristics)
-    parts = [f"{member.short_name} {variant.setting[member.name]:g}{member.suffix}" for member in members
+    parts = [f"{member.short_name} {member.text(variant.setting[member.name])}{member.suffix}" for member in members
              if variant.setting[member.name] != member.original]
     return joined(parts) if parts else "no change at all"
 
