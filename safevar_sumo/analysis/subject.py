@@ -19,10 +19,7 @@ from safevar_sumo.terminal import shown
 if TYPE_CHECKING:
     import pandas as pd
 
-    from safevar_sumo.analysis.evaluator import Progress
     from safevar_sumo.analysis.research_questions.case import Case
-    from safevar_sumo.metrics import Criterion
-    from safevar_sumo.workers.evaluation import Pool
 
 MOST = 3
 """Changes that are named in one line."""
@@ -159,15 +156,12 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
 T = TypeVar("T")
 
 
-def answered(compute: Callable[..., T], subject: Study | Case, options: Options, pool: Pool | None, jobs: int | None,
-             progress: bool | Progress) -> T:
-    """The result of a question's computation, with a bar on the terminal for `progress=True`."""
-    with shown(progress) as show:
-        return compute(subject, options, pool=pool, jobs=jobs, progress=show)
-
-
-def criterion_text(unsafe: Criterion | None) -> str | None:
-    """A criterion as options hold it and a command takes it."""
+def answered(compute: Callable[..., T], subject: Study | Case, options: type[Options], given: Mapping[str, Any]) -> T:
+    """The result of a question's computation; `given` holds the arguments of the question's function by name."""
     from safevar_sumo.metrics import Unsafe
 
-    return None if unsafe is None else str(Unsafe.parse(unsafe))
+    asked = {name: given[name] for name in options.described()}
+    if asked.get("unsafe") is not None:
+        asked["unsafe"] = str(Unsafe.parse(asked["unsafe"]))
+    with shown(given["progress"]) as show:
+        return compute(subject, options(**asked), pool=given["pool"], jobs=given["jobs"], progress=show)

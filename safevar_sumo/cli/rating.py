@@ -10,11 +10,11 @@ import click
 from rich.console import Console
 
 from safevar_sumo.analysis.rating import RatingOptions
-from safevar_sumo.cli.options import PICTURES, check_output, read_changes, settings_of
+from safevar_sumo.cli.options import PICTURES, check_output, read_changes
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import Target, jobs_option, json_option, now_option, options_of, target_of
+from safevar_sumo.cli.target import jobs_option, json_option, now_option, options_of, results_or_study
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import FloatArray
+from safevar_sumo.study import Study
 from safevar_sumo.terminal import stages
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -40,17 +40,17 @@ def rating(place: str, changes: tuple[str, ...], solution: str | None, matrix: b
            template: Path | None, preprocessed: Path | None, force: bool, jobs: int | None, as_json: bool) -> None:
     """Rate the vehicle of STUDY as Euro NCAP does in 2026, and one variant beside it: points, colours, robustness layers."""
     from safevar_sumo.analysis.figures import save
-    from safevar_sumo.analysis.rating.compute import rate, remarks
+    from safevar_sumo.analysis.rating.compute import rate_variant, remarks
     from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating
 
-    target = target_of(place, solution, None)
-    variant = _variant(target, changes)
+    subject = results_or_study(place)
+    options = RatingOptions(changes=_changes(subject if isinstance(subject, Study) else subject.study, changes), solution=solution)
     if plot is not None:
         check_output(plot, "--plot", PICTURES)
         _refuse_existing(plot, "--plot", force)
     book = _workbook(xlsx, template, preprocessed, force)
     with stages(Console(stderr=True)) as progress:
-        result = rate(target.study, variant, jobs=jobs, progress=progress)
+        result = rate_variant(subject, options, jobs=jobs, progress=progress)
     for remark in remarks(result):
         click.echo(f"note: {remark}", err=True)
     if as_json:
@@ -67,18 +67,13 @@ def rating(place: str, changes: tuple[str, ...], solution: str | None, matrix: b
         click.echo(f"Spreadsheet of {rated.name}: {book.output}", err=True)
 
 
-def _variant(target: Target, changes: tuple[str, ...]) -> dict[str, FloatArray]:
-    """The variant by its name, if one is asked for: a solution, or the original, with changes."""
-    characteristics = CharacteristicSet.of(target.study.vehicle.characteristics)
-    values = read_changes(changes, characteristics, False)
+def _changes(study: Study, changes: tuple[str, ...]) -> dict[str, float]:
+    """Values by characteristic, one for each."""
+    values = read_changes(changes, CharacteristicSet.of(study.vehicle.characteristics), False)
     for name, several in values.items():
         if len(several) > 1:
             raise InputError("--set", f"{name} takes {len(several)} values", "one value: one variant stands beside the original")
-    if target.setting is None and not values:
-        return {}
-    base = characteristics.original if target.setting is None else target.setting
-    name = "variant" if target.handle is None else str(target.handle) + (" changed" if values else "")
-    return {name: settings_of(values, base, characteristics)[0]}
+    return {name: value for name, (value,) in values.items()}
 
 
 def _refuse_existing(path: Path, flag: str, force: bool) -> None:

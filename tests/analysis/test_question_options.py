@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 import shlex
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import pytest
 from click.testing import CliRunner
 
+import safevar_sumo as sv
 from safevar_sumo.analysis.explain import ExplainOptions
+from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
+from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.tolerance import ToleranceOptions
@@ -47,10 +53,21 @@ def test_a_default_that_changes_changes_everywhere() -> None:
     assert done.stdout.split() == ["5"] * 3 + ["False", "True"]
 
 
+@pytest.mark.parametrize("options", [ExplainOptions, OpinionOptions, RatingOptions, RiskOptions, RulesOptions, ToleranceOptions])
+def test_a_function_takes_and_documents_the_options_of_its_record(options: type[Options]) -> None:
+    function = getattr(sv, options.question)
+    arguments = inspect.signature(function).parameters
+    record = {one.name: one.default for one in fields(options)}
+    assert {name: one.default for name, one in list(arguments.items())[1:]} == {
+        **record, "pool": None, "jobs": None, "progress": False, "as_it_is_now": False}
+    heads = re.findall(r"^(\w+)\n    \w", inspect.getdoc(function) or "", re.MULTILINE)
+    assert sorted(heads) == sorted([*arguments, "InputError", "SimulationError"])
+
+
 @pytest.mark.parametrize("options", [
     ExplainOptions(), ExplainOptions(solutions=("nsga2:3:0", "rs:1:2"), unsafe="below=0.5", top=3, limit=12_000),
     ToleranceOptions(unsafe="collision", characteristics=("mass", "tireFric"), pairs=True), RiskOptions(samples=4000, width=0.01),
-    RulesOptions(samples=4000, unsafe="collision")])
+    RulesOptions(samples=4000, unsafe="collision"), OpinionOptions(solutions="nsga2:3:0")])
 def test_a_printed_command_asks_for_the_same_options(options: Options) -> None:
     """The command, parsed by its own flags, makes the record that printed it."""
     typed = shlex.split(options.command_line("its results", "CPNA, night"))

@@ -18,7 +18,7 @@ from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.render import print_explained
 from safevar_sumo.analysis.explain.summary import lead
-from safevar_sumo.analysis.rating import compute
+from safevar_sumo.analysis.rating import RatingOptions, compute
 from safevar_sumo.analysis.rating.render import matrices_figure, print_matrices, print_rating, turned_in_words
 from safevar_sumo.analysis.research_questions.case import case_of
 from safevar_sumo.analysis.risk.rare import Response
@@ -112,8 +112,7 @@ def test_explain_names_the_cells_that_turn_and_the_summary_the_points_that_are_l
 
 
 def test_a_rating_prints_draws_and_stands_in_a_page() -> None:
-    worn = Bench(STUDY, Here()).characteristics.setting({"brakeTorque": 0.5}, "it")
-    result = compute.rate(STUDY, {"variant": worn}, pool=Here())
+    result = compute.rate_variant(STUDY, RatingOptions(changes={"brakeTorque": 0.5}), pool=Here())
     assert result.lost > 0
     turned = dict(turned_in_words(result))
     assert set(turned) <= {block.name for block in result.protocol.blocks}
@@ -139,6 +138,11 @@ def test_at_one_cell_a_collision_is_unsafe_and_points_are_no_column() -> None:
     case = case_of(STUDY, record(bench.original(), 0), solutions, pd.DataFrame(), [("nsga2", 0)], scoring=assemble(STUDY).measuring.scoring)
     assert case.unsafe.points is not None
     here = at_point(case, "CCRs, 80 km/h, 100 %, wet")
+    stated = RatingOptions(solution="nsga2:0:1", changes={"payload": 200.0})
+    variant = compute.rate_variant(case, stated, pool=Here()).variant
+    assert variant is not None
+    assert (variant.name, variant.setting["brakeTorque"], variant.setting["payload"]) == ("nsga2:0:1 changed", 0.99, 200.0)
+    assert stated.command_line("it").endswith("rating it --set payload=200.0 --solution nsga2:0:1")
     assert here.unsafe == Unsafe()
     assert here.unsafe.rows(here.solutions).tolist() == [True, False]
     assert "rating_points" not in {*here.solutions, *here.original, *(one.name for one in here.scoring.metrics)}

@@ -1,6 +1,6 @@
 """Why does a vehicle fail: which changes cause it, how little of them is enough, is the failure robust?
 
-The options and the function of the library stand here: the help of a command reads them without loading the computation.
+The options and the function of the library are defined here, so that a command's help can be shown without loading the computation.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from safevar_sumo.analysis.options import Options, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answered, criterion_text, study_or_case
+from safevar_sumo.analysis.options import Options, documented, option, unsafe_option
+from safevar_sumo.analysis.subject import Results, answered, study_or_case
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
@@ -27,13 +27,16 @@ class ExplainOptions(Options):
     question: ClassVar[str] = "explain"
     solutions: tuple[str, ...] = option(
         (), "Explain the N-th solution of a run, from 0; may be repeated.  [default: the failures that matter]",
-        flag="--solution", metavar="ALG:RUN:N", form="repeated")
+        flag="--solution", metavar="ALG:RUN:N", form="repeated",
+        python='Handles of solutions, such as "nsga2:3:0". By default the robust failure with the fewest changes, those with the fewest '
+               "and the smallest changes, the most severe one, and one of each distinct minimal cause, the most frequent first.")
     unsafe: str | None = unsafe_option()
     top: int = option(8, "How many failures are explained in full.", kind=int, low=1, high=1000)
     limit: int = option(40_000, "Simulations, about, for the minimal causes of all failures; of more failures a random sample is looked "
                                  "into.", kind=int, low=1, metavar="N")
 
 
+@documented(ExplainOptions)
 def explain(source: StudyLike | Results, *, solutions: Sequence[str] = ExplainOptions.solutions, unsafe: Criterion | None = None,
             top: int = ExplainOptions.top, limit: int = ExplainOptions.limit, pool: Pool | None = None, jobs: int | None = None,
             progress: bool | Progress = False, as_it_is_now: bool = False) -> Explained:
@@ -43,31 +46,7 @@ def explain(source: StudyLike | Results, *, solutions: Sequence[str] = ExplainOp
     ----------
     source
         Results or their directory, whose solutions are explained; or a study, of which failures all over the domain are.
-    solutions
-        Handles of solutions, such as "nsga2:3:0"; by default the robust failure with the fewest changes, those with the fewest and
-        the smallest changes, the most severe one, and one of each distinct minimal cause, the most frequent first.
-    unsafe
-        "collision", or a number X for a safety degree below X [m, or minus a collision's speed in m/s]; by default a collision if
-        any setting that is looked at is one, else half of the original's safety degree.
-    top
-        How many failures are explained in full at the most.
-    limit
-        Simulations, about, that the minimal causes of all failures may take; of more failures a random sample is looked into.
-    pool
-        Where to simulate, if not in worker processes of its own.
-    jobs
-        Worker processes, by default one for each core.
-    progress
-        True for a bar on the terminal, or a function called with the stage, how many settings are done, and how many there are.
-    as_it_is_now
-        Simulate with what is there now if results were computed with something else, and warn; by default that is refused.
-
-    Raises
-    ------
-    InputError
-        If something that is asked for is not there or cannot be used, or has changed since the results were computed.
     """
     from safevar_sumo.analysis.explain.compute import explain_failures
 
-    options = ExplainOptions(solutions=tuple(solutions), unsafe=criterion_text(unsafe), top=top, limit=limit)
-    return answered(explain_failures, study_or_case(source, as_it_is_now=as_it_is_now), options, pool, jobs, progress)
+    return answered(explain_failures, study_or_case(source, as_it_is_now=as_it_is_now), ExplainOptions, locals())

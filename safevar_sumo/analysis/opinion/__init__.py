@@ -1,6 +1,6 @@
 """What does another vehicle model say of the failures: is each minimal cause one there too?
 
-The options and the function of the library stand here: the help of a command reads them without loading the computation.
+The options and the function of the library are defined here, so that a command's help can be shown without loading the computation.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from safevar_sumo.analysis.options import Options, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answered, criterion_text, study_or_case
+from safevar_sumo.analysis.options import Options, documented, option, unsafe_option
+from safevar_sumo.analysis.subject import Results, answered, study_or_case
 
 if TYPE_CHECKING:
     from safevar_sumo.analysis.evaluator import Progress
@@ -27,7 +27,8 @@ class OpinionOptions(Options):
     question: ClassVar[str] = "opinion"
     solutions: tuple[str, ...] = option(
         (), "Ask about the N-th solution of a run, from 0; may be repeated, or name several between commas.  [default: the failures that a "
-            "report explains]", metavar="ALG:RUN:N", form="repeated")
+            "report explains]", metavar="ALG:RUN:N", form="repeated",
+        python='Handles of solutions, such as "nsga2:3:0". By default the failures that a report explains.')
     unsafe: str | None = unsafe_option()
 
     def __post_init__(self) -> None:
@@ -36,6 +37,7 @@ class OpinionOptions(Options):
         object.__setattr__(self, "solutions", tuple(dict.fromkeys(named)))
 
 
+@documented(OpinionOptions)
 def opinion(source: str | Path | Results, *, solutions: Sequence[str] = OpinionOptions.solutions, unsafe: Criterion | None = None,
             pool: Pool | None = None, jobs: int | None = None, progress: bool | Progress = False, as_it_is_now: bool = False) -> Opinions:
     """Drive minimal causes of failures again with another vehicle model: CommonRoad's multi-body vehicle with Pacejka's tyres.
@@ -44,27 +46,7 @@ def opinion(source: str | Path | Results, *, solutions: Sequence[str] = OpinionO
     ----------
     source
         Results or their directory.
-    solutions
-        Handles of solutions, such as "nsga2:3:0"; by default the failures that a report explains.
-    unsafe
-        "collision", or a number X for a safety degree below X [m, or minus a collision's speed in m/s]; by default a collision if
-        any solution is one, else half of the original's safety degree.
-    pool
-        Where the causes are looked for, if not in worker processes of its own.
-    jobs
-        Worker processes, by default one for each core.
-    progress
-        True for a bar on the terminal, or a function called with the stage, how many settings are done, and how many there are.
-    as_it_is_now
-        Simulate with what is there now if results were computed with something else, and warn; by default that is refused.
-
-    Raises
-    ------
-    InputError
-        If commonroad-vehicle-models is not installed, the second model cannot represent the vehicle at all, something that is asked for
-        is not there, or has changed since the results were computed.
     """
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
 
-    options = OpinionOptions(solutions=tuple(solutions), unsafe=criterion_text(unsafe))
-    return answered(ask_for_opinions, study_or_case(source, as_it_is_now=as_it_is_now), options, pool, jobs, progress)
+    return answered(ask_for_opinions, study_or_case(source, as_it_is_now=as_it_is_now), OpinionOptions, locals())

@@ -11,8 +11,12 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent
+from safevar_sumo.analysis.rating import RatingOptions
+from safevar_sumo.analysis.research_questions.case import Case
+from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, NOT_RED, RED, Block, Cell, Points, Protocol, points_of
 from safevar_sumo.records import CellResults, FloatArray
+from safevar_sumo.results import SolutionId, position_of
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.rater import by_night, rated_study, rater_of
@@ -169,6 +173,29 @@ class Rating:
     def __repr__(self) -> str:
         vehicles = "; ".join(f"{one.name} {one.points:.2f}" for one in self.variants)
         return f"<Rating of {self.study.name}, points of {possible(self.protocol):g}: {vehicles}>"
+
+
+def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | None = None, jobs: int | None = None,
+                 progress: Progress = silent) -> Rating:
+    """Rate the original vehicle and the variant of it that the options describe, if any; raises as `rate`.
+
+    Raises
+    ------
+    InputError
+        If the results have no such solution, or a value is outside its domain.
+    """
+    study, values, name = subject if isinstance(subject, Study) else subject.study, dict[str, float](), "variant"
+    characteristics = CharacteristicSet.of(study.vehicle.characteristics)
+    if options.solution is not None:
+        if isinstance(subject, Study):
+            raise InputError("solution", f"{study.name!r} is a study and has no solutions", "a results directory")
+        row = subject.solutions.iloc[position_of(subject.solutions, SolutionId.parse(options.solution))]
+        values, name = {one: float(row[one]) for one in characteristics.names}, options.solution
+    if options.changes:
+        characteristics.setting(options.changes, "changes")  # refuses what is none
+        values, name = {**values, **options.changes}, f"{name} changed" if values else name
+    variants = {name: characteristics.setting(values, "changes")} if values else {}
+    return rate(study, variants, pool=pool, jobs=jobs, progress=progress)
 
 
 def rate(study: Study, settings: Mapping[str, FloatArray], *, pool: Pool | None = None, jobs: int | None = None,

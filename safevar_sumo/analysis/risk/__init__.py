@@ -1,6 +1,6 @@
 """How likely is an unsafe outcome when vehicles vary as a study says, and which characteristic decides?
 
-The options and the function of the library stand here: the help of a command reads them without loading the computation.
+The options and the function of the library are defined here, so that a command's help can be shown without loading the computation.
 """
 
 from __future__ import annotations
@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from safevar_sumo.analysis.options import Options, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answered, criterion_text, study_of
+from safevar_sumo.analysis.options import Options, documented, option, unsafe_option
+from safevar_sumo.analysis.subject import Results, answered, study_of
 from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.study import StudyLike
 
@@ -32,11 +32,12 @@ class RiskOptions(Options):
                           metavar="N")
     confidence: float = option(0.95, "Confidence of the intervals.", kind=float, low=0, high=1, is_open=(True, True))
     width: float | None = option(
-        None, "Stop as soon as the interval of the probability is no wider.", kind=float, low=0, high=1, is_open=(True, False))
+        None, "Stop as soon as the confidence interval of the probability is at most this wide.", kind=float, low=0, high=1,
+        is_open=(True, False))
     unsafe: str | None = unsafe_option()
-    method: str = option("auto", "How: monte_carlo, subset_simulation, cross_entropy, or auto, which draws 1,000 vehicles and takes "
-                                 "subset_simulation for a probability below 0.01, of which --samples would see fewer than 100 "
-                                 "failures, if OpenTURNS is installed.",
+    method: str = option("auto", "Method: monte_carlo, subset_simulation, cross_entropy, or auto, which draws 1,000 vehicles and takes "
+                                 "subset_simulation if OpenTURNS is installed, the probability is below 0.01 and --samples vehicles "
+                                 "would have fewer than 100 failures.",
                          metavar="METHOD", kind=str)
     rare: bool = option(False, "For rare failures, 1e-3 to 1e-8: as auto, but it needs OpenTURNS and leaves out what decides.", kind=bool)
 
@@ -45,7 +46,7 @@ class RiskOptions(Options):
         if self.method not in METHODS:
             raise unknown("method", repr(self.method), self.method, METHODS)
         if self.rare and self.method == "monte_carlo":
-            raise InputError("rare", "with method = 'monte_carlo'", "one of the two")
+            raise InputError("rare", "cannot be combined with method = 'monte_carlo'", "either rare or method")
 
     @property
     def is_for_rare(self) -> bool:
@@ -53,6 +54,7 @@ class RiskOptions(Options):
         return self.rare or self.method in ("subset_simulation", "cross_entropy")
 
 
+@documented(RiskOptions)
 def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, confidence: float = RiskOptions.confidence,
          width: float | None = RiskOptions.width, unsafe: Criterion | None = None, method: str = RiskOptions.method,
          rare: bool = RiskOptions.rare, pool: Pool | None = None, jobs: int | None = None, progress: bool | Progress = False,
@@ -63,37 +65,7 @@ def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, conf
     ----------
     study
         A study, or results or their directory, whose study is asked about.
-    samples
-        Vehicles that plain Monte Carlo draws at the most.
-    confidence
-        Of the intervals, between 0 and 1.
-    width
-        Stop as soon as the interval of the probability is no wider.
-    unsafe
-        "collision", or a number X for a safety degree below X [m, or minus a collision's speed in m/s]; by default a collision if
-        any of many settings all over the domain is one, else half of the original's safety degree.
-    method
-        "monte_carlo", "subset_simulation", "cross_entropy", or "auto": subset simulation for a probability below 0.01, of which
-        `samples` would see fewer than 100 failures, if OpenTURNS is installed.
-    rare
-        For rare failures, 1e-3 to 1e-8: as "auto", but it needs OpenTURNS and leaves out which characteristic decides.
-    pool
-        Where to simulate, if not in worker processes of its own.
-    jobs
-        Worker processes, by default one for each core.
-    progress
-        True for a bar on the terminal, or a function called with the stage, how many settings are done, and how many there are.
-    as_it_is_now
-        Simulate with what is there now if results were computed with something else, and warn; by default that is refused.
-
-    Raises
-    ------
-    InputError
-        If something that is asked for is not there or cannot be used, or has changed since the results were computed.
-    SimulationError
-        If no vehicle can be simulated.
     """
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
-    options = RiskOptions(samples=samples, confidence=confidence, width=width, unsafe=criterion_text(unsafe), method=method, rare=rare)
-    return answered(estimate_risk, study_of(study, as_it_is_now=as_it_is_now), options, pool, jobs, progress)
+    return answered(estimate_risk, study_of(study, as_it_is_now=as_it_is_now), RiskOptions, locals())
