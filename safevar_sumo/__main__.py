@@ -16,7 +16,9 @@ def main() -> None:
 
         cli.main()
     except KeyboardInterrupt:
-        _fail("interrupted", 130)
+        from safevar_sumo.errors import INTERRUPTED
+
+        _fail("interrupted", INTERRUPTED)
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("safevar_sumo."):
             raise

@@ -20,6 +20,10 @@ STANDSTILL = 1e-3
 """Below this speed a vehicle counts as standing [m/s] (method section 4)."""
 KMH = 3.6
 """km/h per m/s."""
+GRAVITY = 9.81
+"""Acceleration of gravity [m/s^2]."""
+TIME_ROUNDING = 1e-9
+"""Sums of steps with a smaller difference are the same time [s]."""
 TOUCH = 2e-3
 """Bodies that overlap by less may just touch: SUMO takes a millimetre for nothing [m]."""
 TIME_DECIMALS = 9

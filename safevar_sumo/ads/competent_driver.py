@@ -9,8 +9,8 @@ from msgspec import Struct
 
 from safevar_sumo.ads.acc import KEEPING
 from safevar_sumo.ads.base import NotNegative, Positive
-from safevar_sumo.ads.driver import HARDEST, TIME_ROUNDING, Reaction, Start, in_the_way, react, time_to_reach, unaware
-from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.ads.driver import HARDEST, Reaction, Start, in_the_way, react, time_to_reach, unaware
+from safevar_sumo.records import TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
 
 
 class _Memory(NamedTuple):

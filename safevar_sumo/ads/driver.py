@@ -7,7 +7,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.records import GRAVITY, TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
 
 
 def looked_up(speeds: FloatArray, speed: FloatArray, *tables: FloatArray) -> list[FloatArray]:
@@ -105,15 +105,12 @@ def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
     return np.asarray(ahead & ((np.abs(seen.lateral) <= corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0)))
 
 
-GRAVITY = 9.81  # m/s^2
 HARDEST = 0.774 * GRAVITY
 """Deceleration of the competent and careful driver [m/s^2] (UN R157, annex 4, appendix 3)."""
 JERK = 12.65
 """Rise of that deceleration per second [m/s^3] (ibid.)."""
 CRUISE_GAIN = 1.0
 """Acceleration per error of the speed to hold [1/s]."""
-TIME_ROUNDING = 1e-9
-"""Times with a smaller difference are equal [s]."""
 Start = tuple[Annotated[float, Meta(ge=0, le=1)], ...]
 """Throttle in the run's first steps, one value per step [-]: the replayed start of another driver."""
 

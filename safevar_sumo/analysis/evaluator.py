@@ -19,7 +19,8 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from safevar_sumo.workers.batches import evaluate_all, inputs_of
 from safevar_sumo.workers.evaluation import Pool, packed
-from safevar_sumo.workers.local import available_cores, first_of, local_pool
+from safevar_sumo.workers.interrupts import first_of
+from safevar_sumo.workers.local import available_cores, local_pool
 from safevar_sumo.workers.retrying import RetryingPool
 
 PARTS = 2

@@ -13,8 +13,8 @@ from safevar_sumo.campaign.run import Run
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.workers.retrying import RetryingPool
 
-LEAST_BATCH = 10
-"""A smaller simulation takes as long as one of so many: what few runs ask for is shared out among idle workers down to this."""
+LEAST_SHARE = 10
+"""Settings that an idle worker gets at the least, of what few runs ask for: fewer take as long to simulate."""
 BATCHES_PER_WORKER = 2
 """How many batches are under way for each worker: one is computed while another is searched and journalled."""
 MOST_RUNS = 256
@@ -57,7 +57,7 @@ class Batcher:
         workers, asked = self._pool.workers, len(self._asked)
         idle = workers - len(self.under_way)
         if idle > 0:
-            return min(max(math.ceil(asked / idle), LEAST_BATCH), self._size)
+            return min(max(math.ceil(asked / idle), LEAST_SHARE), self._size)
         ahead = len(self.under_way) < BATCHES_PER_WORKER * workers and 2 * asked >= self._size
         return self._size if ahead else 0
 

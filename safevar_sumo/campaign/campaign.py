@@ -24,8 +24,8 @@ from safevar_sumo.sumo.matrix import LARGEST_WORLD
 from safevar_sumo.sumo.rater import is_rated
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from safevar_sumo.workers.evaluation import Pool, packed
+from safevar_sumo.workers.interrupts import first_of, result_of
 from safevar_sumo.workers.isolation import check_code
-from safevar_sumo.workers.local import first_of, result_of
 from safevar_sumo.workers.retrying import RetryingPool
 
 JOURNALS_AT_ONCE = 8

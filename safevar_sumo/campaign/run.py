@@ -12,15 +12,13 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import SPARE, Failure, Journal
 from safevar_sumo.search import Search
+from safevar_sumo.workers.batches import VERIFIED
 
 BY_CHANCE = 10
 """Evaluations of a run that are simulated once more and chosen by chance. What is wrong with 1 % of them shows with a probability
 of 1 - 0.99^300 = 95 % in a study of 30 runs."""
 
-
 FAILED = Outcome.SIMULATOR_ERROR.value
-VERIFIED = 50
-"""Evaluations of a run, beside its solutions, that are driven in SUMO again."""
 
 
 class Observer(Protocol):

@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from safevar_sumo.errors import InputError, SafevarError, did_you_mean
+from safevar_sumo.errors import INTERRUPTED, InputError, SafevarError, did_you_mean
 
 if TYPE_CHECKING:
     from safevar_sumo.study import Study
 
-INTERRUPTED = 130
 COMMANDS = {
     "study": ("study", "Search a study; run the same command again to continue where it stopped."),
     "status": ("study", "Show the progress of a study running in another process: runs, front, collisions, time left."),

@@ -27,7 +27,7 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import evaluate_all, inputs_of
 from safevar_sumo.workers.evaluation import Pool, packed
-from safevar_sumo.workers.local import result_of
+from safevar_sumo.workers.interrupts import result_of
 from safevar_sumo.workers.retrying import RetryingPool
 
 EDGE = 0.01

@@ -1,4 +1,4 @@
-"""Many settings in one SUMO simulation: the kernel of everything."""
+"""Many settings driven at once, in recorded scenes or in copies of a network in SUMO, and scored."""
 
 from __future__ import annotations
 

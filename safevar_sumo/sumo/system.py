@@ -1,4 +1,4 @@
-"""What a study measures and minimises: names turned into records."""
+"""A study assembled: its models looked up by name and given their parameters."""
 
 from __future__ import annotations
 

@@ -9,11 +9,8 @@ import numpy as np
 
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.plugins import Contract, Guard, accepts, read_only_copy
-from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
+from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.sensors import Sensors
-
-GRAVITY = 9.81
-"""[m/s^2]"""
 
 
 class Slope(NamedTuple):

@@ -13,8 +13,8 @@ from typing import Annotated, ClassVar, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import GRAVITY, LEVEL, Characteristics, Slope, SumoType
+from safevar_sumo.records import GRAVITY, TIME_ROUNDING, BoolArray, Command, FloatArray, Observation
+from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType
 from safevar_sumo.vehicles.sensors import Sensors
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
@@ -36,8 +36,7 @@ WHEELS = 4
 WHEEL_MASS = 20.0  # kg each; PxVehicleWheelData.mMass
 AIR_DENSITY = 1.2  # kg/m^3
 FRONTAL_AREA = 2.2  # m^2, of the LincolnMkz2017
-TIME_ROUNDING = 1e-9  # s; below it two sums of steps are the same time
-STANDSTILL = np.array(0.03)  # m/s, below which a braked vehicle is held by its tyres (PxVehicle sticky tires)
+HELD_BELOW = np.array(0.03)  # m/s, below which a braked vehicle is held by its tyres (PxVehicle sticky tires)
 SUBSTEP = 1 / 60  # s at most; CARLA 0.9.10 (MaxSubstepDeltaTime)
 NEWTON_STEPS = 8  # from 1 to a cube root near 1: the last ones change nothing
 TYRE_STEPS = 3  # in a substep; what PhysX takes below 5 m/s (setSubStepCount), here at any speed
@@ -172,7 +171,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             assumed_height=self.camera_height / (self.camera_height + (radius - self.camera_design_radius)),
             slip_offset=np.full_like(radius, self.slip_offset), nothing=np.zeros_like(radius), standstill=np.zeros_like(radius))
         creeps = self._rim_at(prepared._replace(pull=np.abs(prepared.pull)), prepared.nothing)[0]
-        return prepared._replace(standstill=STANDSTILL + creeps)
+        return prepared._replace(standstill=HELD_BELOW + creeps)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared

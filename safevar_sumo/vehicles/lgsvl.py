@@ -36,7 +36,7 @@ SLIPS_BEYOND, FRICTION_LOST = map(np.array, (SLIDING_SLIP - PEAK_SLIP, 1 - SLIDI
 FRICTION = 1.0  # at the extremum
 SLIP_FLOOR = np.array(4.0)  # m/s, least speed that a slip is relative to (assumption, as PhysX has it)
 LEAST_RIM = np.array(1e-3)  # m/s, that a slip limit is relative to
-STANDSTILL = np.array(0.05)  # m/s, below which locked wheels hold the vehicle (assumption)
+HELD_BELOW = np.array(0.05)  # m/s, below which locked wheels hold the vehicle (assumption)
 WHEELBASE = np.array(2.85)  # m
 # The lane keeping has an error to correct: assumption, so that the steering angle has something to act on.
 LATERAL_ERROR, HEADING_ERROR = 0.10, 0.01  # m, rad
@@ -131,13 +131,13 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             step=np.array(step), substep=np.array(substep), pedals_follow=np.array(step / (step + self.pedal_lag)),
             engine_follows=np.array(RPM_RATE * substep / (1 + RPM_RATE * substep)), mass=c["mass"], weight=c["mass"] * slope.down,
             body=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"], back=slope.back, slowed=np.asarray(slope.back * substep),
-            standstill=STANDSTILL, radius=c["radius"], pull_by_stiffness=substep * c["radius"], inertia=inertia, damping=damping,
+            standstill=HELD_BELOW, radius=c["radius"], pull_by_stiffness=substep * c["radius"], inertia=inertia, damping=damping,
             damped_inertia=inertia + substep * damping, brake_torque=WHEELS * c["maxBrakeTorque"], motor_torque=c["maxMotorTorque"],
             least_rpm=c["minRpm"], largest_rpm=c["maxRpm"], steering=c["maxSteeringAngle"] * RADIANS, rolling_drag=c["tireDragCoeff"],
             shift_time=c["shiftTime"], slip_limit=c["tractionControlSlipLimit"], traction_change=np.array(TRACTION_RATE * substep),
             friction=np.asarray(FRICTION * road_friction))
         creeps = _rim_at(prepared, np.zeros_like(prepared.mass), np.abs(prepared.body * prepared.back))
-        return prepared._replace(standstill=STANDSTILL + creeps)
+        return prepared._replace(standstill=HELD_BELOW + creeps)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared

@@ -18,16 +18,16 @@ from safevar_sumo.sumo.rater import driven_in_sumo
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.identity import Inputs, networks_of
+from safevar_sumo.workers.interrupts import first_of, result_of
 from safevar_sumo.workers.isolation import check_code, refuse_unlike_sumo
-from safevar_sumo.workers.local import first_of, result_of
 from safevar_sumo.workers.retrying import RetryingPool
 
 SHARES = 4
 """Batches for each worker, so that none waits long for another."""
 LEAST_BATCH = 100
-"""A smaller one costs as much."""
+"""Least number of settings of a batch: a smaller one costs as much."""
 VERIFIED = 50
-"""Settings of a study that are driven in SUMO, too, over as many calls as it takes."""
+"""Settings of a study that are driven in SUMO, too, over as many calls as it takes; as many evaluations of each run."""
 _batches: dict[bytes, tuple[int, bool]] = {}
 """What `batches_of` says of a packed study."""
 _verified: dict[bytes, int] = {}

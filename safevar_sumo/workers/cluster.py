@@ -21,7 +21,7 @@ from safevar_sumo.errors import InputError, first_line
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import RESULTS
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, evaluate_batch
-from safevar_sumo.workers.local import interrupts_noted
+from safevar_sumo.workers.interrupts import interrupts_noted
 
 ADDRESS = re.compile(r"[a-z]+://[^\s/]+:\d+/?")
 CERTIFICATES = "for tls:// certificates in Dask's configuration: distributed.comm.tls.ca-file and .client.cert, .client.key"

@@ -17,7 +17,7 @@ from safevar_sumo.study import Study, foreign_names, tables_of
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import packed
 from safevar_sumo.workers.identity import Inputs
-from safevar_sumo.workers.local import result_of
+from safevar_sumo.workers.interrupts import result_of
 from safevar_sumo.workers.retrying import RetryingPool
 
 LEGAL = ("what happens to vehicle i depends on vehicle i alone: nothing kept in a class, a module or the model itself from one call or "

@@ -1,8 +1,4 @@
-"""Ctrl-C while a pool works: noted at once, raised where the main thread waits for a result, never while a lock is held.
-
-An interrupt anywhere inside `concurrent.futures` may leave a lock behind that a worker's thread then waits for, for ever,
-and one while a pool is closed would leave workers behind.
-"""
+"""Batches in worker processes of this machine: processes that share nothing, each with a thread that waits for it."""
 
 from __future__ import annotations
 
@@ -12,8 +8,8 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from multiprocessing import connection
 from types import ModuleType
@@ -23,53 +19,13 @@ from safevar_sumo.errors import EnvironmentFault, SafevarError, first_line
 from safevar_sumo.plugins import inherit_reachable, reachable
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, evaluate_batch
-
-SECONDS_BETWEEN_LOOKS = 0.2
-"""How long Ctrl-C may go unnoticed at the most."""
-_pressed = threading.Event()
-
-
-@contextmanager
-def interrupts_noted() -> Iterator[None]:
-    """Within, Ctrl-C is raised by `first_of` and `result_of` alone; what nobody has waited for is raised at the end."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    _pressed.clear()
-    before = signal.signal(signal.SIGINT, lambda *_: _pressed.set())
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)
-    _raise_if_pressed()
-
-
-def first_of(futures: Iterable[Future[Evaluations]]) -> set[Future[Evaluations]]:
-    """The futures that are done, as soon as there is one, or none if there are no futures."""
-    while True:
-        done, not_done = wait(futures, timeout=SECONDS_BETWEEN_LOOKS, return_when=FIRST_COMPLETED)
-        _raise_if_pressed()
-        if done or not not_done:
-            return done
-
-
-def result_of(future: Future[Evaluations]) -> Evaluations:
-    """Wait for a future's result; raises its error."""
-    first_of([future])
-    return future.result()
-
-
-def _raise_if_pressed() -> None:
-    if _pressed.is_set():
-        _pressed.clear()
-        raise KeyboardInterrupt
-
+from safevar_sumo.workers.interrupts import interrupts_noted, leave_interrupts_to_the_caller
 
 START_LIMIT = 120.0
 """How long a worker process may take until it is ready for its first batch [s]."""
-_starting = threading.Lock()
 STARTS = 5
 """How many workers in a row may die before they are ready; no batch is to blame for that."""
+_starting = threading.Lock()
 
 
 def available_cores() -> int:
@@ -104,7 +60,7 @@ class LocalPool:
 
     def __init__(self, jobs: int, time_limit: float) -> None:
         self.workers, self._time_limit = jobs, time_limit
-        self._threads = ThreadPoolExecutor(jobs, thread_name_prefix="worker", initializer=_leave_interrupts_to_the_caller)
+        self._threads = ThreadPoolExecutor(jobs, thread_name_prefix="worker", initializer=leave_interrupts_to_the_caller)
         self._of_thread = threading.local()
         self._living: set[_Worker] = set()
         self._closed = False
@@ -246,13 +202,3 @@ def _end_with_the_caller() -> None:
     assert caller is not None
     caller.join()
     os._exit(1)
-
-
-def _leave_interrupts_to_the_caller() -> None:
-    """Ctrl-C reaches all processes of a terminal: block it in this thread, whose processes then never see it, however young."""
-    if sys.platform == "win32":  # there are no signal masks: a process ignores interrupts once it serves
-        return
-    from multiprocessing import resource_tracker
-
-    resource_tracker.ensure_running()  # its start would unblock interrupts
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

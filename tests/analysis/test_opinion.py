@@ -21,11 +21,11 @@ from safevar_sumo.analysis.opinion.result import Verdict
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.records import GRAVITY
 from safevar_sumo.report import make_report
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.vehicles import LEVEL, VEHICLES
-from safevar_sumo.vehicles.base import GRAVITY
 from tests.in_process import refused
 
 ONE = np.ones(1)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from safevar_sumo.records import Command, Observation
-from safevar_sumo.vehicles.carla import AIR_DENSITY, ENGINE_INERTIA, FINAL_RATIO, FRONTAL_AREA, GEAR_RATIOS, GRAVITY, RPM, WHEELS, Carla
+from safevar_sumo.records import GRAVITY, Command, Observation
+from safevar_sumo.vehicles.carla import AIR_DENSITY, ENGINE_INERTIA, FINAL_RATIO, FRONTAL_AREA, GEAR_RATIOS, RPM, WHEELS, Carla
 from tests.vehicles.drives import STEP, SYSTEMS, braking_after, drawn, drive, ends, original
 
 

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Command, Observation
+from safevar_sumo.records import GRAVITY, Command, Observation
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
-from safevar_sumo.vehicles.base import GRAVITY, LEVEL
+from safevar_sumo.vehicles.base import LEVEL
 from safevar_sumo.vehicles.worn import WornVehicle
 
 CAR = WornVehicle()

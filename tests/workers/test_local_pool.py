@@ -20,7 +20,8 @@ from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.study import ModelTable, Origin, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, packed
-from safevar_sumo.workers.local import LocalPool, first_of, interrupts_noted, local_pool, result_of
+from safevar_sumo.workers.interrupts import first_of, interrupts_noted, result_of
+from safevar_sumo.workers.local import LocalPool, local_pool
 from safevar_sumo.workers.retrying import ATTEMPTS, RetryingPool
 
 pytestmark = pytest.mark.usefixtures("worker_processes")

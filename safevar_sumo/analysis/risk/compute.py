@@ -332,7 +332,7 @@ def _feasible_vehicles(bench: Bench, model: VariationModel, number: int, rng: np
 
 BASE = 512
 """Base points of Saltelli's design; it has n + 2 times as many settings."""
-FEWEST = 100
+LEAST_FOR_INDICES = 100
 """Least number of unsafe, and of safe, settings in the design for indices of being unsafe."""
 RESAMPLES = 200
 """Bootstrap samples that the intervals come from."""
@@ -356,7 +356,7 @@ def sensitivities(bench: Bench, model: VariationModel, unsafe: Unsafe, confidenc
     evaluations = bench.evaluate(model.settings(np.asarray(points)), "what decides")
     degree = np.where(evaluations.valid, evaluations.f_safe, np.nan)
     is_unsafe = np.where(evaluations.valid, unsafe.of(evaluations).astype(float), np.nan)
-    if min(np.count_nonzero(is_unsafe == outcome) for outcome in (0, 1)) < FEWEST:
+    if min(np.count_nonzero(is_unsafe == outcome) for outcome in (0, 1)) < LEAST_FOR_INDICES:
         is_unsafe[:] = np.nan
     return _indices(problem, degree, confidence, seed), _indices(problem, is_unsafe, confidence, seed)
 

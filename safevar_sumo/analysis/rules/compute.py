@@ -26,7 +26,7 @@ from safevar_sumo.terminal import print_constraints, print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
-FEWEST = 10
+LEAST_FOR_RULES = 10
 """Unsafe, and safe, settings that rules need at least."""
 FOLDS, DEEPEST, PRUNINGS = 5, 6, 24
 """Folds of the cross-validation; most conditions of a box; number of prunings that are compared."""
@@ -133,8 +133,8 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
     remark, boxes = "", list[Limits]()
     if number == len(is_unsafe) > 0:
         boxes = [{}]
-    elif min(number, len(is_unsafe) - number) < FEWEST:
-        remark = (f"{number} of {len(is_unsafe)} settings are unsafe: rules need at least {FEWEST} unsafe and as many safe ones "
+    elif min(number, len(is_unsafe) - number) < LEAST_FOR_RULES:
+        remark = (f"{number} of {len(is_unsafe)} settings are unsafe: rules need at least {LEAST_FOR_RULES} unsafe and as many safe ones "
                   "(run `rules --samples N` for more)")
     else:
         boxes = _boxes(training.settings, is_unsafe, members)
@@ -164,7 +164,7 @@ def _pruned_tree(shares: FloatArray, unsafe: BoolArray) -> Any:
     from sklearn.tree import DecisionTreeClassifier
 
     def tree(pruning: float) -> Any:
-        return DecisionTreeClassifier(max_depth=DEEPEST, min_samples_leaf=FEWEST // 2, ccp_alpha=pruning, random_state=0)
+        return DecisionTreeClassifier(max_depth=DEEPEST, min_samples_leaf=LEAST_FOR_RULES // 2, ccp_alpha=pruning, random_state=0)
 
     path = np.unique(np.maximum(tree(0.0).cost_complexity_pruning_path(shares, unsafe).ccp_alphas, 0.0))[:-1]
     prunings = path[np.unique(np.linspace(0, len(path) - 1, PRUNINGS).round().astype(int))] if len(path) else np.zeros(1)
