@@ -242,6 +242,8 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `constraints` tell what the characteristics of one vehicle satisfy together.
     """
 
+    # A new key that changes no result of a campaign also belongs in FREE of results/manifest.py. Any other one becomes part of the identity
+    # of results: let `fixed` there leave its default out, so that results from before it keep theirs.
     name: Annotated[str, Meta(pattern=NAME)]
     title: str
     scenario: ModelTable
