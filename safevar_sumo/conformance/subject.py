@@ -15,7 +15,7 @@ import msgspec
 from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, FmuAds, ScalarAds
 from safevar_sumo.errors import InputError, SafevarError, unknown
 from safevar_sumo.fmu import file_of
-from safevar_sumo.metrics import METRICS, Metric
+from safevar_sumo.metrics import FURTHER, METRICS, Metric
 from safevar_sumo.plugins import Contract, Guard, Lookup, Member
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS
@@ -24,7 +24,8 @@ from safevar_sumo.sumo.traci_module import importable
 from safevar_sumo.vehicles import CHANGES, VEHICLE_CONTRACT, VEHICLES, Change, FmuVehicle
 
 KINDS: Mapping[str, Mapping[str, Any]] = {
-    "ads": ADS, "vehicle": VEHICLES, "scenario": SCENARIOS, "metric": METRICS, "objective": CHANGES, "algorithm": ALGORITHMS, "traci": {}}
+    "ads": ADS, "vehicle": VEHICLES, "scenario": SCENARIOS, "metric": {**METRICS, **FURTHER}, "objective": CHANGES,
+    "algorithm": ALGORITHMS, "traci": {}}
 """Kinds of subjects, and the shipped ones by name."""
 METHODS: Mapping[str, tuple[str, ...]] = {
     "ads": ("start", "drive"), "vehicle": ("prepare", "sumo_type", "at_rest", "sense", "advance"),

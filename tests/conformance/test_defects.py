@@ -11,7 +11,7 @@ import pytest
 
 from safevar_sumo import testing
 from safevar_sumo.conformance import KINDS, check, checked, subject_of, subjects_of, suite
-from safevar_sumo.study import load_study
+from safevar_sumo.study import load_study, study_names
 from safevar_sumo.workers.isolation import check_code
 from safevar_sumo.workers.retrying import RetryingPool
 from tests.in_process import Here, run
@@ -193,6 +193,11 @@ def test_what_is_shipped_passes(kind: str, name: str) -> None:
     report = checked(subject_of(name))
     assert report.kind == kind
     assert report.passed, "\n".join(map(str, report.findings))
+
+
+@pytest.mark.parametrize("name", study_names())
+def test_check_knows_everything_that_a_shipped_study_names(name: str) -> None:
+    assert {"vehicle", "ads", "scenario"} <= {subject.kind for subject in subjects_of(load_study(name))}
 
 
 def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) -> None:
