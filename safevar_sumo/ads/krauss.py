@@ -18,7 +18,7 @@ class _Memory(NamedTuple):
 
 
 class Krauss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Never faster than allows the original vehicle to stop behind the obstacle, after a reaction time.
+    """Never drives faster than a speed from which the original vehicle can stop behind the obstacle after a reaction time.
 
     Parameters
     ----------
@@ -41,12 +41,15 @@ class Krauss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return _Memory(nominal, step)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        """Aim at v_safe = -b t + sqrt((b t)^2 + 2 b gap) with reaction time t, at rest behind a standing obstacle."""
+        """Aim at v_safe = -b t + sqrt((b t)^2 + 2 b gap), t being the reaction time.
+
+        That is the speed from which the vehicle comes to rest behind a standing obstacle.
+        """
         nominal = memory.nominal
         planned = self.braking_share * nominal.decel
-        lost = planned * self.reaction_time
+        reaction_speed = planned * self.reaction_time
         gap = np.minimum(np.maximum(seen.gap - self.standing_gap, 0.0), 1e6)
-        safe = np.sqrt(lost * lost + 2 * planned * gap) - lost
+        safe = np.sqrt(reaction_speed * reaction_speed + 2 * planned * gap) - reaction_speed
         acceleration = (np.minimum(safe, self.cruise_speed) - seen.speed) / (memory.step + nominal.actuator_lag)
         throttle = np.minimum(np.maximum(acceleration / nominal.accel, 0.0), 1.0)
         brake = np.minimum(np.maximum(-acceleration / nominal.decel, 0.0), 1.0)

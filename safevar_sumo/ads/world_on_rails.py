@@ -12,22 +12,25 @@ from safevar_sumo.records import KMH, BoolArray, Command, FloatArray, Nominal, O
 
 NotNegative = Annotated[float, Meta(ge=0, le=60)]
 Throttle = Annotated[float, Meta(ge=0, le=1)]
-Reaction = Annotated[float, Meta(ge=0, le=5)]
+Delay = Annotated[float, Meta(ge=0, le=5)]
 SPEED_LIMIT = 20 / KMH
 """Above this speed the agent releases the throttle [m/s] (its source, 20 km/h)."""
 SPEED_LEVELS = (0.0, 8 / 3, 16 / 3)
-"""Speeds that the policy is interpolated over, as far as the limit lets it [m/s] (its source: four in 0..8 m/s)."""
+"""Speeds between which the policy is interpolated, up to the speed limit [m/s] (its source: four in 0..8 m/s)."""
 PASSED = -0.5
 """Gap at which an obstacle is beside the vehicle rather than ahead [m]."""
 
 
 class _Memory(NamedTuple):
-    """Whether it brakes; commands on their way, newest last; gap and lateral place, and the brake that it wants, on theirs."""
+    """Whether the policy brakes; commands not yet carried out, newest last; delay lines.
+
+    `recognised` delays gap and lateral place, `brake_delay_line` the brake command.
+    """
 
     brakes: BoolArray
     under_way: tuple[Command, ...]
     recognised: Late
-    braked: Late
+    brake_delay_line: Late
 
 
 class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -36,7 +39,7 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     Parameters
     ----------
     first_command
-        Time from the run's start to the first throttle, of a vehicle that stands [s].
+        How long after the start of the run a standing vehicle first gets throttle [s].
     latency
         Time from an image to its command [s], rounded to whole steps.
     corridor
@@ -44,14 +47,15 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     brake_gap, brake_gap_per_speed
         It brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s] for an obstacle at `brake_place`.
     brake_place, brake_gap_before, brake_gap_past
-        For every metre that an obstacle is short of that lateral place, or past it, the gap shrinks by as much [m, -, -]: it brakes
-        later for obstacles that enter or leave the way. The visibility is a factor on the rest.
+        The braking gap shrinks by `brake_gap_before` for each metre that the obstacle is short of `brake_place`, and by `brake_gap_past`
+        for each metre past it [m, -, -]: the policy brakes later for obstacles that enter or leave the way. What remains of the gap is
+        multiplied by the visibility.
     throttle
         Throttle at the policy's speed levels 0, 2.7 and 5.3 m/s.
     recognition_delay
-        By how much later than in clear weather it makes somebody out [s].
+        Additional time to recognise somebody, compared with clear weather [s].
     hesitation
-        By how much later than it lets go of the accelerator it then brakes [s]: it is not sure yet. It lets go of the brake at once.
+        Time between releasing the accelerator and braking, while the policy is not yet sure [s]. It releases the brake at once.
     """
 
     first_command: NotNegative
@@ -63,8 +67,8 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     brake_gap_before: NotNegative
     brake_gap_past: NotNegative
     throttle: Annotated[tuple[Throttle, Throttle, Throttle], Meta()]
-    recognition_delay: Reaction = 0.0
-    hesitation: Reaction = 0.0
+    recognition_delay: Delay = 0.0
+    hesitation: Delay = 0.0
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         idle = Command(np.zeros(n), np.zeros(n))
@@ -77,11 +81,12 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         waits = (seen.speed == 0) & (seen.time < self.first_command)
         throttle = np.where(brakes | waits | (seen.speed > SPEED_LIMIT), 0.0, self._throttle(seen.speed))
         command, *under_way = (*memory.under_way, Command(throttle, np.where(brakes, 1.0, 0.0)))
-        sure, braked = memory.braked.shown(command.brake)
-        return Command(command.throttle, np.minimum(command.brake, sure)), _Memory(brakes, tuple(under_way), recognised, braked)
+        delayed_brake, brake_delay_line = memory.brake_delay_line.shown(command.brake)
+        memory = _Memory(brakes, tuple(under_way), recognised, brake_delay_line)
+        return Command(command.throttle, np.minimum(command.brake, delayed_brake)), memory
 
     def _brakes(self, seen: Observation, braked: BoolArray) -> BoolArray:
-        """Whether the brake probability exceeds one half: an obstacle is near, in the corridor."""
+        """Whether to brake: an obstacle is near and in the corridor. (Stands for the policy's brake probability exceeding one half.)"""
         past = seen.lateral - self.brake_place
         aside = self.brake_gap_past * np.maximum(past, 0.0) + self.brake_gap_before * np.maximum(-past, 0.0)
         near = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - aside)

@@ -1,4 +1,4 @@
-"""The bench on which every question evaluates settings of a study, and designs that cover its domain."""
+"""Evaluates settings of a study for every question, and makes designs that cover its domain."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ Progress = Callable[[str, int, int], None]
 """Called with the stage, how many of its settings are done, and how many there are."""
 
 
-SPREAD = 64
-"""Most points of a sequence that are drawn for each feasible one."""
+DRAWS_PER_FEASIBLE = 64
+"""Points of a sequence that are drawn at most for each feasible point."""
 
 
 def silent(stage: str, done: int, total: int) -> None:
     """Progress that is not shown."""
 
 
-class Bench:
-    """Evaluates settings of one study as they are, without the filter.
+class Evaluator:
+    """Evaluates settings of one study as they are, without the filter, and makes designs that cover its domain.
 
     Attributes
     ----------
@@ -56,20 +56,22 @@ class Bench:
         self._pool, self.progress = pool, progress
         self.simulated = 0
 
-    def evaluate(self, settings: FloatArray, stage: str, before: int = 0, of: int | None = None, *, anywhere: bool = False) -> Evaluations:
-        """Evaluate settings, shape (M, n); `stage` is their name in the progress, where they follow the first `before` of all `of`.
+    def evaluate(self, settings: FloatArray, stage: str, before: int = 0, total: int | None = None, *,
+                 anywhere: bool = False) -> Evaluations:
+        """Evaluate settings, shape (M, n); `stage` is their name in the progress, where they follow the first `before` of all `total`.
 
         Settings that violate a constraint of the study are not simulated, their outcome is `infeasible`, unless `anywhere` is true.
         """
         if self.region and not anywhere:
             feasible = self.region.feasible(settings)
             if not feasible.all():
-                parts = [self.evaluate(settings[feasible], stage, before, of), self._infeasible(settings[~feasible])]
-                return Evaluations.concatenate(parts).take(np.argsort(np.argsort(~feasible, kind="stable"), kind="stable"))
+                parts = [self.evaluate(settings[feasible], stage, before, total), self._infeasible(settings[~feasible])]
+                order = np.argsort(np.argsort(~feasible, kind="stable"), kind="stable")
+                return Evaluations.concatenate(parts).take(order)  # back to the order of settings: the feasible rows were evaluated first
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
-        done, total = 0, len(np.unique(settings, axis=0))
-        whole = total if of is None else of
+        done, different = 0, len(np.unique(settings, axis=0))
+        whole = different if total is None else total
         self.progress(stage, before, whole)
 
         def count(number: int) -> None:
@@ -78,7 +80,7 @@ class Bench:
             self.progress(stage, before + done, whole)
 
         evaluations = evaluate_all(self.study, settings, self._pool, count)
-        self.simulated += total
+        self.simulated += different
         return evaluations
 
     def _infeasible(self, settings: FloatArray) -> Evaluations:
@@ -100,7 +102,7 @@ class Bench:
             drawn += some
             return spread(self.characteristics, drawn, seed)[drawn - some:]
 
-        return self.region.sampled(following, number, rng, filtered=filtered, rejections=SPREAD)
+        return self.region.sampled(following, number, rng, filtered=filtered, rejections=DRAWS_PER_FEASIBLE)
 
     def cells(self, settings: FloatArray, stage: str) -> CellResults:
         """Results of settings, shape (M, n), in every cell of a rated study; each worker has a part of the cells, not of the settings.
@@ -153,19 +155,19 @@ class Bench:
             return Unsafe.default_among(original, original)
         return Unsafe.default_among(self.evaluate(self.spread(PROBED), "settings over the whole domain"), original)
 
-    def with_step(self, step: float) -> Bench:
-        """A bench of the same study with another time step [s]."""
+    def with_step(self, step: float) -> Evaluator:
+        """An evaluator of the same study with another time step [s]."""
         metrics = msgspec.structs.replace(self.study.metrics, sampling_interval=None)  # it need not be a multiple of this step
-        return self.of(msgspec.structs.replace(self.study, step_length=step, metrics=metrics))
+        return self.for_study(msgspec.structs.replace(self.study, step_length=step, metrics=metrics))
 
-    def of(self, study: Study) -> Bench:
-        """A bench of another study, on the same pool."""
-        return Bench(study, self._pool, self.progress)
+    def for_study(self, study: Study) -> Evaluator:
+        """An evaluator of another study, on the same pool."""
+        return Evaluator(study, self._pool, self.progress)
 
 
 @contextmanager
-def open_bench(study: Study, pool: Pool | None = None, jobs: int | None = None, progress: Progress = silent) -> Iterator[Bench]:
-    """A bench on a given pool, or on `jobs` worker processes of its own, by default one for each core.
+def open_evaluator(study: Study, pool: Pool | None = None, jobs: int | None = None, progress: Progress = silent) -> Iterator[Evaluator]:
+    """An evaluator on a given pool, or on `jobs` worker processes of its own, by default one for each core.
 
     Raises
     ------
@@ -173,11 +175,11 @@ def open_bench(study: Study, pool: Pool | None = None, jobs: int | None = None, 
         If the study's models cannot be assembled.
     """
     if pool is not None:
-        yield Bench(study, pool, progress)
+        yield Evaluator(study, pool, progress)
         return
     assemble(study)
     with local_pool(jobs or available_cores(), study.search.time_limit) as own:
-        yield Bench(study, own, progress)
+        yield Evaluator(study, own, progress)
 
 
 def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec.structs import replace
 
-from safevar_sumo.analysis.evaluator import Bench, clopper_pearson
+from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import ModelTable, Study
@@ -88,49 +88,49 @@ class Preventability:
         return f"Preventability in the same vehicle ({sample}{number_of(self.collisions, 'collision')}): {', '.join(parts)}."
 
 
-def preventability(bench: Bench, settings: FloatArray, limit: int = LIMIT) -> Preventability:
+def preventability(evaluator: Evaluator, settings: FloatArray, limit: int = LIMIT) -> Preventability:
     """Who avoids the collisions of these settings, shape (M, n); equal ones count once.
 
     If that takes more than about `limit` simulations, a random sample is looked at, drawn with the study's seed.
     A setting that cannot be simulated with a reference driver counts as not looked at.
     """
     unique = np.unique(settings, axis=0)
-    most = max(limit // (len(PreventableBy) - 1 + len(assemble(bench.study).matrix)), 1)
-    rows = np.random.default_rng(bench.study.search.seed).permutation(len(unique))[:most]
-    return Preventability(numbers=Counter(by for by in preventable_by(bench, unique[rows]) if by is not None), collisions=len(unique))
+    most = max(limit // (len(PreventableBy) - 1 + len(assemble(evaluator.study).matrix)), 1)
+    rows = np.random.default_rng(evaluator.study.search.seed).permutation(len(unique))[:most]
+    return Preventability(numbers=Counter(by for by in preventable_by(evaluator, unique[rows]) if by is not None), collisions=len(unique))
 
 
-def preventable_by(bench: Bench, settings: FloatArray) -> list[PreventableBy | None]:
+def preventable_by(evaluator: Evaluator, settings: FloatArray) -> list[PreventableBy | None]:
     """Who avoids each collision, settings of shape (M, n); in a matrix at the point where the setting comes off worst.
 
     None where a setting cannot be simulated.
     """
     classes: list[PreventableBy | None] = [None] * len(settings)
-    system = assemble(bench.study)
-    worst = _worst_points(bench, system, settings)
+    system = assemble(evaluator.study)
+    worst = _worst_points(evaluator, system, settings)
     for k in np.unique(worst).tolist():
         rows = np.flatnonzero(worst == k)
         point = system.points[k]
-        here = bench.of(study_at(bench.study, point.name, point.name) if system.matrix else bench.study)
+        here = evaluator.for_study(study_at(evaluator.study, point.name, point.name) if system.matrix else evaluator.study)
         for row, by in zip(rows.tolist(), _at_one_point(here, system.at(point), settings[rows]), strict=True):
             classes[row] = by
     return classes
 
 
-def _worst_points(bench: Bench, system: System, settings: FloatArray) -> npt.NDArray[np.intp]:
+def _worst_points(evaluator: Evaluator, system: System, settings: FloatArray) -> npt.NDArray[np.intp]:
     """For every setting the number of the point where it comes off worst."""
     worst = np.zeros(len(settings), dtype=np.intp)
     if system.matrix:
         for start in range(0, len(settings), TOGETHER):
-            bench.progress("worst points of the collisions", start, len(settings))
+            evaluator.progress("worst points of the collisions", start, len(settings))
             worst[start:start + TOGETHER] = worst_points(at_every_point(system, settings[start:start + TOGETHER]))
     return worst
 
 
-def _at_one_point(bench: Bench, system: System, settings: FloatArray) -> list[PreventableBy | None]:
+def _at_one_point(evaluator: Evaluator, system: System, settings: FloatArray) -> list[PreventableBy | None]:
     """Full braking is only tried where the competent driver collides: the classes are disjoint."""
     parameters = approach(system)
-    drivers = {name: bench.of(_driven_by(bench.study, name, parameters)) for name in ("competent_driver", "full_braking")}
+    drivers = {name: evaluator.for_study(_driven_by(evaluator.study, name, parameters)) for name in ("competent_driver", "full_braking")}
     competent = drivers["competent_driver"].evaluate(settings, "a competent driver in the same vehicle")
     left = np.flatnonzero(competent.collided)
     braking = drivers["full_braking"].evaluate(settings[left], "full braking in the same vehicle")

@@ -284,10 +284,10 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
 def evaluated(study: Study, rows: FloatArray, pool: Pool | None = None, jobs: int | None = None,
               progress: Progress | None = None) -> Evaluations:
     """Simulate settings, shape (M, n), in worker processes, whether they satisfy the study's constraints or not."""
-    from safevar_sumo.analysis.evaluator import open_bench, silent
+    from safevar_sumo.analysis.evaluator import open_evaluator, silent
 
-    with open_bench(study, pool, jobs, progress or silent) as bench:
-        return bench.evaluate(rows, "settings", anywhere=True)
+    with open_evaluator(study, pool, jobs, progress or silent) as evaluator:
+        return evaluator.evaluate(rows, "settings", anywhere=True)
 
 
 def _table(settings: Any, characteristics: CharacteristicSet) -> tuple[FloatArray, Any]:

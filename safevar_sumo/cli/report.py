@@ -13,7 +13,7 @@ from safevar_sumo.analysis.research_questions.answer import QUESTIONS, answer
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.analysis.research_questions.gallery import FORMATS as PICTURES
 from safevar_sumo.analysis.research_questions.gallery import draw_all
-from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS, LAID_OUT, LAYOUTS_BY_NAME
+from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS, FORMATS_WITH_LAYOUT, LAYOUTS_BY_NAME
 from safevar_sumo.cli.options import check_output
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import as_it_is_now, jobs_option, now_option, point_option
@@ -33,9 +33,9 @@ WITHOUT_NOTES = ("csv", "json")
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write each table to a file of this directory.")
 def tables(directories: tuple[str, ...], question: str | None, kind: str, layout: str, out: Path | None) -> None:
     """Answer the research questions as tables, from the results directories DIR..., one for each case."""
-    if layout != "full" and kind not in LAID_OUT:
-        raise InputError("--layout", f"{layout!r}, but --format {kind} has no layout", f"--format {', '.join(LAID_OUT)}")
-    write = partial(LAID_OUT[kind], layouts=LAYOUTS_BY_NAME[layout]) if kind in LAID_OUT else FORMATS[kind]
+    if layout != "full" and kind not in FORMATS_WITH_LAYOUT:
+        raise InputError("--layout", f"{layout!r}, but --format {kind} has no layout", f"--format {', '.join(FORMATS_WITH_LAYOUT)}")
+    write = partial(FORMATS_WITH_LAYOUT[kind], layouts=LAYOUTS_BY_NAME[layout]) if kind in FORMATS_WITH_LAYOUT else FORMATS[kind]
     answers = answer(load_cases(directories), question)
     if kind in WITHOUT_NOTES:
         _warn(list(dict.fromkeys(note for one in answers for note in one.notes)))

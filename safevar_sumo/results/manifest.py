@@ -220,7 +220,7 @@ def read_later(directory: Path) -> Files:
     return {name: digest for path in sorted((directory / RUNS).glob(LATER)) for name, digest in _read(path, {}).items()}
 
 
-def begun_and_now(stored: Mapping[str, Any], now: Mapping[str, str], later: Mapping[str, str], places: Sequence[str]
+def comparable_inputs(stored: Mapping[str, Any], now: Mapping[str, str], later: Mapping[str, str], places: Sequence[str]
                   ) -> tuple[dict[str, Any], Files]:
     """A stored manifest and the files that its study reads now, ready to be compared.
 

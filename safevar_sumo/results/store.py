@@ -20,7 +20,7 @@ from safevar_sumo.results.manifest import (
     DIGESTS,
     MANIFEST,
     RUNS,
-    begun_and_now,
+    comparable_inputs,
     difference,
     digest_of_table,
     extent_of,
@@ -54,7 +54,7 @@ class ResultsDirectory:
     study
         The study as it is run.
     identity
-        What its results depend on beside its file; see `safevar_sumo.workers.identity.identity_of`.
+        What the study's results depend on besides the study file; see `safevar_sumo.workers.identity.identity_of`.
     scoring
         Metrics and objectives.
 
@@ -126,12 +126,12 @@ class ResultsDirectory:
     def _refuse_another_study(self) -> None:
         if not (self.path / MANIFEST).exists():
             foreign = sorted(name for path in self.path.iterdir() if (name := path.name) not in (RUNS, SOLUTIONS) and name[0] != ".")
-            if foreign and not (self.path / RUNS).exists():  # with journals, they decide whose directory it is
+            if foreign and not (self.path / RUNS).exists():  # if there are journals, their owner decides whose directory this is
                 raise InputError("out", f"{self.path} holds other things: {foreign[0]}", "an empty directory, or one of this study")
             return
         stored, later = read_manifest(self.path), read_later(self.path)
         if "imported" not in stored and later:
-            stored, self.manifest["sources"] = begun_and_now(stored, self._known, later, self._study.origin.places)
+            stored, self.manifest["sources"] = comparable_inputs(stored, self._known, later, self._study.origin.places)
         text, way_back = ("they are imported", "") if "imported" in stored else difference(stored, self.manifest)
         self._known = {**self.manifest.get("sources", {}), **later}
         if text:
@@ -144,7 +144,7 @@ class ResultsDirectory:
         while (theirs := owner_of(path)) is None and time.monotonic() < end:
             time.sleep(SECONDS_TO_CLAIM / 1000)
         if theirs != owner(self.manifest):
-            raise InputError(self.path, "is taken by another study that runs just now", "another --out")
+            raise InputError(self.path, "is in use by another study that is running now", "another --out")
 
     def _remove(self, path: Path) -> None:
         try:

@@ -8,7 +8,7 @@ from concurrent.futures import Future
 import msgspec
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import CharacteristicTable, Study, load_study
@@ -53,9 +53,9 @@ class Plant:
     def close(self) -> None: ...
 
 
-def made_up_bench(n: int, region: Region) -> Bench:
+def made_up_evaluator(n: int, region: Region) -> Evaluator:
     study = made_up_study(n)
-    return Bench(study, Plant(study, region))
+    return Evaluator(study, Plant(study, region))
 
 
 def nowhere(settings: FloatArray) -> BoolArray:

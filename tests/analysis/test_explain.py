@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, course, sentence
 from safevar_sumo.analysis.explain.causes import RESOLUTION, End, affordable, boundaries, involved, minimal_causes, necessary
@@ -32,7 +32,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Encounter, FloatArray, Outcome, SimulationRuns, Trace
 from safevar_sumo.results import handles
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.analysis.known_regions import ORIGINAL, Plant, box, everywhere, made_up_bench, made_up_study, two_islands
+from tests.analysis.known_regions import ORIGINAL, Plant, box, everywhere, made_up_evaluator, made_up_study, two_islands
 from tests.in_process import Here
 
 
@@ -45,7 +45,7 @@ def collides(case: Case, settings: list[dict[str, float]]) -> list[bool]:
     members = case.characteristics
     rows = np.array([members.setting(values, "test") for values in settings])
     assert (members.filter(rows) == rows).all(), "a value that the filter takes for no change"
-    return list(Bench(case.study, Here()).evaluate(rows, "afresh").collided)
+    return list(Evaluator(case.study, Here()).evaluate(rows, "afresh").collided)
 
 
 def test_every_minimal_cause_is_unsafe_and_no_proper_subset_of_it_is(case: Case, explained: Explained) -> None:
@@ -108,8 +108,8 @@ def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: C
     settings = crashes[list(case.characteristics.names)].to_numpy()
     place = next(i for i, setting in enumerate(settings) if setting.tolist() == list(robust.setting.values()))
     if place:
-        bench = Bench(case.study, Here())
-        assert max(one.share for one in robustness(bench, settings[:place], 0.05, explained.unsafe)) < 0.8
+        evaluator = Evaluator(case.study, Here())
+        assert max(one.share for one in robustness(evaluator, settings[:place], 0.05, explained.unsafe)) < 0.8
 
 
 def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
@@ -181,7 +181,7 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
 
 
 def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Explained) -> None:
-    original = Bench(case.study, Here()).original()
+    original = Evaluator(case.study, Here()).original()
     paragraph, first, *others, more = lead(case.study, case.solutions, original, Here(), "my results")
     crashes = int((case.solutions["outcome"] == "collision").sum())
     assert_tells_a_manager(paragraph, explained)
@@ -272,7 +272,7 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
     unsafe = [set(subset) for size in range(len(columns) + 1) for subset in combinations(columns, size)
               if table[sum(1 << column for column in subset)]]
     smallest = [subset for subset in unsafe if len(subset) == min(map(len, unsafe))]
-    (result,) = minimal_causes(made_up_bench(5, outcome), setting[np.newaxis], COLLISION)
+    (result,) = minimal_causes(made_up_evaluator(5, outcome), setting[np.newaxis], COLLISION)
     assert [set(cause.columns) for cause in result] == smallest
     for cause in result:
         assert not any(set(subset) < set(cause.columns) for subset in unsafe)
@@ -281,9 +281,9 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
 
 
 def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None:
-    bench = made_up_bench(3, two_islands)
-    (causes,) = minimal_causes(bench, np.array([[9.5, 1.0, 8.0]]), COLLISION)
-    (result,) = boundaries(bench, causes, COLLISION)
+    evaluator = made_up_evaluator(3, two_islands)
+    (causes,) = minimal_causes(evaluator, np.array([[9.5, 1.0, 8.0]]), COLLISION)
+    (result,) = boundaries(evaluator, causes, COLLISION)
     assert result.fraction == pytest.approx(1.5 / 4.5, abs=2 * RESOLUTION)
     assert result.setting[0] > 6.5 >= result.setting[0] - 2 * RESOLUTION * 4.5
     assert result.alone == {0: result.setting[0]}
@@ -291,61 +291,62 @@ def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None
 
 
 def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
-    bench = made_up_bench(1, lambda settings: settings[:, 0] > ORIGINAL)
-    (causes,) = minimal_causes(bench, np.array([[9.0]]), COLLISION)
-    (result,) = boundaries(bench, causes, COLLISION)
-    threshold = bench.characteristics.threshold[0]
+    evaluator = made_up_evaluator(1, lambda settings: settings[:, 0] > ORIGINAL)
+    (causes,) = minimal_causes(evaluator, np.array([[9.0]]), COLLISION)
+    (result,) = boundaries(evaluator, causes, COLLISION)
+    threshold = evaluator.characteristics.threshold[0]
     assert result.setting[0] == pytest.approx(ORIGINAL + threshold, rel=1e-3)
-    assert bench.characteristics.filter(result.setting)[0] == result.setting[0]
+    assert evaluator.characteristics.filter(result.setting)[0] == result.setting[0]
     assert (result.end, result.at_threshold) == (End.FILTER, 0)
 
 
 def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
     study = made_up_study(1)
-    bench = Bench(study, Plant(study, lambda rows: rows[:, 0] > 7, failing=lambda rows: (rows[:, 0] > 6) & (rows[:, 0] <= 7)))
-    (causes,) = minimal_causes(bench, np.array([[9.0]]), COLLISION)
-    (result,) = boundaries(bench, causes, COLLISION)
+    evaluator = Evaluator(study, Plant(study, lambda rows: rows[:, 0] > 7, failing=lambda rows: (rows[:, 0] > 6) & (rows[:, 0] <= 7)))
+    (causes,) = minimal_causes(evaluator, np.array([[9.0]]), COLLISION)
+    (result,) = boundaries(evaluator, causes, COLLISION)
     assert (result.setting[0], result.end) == (pytest.approx(7, abs=1e-3), End.NOT_SIMULATED)
 
 
 def test_robust_is_what_its_neighbours_are_too() -> None:
-    bench = made_up_bench(2, box)
-    threshold = bench.characteristics.threshold[0]
-    deep, edge = robustness(bench, np.array([[9.0, 1.0], [7.0, 1.0]]), 0.1, COLLISION)
+    evaluator = made_up_evaluator(2, box)
+    threshold = evaluator.characteristics.threshold[0]
+    deep, edge = robustness(evaluator, np.array([[9.0, 1.0], [7.0, 1.0]]), 0.1, COLLISION)
     assert deep.by_step == {0.1: 1.0, 0.05: 1.0, 0.2: 1.0}
     assert edge.share == pytest.approx(0.5, abs=0.2)
     assert (deep.borderline, edge.borderline) == (False, True)
-    (beyond,) = robustness(bench, np.array([[7.0 + 1.01 * threshold, 1.0]]), 0.1, COLLISION)
+    (beyond,) = robustness(evaluator, np.array([[7.0 + 1.01 * threshold, 1.0]]), 0.1, COLLISION)
     assert beyond.share == 1.0
 
 
 def test_the_smallest_robust_failure_is_the_first_whose_neighbours_are_unsafe_too() -> None:
     """Largest changes of 40, 70 and 80 %; the first lies at the edge of the box."""
-    bench = made_up_bench(2, box)
-    failures = bench.evaluate(np.array([[9.0, 1.0], [7.01, 2.99], [8.5, 2.0]]), "failures")
-    assert smallest_robust(bench, failures, 0.1, COLLISION, limit=1) == 2
-    assert smallest_robust(bench, failures.take([1]), 0.1, COLLISION, limit=1) is None
+    evaluator = made_up_evaluator(2, box)
+    failures = evaluator.evaluate(np.array([[9.0, 1.0], [7.01, 2.99], [8.5, 2.0]]), "failures")
+    assert smallest_robust(evaluator, failures, 0.1, COLLISION, limit=1) == 2
+    assert smallest_robust(evaluator, failures.take([1]), 0.1, COLLISION, limit=1) is None
 
 
 def test_necessary_and_changed_over_failures() -> None:
-    bench = made_up_bench(3, lambda settings: box(settings) | (settings[:, 2] > 9))
+    evaluator = made_up_evaluator(3, lambda settings: box(settings) | (settings[:, 2] > 9))
     settings = np.array([[9.0, 1.0, 5.0], [9.0, 1.0, 8.0], [9.0, 1.0, 9.5]])
-    causes = minimal_causes(bench, settings, COLLISION)
-    frame = necessity(bench.characteristics, bench.characteristics.changed(settings), causes, 3).set_index("characteristic")
+    causes = minimal_causes(evaluator, settings, COLLISION)
+    frame = necessity(evaluator.characteristics, evaluator.characteristics.changed(settings), causes, 3).set_index("characteristic")
     assert frame["changed"].to_dict() == pytest.approx({"a": 1, "b": 1, "c": 2 / 3})
     assert frame["necessary"].to_dict() == pytest.approx({"a": 2 / 3, "b": 2 / 3, "c": 1 / 3})
     assert frame["necessary_lower"].equals(frame["necessary"]), "of all failures the shares are exact"
-    sampled = necessity(bench.characteristics, bench.characteristics.changed(settings), causes, 4).set_index("characteristic").loc["c"]
+    members = evaluator.characteristics
+    sampled = necessity(members, members.changed(settings), causes, 4).set_index("characteristic").loc["c"]
     ends = [scipy.stats.beta.ppf(q, *shape) for q, shape in ((0.025, (1, 3)), (0.975, (2, 2)))]
     assert sampled[["necessary_lower", "necessary_upper"]].tolist() == pytest.approx(ends), "1 of a sample of 3"
-    distinct = distinct_causes(bench.characteristics, causes)
+    distinct = distinct_causes(evaluator.characteristics, causes)
     assert list(zip(distinct["cause"], distinct["failures"], strict=True)) == [(("a up", "b down"), 2), (("c up",), 1)]
 
 
 def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() -> None:
-    bench = made_up_bench(8, everywhere)
+    evaluator = made_up_evaluator(8, everywhere)
     settings = np.random.default_rng(1).uniform(6, 9, (50, 8))
-    few = affordable(settings, bench, 2000)
-    assert few == affordable(settings, bench, 2000)
+    few = affordable(settings, evaluator, 2000)
+    assert few == affordable(settings, evaluator, 2000)
     assert 0 < len(few) < 50
-    assert affordable(settings, bench, 10**6) == list(range(50))
+    assert affordable(settings, evaluator, 10**6) == list(range(50))

@@ -10,7 +10,7 @@ import pytest
 import scipy
 
 from safevar_sumo.ads.competent_driver import CompetentDriver
-from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.braking_comparison import sentence
 from safevar_sumo.analysis.explain.compute import Where, points_in_words, where
 from safevar_sumo.analysis.explain.summary import lead
@@ -29,10 +29,10 @@ NAMES = list(STUDY.vehicle.characteristics)
 ORIGINAL = np.array([one.original for one in STUDY.vehicle.characteristics.values()])
 
 
-def bench(**parameters: object) -> Bench:
+def evaluator(**parameters: object) -> Evaluator:
     """A short-sighted driving system in one scenario."""
     scenario = ModelTable(model="crossing", parameters=parameters)
-    return Bench(msgspec.structs.replace(STUDY, matrix=None, ads=BLIND, scenario=scenario), Here())
+    return Evaluator(msgspec.structs.replace(STUDY, matrix=None, ads=BLIND, scenario=scenario), Here())
 
 
 def vehicle(brakes: float = 1.0, max_rpm: float = 1.0) -> FloatArray:
@@ -43,17 +43,17 @@ def vehicle(brakes: float = 1.0, max_rpm: float = 1.0) -> FloatArray:
 
 def test_a_competent_driver_avoids_what_a_short_sighted_system_does_not_and_nobody_stops_without_brakes() -> None:
     both = np.stack([vehicle(), vehicle(brakes=0.1)])
-    assert preventable_by(bench(test="CPFA", speed=30), both) == [PreventableBy.COMPETENT_DRIVER, PreventableBy.NOBODY]
+    assert preventable_by(evaluator(test="CPFA", speed=30), both) == [PreventableBy.COMPETENT_DRIVER, PreventableBy.NOBODY]
 
 
 def test_a_child_that_comes_out_late_is_avoided_by_full_braking_alone() -> None:
-    assert preventable_by(bench(test="CPNCO", speed=40), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
+    assert preventable_by(evaluator(test="CPNCO", speed=40), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
 
 
 def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     """Of 60 collisions, the 40 of the lowest engine speeds are the brakeless ones: those that come first when settings are sorted."""
     collisions = np.stack([vehicle(0.1, 1 - (60 - k) / 1e6) for k in range(40)] + [vehicle(1.0, 1 - k / 1e6) for k in range(20)])
-    here = bench(test="CPFA", speed=30)
+    here = evaluator(test="CPFA", speed=30)
     whole = preventability(here, np.concatenate([collisions, collisions])).to_dict()
     assert whole == {"competent_driver": pytest.approx(1 / 3), "full_braking": 0, "nobody": pytest.approx(2 / 3), "looked_at": 60,
                      "interval_competent_driver": [pytest.approx(1 / 3)] * 2}
@@ -75,7 +75,7 @@ def test_reference_drivers_approach_as_the_driving_system_does() -> None:
     danger = int(np.argmax(theirs.gap[:, 0] < 2 * theirs.speed[:, 0]))
     assert theirs.speed[danger, 0] > 4
     assert np.array_equal(theirs.position[:danger + 1], his.position[:danger + 1])
-    assert approach(assemble(bench(test="CPFA", speed=30).study)) == {}
+    assert approach(assemble(evaluator(test="CPFA", speed=30).study)) == {}
 
 
 def test_in_a_matrix_the_worst_point_counts() -> None:
@@ -84,7 +84,7 @@ def test_in_a_matrix_the_worst_point_counts() -> None:
     tests = [msgspec.structs.replace(one, over={}, parameters={**one.parameters, "speed": speeds[one.name]}, weathers=[])
              for one in STUDY.matrix.tests if one.name in speeds]
     study = msgspec.structs.replace(STUDY, ads=BLIND, matrix=msgspec.structs.replace(STUDY.matrix, tests=tests))
-    assert preventable_by(Bench(study, Here()), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
+    assert preventable_by(Evaluator(study, Here()), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
 
 
 TESTS = [{"name": "CPLA", "model": "along", "over": {"speed": [20, 40]}, "weathers": ["clear", "night"]},

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from safevar_sumo import tolerance
-from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.tolerance import joint as safe_box
 from safevar_sumo.analysis.tolerance.compute import Tolerance
 from safevar_sumo.analysis.tolerance.render import profiles_figure
@@ -112,8 +112,8 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe(monkeypatch: py
     q, wrong, seeds, study = 0.031, 0, 100, made_up_study(2)
     for seed in range(seeds):
         seeded = msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, seed=seed))
-        bench = Bench(seeded, Plant(seeded, lambda rows: np.log(np.abs(rows[:, 0] - 5) + 1e-99) * 1e6 % 1 < q))
-        result = safe_box.safe_box(bench, [0, 1], Unsafe(), np.zeros((0, 2)))
+        evaluator = Evaluator(seeded, Plant(seeded, lambda rows: np.log(np.abs(rows[:, 0] - 5) + 1e-99) * 1e6 % 1 < q))
+        result = safe_box.safe_box(evaluator, [0, 1], Unsafe(), np.zeros((0, 2)))
         wrong += result.unsafe_at_most < q
     assert 0 < wrong <= 0.05 * seeds
 

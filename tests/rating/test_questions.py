@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.render import print_explained
@@ -89,10 +89,10 @@ def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
 
 
 def test_explain_names_the_cells_that_turn_and_the_summary_the_points_that_are_lost() -> None:
-    bench = Bench(STUDY, Here())
-    members = bench.characteristics
+    evaluator = Evaluator(STUDY, Here())
+    members = evaluator.characteristics
     settings = np.array([members.setting({"brakeTorque": value, "payload": 200.0}, "it") for value in (0.5, 0.6)])
-    original, evaluations = bench.original(), bench.evaluate(settings, "it")
+    original, evaluations = evaluator.original(), evaluator.evaluate(settings, "it")
     case: Any = type("Case", (), {"study": STUDY, "solutions": solutions_frame(members.names, [(("nsga2", 0), evaluations)]),
                                   "characteristics": members})()
     points = float(original.column("rating_points")[0])
@@ -131,11 +131,12 @@ def test_a_rating_prints_draws_and_stands_in_a_page() -> None:
 
 def test_at_one_cell_a_collision_is_unsafe_and_points_are_no_column() -> None:
     """One cell has no rating: metres would be compared with points of the whole study."""
-    bench = Bench(STUDY, Here())
-    settings = np.array([bench.characteristics.setting({"brakeTorque": value}, "it") for value in (0.5, 0.99)])
-    evaluations = bench.evaluate(settings, "it")
-    solutions = solutions_frame(bench.characteristics.names, [(("nsga2", 0), evaluations)])
-    case = case_of(STUDY, record(bench.original(), 0), solutions, pd.DataFrame(), [("nsga2", 0)], scoring=assemble(STUDY).measuring.scoring)
+    evaluator = Evaluator(STUDY, Here())
+    settings = np.array([evaluator.characteristics.setting({"brakeTorque": value}, "it") for value in (0.5, 0.99)])
+    evaluations = evaluator.evaluate(settings, "it")
+    solutions = solutions_frame(evaluator.characteristics.names, [(("nsga2", 0), evaluations)])
+    scoring = assemble(STUDY).measuring.scoring
+    case = case_of(STUDY, record(evaluator.original(), 0), solutions, pd.DataFrame(), [("nsga2", 0)], scoring=scoring)
     assert case.unsafe.points is not None
     here = at_point(case, "CCRs, 80 km/h, 100 %, wet")
     stated = RatingOptions(solution="nsga2:0:1", changes={"payload": 200.0})
@@ -149,7 +150,8 @@ def test_at_one_cell_a_collision_is_unsafe_and_points_are_no_column() -> None:
 
 
 def test_rare_failures_are_approached_by_points_where_points_are_the_criterion() -> None:
-    bench = Bench(STUDY, Here())
-    evaluations = bench.evaluate(bench.characteristics.original[np.newaxis], "it")
+    evaluator = Evaluator(STUDY, Here())
+    evaluations = evaluator.evaluate(evaluator.characteristics.original[np.newaxis], "it")
     points = float(evaluations.column("rating_points")[0])
-    assert Response(bench, lambda where: where, Unsafe(points=points - 2)).take(evaluations.settings, evaluations) == pytest.approx([2.0])
+    response = Response(evaluator, lambda where: where, Unsafe(points=points - 2))
+    assert response.take(evaluations.settings, evaluations) == pytest.approx([2.0])

@@ -22,9 +22,9 @@ from matplotlib.transforms import Bbox, BboxBase
 from safevar_sumo.analysis.research_questions.answer import answer
 from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
 from safevar_sumo.analysis.research_questions.figures import changed_characteristics, number_of_changes, pareto_fronts, sizes_of_changes
-from safevar_sumo.analysis.research_questions.gallery import OF_A_CASE, OF_ALL, draw, draw_all
+from safevar_sumo.analysis.research_questions.gallery import FIGURES_OF_ALL_CASES, FIGURES_OF_ONE_CASE, draw, draw_all
 from safevar_sumo.analysis.research_questions.layout import PAPER
-from safevar_sumo.analysis.research_questions.tables import FORMATS, as_json, escaped, latex, markdown, text
+from safevar_sumo.analysis.research_questions.tables import FORMATS, as_json, escaped_for_latex, latex, markdown, text
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable, load_study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -91,7 +91,7 @@ def test_latex_compiles(cases: list[Case], tmp_path: Path) -> None:
     ("é", "é"), ("Δ", "U+0394"), ("--", "-{}-"),
     ("\\", r"\textbackslash{}")])
 def test_special_characters_are_escaped(plain: str, latex_form: str) -> None:
-    assert escaped(plain) == latex_form
+    assert escaped_for_latex(plain) == latex_form
 
 
 def test_markdown_rows_are_as_wide_as_their_heads(cases: list[Case]) -> None:
@@ -178,12 +178,12 @@ def case() -> Case:
 
 
 @pytest.mark.parametrize("study", ["made-up", "lgsvl"])
-@pytest.mark.parametrize("name", [*OF_ALL, *OF_A_CASE])
+@pytest.mark.parametrize("name", [*FIGURES_OF_ALL_CASES, *FIGURES_OF_ONE_CASE])
 def test_axes_are_labelled_and_no_text_lies_on_another(name: str, study: str, case: Case) -> None:
     shown = case if study == "made-up" else random_setting(study)
     if name == "critical-differences":
         shown = three_algorithms()
-    figure = OF_ALL[name]([shown]) if name in OF_ALL else OF_A_CASE[name](shown)
+    figure = FIGURES_OF_ALL_CASES[name]([shown]) if name in FIGURES_OF_ALL_CASES else FIGURES_OF_ONE_CASE[name](shown)
     _check_layout(figure, name)
 
 

@@ -145,7 +145,7 @@ def test_a_directory_belongs_to_who_comes_first(tmp_path: Path, study: Study) ->
     first = ResultsDirectory(tmp_path, study)
     second, same = ResultsDirectory(tmp_path, with_search(study, seed=2)), ResultsDirectory(tmp_path, study)
     journal = first.journal("original")
-    with pytest.raises(InputError, match="is taken by another study that runs just now"):
+    with pytest.raises(InputError, match="is in use by another study that is running now"):
         second.journal("original")
     with pytest.raises(JournalBusy):
         same.journal("original")

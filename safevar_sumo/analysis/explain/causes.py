@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import Bench, finite_or_none
+from safevar_sumo.analysis.evaluator import Evaluator, finite_or_none
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray
 
@@ -41,13 +41,13 @@ class _Subset(NamedTuple):
     columns: tuple[int, ...]
 
 
-def minimal_causes(bench: Bench, settings: FloatArray, unsafe: Unsafe) -> list[list[MinimalCause]]:
+def minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> list[list[MinimalCause]]:
     """All smallest unsafe subsets of the changes of every setting, shape (M, n); none where no subset is unsafe.
 
     The empty subset counts: a study whose original vehicle is unsafe needs no change.
     """
-    original = bench.characteristics.original
-    changed = [tuple(np.flatnonzero(row).tolist()) for row in bench.characteristics.changed(settings)]
+    original = evaluator.characteristics.original
+    changed = [tuple(np.flatnonzero(row).tolist()) for row in evaluator.characteristics.changed(settings)]
     causes: list[list[MinimalCause]] = [[] for _ in settings]
     for size in range(max(map(len, changed), default=0) + 1):
         subsets = [_Subset(setting, columns) for setting, group in enumerate(changed) if not causes[setting]
@@ -57,7 +57,7 @@ def minimal_causes(bench: Bench, settings: FloatArray, unsafe: Unsafe) -> list[l
             tried = np.tile(original, (len(part), 1))
             for row, (setting, columns) in enumerate(part):
                 tried[row, list(columns)] = settings[setting, list(columns)]
-            evaluations = bench.evaluate(tried, f"subsets of {size} changes")
+            evaluations = evaluator.evaluate(tried, f"subsets of {size} changes")
             for row in np.flatnonzero(unsafe.of(evaluations)).tolist():
                 causes[part[row].setting].append(
                     MinimalCause(part[row].columns, tried[row], str(evaluations.outcome[row]), finite_or_none(evaluations.f_safe[row])))
@@ -72,12 +72,12 @@ def expected_cost(changes: int) -> int:
     return sum(comb(changes, size) for size in range((changes + 1) // 2 + 1))
 
 
-def affordable(settings: FloatArray, bench: Bench, limit: int) -> list[int]:
+def affordable(settings: FloatArray, evaluator: Evaluator, limit: int) -> list[int]:
     """Rows of settings whose minimal causes can be found with about `limit` simulations: all, or a random sample of them."""
-    costs = [expected_cost(int(changes)) for changes in bench.characteristics.number_changed(settings)]
+    costs = [expected_cost(int(changes)) for changes in evaluator.characteristics.number_changed(settings)]
     if sum(costs) <= limit:
         return list(range(len(settings)))
-    order = np.random.default_rng(bench.study.search.seed).permutation(len(settings))
+    order = np.random.default_rng(evaluator.study.search.seed).permutation(len(settings))
     within = np.cumsum([costs[row] for row in order]) <= limit
     return sorted(order[within].tolist())
 
@@ -123,12 +123,12 @@ class Boundary(NamedTuple):
     at_threshold: int | None = None
 
 
-def boundaries(bench: Bench, causes: list[MinimalCause], unsafe: Unsafe) -> list[Boundary]:
+def boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Unsafe) -> list[Boundary]:
     """Shrink causes, all changes by a common factor and each alone, as far as they stay unsafe and above the filter's thresholds."""
     together = [(cause, cause.columns) for cause in causes]
     alone = [(cause, (column,)) for cause in causes for column in cause.columns]
-    lines = [Line.moving(bench, cause, columns) for cause, columns in [*together, *alone]]
-    fractions, ends = edges(bench, lines, unsafe)
+    lines = [Line.moving(evaluator, cause, columns) for cause, columns in [*together, *alone]]
+    fractions, ends = edges(evaluator, lines, unsafe)
     single = iter(zip(lines[len(causes):], fractions[len(causes):], strict=True))
     shrunk = []
     for i, cause in enumerate(causes):
@@ -140,7 +140,7 @@ def boundaries(bench: Bench, causes: list[MinimalCause], unsafe: Unsafe) -> list
             line, fraction = next(single)
             group[column] = float(line.at(np.array([fraction]))[0, column])
         setting = lines[i].at(fractions[i:i + 1])[0]
-        limiting = lines[i].first_filtered(bench.characteristics.threshold) if ends[i] == End.FILTER else None
+        limiting = lines[i].first_filtered(evaluator.characteristics.threshold) if ends[i] == End.FILTER else None
         shrunk.append(Boundary(float(fractions[i]), setting, group, ends[i], limiting))
     return shrunk
 
@@ -153,9 +153,9 @@ class Line(NamedTuple):
     lowest: float
 
     @classmethod
-    def moving(cls, bench: Bench, cause: MinimalCause, columns: tuple[int, ...]) -> Line:
+    def moving(cls, evaluator: Evaluator, cause: MinimalCause, columns: tuple[int, ...]) -> Line:
         """The line on which some columns of a cause go from the original to their values."""
-        members = bench.characteristics
+        members = evaluator.characteristics
         indices = list(columns)
         start = cause.setting.copy()
         start[indices] = members.original[indices]
@@ -173,12 +173,12 @@ class Line(NamedTuple):
         return np.where(part >= 1, self.end, self.start + part * (self.end - self.start))
 
 
-def first_unsafe(bench: Bench, lines: list[Line], unsafe: Unsafe, what: str = "boundaries") -> FloatArray:
+def first_unsafe(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, what: str = "boundaries") -> FloatArray:
     """The first unsafe share of every line, whose end is unsafe; exact to `RESOLUTION` of the line above `lowest`."""
-    return edges(bench, lines, unsafe, what)[0]
+    return edges(evaluator, lines, unsafe, what)[0]
 
 
-def edges(bench: Bench, lines: list[Line], unsafe: Unsafe, what: str = "boundaries") -> tuple[FloatArray, list[End]]:
+def edges(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, what: str = "boundaries") -> tuple[FloatArray, list[End]]:
     """The first unsafe share of every line as `first_unsafe`, and the state just below it.
 
     A place that cannot be simulated is neither safe nor unsafe: the search passes it and reports `NOT_SIMULATED` if it ends there.
@@ -189,7 +189,7 @@ def edges(bench: Bench, lines: list[Line], unsafe: Unsafe, what: str = "boundari
         shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(1, parts + 1) / parts
         shares[:, -1] = high
         inner = np.concatenate([line.at(group[:-1]) for line, group in zip(lines, shares, strict=True)]) if lines else np.zeros((0, 0))
-        evaluations = bench.evaluate(inner, what)
+        evaluations = evaluator.evaluate(inner, what)
         is_unsafe, valid = (np.ones(shares.shape, dtype=bool) for _ in range(2))
         is_unsafe[:, :-1] = unsafe.of(evaluations).reshape(len(lines), parts - 1)
         valid[:, :-1] = evaluations.valid.reshape(len(lines), parts - 1)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent
+from safevar_sumo.analysis.evaluator import Evaluator, Progress, finite_or_none, open_evaluator, silent
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, course
 from safevar_sumo.analysis.explain.causes import MinimalCause, affordable, boundaries, minimal_causes, necessary
@@ -62,7 +62,8 @@ class Failures(NamedTuple):
         return self.rows[int(np.lexsort([getattr(among, name) for name in reversed(CHOICES[choice])])[0])]
 
 
-def failures_of(source: Study | Case, bench: Bench, original: Evaluations, named: Sequence[SolutionId], unsafe: Unsafe | None) -> Failures:
+def failures_of(source: Study | Case, evaluator: Evaluator, original: Evaluations, named: Sequence[SolutionId],
+                unsafe: Unsafe | None) -> Failures:
     """Evaluate all solutions of results, or settings all over a study's domain.
 
     Raises
@@ -74,19 +75,19 @@ def failures_of(source: Study | Case, bench: Bench, original: Evaluations, named
         if named:
             raise InputError("solution", f"{source.name!r} is a study and has no solutions", "a results directory")
         number = RATED_LOOKED_AT if is_rated(source) else LOOKED_AT
-        settings = bench.characteristics.filter(bench.spread(number, source.search.seed, filtered=True))
+        settings = evaluator.characteristics.filter(evaluator.spread(number, source.search.seed, filtered=True))
         solution_handles: list[SolutionId | None] = [None] * len(settings)
         recorded = None
         rows = None
     else:
         solutions = source.solutions
-        all_handles, all_settings = handles(solutions), solutions[list(bench.characteristics.names)].to_numpy(dtype=float)
+        all_handles, all_settings = handles(solutions), solutions[list(evaluator.characteristics.names)].to_numpy(dtype=float)
         asked = list(dict.fromkeys(position_of(solutions, handle) for handle in named))
         kept = [*asked, *(row for row in _each_once(all_settings) if row not in set(asked))]
         settings, solution_handles = all_settings[kept], [all_handles[row] for row in kept]
         recorded = solutions["outcome"].to_numpy(dtype=str)[kept]
         rows = list(range(len(asked))) if named else None
-    evaluations = bench.evaluate(settings, "settings to explain")
+    evaluations = evaluator.evaluate(settings, "settings to explain")
     criterion = unsafe or Unsafe.default_among(evaluations, original)
     if rows is None:
         rows = np.flatnonzero(criterion.of(evaluations)).tolist()
@@ -130,11 +131,11 @@ def where(system: System, original: FloatArray, settings: FloatArray, unsafe: Un
     return places, at_points[0].drives.trace.step
 
 
-def turned(bench: Bench, original: FloatArray, settings: FloatArray) -> tuple[list[Where], float]:
+def turned(evaluator: Evaluator, original: FloatArray, settings: FloatArray) -> tuple[list[Where], float]:
     """As `where`, of a rated study: the cells with another colour than the original's, and both vehicles in the cell that turns most."""
-    system = assemble(bench.study)
+    system = assemble(evaluator.study)
     assert system.rater is not None
-    colours = system.rater.points(bench.cells(np.concatenate([original, settings]), "cells that turn")).colours.astype(int)
+    colours = system.rater.points(evaluator.cells(np.concatenate([original, settings]), "cells that turn")).colours.astype(int)
     places, step = list[Where](), 0.0
     for row in range(1, len(colours)):
         worse = colours[row] - colours[0]
@@ -182,21 +183,21 @@ class Chosen(NamedTuple):
     reasons: Mapping[int, Reasons]
 
 
-def chosen_failures(source: Study | Case, options: ExplainOptions, bench: Bench) -> Chosen:
+def chosen_failures(source: Study | Case, options: ExplainOptions, evaluator: Evaluator) -> Chosen:
     """Choose failures by name, or those that matter; raises as `explain_failures`."""
     unsafe = None if options.unsafe is None else Unsafe.parse(options.unsafe)
     named = [SolutionId.parse(text) for text in options.solutions]
-    limit = options.limit // len(assemble(bench.study).points)
-    original = bench.original()
-    failures = failures_of(source, bench, original, named, unsafe)
+    limit = options.limit // len(assemble(evaluator.study).points)
+    original = evaluator.original()
+    failures = failures_of(source, evaluator, original, named, unsafe)
     settings, rows = failures.evaluations.settings, failures.rows
-    sample = rows if named else [rows[i] for i in affordable(settings[rows], bench, limit)]
-    robust = None if named or is_rated(bench.study) else _robust(failures, bench, original, limit)
+    sample = rows if named else [rows[i] for i in affordable(settings[rows], evaluator, limit)]
+    robust = None if named or is_rated(evaluator.study) else _robust(failures, evaluator, original, limit)
     reasons = dict.fromkeys(rows[:len(named)], ("asked for",)) if named else _that_matter(failures, robust)
     explained = sorted({*sample, *reasons})
-    causes = dict(zip(explained, minimal_causes(bench, settings[explained], failures.unsafe), strict=True))
+    causes = dict(zip(explained, minimal_causes(evaluator, settings[explained], failures.unsafe), strict=True))
     if not named:
-        reasons = _with_one_of_each_cause(failures, bench, {row: causes[row] for row in sample}, reasons, causes, options.top)
+        reasons = _with_one_of_each_cause(failures, evaluator, {row: causes[row] for row in sample}, reasons, causes, options.top)
     return Chosen(original, failures, sample, causes, reasons)
 
 
@@ -210,16 +211,16 @@ def explain_failures(source: Study | Case, options: ExplainOptions, *, pool: Poo
         If `unsafe` or a handle cannot be read, or the study cannot be assembled.
     """
     study = source if isinstance(source, Study) else source.study
-    with open_bench(study, pool, jobs, progress) as bench:
-        original, failures, sample, causes, reasons = chosen_failures(source, options, bench)
+    with open_evaluator(study, pool, jobs, progress) as evaluator:
+        original, failures, sample, causes, reasons = chosen_failures(source, options, evaluator)
         settings = failures.evaluations.settings
-        explanations = _explained(failures, bench, original, causes, reasons)
-        preventable = preventability(bench, settings[_avoidable(study, failures.evaluations)])
+        explanations = _explained(failures, evaluator, original, causes, reasons)
+        preventable = preventability(evaluator, settings[_avoidable(study, failures.evaluations)])
     of_sample = [causes[row] for row in sample]
     return Explained(
         study=study, unsafe=failures.unsafe, original=original, explanations=explanations,
-        necessity=necessity(bench.characteristics, bench.characteristics.changed(settings[sample]), of_sample, len(failures.rows)),
-        distinct=distinct_causes(bench.characteristics, of_sample), looked_at=len(failures.evaluations), failures=len(failures.rows),
+        necessity=necessity(evaluator.characteristics, evaluator.characteristics.changed(settings[sample]), of_sample, len(failures.rows)),
+        distinct=distinct_causes(evaluator.characteristics, of_sample), looked_at=len(failures.evaluations), failures=len(failures.rows),
         analysed=len(sample), otherwise=failures.otherwise, preventability=preventable)
 
 
@@ -228,12 +229,12 @@ def _avoidable(study: Study, evaluations: Evaluations) -> BoolArray:
     return np.asarray(evaluations.collided & (not is_rated(study)))
 
 
-def _robust(failures: Failures, bench: Bench, original: Evaluations, limit: int) -> int | None:
+def _robust(failures: Failures, evaluator: Evaluator, original: Evaluations, limit: int) -> int | None:
     """The smallest robust failure, if there is one among those that may be tried; none where the original vehicle is unsafe itself."""
     if not failures.rows or failures.unsafe.of(original)[0]:
         return None
-    _, step = where(assemble(bench.study), original.settings, original.settings[:0], failures.unsafe)
-    row = smallest_robust(bench, failures.evaluations.take(failures.rows), step, failures.unsafe, limit)
+    _, step = where(assemble(evaluator.study), original.settings, original.settings[:0], failures.unsafe)
+    row = smallest_robust(evaluator, failures.evaluations.take(failures.rows), step, failures.unsafe, limit)
     return None if row is None else failures.rows[row]
 
 
@@ -247,12 +248,12 @@ def _that_matter(failures: Failures, robust: int | None) -> dict[int, Reasons]:
     return reasons
 
 
-def _with_one_of_each_cause(failures: Failures, bench: Bench, sample: Causes, reasons: Mapping[int, Reasons], causes: Causes,
+def _with_one_of_each_cause(failures: Failures, evaluator: Evaluator, sample: Causes, reasons: Mapping[int, Reasons], causes: Causes,
                             top: int) -> dict[int, Reasons]:
     """Add one failure of each distinct minimal cause that is not there yet, the simplest that has it, up to `top` in all."""
     chosen = dict(list(reasons.items())[:top])
-    keys = {row: {key_of(bench.characteristics, cause) for cause in group} for row, group in causes.items()}
-    for key in distinct_causes(bench.characteristics, list(sample.values()))["cause"]:
+    keys = {row: {key_of(evaluator.characteristics, cause) for cause in group} for row, group in causes.items()}
+    for key in distinct_causes(evaluator.characteristics, list(sample.values()))["cause"]:
         if len(chosen) >= top:
             break
         if not any(key in keys[row] for row in chosen):
@@ -262,22 +263,22 @@ def _with_one_of_each_cause(failures: Failures, bench: Bench, sample: Causes, re
     return chosen
 
 
-def _explained(failures: Failures, bench: Bench, original: Evaluations, causes: Causes,
+def _explained(failures: Failures, evaluator: Evaluator, original: Evaluations, causes: Causes,
                reasons: Mapping[int, Reasons]) -> tuple[Explanation, ...]:
     """The chosen failures explained in full."""
     if not reasons:
         return ()
     rows = list(reasons)
-    here, names = failures.evaluations.take(rows), bench.characteristics.names
-    if is_rated(bench.study):
-        beside, step = turned(bench, original.settings, here.settings)
-        robust = robustness(bench, here.settings, step, failures.unsafe, STEP_FACTORS[:1])
+    here, names = failures.evaluations.take(rows), evaluator.characteristics.names
+    if is_rated(evaluator.study):
+        beside, step = turned(evaluator, original.settings, here.settings)
+        robust = robustness(evaluator, here.settings, step, failures.unsafe, STEP_FACTORS[:1])
     else:
-        beside, step = where(assemble(bench.study), original.settings, here.settings, failures.unsafe)
-        robust = robustness(bench, here.settings, step, failures.unsafe)
-    shrunk = iter(boundaries(bench, [cause for row in rows for cause in causes[row]], failures.unsafe))
-    collided = np.flatnonzero(_avoidable(bench.study, here))
-    avoided = dict(zip(collided.tolist(), preventable_by(bench, here.settings[collided]), strict=True))
+        beside, step = where(assemble(evaluator.study), original.settings, here.settings, failures.unsafe)
+        robust = robustness(evaluator, here.settings, step, failures.unsafe)
+    shrunk = iter(boundaries(evaluator, [cause for row in rows for cause in causes[row]], failures.unsafe))
+    collided = np.flatnonzero(_avoidable(evaluator.study, here))
+    avoided = dict(zip(collided.tolist(), preventable_by(evaluator, here.settings[collided]), strict=True))
     explanations = []
     for i, row in enumerate(rows):
         group = []
@@ -289,7 +290,7 @@ def _explained(failures: Failures, bench: Bench, original: Evaluations, causes: 
                 alone={names[column]: value for column, value in boundary.alone.items()}, outcome=cause.outcome,
                 safety_degree=cause.safety_degree, end=boundary.end,
                 at_threshold=None if boundary.at_threshold is None else names[boundary.at_threshold]))
-        changed = bench.characteristics.changed(here.settings[i])
+        changed = evaluator.characteristics.changed(here.settings[i])
         explanations.append(Explanation(
             handle=failures.handles[row], reasons=reasons[row], setting=dict(zip(names, here.settings[i].tolist(), strict=True)),
             outcome=str(here.outcome[i]), safety_degree=finite_or_none(here.f_safe[i]),

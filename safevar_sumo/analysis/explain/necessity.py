@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Bench, clopper_pearson
+from safevar_sumo.analysis.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.analysis.explain.causes import MinimalCause, involved, necessary
 from safevar_sumo.analysis.words import direction
 from safevar_sumo.metrics import Unsafe
@@ -103,7 +103,7 @@ def is_borderline(share: float) -> bool:
     return share < BORDERLINE
 
 
-def robustness(bench: Bench, settings: FloatArray, step: float, unsafe: Unsafe,
+def robustness(evaluator: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe,
                factors: Sequence[float] = STEP_FACTORS) -> list[Robustness]:
     """How robust settings, shape (M, n), are.
 
@@ -112,19 +112,19 @@ def robustness(bench: Bench, settings: FloatArray, step: float, unsafe: Unsafe,
     Neighbours that cannot be simulated
     are left out of the share.
     """
-    members = bench.characteristics
-    offsets = np.random.default_rng(bench.study.search.seed).uniform(-1, 1, (NEIGHBOURS, len(members))) * members.threshold
+    members = evaluator.characteristics
+    offsets = np.random.default_rng(evaluator.study.search.seed).uniform(-1, 1, (NEIGHBOURS, len(members))) * members.threshold
     around = np.clip(settings[:, np.newaxis] + offsets, members.lower, members.upper).reshape(-1, len(members))
     shares = {}
     for factor in factors:
-        on = bench if factor == 1 else bench.with_step(step * factor)
+        on = evaluator if factor == 1 else evaluator.with_step(step * factor)
         evaluations = on.evaluate(around, f"neighbours at {step * factor:g} s a step")
         outcomes, valid = (truths.reshape(len(settings), NEIGHBOURS) for truths in (unsafe.of(evaluations), evaluations.valid))
         shares[step * factor] = (outcomes & valid).sum(axis=1) / np.maximum(valid.sum(axis=1), 1)
     return [Robustness({step: float(group[row]) for step, group in shares.items()}) for row in range(len(settings))]
 
 
-def smallest_robust(bench: Bench, failures: Evaluations, step: float, unsafe: Unsafe, limit: int) -> int | None:
+def smallest_robust(evaluator: Evaluator, failures: Evaluations, step: float, unsafe: Unsafe, limit: int) -> int | None:
     """The row of the smallest failure that is not borderline: of the fewest changes, then the smallest largest change.
 
     They are tried in that order until one is robust or about `limit` simulations are spent; None if none is robust by then.
@@ -133,7 +133,7 @@ def smallest_robust(bench: Bench, failures: Evaluations, step: float, unsafe: Un
     most = max(TOGETHER, limit // (NEIGHBOURS * len(STEP_FACTORS)))
     for first in range(0, min(len(order), most), TOGETHER):
         rows = order[first:first + TOGETHER]
-        for row, result in zip(rows.tolist(), robustness(bench, failures.settings[rows], step, unsafe), strict=True):
+        for row, result in zip(rows.tolist(), robustness(evaluator, failures.settings[rows], step, unsafe), strict=True):
             if not result.borderline:
                 return int(row)
     return None

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Bench, finite_or_none
+from safevar_sumo.analysis.evaluator import Evaluator, finite_or_none
 from safevar_sumo.analysis.explain.causes import MinimalCause, minimal_causes
 from safevar_sumo.analysis.explain.compute import points_in_words, points_of, where
 from safevar_sumo.analysis.explain.necessity import Robustness, robustness, smallest_robust
@@ -53,7 +53,7 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
         return rated_lead(study, solutions, original, place)
     if original.collided[0]:
         return ["The original vehicle itself collides: no change is needed."]
-    bench, degree = Bench(study, pool), float(original.f_safe[0])
+    evaluator, degree = Evaluator(study, pool), float(original.f_safe[0])
     criterion = Unsafe.default(record(original, 0), solutions["outcome"])
     unsafe = criterion.rows(solutions)
     if not unsafe.any():
@@ -61,42 +61,43 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
                 f"How far each characteristic may go: {ask('tolerance', place)}"]
     chosen = {reason: chosen_handle(solutions, criterion, choice, study.name) for choice, reason in REASONS.items()}
     rows = solutions.iloc[[position_of(solutions, handle) for handle in chosen.values()]]
-    settings = rows[list(bench.characteristics.names)].to_numpy(dtype=float)
-    causes_of, (places, worst) = minimal_causes(bench, settings, criterion), _places(study, settings, criterion)
+    settings = rows[list(evaluator.characteristics.names)].to_numpy(dtype=float)
+    causes_of, (places, worst) = minimal_causes(evaluator, settings, criterion), _places(study, settings, criterion)
     counted = f"{int(unsafe.sum())} of {number_of(len(solutions), 'vehicle')} found"
-    lines = [_paragraph(bench, solutions, unsafe, original, criterion, worst),
+    lines = [_paragraph(evaluator, solutions, unsafe, original, criterion, worst),
              f"{counted} collide." if criterion.below is None else
              f"No collision. {counted} keep less than half of the original's {degree:.2f} m."]
     for (reason, handle), row, causes, fails in zip(chosen.items(), rows.to_dict("records"), causes_of, places, strict=True):
         size = f"{number_of(int(row['f_num_diff']), 'change')} of up to {row['f_diff']:.0%}"
         end = f"{row['outcome']}, SD {row['f_safe']:.2f}"
-        lines.append(f"{LABELS.get(reason, reason).capitalize()}: {handle}, {end}, {size}. {_in_words(bench, causes)}{fails}")
+        lines.append(f"{LABELS.get(reason, reason).capitalize()}: {handle}, {end}, {size}. {_in_words(evaluator, causes)}{fails}")
     at_worst = f"at the worst point of the first (without --point: at all {len(assemble(study).points)}, which takes long)"
     return [*lines, f"Why, and how far{f', {at_worst}' if worst else ''}: {ask('explain', place, worst)}"]
 
 
-def _paragraph(bench: Bench, solutions: pd.DataFrame, is_unsafe: pd.Series[bool], original: Evaluations, unsafe: Unsafe, point: str) -> str:
+def _paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Series[bool], original: Evaluations, unsafe: Unsafe,
+               point: str) -> str:
     """The unsafe solutions in one paragraph; with `point` those that are unsafe at that point of a matrix."""
-    names, all_handles = bench.characteristics.names, handles(solutions)
+    names, all_handles = evaluator.characteristics.names, handles(solutions)
     kept = np.flatnonzero(is_unsafe.to_numpy() & ~solutions.duplicated(list(names)).to_numpy())
     if point:
-        bench = bench.of(study_at(bench.study, point, point))
-        original = bench.original()
-    system = assemble(bench.study)
-    evaluations = bench.evaluate(solutions.iloc[kept][list(names)].to_numpy(dtype=float), "unsafe solutions")
-    preventable = preventability(bench, evaluations.settings[evaluations.collided])
+        evaluator = evaluator.for_study(study_at(evaluator.study, point, point))
+        original = evaluator.original()
+    system = assemble(evaluator.study)
+    evaluations = evaluator.evaluate(solutions.iloc[kept][list(names)].to_numpy(dtype=float), "unsafe solutions")
+    preventable = preventability(evaluator, evaluations.settings[evaluations.collided])
     failing = np.flatnonzero(unsafe.of(evaluations))
     failures = evaluations.take(failing)
     if not len(failures):
         return in_short(system, original, None, None, preventable)
     step = where(system, original.settings, original.settings[:0], unsafe)[1]
-    robust = smallest_robust(bench, failures, step, unsafe, LIMIT // len(system.points))
+    robust = smallest_robust(evaluator, failures, step, unsafe, LIMIT // len(system.points))
     fewest = int(np.lexsort([getattr(failures, name) for name in reversed(CHOICES["fewest"])])[0])
     rows = [fewest] if robust is None else [fewest, robust]
     findings, here = [], failures.take(rows)
-    causes, shares = minimal_causes(bench, here.settings, unsafe), robustness(bench, here.settings, step, unsafe)
+    causes, shares = minimal_causes(evaluator, here.settings, unsafe), robustness(evaluator, here.settings, step, unsafe)
     for i, row in enumerate(rows):
-        changed = np.flatnonzero(bench.characteristics.changed(here.settings[i]))
+        changed = np.flatnonzero(evaluator.characteristics.changed(here.settings[i]))
         changes = {names[column]: float(here.settings[i, column]) for column in changed}
         name, degree = str(all_handles[kept[failing[row]]]), finite_or_none(here.f_safe[i])
         findings.append(Finding(name, changes, str(here.outcome[i]), degree, shares[i], len(causes[i][0].columns)))
@@ -113,14 +114,14 @@ def _places(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple[list[st
     return words, at_points[worst_points(at_points)[0]].point.name
 
 
-def _in_words(bench: Bench, causes: list[MinimalCause]) -> str:
+def _in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
     """The first of a setting's minimal causes, and how many others there are."""
     if not causes:
         return "Simulated again it is not unsafe."
-    values = {bench.characteristics.names[column]: float(causes[0].setting[column]) for column in causes[0].columns}
+    values = {evaluator.characteristics.names[column]: float(causes[0].setting[column]) for column in causes[0].columns}
     more = len(causes) - 1
     others = f" ({number_of(more, 'alternative set')} of the same size; see explain)" if more else ""
-    return f"These changes alone cause it: {changes(bench.characteristics, values)}{others}."
+    return f"These changes alone cause it: {changes(evaluator.characteristics, values)}{others}."
 
 
 NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")

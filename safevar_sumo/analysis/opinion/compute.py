@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import Progress, finite_or_none, open_bench, silent
+from safevar_sumo.analysis.evaluator import Progress, finite_or_none, open_evaluator, silent
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.causes import RESOLUTION, boundaries
 from safevar_sumo.analysis.explain.compute import chosen_failures
@@ -79,11 +79,11 @@ def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Poo
         raise InputError("opinion", f"{source.name!r} is a study and has no solutions", "a directory that the command study has written")
     second_system(source.study)
     asked = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=LIMIT)
-    with open_bench(source.study, pool, jobs, progress) as bench:
-        chosen = chosen_failures(source, asked, bench)
+    with open_evaluator(source.study, pool, jobs, progress) as evaluator:
+        chosen = chosen_failures(source, asked, evaluator)
         minimal = [(str(chosen.failures.handles[row]), cause) for row in chosen.reasons for cause in chosen.causes[row]]
-        limits = boundaries(bench, [cause for _, cause in minimal], chosen.failures.unsafe)
-    names = bench.characteristics.names
+        limits = boundaries(evaluator, [cause for _, cause in minimal], chosen.failures.unsafe)
+    names = evaluator.characteristics.names
     causes = [Cause(handle, {names[column]: float(cause.setting[column]) for column in cause.columns}, limit.fraction)
               for (handle, cause), limit in zip(minimal, limits, strict=True)]
     opinions = opinions_of(source.study, causes, chosen.failures.unsafe, progress)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent
+from safevar_sumo.analysis.evaluator import Evaluator, Progress, finite_or_none, open_evaluator, silent
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
@@ -209,21 +209,21 @@ def rate(study: Study, settings: Mapping[str, FloatArray], *, pool: Pool | None 
     SimulationError
         If a vehicle cannot be simulated.
     """
-    with open_bench(rated_study(study, EURO_NCAP_2026), pool, jobs, progress) as bench:
-        return rate_on(bench, settings)
+    with open_evaluator(rated_study(study, EURO_NCAP_2026), pool, jobs, progress) as evaluator:
+        return rate_on(evaluator, settings)
 
 
-def rate_on(bench: Bench, settings: Mapping[str, FloatArray]) -> Rating:
-    """The same on a bench of the rated study."""
-    rater = rater_of(bench.study, f"study {bench.study.name!r}")
+def rate_on(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
+    """The same on an evaluator of the rated study."""
+    rater = rater_of(evaluator.study, f"study {evaluator.study.name!r}")
     assert rater is not None
-    names = CharacteristicSet.of(bench.study.vehicle.characteristics).names
-    rows = {"original": bench.characteristics.original, **settings}
-    cells = bench.cells(np.stack(list(rows.values())), "cells and robustness layers")
+    names = CharacteristicSet.of(evaluator.study.vehicle.characteristics).names
+    rows = {"original": evaluator.characteristics.original, **settings}
+    cells = evaluator.cells(np.stack(list(rows.values())), "cells and robustness layers")
     variants = [Rated(name=name, setting=dict(zip(names, setting.tolist(), strict=True)), protocol=rater.protocol, cells=cells.of([row]),
                       scored=points_of(rater.protocol, cells.of([row]), rater.claims), claims=rater.claims)
                 for row, (name, setting) in enumerate(rows.items())]
-    return Rating(study=bench.study, protocol=rater.protocol, variants=variants)
+    return Rating(study=evaluator.study, protocol=rater.protocol, variants=variants)
 
 
 def remarks(rating: Rating) -> list[str]:

@@ -1,4 +1,4 @@
-"""RQ2 for any set of algorithms: every pair, ranks over runs (Friedman), and which part of the objectives runs attain."""
+"""RQ2 for any set of algorithms: every pair, ranks over runs (Friedman), and which region of the objective space the runs attain."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pandas as pd
 import scipy
 
 from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
-from safevar_sumo.analysis.research_questions.comparisons import ALPHA, compare_samples, turned
+from safevar_sumo.analysis.research_questions.comparisons import ALPHA, compare_samples, from_other_side
 from safevar_sumo.analysis.research_questions.indicators import MORE_IS_BETTER, indicators, objectives
 from safevar_sumo.analysis.research_questions.over_runs import holm, series_of_means
 from safevar_sumo.records import FloatArray
@@ -39,7 +39,7 @@ def pairs(case: Case) -> pd.DataFrame:
         for metric, (more_is_better, by_algorithm) in samples.items():
             test = compare_samples(*(by_algorithm[name].dropna() for name in (first, second)))
             rows.append({"setting": case.name, "algorithm": first, "other": second, "metric": metric,
-                         **(test if more_is_better else turned(test))._asdict()})
+                         **(test if more_is_better else from_other_side(test))._asdict()})
     for row, p in zip(rows, holm([row["p_value"] for row in rows]), strict=True):
         row["p_holm"] = p
     return pd.DataFrame(rows, columns=PAIR_COLUMNS, dtype=object)
@@ -82,8 +82,8 @@ def critical_difference(algorithms: int, runs: int, alpha: float = ALPHA) -> flo
 def attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
     """Empirical attainment surfaces of the first two objectives, by algorithm and percentage of its runs.
 
-    Points, shape (K, 2), in the objectives' units, in the order of the first one: a setting at least as good as one of them
-    was found by so many of the runs (Fonseca, Guerreiro, Lopez-Ibanez, Paquete 2011).
+    Points, shape (K, 2), in the objectives' units, sorted by the first objective; that share of the runs found a setting at least as good
+    as the point (Fonseca, Guerreiro, Lopez-Ibanez, Paquete 2011).
 
     Raises
     ------
@@ -109,7 +109,7 @@ def attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
 
 
 def _samples(case: Case, fewest: int) -> Mapping[str, tuple[bool, dict[str, pd.Series[float]]]]:
-    """Of every indicator and metric whether more is better, and by algorithm its value in every run that has one."""
+    """For each indicator and metric: whether more is better, and per algorithm a series of its values over the runs."""
     if not case.has_runs:
         case.runs_of(next(iter(case.algorithms), ""))  # says why there is no answer
     if len(case.algorithms) < fewest:
@@ -119,10 +119,11 @@ def _samples(case: Case, fewest: int) -> Mapping[str, tuple[bool, dict[str, pd.S
     if len(case.solutions):
         quality = indicators(case).set_index(["algorithm", "run"])
         for name, more_is_better in MORE_IS_BETTER.items():
-            samples[name] = more_is_better, {one: quality.loc[quality.index.get_level_values(0) == one, name].droplevel(0)
-                                           for one in case.algorithms}
+            samples[name] = more_is_better, {
+                algorithm: quality.loc[quality.index.get_level_values(0) == algorithm, name].droplevel(0) for algorithm in case.algorithms}
     for metric in case.scoring.metrics:
-        samples[metric.name] = metric.more_is_unsafe, {one: series_of_means(case, one, metric) for one in case.algorithms}
+        samples[metric.name] = metric.more_is_unsafe, {
+            algorithm: series_of_means(case, algorithm, metric) for algorithm in case.algorithms}
     return samples
 
 

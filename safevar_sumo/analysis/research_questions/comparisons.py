@@ -23,7 +23,7 @@ EXACT_UP_TO = 8
 EXACT = "Mann-Whitney U, two-sided, exact"
 ASYMPTOTIC = "Mann-Whitney U, two-sided, normal approximation with corrections for ties and continuity"
 MAGNITUDES = ((0.714, "large"), (0.638, "medium"), (0.556, "small"))
-"""Kitchenham's: from which distance to either end an effect size is how large."""
+"""Kitchenham's magnitudes: the least max(A12, 1 - A12) for each."""
 NOTABLE = ("medium", "large")
 
 
@@ -74,7 +74,7 @@ def rq1(case: Case) -> pd.DataFrame:
     """Every algorithm's solutions against the original's value, repeated to the sample's size, metric by metric.
 
     Columns: `RQ1_COLUMNS`. `effect_size` is A12, turned so that a smaller one means that the algorithm's solutions are
-    more unsafe; `mean` is theirs, `original` the original's value. What is undefined is None.
+    more unsafe; `mean` is the mean over the algorithm's solutions, `original` the original vehicle's value. What is undefined is None.
 
     Raises
     ------
@@ -100,12 +100,12 @@ def rq1_rows(case: Case, sample_of: Sample, test: Callable[[FloatArray, float], 
             sample, original = sample_of(algorithm, metric), case.original[metric.name]
             result = test(sample, original)
             rows.append({"setting": case.name, "algorithm": algorithm, "metric": metric.name,
-                         **(turned(result) if metric.more_is_unsafe else result)._asdict(), "runs": len(sample),
+                         **(from_other_side(result) if metric.more_is_unsafe else result)._asdict(), "runs": len(sample),
                          "mean": float(np.mean(sample)) if sample.size else None, "original": None if np.isnan(original) else original})
     return rows
 
 
-def turned(test: TwoSampleTest) -> TwoSampleTest:
+def from_other_side(test: TwoSampleTest) -> TwoSampleTest:
     """The same comparison with the effect size of the other sample, A21 = 1 - A12."""
     effect = None if test.effect_size is None else 1 - test.effect_size
     return test if effect is None else test._replace(effect_size=effect, magnitude=magnitude(effect))
@@ -126,7 +126,7 @@ def rq2(case: Case) -> pd.DataFrame:
     Unanswerable
         If NSGA-II or every other algorithm is missing.
     """
-    case.solutions_of(NSGA2)  # says if there are none
+    case.solutions_of(NSGA2)  # raises Unanswerable if there are none
     if all(name == NSGA2 for name in case.algorithms):
         raise Unanswerable(case.name, f"has finished runs of {NSGA2} alone", "results of another algorithm to compare with, such as rs")
     rows = rq2_rows(case, lambda algorithm, metric: values(case.solutions_of(algorithm), metric))
@@ -144,6 +144,6 @@ def rq2_rows(case: Case, sample_of: Sample) -> list[dict[str, Any]]:
             for name, more_is_better in MORE_IS_BETTER.items()]
         tests += [(metric.name, not metric.more_is_unsafe, compare_samples(*(sample_of(one, metric) for one in pair)))
                   for metric in case.scoring.metrics]
-        rows += [{"setting": case.name, "baseline": baseline, "metric": name, **(turned(test) if turn else test)._asdict()}
+        rows += [{"setting": case.name, "baseline": baseline, "metric": name, **(from_other_side(test) if turn else test)._asdict()}
                  for name, turn, test in tests]
     return rows

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FORMATS = ("png", "pdf", "svg")
-FEWEST = 3
-"""Algorithms whose ranks are drawn; of two, a pair's test says all."""
-OF_ALL: Mapping[str, Callable[[Sequence[Case]], Figure]] = {"rq3.1-number-of-changes": number_of_changes}
-OF_A_CASE: Mapping[str, Callable[[Case], Figure]] = {
+LEAST_RANKED = 3
+"""Ranks are drawn for at least so many algorithms; for two, the test of the pair says all."""
+FIGURES_OF_ALL_CASES: Mapping[str, Callable[[Sequence[Case]], Figure]] = {"rq3.1-number-of-changes": number_of_changes}
+FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
     "rq3.2-changed-characteristics": changed_characteristics,
     "rq3.3-sizes-of-changes": sizes_of_changes,
     "pareto-fronts": pareto_fronts,
@@ -45,17 +45,17 @@ def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
     """
     figures, refused = {}, []
     alone = len(cases) == 1
-    for name, of_all in OF_ALL.items():
+    for name, of_all in FIGURES_OF_ALL_CASES.items():
         able, unable = _able(cases)
         refused += unable
         if able:
             figures[name] = of_all(able)
     for case in cases:
-        for name, group in OF_A_CASE.items():
-            if group is critical_differences and len(case.algorithms) < FEWEST:
+        for name, draw_figure in FIGURES_OF_ONE_CASE.items():
+            if draw_figure is critical_differences and len(case.algorithms) < LEAST_RANKED:
                 continue
             try:
-                figures[name if alone else f"{case.name}-{name}"] = group(case)
+                figures[name if alone else f"{case.name}-{name}"] = draw_figure(case)
             except Unanswerable as error:
                 refused.append(error)
     if not figures:

@@ -78,7 +78,8 @@ def pivoted(title: str, frame: pd.DataFrame, labels: Sequence[str], cells: Calla
             over: str = "setting", names: Mapping[str, str] | None = None, notes: Sequence[str] = ()) -> Table:
     """A row for each combination of `labels`, and a block of cells for each value of the column `over`.
 
-    A block has a cell for each of `heads` under the value as a span; without `heads` it is a single column with the value as its head.
+    Each block has one column per head, below the value of `over` as a spanning heading; without `heads` a block is one column, headed by
+    that value.
     `names` are titles for the values of labels.
     """
     blocks = list(dict.fromkeys(frame[over]))
@@ -114,8 +115,8 @@ def _names(answer: Answer) -> dict[str, str]:
     return {**ALGORITHM_TITLES, **titles_of(answer.metrics)}
 
 
-def _tests(answer: Answer, who: str, sizes: tuple[str, ...], notes: tuple[str, ...]) -> Table:
-    """P-values, over runs also corrected, and effect sizes; cases side by side."""
+def _tests(answer: Answer, group_column: str, sizes: tuple[str, ...], notes: tuple[str, ...]) -> Table:
+    """P-values (with Holm's correction too if the answer is over runs) and effect sizes; one block of columns per case."""
     frame = answer.frame
     corrected = "p_holm" in frame
     exact_marked = not corrected and EXACT in set(frame["method"])
@@ -132,7 +133,7 @@ def _tests(answer: Answer, who: str, sizes: tuple[str, ...], notes: tuple[str, .
 
     methods = [f"p{' with e' if exact_marked and method == EXACT else ''}: {method}."
                for method in (EXACT_SIGNED, ASYMPTOTIC_SIGNED, ASYMPTOTIC, EXACT) if method in set(frame["method"])]
-    return pivoted(TITLES[answer.name], frame, (who, "metric"), cells, parts, names=_names(answer),
+    return pivoted(TITLES[answer.name], frame, (group_column, "metric"), cells, parts, names=_names(answer),
                    notes=(*methods, *notes, HOLM_NOTE if corrected else BOLD_NOTE))
 
 
@@ -154,7 +155,7 @@ def _rq1(answer: Answer) -> list[Table]:
 def _rq2(answer: Answer) -> list[Table]:
     sizes = ("n1", "n2") if answer.frame["setting"].nunique() == 1 else ()
     return [_tests(answer, "baseline", sizes, (
-        "A12 above 0.5: NSGA-II is better; IGD, IGD+, HV: run against run, the others: pooled solutions.",
+        "A12 above 0.5: NSGA-II is better. IGD, IGD+ and HV compare runs; the other metrics compare pooled solutions.",
         non_collision_note(answer.metrics), "IGD on the objectives as they are, IGD+ and hypervolume (HV) on normalised ones."))]
 
 
@@ -166,7 +167,7 @@ def _rq1_runs(answer: Answer) -> list[Table]:
 
 def _rq2_runs(answer: Answer) -> list[Table]:
     return [_tests(answer, "baseline", ("n1", "n2"), (
-        "One value for each run (SD and the like: the mean of its solutions); A12 above 0.5: NSGA-II is better.",
+        "One value for each run (for safety metrics, the mean over its solutions); A12 above 0.5: NSGA-II is better.",
         non_collision_note(answer.metrics)))]
 
 
@@ -188,7 +189,7 @@ def _rq2_pairs(answer: Answer) -> list[Table]:
 
 
 def _rq2_ranks(answer: Answer) -> list[Table]:
-    """Mean ranks, an algorithm a column; a table for each case."""
+    """Mean ranks, one column per algorithm and one table per case."""
     names, tables = _names(answer), []
     for case, group in answer.frame.groupby("setting", sort=False):
         algorithms = list(dict.fromkeys(group["algorithm"]))
@@ -201,7 +202,7 @@ def _rq2_ranks(answer: Answer) -> list[Table]:
                          _number(first["critical_difference"], ".2f"), p, _bold(holm, significant), str(first["runs"])))
         heads = ("metric", *(names.get(name, name) for name in algorithms), "critical difference", "p", "p Holm", "runs")
         tables.append(Table(f"{TITLES['rq2-ranks']}: {case}", heads, rows, 1, notes=(
-            "p: Friedman's test, runs of the same number being a block; Holm's correction is for all metrics of a setting.",
+            "p: Friedman's test; runs with the same number form a block. Holm's correction is for all metrics of a setting.",
             f"Mean ranks that differ by less than the critical difference are not told apart (Nemenyi, {ALPHA:g}).",
             non_collision_note(answer.metrics))))
     return tables
@@ -254,8 +255,8 @@ def _safety(case: str, group: pd.DataFrame) -> list[Table]:
         if name != "avgSD_cS":
             rows.append(("  % of the original", *percent))
     return [Table(f"{TITLES[SAFETY]}: {case}", ("mean of", *values.heads[1:]), rows, 1, notes=(
-        "avgSD_mD: reduction of the distance; TET, TIT: increase (all three without collisions);",
-        "avgSD_cS: speed of collisions; aveDece: decrease, over all."))]
+        "Without collisions: avgSD_mD is the reduction of the distance, TET and TIT are increases.",
+        "avgSD_cS is the speed of the collisions. aveDece is the decrease over all solutions."))]
 
 
 def _collisions(answer: Answer) -> list[Table]:
@@ -283,7 +284,7 @@ def _weather(answer: Answer) -> list[Table]:
     return tables
 
 
-def _paper_tests(answer: Answer, who: str, note: str) -> list[Table]:
+def _paper_tests(answer: Answer, group_column: str, note: str) -> list[Table]:
     """A row for each case and algorithm, a column for each metric."""
     names = _names(answer)
 
@@ -293,13 +294,13 @@ def _paper_tests(answer: Answer, who: str, note: str) -> list[Table]:
         cell = f"{p_value(row['p_value'])} / {row['effect_size']:.3f}"
         return (_bold(cell, row["p_value"] < ALPHA and row["magnitude"] in NOTABLE),)
 
-    table = pivoted(TITLES[answer.name], answer.frame, ("setting", who), cells, over="metric", names=ALGORITHM_TITLES,
+    table = pivoted(TITLES[answer.name], answer.frame, ("setting", group_column), cells, over="metric", names=ALGORITHM_TITLES,
                     notes=(CELL_NOTE, note))
-    return [table._replace(heads=("case", who, *(names.get(metric, metric) for metric in table.heads[2:])))]
+    return [table._replace(heads=("case", group_column, *(names.get(metric, metric) for metric in table.heads[2:])))]
 
 
 def _paper_combinations(answer: Answer) -> list[Table]:
-    """A row for each characteristic, a column for each combination; marks where the combination has the characteristic."""
+    """A row for each characteristic, a column for each combination; a cell is marked if the combination contains the characteristic."""
     records = answer.frame.to_dict("records")
     names = dict.fromkeys(name for row in records for name in row["characteristics"])
     rows = [(name, *(MARK if name in row["characteristics"] else "" for row in records)) for name in names]

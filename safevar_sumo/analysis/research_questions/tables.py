@@ -22,7 +22,7 @@ _LATEX = {
     "\N{DEGREE SIGN}": r"\textdegree{}", "\N{MICRO SIGN}": r"\textmu{}", "\N{GREEK SMALL LETTER MU}": r"\textmu{}",
     "\N{SUPERSCRIPT TWO}": r"\textsuperscript{2}", "\N{SUPERSCRIPT THREE}": r"\textsuperscript{3}",
     "\N{MIDDLE DOT}": r"\textperiodcentered{}", MINUS: r"\textminus{}"}
-"""LaTeX of its special characters, and of some that occur in units."""
+"""LaTeX code for LaTeX's special characters, and for some characters that occur in units."""
 _LAST_PLAIN = "\N{LATIN SMALL LETTER Z WITH CARON}"
 """Up to here, LaTeX's T1 fonts have nearly every letter."""
 LATEX_NEEDS = r"% In the preamble: \usepackage[T1]{fontenc} \usepackage{textcomp} \usepackage{booktabs} \usepackage{graphicx}"
@@ -34,7 +34,7 @@ def text(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
 
 
 def markdown(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
-    """Markdown tables; a heading over several columns stands in each of theirs."""
+    """Markdown tables; a heading that spans several columns is repeated in the heading of each."""
     return "\n".join(_markdown(table) for answer in answers for table in lay_out(answer, layouts))
 
 
@@ -46,7 +46,7 @@ def latex(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
 
 
 def csv(answers: Sequence[Answer]) -> str:
-    """The tidy frame; several, each after a line with its name, with an empty line between."""
+    """The tidy frame as CSV; several frames are separated by empty lines, and each follows a line with its name."""
     parts = []
     for answer in answers:
         frame = answer.frame
@@ -58,7 +58,7 @@ def csv(answers: Sequence[Answer]) -> str:
 
 
 def as_json(answers: Sequence[Answer]) -> str:
-    """One list of records; of several tables, each record tells its own under "table"."""
+    """One list of records; with several tables, each record names its table under "table"."""
     several = len(answers) > 1
     rows = [{"table": answer.name, **row} if several else row for answer in answers for row in records(answer.frame)]
     return json.dumps(rows, indent=2, allow_nan=False) + "\n"
@@ -71,9 +71,9 @@ def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 LAYOUTS_BY_NAME: Mapping[str, Layouts] = {"full": LAYOUTS, "paper": PAPER}
-LAID_OUT: Mapping[str, Callable[..., str]] = {"text": text, "markdown": markdown, "latex": latex}
+FORMATS_WITH_LAYOUT: Mapping[str, Callable[..., str]] = {"text": text, "markdown": markdown, "latex": latex}
 """Formats for readers, whose functions take a layout; the other formats hold the frames."""
-FORMATS: Mapping[str, Callable[..., str]] = {**LAID_OUT, "csv": csv, "json": as_json}
+FORMATS: Mapping[str, Callable[..., str]] = {**FORMATS_WITH_LAYOUT, "csv": csv, "json": as_json}
 ENDINGS = {"text": "txt", "markdown": "md", "latex": "tex", "csv": "csv", "json": "json"}
 
 
@@ -107,24 +107,25 @@ def _markdown(table: Table) -> str:
     for (span, number), start in zip(table.spans, _starts(table), strict=True):
         if len(table.spans) > 1 or heads[start] in table.spans[0][0]:
             heads[start:start + number] = [f"{span}: {head}" for head in heads[start:start + number]]
-    lines = [f"**{_marked(table.title)}**", ""]
+    lines = [f"**{_escaped_for_markdown(table.title)}**", ""]
     if heads:
         rule = [":---" if i < table.labels else "---:" for i in range(len(heads))]
-        cells = [[f"**{_marked(cell)}**" if isinstance(cell, Bold) else _marked(cell) for cell in row] for row in table.rows]
-        lines += [f"| {' | '.join(row)} |" for row in ([_marked(head) for head in heads], rule, *cells)] + [""]
-    return "\n".join([*lines, *(f"{_marked(note)}  " for note in table.notes), ""])
+        cells = [[f"**{_escaped_for_markdown(cell)}**" if isinstance(cell, Bold) else _escaped_for_markdown(cell) for cell in row]
+                 for row in table.rows]
+        lines += [f"| {' | '.join(row)} |" for row in ([_escaped_for_markdown(head) for head in heads], rule, *cells)] + [""]
+    return "\n".join([*lines, *(f"{_escaped_for_markdown(note)}  " for note in table.notes), ""])
 
 
-def _marked(plain: str) -> str:
+def _escaped_for_markdown(plain: str) -> str:
     """Plain text as Markdown, with Markdown's own signs escaped."""
     return re.sub(r"([\\`*_|<>\[\]~^#$])", r"\\\1", plain.replace("\n", " "))
 
 
 def _latex(table: Table, label: str) -> str:
-    lines = [r"\begin{table}[htbp]", r"\centering", rf"\caption{{{escaped(table.title)}}}", rf"\label{{tab:{label}}}"]
+    lines = [r"\begin{table}[htbp]", r"\centering", rf"\caption{{{escaped_for_latex(table.title)}}}", rf"\label{{tab:{label}}}"]
     if table.heads:
         lines += [r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%", *_tabular(table), "}"]
-    lines += [rf"\par\smallskip{{\footnotesize {' '.join(escaped(note) for note in table.notes)}\par}}"] if table.notes else []
+    lines += [rf"\par\smallskip{{\footnotesize {' '.join(escaped_for_latex(note) for note in table.notes)}\par}}"] if table.notes else []
     return "\n".join([*lines, r"\end{table}", ""])
 
 
@@ -132,16 +133,17 @@ def _tabular(table: Table) -> list[str]:
     columns = "l" * table.labels + "r" * (len(table.heads) - table.labels)
     lines = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule"]
     if table.spans:
-        spans = [rf"\multicolumn{{{number}}}{{c}}{{{escaped(span)}}}" for span, number in table.spans]
+        spans = [rf"\multicolumn{{{number}}}{{c}}{{{escaped_for_latex(span)}}}" for span, number in table.spans]
         rules = [rf"\cmidrule(lr){{{start + 1}-{start + number}}}" for (_, number), start in zip(table.spans, _starts(table), strict=True)]
         lines += [" & ".join([""] * table.labels + spans).strip() + r" \\", "".join(rules)]
-    lines += [" & ".join(escaped(head) for head in table.heads) + r" \\", r"\midrule"]
-    lines += [" & ".join(rf"\textbf{{{escaped(cell)}}}" if isinstance(cell, Bold) else escaped(cell) for cell in row) + r" \\"
-              for row in table.rows]
+    lines += [" & ".join(escaped_for_latex(head) for head in table.heads) + r" \\", r"\midrule"]
+    cells = [[rf"\textbf{{{escaped_for_latex(cell)}}}" if isinstance(cell, Bold) else escaped_for_latex(cell) for cell in row]
+             for row in table.rows]
+    lines += [" & ".join(row) + r" \\" for row in cells]
     return [*lines, r"\bottomrule", r"\end{tabular}%"]
 
 
-def escaped(plain: str) -> str:
+def escaped_for_latex(plain: str) -> str:
     """Plain text as LaTeX; a character that its fonts may lack becomes its code point."""
     powers = re.split(r"\^(-?\d+)", re.sub(r"(?<![\w)^-])-(?=\.?\d)", MINUS, " ".join(plain.split())))
     text = "".join(rf"\textsuperscript{{{''.join(map(_letter, part.replace('-', MINUS)))}}}" if i % 2 else "".join(map(_letter, part))
@@ -156,7 +158,7 @@ def _letter(sign: str) -> str:
 
 
 def _starts(table: Table) -> list[int]:
-    """The first column under each heading over several."""
+    """The first column under each spanning heading."""
     return [table.labels + before for before in accumulate([number for _, number in table.spans[:-1]], initial=0)] if table.spans else []
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.evaluator import Bench, Progress, clopper_pearson, finite_or_none, open_bench, silent
+from safevar_sumo.analysis.evaluator import Evaluator, Progress, clopper_pearson, finite_or_none, open_evaluator, silent
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.risk.rare import (
     ENOUGH,
@@ -222,24 +222,24 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
         If no vehicle can be simulated.
     """
     model = VariationModel(study)
-    with open_bench(study, pool, jobs, progress) as bench:
-        unsafe = bench.criterion(options.unsafe)
-        beginning = bench.simulated
-        response = Response(bench, model.of_normal, unsafe)
-        counts = _sampled(bench, model, unsafe, options, response)
+    with open_evaluator(study, pool, jobs, progress) as evaluator:
+        unsafe = evaluator.criterion(options.unsafe)
+        beginning = evaluator.simulated
+        response = Response(evaluator, model.of_normal, unsafe)
+        counts = _sampled(evaluator, model, unsafe, options, response)
         if isinstance(counts, Estimate):
             estimate, method = counts, _method(options)
         else:
             estimate, method = counts.estimate(options.confidence), "monte_carlo"
-        left_out = model.correlated or bool(bench.region) or options.is_for_rare
-        of_degree, of_unsafe = (None, None) if left_out else sensitivities(bench, model, unsafe, options.confidence)
+        left_out = model.correlated or bool(evaluator.region) or options.is_for_rare
+        of_degree, of_unsafe = (None, None) if left_out else sensitivities(evaluator, model, unsafe, options.confidence)
     point = None if estimate.design_point is None else model.of_normal(estimate.design_point[np.newaxis])[0]
     return Risk(
         study=study, unsafe=unsafe, samples=estimate.simulations - estimate.errors, failures=estimate.failures, errors=estimate.errors,
         confidence=options.confidence, sensitivity=of_degree, sensitivity_of_unsafe=of_unsafe, probability=estimate.probability,
         interval=estimate.interval, method=method, simulations=beginning + estimate.simulations,
         coefficient_of_variation=estimate.variation, remark=estimate.remark,
-        design_point=None if point is None else dict(zip(bench.characteristics.names, point.tolist(), strict=True)))
+        design_point=None if point is None else dict(zip(evaluator.characteristics.names, point.tolist(), strict=True)))
 
 
 @dataclass(kw_only=True)
@@ -263,11 +263,11 @@ def _method(options: RiskOptions) -> str:
     return options.method if options.method == "cross_entropy" else "subset_simulation"
 
 
-def _sampled(bench: Bench, model: VariationModel, unsafe: Unsafe, options: RiskOptions, response: Response) -> Estimate | _Counts:
+def _sampled(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, options: RiskOptions, response: Response) -> Estimate | _Counts:
     """Draw vehicles by plain Monte Carlo; if few of the first are unsafe, switch to a method for rare failures."""
-    counts, rng = _Counts(), np.random.default_rng(bench.study.search.seed)
-    chooses = _may_be_rare(options) and not bench.region
-    if options.is_for_rare and bench.region:
+    counts, rng = _Counts(), np.random.default_rng(evaluator.study.search.seed)
+    chooses = _may_be_rare(options) and not evaluator.region
+    if options.is_for_rare and evaluator.region:
         counts.remark = "the study has constraints, within which only plain Monte Carlo draws"
     if options.is_for_rare:
         openturns()  # raises at once if it is missing
@@ -276,9 +276,9 @@ def _sampled(bench: Bench, model: VariationModel, unsafe: Unsafe, options: RiskO
         chunk = PILOT if chooses else CHUNK if options.width is not None else LARGEST_CHUNK
         drawn = counts.count + counts.errors
         number = min(chunk, most - drawn)
-        probabilities = rng.random((number, len(bench.characteristics))) if chooses else None
-        settings = _feasible_vehicles(bench, model, number, rng) if probabilities is None else model.settings(probabilities)
-        evaluations = bench.evaluate(settings, "vehicles as they vary", drawn, most)
+        probabilities = rng.random((number, len(evaluator.characteristics))) if chooses else None
+        settings = _feasible_vehicles(evaluator, model, number, rng) if probabilities is None else model.settings(probabilities)
+        evaluations = evaluator.evaluate(settings, "vehicles as they vary", drawn, most)
         valid = int(np.count_nonzero(evaluations.valid))
         counts.count, counts.errors = counts.count + valid, counts.errors + number - valid
         counts.failures += int(np.count_nonzero(unsafe.of(evaluations)))
@@ -287,7 +287,7 @@ def _sampled(bench: Bench, model: VariationModel, unsafe: Unsafe, options: RiskO
             values = response.take(scipy.stats.norm.ppf(probabilities), evaluations)
             is_frequent = not options.is_for_rare and counts.failures * (most / number) >= ENOUGH
             if valid and counts.failures < RARE_BELOW * valid and not is_frequent:
-                estimate = _rare(response, values, options, counts, bench.study.search.seed)
+                estimate = _rare(response, values, options, counts, evaluator.study.search.seed)
                 if estimate is not None:
                     return estimate
             elif options.is_for_rare:
@@ -296,7 +296,7 @@ def _sampled(bench: Bench, model: VariationModel, unsafe: Unsafe, options: RiskO
         if options.width is not None and high - low <= options.width:
             break
     if not counts.count:
-        raise SimulationError(f"study {bench.study.name!r}: not one of {counts.errors} vehicles could be simulated")
+        raise SimulationError(f"study {evaluator.study.name!r}: not one of {counts.errors} vehicles could be simulated")
     return counts
 
 
@@ -321,12 +321,12 @@ def _rare(response: Response, values: FloatArray, options: RiskOptions, counts: 
         return None
 
 
-def _feasible_vehicles(bench: Bench, model: VariationModel, number: int, rng: np.random.Generator) -> FloatArray:
+def _feasible_vehicles(evaluator: Evaluator, model: VariationModel, number: int, rng: np.random.Generator) -> FloatArray:
     """Vehicles as they vary, without those that violate a constraint; shape (number, n)."""
-    settings = bench.region.sampled(lambda some: model.settings(rng.random((some, len(bench.characteristics)))), number)
+    settings = evaluator.region.sampled(lambda some: model.settings(rng.random((some, len(evaluator.characteristics)))), number)
     if len(settings) < number:
-        raise InputError(f"study {bench.study.name!r}", f"fewer than 1 in {REJECTIONS} vehicles as they vary satisfy the constraints: "
-                         f"{bench.region}", "a [variation] and [[constraints]] that agree")
+        raise InputError(f"study {evaluator.study.name!r}", f"fewer than 1 in {REJECTIONS} vehicles as they vary satisfy the constraints: "
+                         f"{evaluator.region}", "a [variation] and [[constraints]] that agree")
     return settings
 
 
@@ -338,7 +338,7 @@ RESAMPLES = 200
 """Bootstrap samples that the intervals come from."""
 
 
-def sensitivities(bench: Bench, model: VariationModel, unsafe: Unsafe, confidence: float) -> tuple[pd.DataFrame, pd.DataFrame]:
+def sensitivities(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, confidence: float) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Sensitivity of the safety degree, and of being unsafe.
 
     Returns
@@ -350,10 +350,10 @@ def sensitivities(bench: Bench, model: VariationModel, unsafe: Unsafe, confidenc
     """
     from SALib.sample import sobol  # takes a second to load
 
-    seed, names = bench.study.search.seed % 2**32, bench.characteristics.names
+    seed, names = evaluator.study.search.seed % 2**32, evaluator.characteristics.names
     problem = {"num_vars": len(names), "names": list(names), "bounds": [[0.0, 1.0]] * len(names)}
     points = sobol.sample(problem, BASE, calc_second_order=False, seed=seed)
-    evaluations = bench.evaluate(model.settings(np.asarray(points)), "what decides")
+    evaluations = evaluator.evaluate(model.settings(np.asarray(points)), "what decides")
     degree = np.where(evaluations.valid, evaluations.f_safe, np.nan)
     is_unsafe = np.where(evaluations.valid, unsafe.of(evaluations).astype(float), np.nan)
     if min(np.count_nonzero(is_unsafe == outcome) for outcome in (0, 1)) < LEAST_FOR_INDICES:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from safevar_sumo.analysis.evaluator import Bench
+from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -80,9 +80,9 @@ class Estimate:
 class Response:
     """The response g(u), below 0 where it is unsafe; remembers failures and how near to failing whatever is asked was."""
 
-    def __init__(self, bench: Bench, settings_of: Model, unsafe: Unsafe) -> None:
-        self._bench, self._settings_of, self._unsafe = bench, settings_of, unsafe
-        self.dimensions = len(bench.characteristics)
+    def __init__(self, evaluator: Evaluator, settings_of: Model, unsafe: Unsafe) -> None:
+        self._evaluator, self._settings_of, self._unsafe = evaluator, settings_of, unsafe
+        self.dimensions = len(evaluator.characteristics)
         self.simulations = self.errors = self.failed = 0
         self.stage = "rare failures"
         self.expected = 1
@@ -97,7 +97,7 @@ class Response:
     def __call__(self, points: Any) -> FloatArray:
         """The response at points, shape (N, n)."""
         where = np.asarray(points, dtype=float).reshape(-1, self.dimensions)
-        evaluations = self._bench.evaluate(self._settings_of(where), self.stage, self.simulations, max(self.expected, self.simulations))
+        evaluations = self._evaluator.evaluate(self._settings_of(where), self.stage, self.simulations, max(self.expected, self.simulations))
         return self.take(where, evaluations)
 
     def take(self, where: FloatArray, evaluations: Evaluations) -> FloatArray:

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
-from safevar_sumo.analysis.evaluator import CONFIDENCE, Bench, Progress, clopper_pearson, open_bench, silent
+from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, Progress, clopper_pearson, open_evaluator, silent
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.words import joined
 from safevar_sumo.metrics import Unsafe
@@ -125,9 +125,9 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
         If `unsafe` cannot be used, or the study cannot be assembled.
     """
     members = CharacteristicSet.of(study.vehicle.characteristics)
-    with open_bench(study, pool, jobs, progress) as bench:
-        unsafe = bench.criterion(options.unsafe)
-        training, validation = (_design(bench, options.samples // 2, study.search.seed + half) for half in (1, 2))
+    with open_evaluator(study, pool, jobs, progress) as evaluator:
+        unsafe = evaluator.criterion(options.unsafe)
+        training, validation = (_design(evaluator, options.samples // 2, study.search.seed + half) for half in (1, 2))
     is_unsafe, is_unsafe_validation = unsafe.of(training), unsafe.of(validation)
     number = int(np.count_nonzero(is_unsafe))
     remark, boxes = "", list[Limits]()
@@ -143,9 +143,9 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
                  samples=len(training) + len(validation), unsafe_share=float(np.mean(np.concatenate([is_unsafe, is_unsafe_validation]))))
 
 
-def _design(bench: Bench, number: int, seed: int) -> Evaluations:
+def _design(evaluator: Evaluator, number: int, seed: int) -> Evaluations:
     """Evaluated settings over the whole domain, without those that could not be simulated."""
-    evaluations = bench.evaluate(bench.spread(number, seed), "settings over the whole domain")
+    evaluations = evaluator.evaluate(evaluator.spread(number, seed), "settings over the whole domain")
     return evaluations.take(evaluations.valid)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Bench, Progress, finite_or_none, open_bench, silent
+from safevar_sumo.analysis.evaluator import Evaluator, Progress, finite_or_none, open_evaluator, silent
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.joint import Pair, SafeBox, no_box, planes, safe_box
 from safevar_sumo.errors import unknown
@@ -114,17 +114,17 @@ def _ends(part: pd.DataFrame) -> Interval:
     return float(part["value"].iloc[0]), float(part["value"].iloc[-1])
 
 
-def scan(bench: Bench, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATimeScan]:
+def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[OneAtATimeScan]:
     """Scan the domains of some characteristics, one at a time."""
-    members = bench.characteristics.members
-    number, rounds = (RATED_VALUES, RATED_ROUNDS) if is_rated(bench.study) else (VALUES, ROUNDS)
+    members = evaluator.characteristics.members
+    number, rounds = (RATED_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (VALUES, ROUNDS)
     values = [np.union1d(np.linspace(members[column].lower, members[column].upper, number), members[column].original) for column in columns]
-    profiles = _evaluated(bench, columns, values, unsafe)
+    profiles = _evaluated(evaluator, columns, values, unsafe)
     for _ in range(rounds):
         between = [_between_states(profile) for profile in profiles]
         if not any(map(len, between)):
             break
-        finer = _evaluated(bench, columns, between, unsafe)
+        finer = _evaluated(evaluator, columns, between, unsafe)
         profiles = [pd.concat([profile, more], ignore_index=True).sort_values("value", ignore_index=True)
                     for profile, more in zip(profiles, finer, strict=True)]
     return [OneAtATimeScan(characteristic=members[column], profile=profile) for column, profile in zip(columns, profiles, strict=True)]
@@ -143,13 +143,13 @@ def _states(profile: pd.DataFrame) -> npt.NDArray[np.int_]:
     return np.where(profile["valid"], np.where(profile["unsafe"], UNSAFE, SAFE), failed)
 
 
-def _evaluated(bench: Bench, columns: Sequence[int], values: Sequence[FloatArray], unsafe: Unsafe) -> list[pd.DataFrame]:
+def _evaluated(evaluator: Evaluator, columns: Sequence[int], values: Sequence[FloatArray], unsafe: Unsafe) -> list[pd.DataFrame]:
     """Profiles of characteristics at some values each."""
     ends = np.cumsum([len(group) for group in values])
-    settings = np.tile(bench.characteristics.original, (ends[-1], 1))
+    settings = np.tile(evaluator.characteristics.original, (ends[-1], 1))
     for column, group, end in zip(columns, values, ends, strict=True):
         settings[end - len(group):end, column] = group
-    evaluations = bench.evaluate(settings, "one characteristic at a time")
+    evaluations = evaluator.evaluate(settings, "one characteristic at a time")
     frame = pd.DataFrame({"value": np.concatenate(values), SAFETY_DEGREE: evaluations.f_safe, "outcome": evaluations.outcome,
                           "unsafe": unsafe.of(evaluations), "valid": evaluations.valid})
     if RATING_POINTS.name in evaluations.metrics:
@@ -217,14 +217,14 @@ def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | Non
         If `unsafe` or a name cannot be used, or the study cannot be assembled.
     """
     columns = _columns(study, options.characteristics)
-    with open_bench(study, pool, jobs, progress) as bench:
-        original = bench.original()
-        unsafe = bench.criterion(options.unsafe, original)
-        alone = scan(bench, columns, unsafe)
-        pairs = planes(bench, columns, unsafe) if options.pairs else None
+    with open_evaluator(study, pool, jobs, progress) as evaluator:
+        original = evaluator.original()
+        unsafe = evaluator.criterion(options.unsafe, original)
+        alone = scan(evaluator, columns, unsafe)
+        pairs = planes(evaluator, columns, unsafe) if options.pairs else None
         is_safe = not unsafe.of(original)[0]
         boxed = is_safe and not is_rated(study)  # thousands of whole matrices
-        box = safe_box(bench, columns, unsafe, _unsafe_settings(bench, alone, pairs or [])) if boxed else no_box(bench, columns)
+        box = safe_box(evaluator, columns, unsafe, _unsafe_settings(evaluator, alone, pairs or [])) if boxed else no_box(evaluator, columns)
     return Tolerance(study=study, unsafe=unsafe, original=original, alone=alone, pairs=pairs, joint=box)
 
 
@@ -236,9 +236,9 @@ def _columns(study: Study, characteristics: Sequence[str] | None) -> list[int]:
     return [column for column, name in enumerate(names) if characteristics is None or name in characteristics]
 
 
-def _unsafe_settings(bench: Bench, alone: Sequence[OneAtATimeScan], pairs: Sequence[Pair]) -> FloatArray:
+def _unsafe_settings(evaluator: Evaluator, alone: Sequence[OneAtATimeScan], pairs: Sequence[Pair]) -> FloatArray:
     """The unsafe settings of scans and pairs, shape (K, n)."""
     changes = [{scan.characteristic.name: value} for scan in alone for interval in scan.unsafe for value in interval]
     changes += [dict(zip((member.name for member in pair.characteristics), pair.nearest, strict=True)) for pair in pairs if pair.nearest]
-    original = dict(zip(bench.characteristics.names, bench.characteristics.original.tolist(), strict=True))
+    original = dict(zip(evaluator.characteristics.names, evaluator.characteristics.original.tolist(), strict=True))
     return np.array([list({**original, **values}.values()) for values in changes]).reshape(-1, len(original))

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from safevar_sumo.analysis.evaluator import CONFIDENCE, Bench, sobol_points
+from safevar_sumo.analysis.evaluator import CONFIDENCE, Evaluator, sobol_points
 from safevar_sumo.analysis.explain.causes import Line, first_unsafe
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, FloatArray
@@ -69,31 +69,32 @@ class Pair:
                 "nearest": None if self.nearest is None else dict(zip(names, self.nearest, strict=True))}
 
 
-def planes(bench: Bench, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
+def planes(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
     """Every pair of some characteristics; where one is unsafe, with its nearest unsafe setting."""
-    members, original = bench.characteristics.members, bench.characteristics.original
+    members, original = evaluator.characteristics.members, evaluator.characteristics.original
     chosen = list(combinations(columns, 2))
     axes = {column: np.linspace(members[column].lower, members[column].upper, SIDE) for column in columns}
     settings = np.tile(original, (len(chosen), SIDE, SIDE, 1))
     for group, (first, second) in zip(settings, chosen, strict=True):
         group[:, :, first], group[:, :, second] = axes[first][:, np.newaxis], axes[second]
-    evaluations = bench.evaluate(settings.reshape(-1, len(original)), "two characteristics at a time")
+    evaluations = evaluator.evaluate(settings.reshape(-1, len(original)), "two characteristics at a time")
     shape = (len(chosen), SIDE, SIDE)
     degrees, valid, infeasible = (values.reshape(shape) for values in (evaluations.f_safe, evaluations.valid, evaluations.infeasible))
     is_unsafe = unsafe.of(evaluations).reshape(shape)
-    nearest = _nearest(bench, chosen, is_unsafe, unsafe)
+    nearest = _nearest(evaluator, chosen, is_unsafe, unsafe)
     return [Pair(characteristics=(members[first], members[second]), values=np.stack([axes[first], axes[second]]), safety_degree=degrees[i],
                  unsafe=is_unsafe[i], valid=valid[i], infeasible=infeasible[i], nearest=nearest.get(i))
             for i, (first, second) in enumerate(chosen)]
 
 
-def _nearest(bench: Bench, chosen: Sequence[tuple[int, int]], is_unsafe: BoolArray, unsafe: Unsafe) -> dict[int, tuple[float, float]]:
+def _nearest(evaluator: Evaluator, chosen: Sequence[tuple[int, int]], is_unsafe: BoolArray,
+             unsafe: Unsafe) -> dict[int, tuple[float, float]]:
     """Of every plane that has one, the unsafe setting nearest to the original, in widths of the domains.
 
     A branch and bound search: squares with an unsafe corner are divided into smaller ones, as long as a place in them is nearer than
     the nearest unsafe setting so far; of each plane the `SQUARES` nearest ones at a time.
     """
-    members = bench.characteristics
+    members = evaluator.characteristics
     which = np.array(chosen, dtype=int).reshape(-1, 2)
     original, width = members.original[which], (members.upper - members.lower)[which]
     lower, size = members.lower[which], width / (SIDE - 1)
@@ -124,7 +125,7 @@ def _nearest(bench: Bench, chosen: Sequence[tuple[int, int]], is_unsafe: BoolArr
         values = np.minimum(np.repeat(corner, len(steps), axis=0) + np.tile(steps, (len(kept), 1)) * size[plane], (lower + width)[plane])
         settings = np.tile(members.original, (len(values), 1))
         np.put_along_axis(settings, which[plane], values, axis=1)
-        hits = unsafe.of(bench.evaluate(settings, "nearest unsafe settings"))
+        hits = unsafe.of(evaluator.evaluate(settings, "nearest unsafe settings"))
         improve(plane[hits], values[hits])
         square, i, j = np.nonzero(_with_unsafe_corner(hits.reshape(len(kept), PARTS + 1, PARTS + 1)))
         square_of, corner = square_of[square], corner[square] + np.stack([i, j], axis=1) * size[square_of[square]]
@@ -169,12 +170,12 @@ class SafeBox(NamedTuple):
         return {**self._asdict(), "characteristics": list(self.characteristics)}
 
 
-def no_box(bench: Bench, columns: Sequence[int], attempts: int = 0) -> SafeBox:
+def no_box(evaluator: Evaluator, columns: Sequence[int], attempts: int = 0) -> SafeBox:
     """The result where the original vehicle itself is unsafe, or settings however near to it."""
-    return SafeBox(0.0, CONFIDENCE, 0, 0, attempts, 1.0, tuple(bench.characteristics.names[column] for column in columns))
+    return SafeBox(0.0, CONFIDENCE, 0, 0, attempts, 1.0, tuple(evaluator.characteristics.names[column] for column in columns))
 
 
-def safe_box(bench: Bench, columns: Sequence[int], unsafe: Unsafe, beyond: FloatArray) -> SafeBox:
+def safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, beyond: FloatArray) -> SafeBox:
     """The largest safe box around an original vehicle that is safe itself.
 
     Parameters
@@ -196,39 +197,39 @@ def safe_box(bench: Bench, columns: Sequence[int], unsafe: Unsafe, beyond: Float
     alpha_k at the most; all tests together fail with probability sum alpha_k <= alpha, whichever of them accepts. Later tests draw more
     settings, so that the bound stays `UNSAFE_AT_MOST` if all of them can be simulated.
     """
-    factor = min(1.0, STEP_BACK * float(np.min(_reach(bench, beyond), initial=np.inf)))
+    factor = min(1.0, STEP_BACK * float(np.min(_reach(evaluator, beyond), initial=np.inf)))
     attempt = 0
     for search in range(10**6):
         if factor < SMALLEST:
             break
         for number in (PROBE, SEARCHED):
-            sobol = sobol_points(number, len(columns), bench.study.search.seed + search)
+            sobol = sobol_points(number, len(columns), evaluator.study.search.seed + search)
             points = np.concatenate([sobol, np.round(sobol)])  # and corners
-            hits, _ = _unsafe_of(bench, factor, _in_box(bench, columns, factor, points), unsafe)
+            hits, _ = _unsafe_of(evaluator, factor, _in_box(evaluator, columns, factor, points), unsafe)
             if len(hits):
                 break
         else:
             attempt += 1
             error = (1 - CONFIDENCE) / 2**attempt
             samples = math.ceil(math.log(error) / math.log1p(-UNSAFE_AT_MOST))
-            settings = _drawn_in_box(bench, columns, factor, samples, np.random.default_rng((bench.study.search.seed, attempt)))
+            settings = _drawn_in_box(evaluator, columns, factor, samples, np.random.default_rng((evaluator.study.search.seed, attempt)))
             samples = len(settings)
-            hits, failed = _unsafe_of(bench, factor, settings, unsafe)
+            hits, failed = _unsafe_of(evaluator, factor, settings, unsafe)
             if not len(hits):
                 share = float(scipy.stats.beta.ppf(1 - error, failed + 1, samples - failed)) if failed < samples else 1.0
                 return SafeBox(factor, CONFIDENCE, samples, failed, attempt, share,
-                               tuple(bench.characteristics.names[column] for column in columns))
-        near = hits[np.argsort(_reach(bench, hits), kind="stable")[:FOLLOWED]]
-        lines = [Line(bench.characteristics.original, end, 0.0) for end in near]
-        shares = first_unsafe(bench, lines, unsafe, "nearest unsafe settings")
+                               tuple(evaluator.characteristics.names[column] for column in columns))
+        near = hits[np.argsort(_reach(evaluator, hits), kind="stable")[:FOLLOWED]]
+        lines = [Line(evaluator.characteristics.original, end, 0.0) for end in near]
+        shares = first_unsafe(evaluator, lines, unsafe, "nearest unsafe settings")
         edge = np.stack([line.at(np.array([share]))[0] for line, share in zip(lines, shares, strict=True)])
-        factor = min(factor, float(np.min(_reach(bench, edge)))) * STEP_BACK
-    return no_box(bench, columns, attempt)
+        factor = min(factor, float(np.min(_reach(evaluator, edge)))) * STEP_BACK
+    return no_box(evaluator, columns, attempt)
 
 
-def _in_box(bench: Bench, columns: Sequence[int], factor: float, points: FloatArray) -> FloatArray:
+def _in_box(evaluator: Evaluator, columns: Sequence[int], factor: float, points: FloatArray) -> FloatArray:
     """Settings in a box around the original, from points of the unit cube; shape (K, n)."""
-    members, which = bench.characteristics, list(columns)
+    members, which = evaluator.characteristics, list(columns)
     lower = members.original - factor * (members.original - members.lower)
     upper = members.original + factor * (members.upper - members.original)
     settings = np.tile(members.original, (len(points), 1))
@@ -236,20 +237,20 @@ def _in_box(bench: Bench, columns: Sequence[int], factor: float, points: FloatAr
     return settings
 
 
-def _drawn_in_box(bench: Bench, columns: Sequence[int], factor: float, number: int, rng: np.random.Generator) -> FloatArray:
+def _drawn_in_box(evaluator: Evaluator, columns: Sequence[int], factor: float, number: int, rng: np.random.Generator) -> FloatArray:
     """Feasible settings drawn uniformly in a box; fewer than `number` where hardly any is feasible."""
-    return bench.region.sampled(lambda some: _in_box(bench, columns, factor, rng.random((some, len(columns)))), number)
+    return evaluator.region.sampled(lambda some: _in_box(evaluator, columns, factor, rng.random((some, len(columns)))), number)
 
 
-def _unsafe_of(bench: Bench, factor: float, settings: FloatArray, unsafe: Unsafe) -> tuple[FloatArray, int]:
+def _unsafe_of(evaluator: Evaluator, factor: float, settings: FloatArray, unsafe: Unsafe) -> tuple[FloatArray, int]:
     """The unsafe settings, shape (K, n), and the number of feasible ones that could not be simulated."""
-    evaluations = bench.evaluate(settings, f"all characteristics within {factor:.0%} of the domain")
+    evaluations = evaluator.evaluate(settings, f"all characteristics within {factor:.0%} of the domain")
     return settings[unsafe.of(evaluations)], int(np.count_nonzero(~evaluations.valid & ~evaluations.infeasible))
 
 
-def _reach(bench: Bench, settings: FloatArray) -> FloatArray:
+def _reach(evaluator: Evaluator, settings: FloatArray) -> FloatArray:
     """Factor of the box that has a setting on its surface, shape (K,)."""
-    members = bench.characteristics
+    members = evaluator.characteristics
     change = settings - members.original
     room = np.where(change < 0, members.original - members.lower, members.upper - members.original)
     return np.asarray(np.max(np.divide(np.abs(change), room, out=np.zeros_like(change), where=room > 0), axis=1, initial=0.0))
