@@ -25,11 +25,11 @@ class Krauss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     cruise_speed
         Desired speed [m/s].
     standing_gap
-        Gap at which it means to stand [m].
+        Intended gap at standstill [m].
     braking_share
-        Share of the original's greatest deceleration that it plans with [-].
+        Planned deceleration as a share of the original vehicle's greatest one [-].
     reaction_time
-        Time that it plans to lose before it brakes [s].
+        Planned time until braking begins [s].
     """
 
     cruise_speed: Annotated[float, Meta(gt=0)] = 13.89

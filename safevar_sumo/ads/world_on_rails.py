@@ -14,9 +14,9 @@ NotNegative = Annotated[float, Meta(ge=0, le=60)]
 Throttle = Annotated[float, Meta(ge=0, le=1)]
 Delay = Annotated[float, Meta(ge=0, le=5)]
 SPEED_LIMIT = 20 / KMH
-"""Above this speed the agent releases the throttle [m/s] (its source, 20 km/h)."""
+"""Above this speed the agent releases the throttle [m/s] (20 km/h in its source code)."""
 SPEED_LEVELS = (0.0, 8 / 3, 16 / 3)
-"""Speeds between which the policy is interpolated, up to the speed limit [m/s] (its source: four in 0..8 m/s)."""
+"""Speeds between which the policy is interpolated, up to the speed limit [m/s] (four levels in 0..8 m/s in its source code)."""
 PASSED = -0.5
 """Gap at which an obstacle is beside the vehicle rather than ahead [m]."""
 
@@ -43,9 +43,9 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     latency
         Time from an image to its command [s], rounded to whole steps.
     corridor
-        Half the width of the corridor in which it brakes for obstacles; it releases the brake when they leave it [m].
+        Half the width of the corridor in which the policy brakes for obstacles; it releases the brake when they leave the corridor [m].
     brake_gap, brake_gap_per_speed
-        It brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s] for an obstacle at `brake_place`.
+        The policy brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s] for an obstacle at `brake_place`.
     brake_place, brake_gap_before, brake_gap_past
         The braking gap shrinks by `brake_gap_before` for each metre that the obstacle is short of `brake_place`, and by `brake_gap_past`
         for each metre past it [m, -, -]: the policy brakes later for obstacles that enter or leave the way. What remains of the gap is

@@ -153,7 +153,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     """The answer; a table of the algorithms' solutions and the original; the most critical setting; RQ1 and RQ2 in brief."""
     from safevar_sumo.analysis.explain.summary import lead
     from safevar_sumo.analysis.research_questions.case import case_of
-    from safevar_sumo.analysis.research_questions.over_runs import brief  # takes longer to load than all the rest
+    from safevar_sumo.analysis.research_questions.over_runs import summary_lines  # takes longer to load than all the rest
 
     names = tuple(study.vehicle.characteristics)
     solutions = solutions_frame(names, campaign.solutions.items())
@@ -185,7 +185,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     _print_most_critical(console, study, campaign)
     case = case_of(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
                    scoring=campaign.scoring)
-    for line in brief(case):
+    for line in summary_lines(case):
         print_text(console, line)
     print_text(console, f"All tables: {RUN} tables {shlex.quote(str(directory))}")
 

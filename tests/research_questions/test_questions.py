@@ -25,7 +25,7 @@ from safevar_sumo.analysis.research_questions.changes import (
     weather_pairs,
 )
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, rq1, rq2
-from safevar_sumo.analysis.research_questions.over_runs import brief, difference_line, holm, rq1_runs, rq2_runs
+from safevar_sumo.analysis.research_questions.over_runs import difference_line, holm, rq1_runs, rq2_runs, summary_lines
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import CharacteristicTable
 from tests.research_questions.made_up import CHARACTERISTICS, ORIGINAL, made_up, made_up_study, row
@@ -206,10 +206,10 @@ def test_several_settings_stand_in_one_frame_and_the_refused_in_the_notes() -> N
 
 def test_the_brief_lines_say_what_the_data_allows() -> None:
     five = made_up(*(row(name, run=run, sd=sd + run / 10) for name, sd in (("nsga2", 1.0), ("rs", 2.5)) for run in range(5)))
-    lines = brief(five)
+    lines = summary_lines(five)
     assert any("NSGA-II: SD 0.00, " in line and line.endswith("too few runs for a test (8 are needed)") for line in lines)
     assert any("RS: IGD " in line and "too few" not in line for line in lines), "five runs against five can differ significantly"
-    assert any("RQ2: has finished runs of nsga2 alone" in line for line in brief(made_up(row())))
+    assert any("RQ2: has finished runs of nsga2 alone" in line for line in summary_lines(made_up(row())))
 
 
 def test_holms_correction_of_a_worked_example() -> None:

@@ -98,8 +98,8 @@ def attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
         fronts = [front for front in fronts if len(front)]
         if fronts:
             sets = np.repeat(np.arange(len(fronts)), [len(front) for front in fronts])
-            wanted = sorted({100 / len(fronts), *ATTAINED})
-            points = moocore.eaf(np.concatenate(fronts), sets, percentiles=wanted)
+            percentages = sorted({100 / len(fronts), *ATTAINED})
+            points = moocore.eaf(np.concatenate(fronts), sets, percentiles=percentages)
             levels = np.unique(points[:, 2])
             surfaces[algorithm] = {level: (group := points[points[:, 2] == level, :2])[np.argsort(group[:, 0], kind="stable")] * signs
                                    for level in levels.tolist()}
@@ -113,7 +113,7 @@ def _samples(case: Case, fewest: int) -> Mapping[str, tuple[bool, dict[str, pd.S
     if not case.has_runs:
         case.runs_of(next(iter(case.algorithms), ""))  # says why there is no answer
     if len(case.algorithms) < fewest:
-        raise Unanswerable(case.name, f"has finished runs of {len(case.algorithms)} algorithms: {', '.join(case.algorithms) or 'none'}",
+        raise Unanswerable(case.name, f"has finished runs of {len(case.algorithms)} algorithms ({', '.join(case.algorithms) or 'none'})",
                            f"results of {fewest} algorithms or more")
     samples: dict[str, tuple[bool, dict[str, pd.Series[float]]]] = {}
     if len(case.solutions):

@@ -27,9 +27,9 @@ from safevar_sumo.metrics import SAFEVAR, MetricFacts
 
 Frames = dict[str, pd.DataFrame]
 SAFETY = "rq3.3-safety"
-"""The footer of RQ3.3's table, a table of its own."""
+"""Name of the table with the effect on safety, the footer of the paper's table of RQ3.3."""
 
-OF_A_CASE: Mapping[str, Callable[[Case], Frames]] = {
+FRAMES_OF_ONE_CASE: Mapping[str, Callable[[Case], Frames]] = {
     "rq1": lambda case: {"rq1": rq1(case)},
     "rq2": lambda case: {"rq2": rq2(case)},
     "rq1-runs": lambda case: {"rq1-runs": rq1_runs(case)},
@@ -43,11 +43,11 @@ OF_A_CASE: Mapping[str, Callable[[Case], Frames]] = {
     "combinations": lambda case: {"combinations": combinations(case)},
 }
 WEATHER = "weather"
-QUESTIONS = (*OF_A_CASE, WEATHER)
+QUESTIONS = (*FRAMES_OF_ONE_CASE, WEATHER)
 
 
 class Answer(NamedTuple):
-    """The answer to a question: a tidy frame over all cases (empty if none can be asked), notes about it, and its metrics."""
+    """The answer to a question: a tidy frame over all cases (empty if no case holds an answer), notes on the frame, and its metrics."""
 
     name: str
     frame: pd.DataFrame
@@ -61,7 +61,7 @@ def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
     Raises
     ------
     InputError
-        If there is no such question, or no case holds what the one question, or any, asks for.
+        If there is no such question, or no case holds an answer.
     """
     if question is not None and question not in QUESTIONS:
         raise unknown("question", f"there is no question {question!r}", question, QUESTIONS)
@@ -75,21 +75,24 @@ def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
             answers.append(Answer(name, pd.DataFrame(), tuple(notes)))
         for table, frames in tables.items():
             frame = pd.concat(frames, ignore_index=True)
-            inside = {*frame["setting"], *frame["other"]} if name == WEATHER else set(names) - {error.source for error in refused}
-            about = [note for case in cases if case.name in inside for note in _notes(name, case)]
-            answers.append(Answer(table, frame, tuple(dict.fromkeys([*notes, *about])), metrics))
+            answered_cases = {*frame["setting"], *frame["other"]} if name == WEATHER else set(names) - {error.source for error in refused}
+            case_notes = [note for case in cases if case.name in answered_cases for note in _notes(name, case)]
+            answers.append(Answer(table, frame, tuple(dict.fromkeys([*notes, *case_notes])), metrics))
     if refusals and all(one.frame.empty for one in answers):
         raise refusals[0]
     return answers
 
 
 def _ask(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd.DataFrame]], list[Unanswerable]]:
-    """The frames of a question by table, and why some cases have none."""
+    """The frames of a question by table, and the reason for each case that has no frame."""
     tables: dict[str, list[pd.DataFrame]] = {}
     refused = []
     for group in [cases] if name == WEATHER else [[case] for case in cases]:
         try:
-            frames = {WEATHER: pd.concat([weather(*pair) for pair in weather_pairs(group)])} if name == WEATHER else OF_A_CASE[name](*group)
+            if name == WEATHER:
+                frames = {WEATHER: pd.concat([weather(*pair) for pair in weather_pairs(group)])}
+            else:
+                frames = FRAMES_OF_ONE_CASE[name](*group)
             for table, frame in frames.items():
                 tables.setdefault(table, []).append(frame)
         except Unanswerable as error:

@@ -11,7 +11,7 @@ import numpy as np
 from safevar_sumo.analysis.figures import FONT, as_formula, literal, new_figure, panels
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, Case, Unanswerable
 from safevar_sumo.analysis.research_questions.changes import ANY, critical, effects, rq31, rq32
-from safevar_sumo.analysis.research_questions.indicators import WORST, convergence, nondominated, objectives
+from safevar_sumo.analysis.research_questions.indicators import REFERENCE_COORDINATE, convergence, nondominated, objectives
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, Objective
 from safevar_sumo.study import SAFETY_DEGREE
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's, which colour-blind readers can tell apart; markers and line styles repeat the distinction."""
+"""Okabe and Ito's colours, which colour-blind readers can tell apart; each has its own marker and line style, too."""
 MARKERS, DASHES = ("o", "X", "^", "s", "D", "v"), ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
 INCREASE, DECREASE = COLOURS[1], COLOURS[0]
 OBJECTIVE_TITLES = {"f_safe": "f_safe: safety degree [m, -m/s]", "f_diff": "f_diff: largest change [fraction of the original]",
                     "f_num_diff": "f_numDiff: characteristics changed"}
 LONG_NAME = 28
-"""Letters that fit above a small axis."""
+"""Number of letters that fit above a small axis."""
 PANELS = 3
-"""Panels of cases in a row."""
+"""Number of panels in a row."""
 BINS = 24
-"""Bins over a characteristic's domain."""
+"""Number of bins over a characteristic's domain."""
 
 
 def number_of_changes(cases: Sequence[Case]) -> Figure:
@@ -57,7 +57,7 @@ def number_of_changes(cases: Sequence[Case]) -> Figure:
 
 
 def changed_characteristics(case: Case) -> Figure:
-    """RQ3.2: in which share of the critical solutions with j changed each characteristic is changed, as a heat map."""
+    """RQ3.2 as a heat map: the share of critical solutions with j changed characteristics in which each characteristic is changed."""
     import seaborn as sns
 
     _number_critical(case)
@@ -79,7 +79,7 @@ def changed_characteristics(case: Case) -> Figure:
 
 
 def sizes_of_changes(case: Case) -> Figure:
-    """How each characteristic is changed in the critical solutions: the distribution of its signed changes."""
+    """The distribution of each characteristic's signed changes in the critical solutions."""
     import seaborn as sns
 
     total = _number_critical(case)
@@ -110,9 +110,9 @@ def sizes_of_changes(case: Case) -> Figure:
 
 
 def pareto_fronts(case: Case) -> Figure:
-    """The non-dominated solutions of each algorithm, all its runs together, in every pair of objectives.
+    """The non-dominated solutions of each algorithm, from all its runs together, for every pair of objectives.
 
-    Beside them the original vehicle, and the line at and left of which a solution is a collision.
+    Each panel also shows the original vehicle; solutions on the dashed line or left of it are collisions.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def pareto_fronts(case: Case) -> Figure:
     columns = len(pairs) // rows
     figure, axes = new_figure(f"{case.name}: non-dominated solutions of each algorithm, all runs together", rows, columns,
                            (max(3.2 * columns, 5), 3.7 * rows))
-    original = [_of_original(case, one) for one in goals]
+    original = [_original_value(case, one) for one in goals]
     for axis, (first, second) in zip(axes.flat, pairs, strict=True):
         for i, (algorithm, points) in enumerate(fronts.items()):
             axis.plot(points[:, first], points[:, second], linestyle="", marker=MARKERS[i % len(MARKERS)], markersize=4, alpha=0.6,
@@ -152,15 +152,15 @@ def objective_title(objective: Objective) -> str:
     return OBJECTIVE_TITLES.get(objective.name) or f"{literal(objective.title)} [{as_formula(objective.unit)}]"
 
 
-def _of_original(case: Case, objective: Objective) -> float:
-    """The original vehicle's value; NaN where it is unknown."""
+def _original_value(case: Case, objective: Objective) -> float:
+    """The original vehicle's value of an objective; NaN if it is unknown."""
     if objective.name in (F_DIFF.name, F_NUM_DIFF.name):
         return 0.0
     return case.original.get(SAFETY_DEGREE if objective == F_SAFE else objective.name, np.nan)
 
 
 def hypervolume_growth(case: Case) -> Figure:
-    """Convergence: the hypervolume of all settings so far against evaluations, median and range over the runs."""
+    """Convergence: the hypervolume of all settings so far over the number of evaluations, as median and range over the runs."""
     growth = convergence(case)
     figure, ((axis,),) = new_figure(f"{case.name}: convergence", 1, 1, (6.4, 4.0))
     for i, (algorithm, group) in enumerate(growth.groupby("algorithm", sort=False)):
@@ -172,13 +172,14 @@ def hypervolume_growth(case: Case) -> Figure:
         axis.plot(over.index, over["median"], color=colour, linestyle=DASHES[i % len(DASHES)], linewidth=1.8,
                   label=f"{_title(str(algorithm))} ({group['run'].nunique()} runs)")
     axis.set_xlabel("evaluations")
-    axis.set_ylabel(f"hypervolume of all found, normalised\n(thick: median, thin: range over runs; reference point {WORST:g})")
+    axis.set_ylabel(f"normalised hypervolume of all settings so far\n"
+                    f"(thick: median, thin: range over runs; reference point {REFERENCE_COORDINATE:g})")
     legend_below(figure, axis)
     return _spaced(figure)
 
 
 def _spaced(figure: Figure) -> Figure:
-    """The figure with room between its axes."""
+    """The figure, with space between its axes."""
     figure.set_layout_engine("constrained", w_pad=0.1)
     return figure
 

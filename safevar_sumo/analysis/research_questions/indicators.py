@@ -16,12 +16,12 @@ from safevar_sumo.records import FloatArray
 
 MORE_IS_BETTER = {"igd": False, "igd_plus": False, "hypervolume": True}
 INDICATOR_TITLES = {"igd": "IGD", "igd_plus": "IGD+", "hypervolume": "HV"}
-WORST = 1.1
-"""Each coordinate of hypervolume's reference point, on objectives normalised to 0..1: the nadir, a tenth further away."""
+REFERENCE_COORDINATE = 1.1
+"""Each coordinate of the hypervolume's reference point for objectives normalised to 0..1: a tenth beyond the nadir."""
 
 
 def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
-    """What metrics and quality indicators are called in tables, by name."""
+    """Titles of metrics and quality indicators in tables, by name."""
     return {**INDICATOR_TITLES, **{metric.name: metric.title for metric in metrics}}
 
 
@@ -36,11 +36,11 @@ def igd(front: FloatArray, reference: FloatArray) -> float:
 
 
 def igd_plus(front: FloatArray, reference: FloatArray) -> float:
-    """As IGD, of distances that only count where `front` is worse."""
+    """IGD with distances to which only those objectives contribute in which `front` is worse."""
     return float(moocore.igd_plus(_checked(front, "the front"), ref=_checked(reference, "the reference front")))
 
 
-def hypervolume(front: FloatArray, worst: float = WORST) -> float:
+def hypervolume(front: FloatArray, worst: float = REFERENCE_COORDINATE) -> float:
     """The volume between `front` and the point (worst, ..., worst)."""
     points = _checked(front, "the front")
     return float(moocore.hypervolume(points, ref=np.full(points.shape[1], worst)))
@@ -54,7 +54,7 @@ class Scale(NamedTuple):
 
     @classmethod
     def of(cls, reference: FloatArray) -> Scale:
-        """By a reference front's best and worst value of each objective; where those are equal the width is 1."""
+        """The scale from the best to the worst value of each objective in a reference front; the width is 1 if both are equal."""
         ideal, nadir = reference.min(axis=0), reference.max(axis=0)
         return cls(ideal, np.where(nadir > ideal, nadir - ideal, 1.0))
 
@@ -88,7 +88,7 @@ def reference_front(case: Case) -> FloatArray:
 
 
 def indicators(case: Case) -> pd.DataFrame:
-    """IGD, IGD+ and hypervolume of every finished run that has solutions; columns algorithm, run and theirs.
+    """IGD, IGD+ and hypervolume of every finished run that has solutions; columns algorithm, run, igd, igd_plus and hypervolume.
 
     Raises
     ------
@@ -100,13 +100,13 @@ def indicators(case: Case) -> pd.DataFrame:
     if runs:
         reference = reference_front(case)
         scale = Scale.of(reference)
-        normal = scale.normalised(reference)
+        scaled_reference = scale.normalised(reference)
     by_run = dict(list(case.solutions.groupby(["algorithm", "run"])))
     for algorithm, run in runs:
         front = objectives(case, by_run[algorithm, run]) if (algorithm, run) in by_run else np.zeros((0, 0))
         if len(front):
             scaled = scale.normalised(front)
-            rows.append((algorithm, run, igd(front, reference), igd_plus(scaled, normal), hypervolume(scaled)))
+            rows.append((algorithm, run, igd(front, reference), igd_plus(scaled, scaled_reference), hypervolume(scaled)))
     return pd.DataFrame(rows, columns=["algorithm", "run", *MORE_IS_BETTER])
 
 
@@ -138,12 +138,12 @@ def _growth(case: Case, evaluations: pd.DataFrame, scale: Scale, grid: np.ndarra
     defined = np.isfinite(scaled).all(axis=1)
     scaled, places = scaled[defined], evaluations["evaluation"].to_numpy()[defined]
     ends = np.searchsorted(places, grid, side="left")
-    front, grown = np.zeros((0, scaled.shape[1])), []
+    front, volumes = np.zeros((0, scaled.shape[1])), []
     for start, end in zip([0, *ends[:-1]], ends, strict=True):
         front = np.concatenate([front, scaled[start:end]])
         front = nondominated(front) if len(front) else front
-        grown.append(hypervolume(front) if len(front) else 0.0)
-    return grown
+        volumes.append(hypervolume(front) if len(front) else 0.0)
+    return volumes
 
 
 def _checked(points: FloatArray, what: str) -> FloatArray:

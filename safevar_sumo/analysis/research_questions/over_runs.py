@@ -1,7 +1,7 @@
-"""RQ1 and RQ2 over runs: one mean for each run, so that the values of a test are independent; corrected for their number.
+"""RQ1 and RQ2 over runs: one mean for each run, so that the values of a test are independent; p-values corrected for the number of tests.
 
 The paper pools the solutions of all runs and repeats the original's value to the sample's size. Solutions of one run resemble each
-other, and a repeated value is no sample: p-values become too small. Here every run gives one value.
+other, and a repeated value is no sample: p-values become too small. Here each run contributes one value.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ def rq2_runs(case: Case) -> pd.DataFrame:
     Unanswerable
         If the solutions belong to no run, or NSGA-II or every other algorithm is missing.
     """
-    own = _corrected(case)[1]
-    if own is None:
+    frame = _corrected(case)[1]
+    if frame is None:
         rq2(case)  # says why there is no answer
         raise Unanswerable(case.name, "has no runs to compare", "results of nsga2 and another algorithm")
-    return own
+    return frame
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
@@ -71,9 +71,9 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 
 
 def signed_rank(sample: FloatArray, value: float) -> TwoSampleTest:
-    """A sample of independent values against one value, shape (N,): Wilcoxon's test and the share of greater values (A12).
+    """Compare independent values, shape (N,), with one value: Wilcoxon's test, and the share of greater values (A12).
 
-    Values equal to `value` are dropped from the test (Wilcoxon's own way) and count half in the effect size.
+    Values equal to `value` are dropped from the test (as Wilcoxon did) and count half in the effect size.
     """
     if not sample.size or np.isnan(value):
         return TwoSampleTest(None, None, None, len(sample), 0, None)
@@ -88,12 +88,12 @@ def signed_rank(sample: FloatArray, value: float) -> TwoSampleTest:
 
 
 def fewest_runs(question: str) -> int:
-    """The least number of runs at which a test of this question can be significant at all, before any correction."""
+    """Least number of runs with which a test of this question can be significant before any correction."""
     return next(n for n in range(1, 100) if 2 / (2**n if question == "RQ1" else math.comb(2 * n, n)) < ALPHA)
 
 
 def difference_line(case: Case) -> str:
-    """Which tests are significant (p < ALPHA) in the paper's way and not over runs, or the other way round; a single line.
+    """One line: the tests that are significant (p < ALPHA) for the paper's pooled solutions but not over runs, or only over runs.
 
     Such as "... RQ2 SafeFuzzer TET loses its star (p 3.8e-4 to 0.059, 0.23 after Holm)".
 
@@ -106,13 +106,13 @@ def difference_line(case: Case) -> str:
     first, second = _corrected(case)
     sides = [("RQ1", "algorithm", rq1(case), first), *([] if second is None else [("RQ2", "baseline", rq2(case), second)])]
     changes, number = [], 0
-    for question, who, paper, runs in sides:
+    for question, group_column, paper, runs in sides:
         for old, new in zip(paper.to_dict("records"), runs.to_dict("records"), strict=True):
             before, after = old["p_value"], new["p_holm"]
             number += after is not None
             if before is None or after is None or (before < ALPHA) == (after < ALPHA):
                 continue
-            name = ALGORITHM_TITLES.get(old[who], old[who])
+            name = ALGORITHM_TITLES.get(old[group_column], old[group_column])
             verb = "loses" if before < ALPHA else "gains"
             changes.append(f"{question} {name} {titles[old['metric']]} {verb} its star (p {_p(before)} to {_p(new['p_value'])}, "
                            f"{_p(after)} after Holm)")
@@ -120,35 +120,35 @@ def difference_line(case: Case) -> str:
             f"{'; '.join(changes) or 'the same tests are significant'}.")
 
 
-def brief(case: Case) -> list[str]:
-    """RQ1 and RQ2 for the end of a study: effect sizes over runs, an asterisk where significant; and what differs from pooling.
+def summary_lines(case: Case) -> list[str]:
+    """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, an asterisk for significant ones, and `difference_line`.
 
-    Where runs are too few for a significant difference, the line says so.
+    If there are too few runs for a significant difference, the line says so.
     """
     titles = titles_of(case.scoring.metrics)
-    lines, enough = [], False
-    for question, ask, who, meaning in BRIEF:
+    lines, any_testable = [], False
+    for question, ask, group_column, meaning in SUMMARISED:
         try:
             frame = ask(case)
         except Unanswerable as error:
             lines.append(f"{question}: {error.problem}.")
             continue
         lines.append(f"{question}: {meaning}; * p < {ALPHA:g} after Holm's correction")
-        for name, group in frame.groupby(who, sort=False):
+        for name, group in frame.groupby(group_column, sort=False):
             rows = group.to_dict("records")
             defined = [row for row in rows if row["effect_size"] is not None]
             few = [titles[row["metric"]] for row in defined if min(row.get("runs", np.inf), row.get("n1", np.inf), row.get("n2", np.inf))
                    < fewest_runs(question)]
-            enough = enough or len(few) < len(defined)
+            any_testable = any_testable or len(few) < len(defined)
             subject = "" if len(few) == len(defined) else f"{', '.join(few)}: "
             note = f"; {subject}too few runs for a test ({fewest_runs(question)} are needed)" if few else ""
             effects = ", ".join(f"{titles[row['metric']]} " + ("-" if row["effect_size"] is None or row["p_holm"] is None else
                                 f"{row['effect_size']:.2f}{'*' if row['p_holm'] < ALPHA else ''}") for row in rows)
             lines.append(f"  {ALGORITHM_TITLES.get(str(name), name)}: {effects}{note}")
-    return [*lines, difference_line(case)] if enough else lines
+    return [*lines, difference_line(case)] if any_testable else lines
 
 
-BRIEF = (("RQ1", rq1_runs, "algorithm", "runs are more unsafe than the original if below 0.5 (A12)"),
+SUMMARISED = (("RQ1", rq1_runs, "algorithm", "runs are more unsafe than the original if below 0.5 (A12)"),
          ("RQ2", rq2_runs, "baseline", "NSGA-II's runs are better than the other's if above 0.5 (A12)"))
 
 
@@ -157,21 +157,21 @@ def _p(value: float) -> str:
 
 
 def _corrected(case: Case) -> tuple[pd.DataFrame, pd.DataFrame | None]:
-    """Both questions over runs, their p-values corrected as one family; without RQ2 where it cannot be asked."""
+    """The frames of RQ1 and RQ2 over runs, with p-values corrected as one family; None for RQ2 if it has no answer."""
     if not case.algorithms:
         raise Unanswerable(case.name, "has no finished run", "results with at least one finished run")
     means = partial(run_means, case)
     first = rq1_rows(case, means, signed_rank)
-    several = NSGA2 in case.algorithms and len(case.algorithms) > 1
-    second = rq2_rows(case, means) if several else []
+    has_rq2 = NSGA2 in case.algorithms and len(case.algorithms) > 1
+    second = rq2_rows(case, means) if has_rq2 else []
     for row, p in zip([*first, *second], holm([row["p_value"] for row in [*first, *second]]), strict=True):
         row["p_holm"] = p
     return (pd.DataFrame(first, columns=RQ1_COLUMNS, dtype=object),
-            pd.DataFrame(second, columns=RQ2_COLUMNS, dtype=object) if several else None)
+            pd.DataFrame(second, columns=RQ2_COLUMNS, dtype=object) if has_rq2 else None)
 
 
 def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
-    """The mean of a metric in every finished run that has a value of it, over the solutions where it counts; shape (runs,).
+    """A metric's mean over the solutions for which it is defined, for each finished run that has such solutions; shape (runs,).
 
     Raises
     ------
@@ -182,7 +182,7 @@ def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
 
 
 def series_of_means(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
-    """The means of `run_means` by run."""
+    """The means of `run_means`, indexed by the number of the run."""
     solutions = case.solutions_of(algorithm)
     samples = {run: values(solutions[solutions["run"] == run], metric) for run in case.runs_of(algorithm)}
     return pd.Series({run: float(np.mean(sample)) for run, sample in samples.items() if sample.size}, dtype=float)

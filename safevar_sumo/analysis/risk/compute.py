@@ -34,7 +34,7 @@ from safevar_sumo.vehicles.region import REJECTIONS
 from safevar_sumo.workers.evaluation import Pool
 
 Quantile = Callable[[FloatArray], FloatArray]
-"""From probabilities to values in the characteristic's unit."""
+"""Turns probabilities into values in the characteristic's unit."""
 
 
 class VariationModel:
@@ -62,7 +62,7 @@ class VariationModel:
         return self._factor is not None
 
     def settings(self, probabilities: FloatArray) -> FloatArray:
-        """Settings at points of the unit cube, shape (N, n): independent there, correlated as the study says in the result."""
+        """Settings at independent points of the unit cube, shape (N, n); the settings are correlated as the study says."""
         if self._factor is not None:
             return self.of_normal(scipy.stats.norm.ppf(probabilities))
         return self._of(probabilities)
@@ -79,22 +79,22 @@ class VariationModel:
         low, high = member.lower, member.upper
         match law:
             case Fixed():
-                value = _given(law.value, member.original)
+                value = _or_default(law.value, member.original)
                 return lambda p: np.full_like(p, value)
             case Uniform() | Triangular():
-                lower, upper = _given(law.lower, low), _given(law.upper, high)
+                lower, upper = _or_default(law.lower, low), _or_default(law.upper, high)
                 if isinstance(law, Uniform):
                     return lambda p: lower + p * (upper - lower)
-                mode = _given(law.mode, member.original)
+                mode = _or_default(law.mode, member.original)
                 triangle = scipy.stats.triang((mode - lower) / (upper - lower), loc=lower, scale=upper - lower)
                 return lambda p: np.asarray(triangle.ppf(p))
             case Normal():
-                mean = _given(law.mean, member.original)
-                cut = scipy.stats.truncnorm((low - mean) / law.deviation, (high - mean) / law.deviation, loc=mean, scale=law.deviation)
-                return lambda p: np.asarray(cut.ppf(p))
+                mean = _or_default(law.mean, member.original)
+                normal = _truncated_normal(low, high, mean, law.deviation)
+                return lambda p: np.asarray(normal.ppf(p))
             case Lognormal():
-                middle, sigma = np.log(_given(law.median, member.original)), law.sigma
-                logarithm = scipy.stats.truncnorm((np.log(low) - middle) / sigma, (np.log(high) - middle) / sigma, loc=middle, scale=sigma)
+                log_median = np.log(_or_default(law.median, member.original))
+                logarithm = _truncated_normal(np.log(low), np.log(high), log_median, law.sigma)
                 return lambda p: np.exp(logarithm.ppf(p))
 
     def _cholesky(self, correlations: Sequence[Correlation]) -> FloatArray | None:
@@ -113,12 +113,16 @@ class VariationModel:
             raise InputError(self._source, f"correlations contradict each other: {pairs}", "a positive definite matrix") from None
 
 
-def _given(value: float | None, default: float) -> float:
+def _truncated_normal(low: float, high: float, mean: float, deviation: float) -> Any:
+    return scipy.stats.truncnorm((low - mean) / deviation, (high - mean) / deviation, loc=mean, scale=deviation)
+
+
+def _or_default(value: float | None, default: float) -> float:
     return default if value is None else value
 
 
 FLEET = 1000
-"""Vehicles of the fleet in examples."""
+"""Number of vehicles of the fleet in examples."""
 
 
 def fleet_probability(probability: float, vehicles: int) -> float:
@@ -129,7 +133,7 @@ def fleet_probability(probability: float, vehicles: int) -> float:
 CHUNK = 1000
 """Samples between two checks of the interval's width."""
 LARGEST_CHUNK = 50_000
-"""Samples at once without an option `width`; bounds the memory of a process."""
+"""Samples of one evaluation where `width` is not given; bounds the memory of a process."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,16 +147,16 @@ class Risk:
     method
         "monte_carlo", "subset_simulation" or "cross_entropy".
     simulations
-        Simulations of the estimate, without those of the sensitivity.
+        Number of simulations for the estimate; those for the sensitivities are not counted.
     coefficient_of_variation
-        Standard error over the probability; NaN without a failure.
+        Standard error divided by the probability; NaN if no vehicle was unsafe.
     design_point
-        The most probable failure by characteristic, of rare ones.
+        Values of the most probable failure by characteristic, if a method for rare failures was used.
     remark
-        What the estimate may have missed, or the reason for its method; may be empty.
+        What the estimate may have missed, or why its method was chosen; may be empty.
     sensitivity, sensitivity_of_unsafe
-        Frames of `sensitivities`, of the safety degree and of being unsafe; None where
-        characteristics are correlated or bound by constraints, for which they are not defined.
+        The two frames of `sensitivities`; None if characteristics are correlated or bound by constraints: then Sobol indices are
+        not defined.
     """
 
     study: Study
@@ -212,7 +216,7 @@ class Risk:
 
 def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = None, jobs: int | None = None,
                   progress: Progress = silent) -> Risk:
-    """Estimate the probability of an unsafe outcome. Nothing is filtered: this is about vehicles, not about a search.
+    """Estimate the probability of an unsafe outcome. The filter of small changes is not applied: vehicles vary, no search changes them.
 
     Raises
     ------
@@ -224,20 +228,20 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
     model = VariationModel(study)
     with open_evaluator(study, pool, jobs, progress) as evaluator:
         unsafe = evaluator.criterion(options.unsafe)
-        beginning = evaluator.simulated
+        simulated_before = evaluator.simulated
         response = Response(evaluator, model.of_normal, unsafe)
-        counts = _sampled(evaluator, model, unsafe, options, response)
+        counts = _draw_vehicles(evaluator, model, unsafe, options, response)
         if isinstance(counts, Estimate):
             estimate, method = counts, _method(options)
         else:
             estimate, method = counts.estimate(options.confidence), "monte_carlo"
         left_out = model.correlated or bool(evaluator.region) or options.is_for_rare
-        of_degree, of_unsafe = (None, None) if left_out else sensitivities(evaluator, model, unsafe, options.confidence)
+        degree_indices, unsafe_indices = (None, None) if left_out else sensitivities(evaluator, model, unsafe, options.confidence)
     point = None if estimate.design_point is None else model.of_normal(estimate.design_point[np.newaxis])[0]
     return Risk(
         study=study, unsafe=unsafe, samples=estimate.simulations - estimate.errors, failures=estimate.failures, errors=estimate.errors,
-        confidence=options.confidence, sensitivity=of_degree, sensitivity_of_unsafe=of_unsafe, probability=estimate.probability,
-        interval=estimate.interval, method=method, simulations=beginning + estimate.simulations,
+        confidence=options.confidence, sensitivity=degree_indices, sensitivity_of_unsafe=unsafe_indices, probability=estimate.probability,
+        interval=estimate.interval, method=method, simulations=simulated_before + estimate.simulations,
         coefficient_of_variation=estimate.variation, remark=estimate.remark,
         design_point=None if point is None else dict(zip(evaluator.characteristics.names, point.tolist(), strict=True)))
 
@@ -263,27 +267,28 @@ def _method(options: RiskOptions) -> str:
     return options.method if options.method == "cross_entropy" else "subset_simulation"
 
 
-def _sampled(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, options: RiskOptions, response: Response) -> Estimate | _Counts:
+def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, options: RiskOptions,
+                   response: Response) -> Estimate | _Counts:
     """Draw vehicles by plain Monte Carlo; if few of the first are unsafe, switch to a method for rare failures."""
     counts, rng = _Counts(), np.random.default_rng(evaluator.study.search.seed)
-    chooses = _may_be_rare(options) and not evaluator.region
+    is_pilot = _may_be_rare(options) and not evaluator.region
     if options.is_for_rare and evaluator.region:
         counts.remark = "the study has constraints, within which only plain Monte Carlo draws"
     if options.is_for_rare:
         openturns()  # raises at once if it is missing
     most = max(options.samples, PILOT) if options.is_for_rare else options.samples
     while counts.count + counts.errors < most:
-        chunk = PILOT if chooses else CHUNK if options.width is not None else LARGEST_CHUNK
+        chunk = PILOT if is_pilot else CHUNK if options.width is not None else LARGEST_CHUNK
         drawn = counts.count + counts.errors
         number = min(chunk, most - drawn)
-        probabilities = rng.random((number, len(evaluator.characteristics))) if chooses else None
+        probabilities = rng.random((number, len(evaluator.characteristics))) if is_pilot else None
         settings = _feasible_vehicles(evaluator, model, number, rng) if probabilities is None else model.settings(probabilities)
         evaluations = evaluator.evaluate(settings, "vehicles as they vary", drawn, most)
         valid = int(np.count_nonzero(evaluations.valid))
         counts.count, counts.errors = counts.count + valid, counts.errors + number - valid
         counts.failures += int(np.count_nonzero(unsafe.of(evaluations)))
         if probabilities is not None:
-            chooses = False
+            is_pilot = False
             values = response.take(scipy.stats.norm.ppf(probabilities), evaluations)
             is_frequent = not options.is_for_rare and counts.failures * (most / number) >= ENOUGH
             if valid and counts.failures < RARE_BELOW * valid and not is_frequent:
@@ -322,20 +327,20 @@ def _rare(response: Response, values: FloatArray, options: RiskOptions, counts: 
 
 
 def _feasible_vehicles(evaluator: Evaluator, model: VariationModel, number: int, rng: np.random.Generator) -> FloatArray:
-    """Vehicles as they vary, without those that violate a constraint; shape (number, n)."""
-    settings = evaluator.region.sampled(lambda some: model.settings(rng.random((some, len(evaluator.characteristics)))), number)
+    """Random vehicles that satisfy the constraints, shape (number, n)."""
+    settings = evaluator.region.sampled(lambda count: model.settings(rng.random((count, len(evaluator.characteristics)))), number)
     if len(settings) < number:
-        raise InputError(f"study {evaluator.study.name!r}", f"fewer than 1 in {REJECTIONS} vehicles as they vary satisfy the constraints: "
+        raise InputError(f"study {evaluator.study.name!r}", f"fewer than 1 in {REJECTIONS} random vehicles satisfy the constraints: "
                          f"{evaluator.region}", "a [variation] and [[constraints]] that agree")
     return settings
 
 
 BASE = 512
-"""Base points of Saltelli's design; it has n + 2 times as many settings."""
+"""Number of base points of Saltelli's design, which has n + 2 settings for each."""
 LEAST_FOR_INDICES = 100
-"""Least number of unsafe, and of safe, settings in the design for indices of being unsafe."""
+"""Sobol indices of being unsafe need at least so many unsafe and so many safe settings in the design."""
 RESAMPLES = 200
-"""Bootstrap samples that the intervals come from."""
+"""Number of bootstrap samples for the intervals."""
 
 
 def sensitivities(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, confidence: float) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -346,7 +351,7 @@ def sensitivities(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, c
     tuple of pandas.DataFrame
         One row per characteristic: `characteristic`, `first_order`, `total` [share of the variance], and the intervals'
         ends `first_order_lower`, `first_order_upper`, `total_lower`, `total_upper`; NaN where nothing varies, or too few
-        settings are unsafe (or safe) to tell.
+        settings are unsafe (or safe).
     """
     from SALib.sample import sobol  # takes a second to load
 
@@ -362,7 +367,7 @@ def sensitivities(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, c
 
 
 def _indices(problem: dict[str, Any], output: FloatArray, confidence: float, seed: int) -> pd.DataFrame:
-    """Indices of an output over the design; a base point without a number at one of its settings is left out."""
+    """Sobol indices of an output over the design; base points at which the output is undefined for a setting are left out."""
     from SALib.analyze import sobol
 
     blocks = output.reshape(BASE, -1)
