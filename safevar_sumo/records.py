@@ -18,7 +18,7 @@ IntArray = npt.NDArray[np.int_]
 
 STANDSTILL = 1e-3
 """Below this speed a vehicle counts as standing [m/s] (method section 4)."""
-KMH = 3.6
+KMH_PER_MS = 3.6
 """km/h per m/s."""
 GRAVITY = 9.81
 """Acceleration of gravity [m/s^2]."""

@@ -8,12 +8,12 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.ads.driver import Late
-from safevar_sumo.records import KMH, BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.records import KMH_PER_MS, BoolArray, Command, FloatArray, Nominal, Observation
 
 NotNegative = Annotated[float, Meta(ge=0, le=60)]
 Throttle = Annotated[float, Meta(ge=0, le=1)]
 Delay = Annotated[float, Meta(ge=0, le=5)]
-SPEED_LIMIT = 20 / KMH
+SPEED_LIMIT = 20 / KMH_PER_MS
 """Above this speed the agent releases the throttle [m/s] (20 km/h in its source code)."""
 SPEED_LEVELS = (0.0, 8 / 3, 16 / 3)
 """Speeds between which the policy is interpolated, up to the speed limit [m/s] (four levels in 0..8 m/s in its source code)."""

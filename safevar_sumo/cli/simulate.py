@@ -29,7 +29,7 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import Target, now_option, replay_options, target_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import KMH, Evaluations, FloatArray, Outcome
+from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import tags
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable
@@ -309,6 +309,6 @@ def _cell(result: dict[str, Any]) -> Text:
     if result["impact_speed"] is None:
         touched = f", {result['contact']['side']} side touched" if "contact" in result else ""
         return Text("avoided" + touched if result["outcome"] in (Outcome.STOPPED, Outcome.PASSED) else result["outcome"], "green")
-    relative = (result["relative_impact_speed"] or 0.0) * KMH
+    relative = (result["relative_impact_speed"] or 0.0) * KMH_PER_MS
     colour = next((colour for below, colour in BANDS if relative < below), "red")
-    return Text(f"{result['impact_speed'] * KMH:.1f} km/h", colour)
+    return Text(f"{result['impact_speed'] * KMH_PER_MS:.1f} km/h", colour)

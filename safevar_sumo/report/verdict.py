@@ -16,7 +16,7 @@ from safevar_sumo.analysis.model_spread import model_spreads
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, collided
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import METRICS, Unsafe
-from safevar_sumo.records import KMH, FloatArray, Outcome
+from safevar_sumo.records import KMH_PER_MS, FloatArray, Outcome
 from safevar_sumo.reference import Totals, quoted
 from safevar_sumo.replay.comparison import number, raised
 from safevar_sumo.report.findings import FIRST, Failures, handle_of
@@ -205,7 +205,7 @@ def _smallest(robust: Mapping[str, Any] | None, explained: Failures, result: Map
 def _severity(worst: Mapping[str, Any] | None, material: ReportInput) -> dict[str, str]:
     degree = float(material.case.solutions["f_safe"].min()) if worst is None else worst["f_safe"]
     if degree < 0:
-        return {"title": "Most severe", "value": f"collision at {-degree:.1f} m/s", "note": f"{-KMH * degree:.0f} km/h"}
+        return {"title": "Most severe", "value": f"collision at {-degree:.1f} m/s", "note": f"{-KMH_PER_MS * degree:.0f} km/h"}
     return {"title": "Most severe", "value": f"{degree:.2f} m to spare", "note": "no collision among the solutions"}
 
 

@@ -12,11 +12,11 @@ import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import KMH_PER_MS, FloatArray
 from safevar_sumo.scenarios.base import Actors, Coordinates
 from safevar_sumo.scenarios.frame import Frame
 
-KMH = 1 / 3.6
+KMH = 1 / KMH_PER_MS
 """m/s per km/h."""
 VUT_LENGTH, VUT_WIDTH = 4.9016, 2.1284
 """The bounding box of CARLA's vehicle.lincoln.mkz2017 [m]."""

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.protocol import Points, Protocol, points_of, protocol_of
-from safevar_sumo.records import KMH, CellResults, FloatArray, Outcome, SimulationRuns
+from safevar_sumo.records import KMH_PER_MS, CellResults, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import OBJECTIVES, MatrixTable, MatrixTest, RatingTable, Study, Weather
 
@@ -37,7 +37,7 @@ class Rater:
 def cell_columns(runs: SimulationRuns) -> tuple[FloatArray, FloatArray, Any]:
     """What N simulations of a cell are for a rating: impact [km/h], warning [s], validity; shape (N,) each, see `CellResults`."""
     warning = np.broadcast_to(runs.warning_ttc, runs.relative_speed.shape)
-    return runs.relative_speed * KMH, warning, (runs.outcome != Outcome.INVALID_TEST) & (runs.outcome != Outcome.SIMULATOR_ERROR)
+    return runs.relative_speed * KMH_PER_MS, warning, (runs.outcome != Outcome.INVALID_TEST) & (runs.outcome != Outcome.SIMULATOR_ERROR)
 
 
 def joined_cells(columns: Sequence[tuple[FloatArray, FloatArray, Any]]) -> CellResults:

@@ -17,7 +17,7 @@ from safevar_sumo.analysis.preventability import Preventability, PreventableBy, 
 from safevar_sumo.analysis.rating.summary import rated_lead
 from safevar_sumo.analysis.words import ENDS, ask, changes, joined, number_of
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
-from safevar_sumo.records import KMH, Evaluations, FloatArray, Outcome
+from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, record
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.base import pre_crash_of
@@ -236,7 +236,7 @@ def _outcome(failure: Finding) -> str:
 
 def _speed(degree: float) -> str:
     """A collision's speed in whole km/h, below 3 km/h with a decimal."""
-    speed = -degree * KMH
+    speed = -degree * KMH_PER_MS
     return f"{speed:.{int(speed < 3)}f} km/h"
 
 
