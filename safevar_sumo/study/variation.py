@@ -20,21 +20,21 @@ and cannot be computed reliably."""
 
 
 class Uniform(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="uniform"):
-    """Evenly from `lower` to `upper`, by default over the whole domain."""
+    """Every value from `lower` to `upper` is equally likely; by default the whole domain."""
 
     lower: float | None = None
     upper: float | None = None
 
 
 class Normal(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="normal"):
-    """Around `mean`, by default the original, with standard deviation `deviation`; cut off at the ends of the domain."""
+    """A normal distribution with `mean`, by default the original, and standard deviation `deviation`, cut off at the ends of the domain."""
 
     deviation: Annotated[float, Meta(gt=0)]
     mean: float | None = None
 
 
 class Triangular(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="triangular"):
-    """Most often `mode`, by default the original, never beyond `lower` and `upper`, by default the domain's."""
+    """A triangular distribution from `lower` to `upper`, by default the domain, with its peak at `mode`, by default the original."""
 
     mode: float | None = None
     lower: float | None = None
@@ -42,14 +42,17 @@ class Triangular(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, 
 
 
 class Lognormal(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="lognormal"):
-    """Half of it below `median`, by default the original; `sigma` [-] is the standard deviation of its logarithm. Cut off as `Normal`."""
+    """A lognormal distribution with `median`, by default the original, cut off at the ends of the domain.
+
+    `sigma` [-] is the standard deviation of the value's logarithm.
+    """
 
     sigma: Annotated[float, Meta(gt=0)]
     median: float | None = None
 
 
 class Fixed(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="fixed"):
-    """Always `value`, by default the original."""
+    """The characteristic always has `value`, by default the original."""
 
     value: float | None = None
 
@@ -58,7 +61,7 @@ Distribution = Uniform | Normal | Triangular | Lognormal | Fixed
 
 
 class Correlation(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The correlation of two characteristics once either is a standard normal variable (Gaussian copula)."""
+    """The correlation of two characteristics after each is transformed to a standard normal variable (Gaussian copula)."""
 
     between: tuple[str, str]
     value: Annotated[float, Meta(gt=-1, lt=1)]
@@ -100,9 +103,9 @@ def _correlation_mistakes(source: object, names: Sequence[str], correlations: Se
     values: dict[frozenset[str], float] = {}
     for correlation in correlations:
         between, pair = correlation.between, frozenset(correlation.between)
-        strange = [name for name in between if name not in names]
-        if strange:
-            yield unknown(source, f"correlations.between: there is no characteristic {strange[0]!r}", strange[0], names)
+        unknown_names = [name for name in between if name not in names]
+        if unknown_names:
+            yield unknown(source, f"correlations.between: there is no characteristic {unknown_names[0]!r}", unknown_names[0], names)
         elif len(pair) == 1:
             yield InputError(source, f"correlations.between = {list(between)}", "two different characteristics")
         elif pair in values:

@@ -33,17 +33,18 @@ def necessity(characteristics: CharacteristicSet, changed: BoolArray, causes: Se
     changed
         Which characteristics each of M failures changes, shape (M, n).
     causes
-        The minimal causes of each.
+        The minimal causes of each of the M failures.
     failures
-        How many failures there are; if more than M, the M are a random sample of them.
+        Number of all failures; if it is larger than M, the M failures are a random sample of them.
 
     Returns
     -------
     pandas.DataFrame
-        One row per characteristic: `characteristic`, and shares of the failures: `changed`; `necessary`, in every minimal
-        cause; `involved`, in one at least; and `necessary_lower` and `necessary_upper`, the 95 % interval of `necessary` among
-        all failures: Clopper and Pearson's for a sample (a little too wide, as it is drawn without replacement from finitely many),
-        the share itself where all failures were analysed. Ordered by necessary, involved, changed; without rows if there is no failure.
+        One row per characteristic: `characteristic`, and the shares of failures in which it is `changed`, `necessary` (part of every
+        minimal cause) and `involved` (part of at least one). `necessary_lower` and `necessary_upper` are the 95 % interval of
+        `necessary` among all failures: Clopper and Pearson's for a sample (slightly too wide, because the sample is drawn without
+        replacement from finitely many failures), the share itself if all failures were analysed. Ordered by necessary, involved,
+        changed; no rows if there is no failure.
     """
     columns = range(len(characteristics) if len(changed) else 0)
     counts = {"changed": Counter(np.nonzero(changed)[1].tolist()),
@@ -66,7 +67,8 @@ def distinct_causes(characteristics: CharacteristicSet, causes: Sequence[Sequenc
     Returns
     -------
     pandas.DataFrame
-        Columns `cause`, a tuple of changes with their directions; `failures`, how many have it; `share` of all failures.
+        Columns `cause`, a tuple of changes with their directions; `failures`, the number of failures with this cause; `share` of all
+        failures.
     """
     counts = Counter(key for group in causes for key in {key_of(characteristics, cause) for cause in group})
     order = sorted(counts, key=lambda key: (-counts[key], len(key), key))
@@ -76,11 +78,12 @@ def distinct_causes(characteristics: CharacteristicSet, causes: Sequence[Sequenc
 
 
 NEIGHBOURS = 64
+"""Neighbours of a setting that are simulated with each time step."""
 STEP_FACTORS = (1.0, 0.5, 2.0)
 """Factors on the study's time step."""
 BORDERLINE = 0.8
 """Share of unsafe neighbours below which a failure is called borderline."""
-TOGETHER = 8
+FAILURES_PER_BATCH = 8
 """Number of failures that are tried at a time, the smallest first."""
 
 
@@ -105,21 +108,19 @@ def is_borderline(share: float) -> bool:
 
 def robustness(evaluator: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe,
                factors: Sequence[float] = STEP_FACTORS) -> list[Robustness]:
-    """How robust settings, shape (M, n), are.
+    """The robustness of each of M settings, shape (M, n).
 
-    The neighbours of a setting differ from it in every characteristic by no more than the filter takes for no change;
-    they are simulated as they are, with `factors` of the study's time step (`step` seconds), by default itself, half of it and twice.
-    Neighbours that cannot be simulated
-    are left out of the share.
+    A setting's neighbours differ from it in each characteristic by at most the filter's threshold. They are simulated without the filter,
+    with each of `factors` times the study's time step (`step` seconds). Neighbours that cannot be simulated do not count.
     """
     members = evaluator.characteristics
     offsets = np.random.default_rng(evaluator.study.search.seed).uniform(-1, 1, (NEIGHBOURS, len(members))) * members.threshold
-    around = np.clip(settings[:, np.newaxis] + offsets, members.lower, members.upper).reshape(-1, len(members))
+    neighbours = np.clip(settings[:, np.newaxis] + offsets, members.lower, members.upper).reshape(-1, len(members))
     shares = {}
     for factor in factors:
-        on = evaluator if factor == 1 else evaluator.with_step(step * factor)
-        evaluations = on.evaluate(around, f"neighbours at {step * factor:g} s a step")
-        outcomes, valid = (truths.reshape(len(settings), NEIGHBOURS) for truths in (unsafe.of(evaluations), evaluations.valid))
+        with_step = evaluator if factor == 1 else evaluator.with_step(step * factor)
+        evaluations = with_step.evaluate(neighbours, f"neighbours at {step * factor:g} s a step")
+        outcomes, valid = (flags.reshape(len(settings), NEIGHBOURS) for flags in (unsafe.of(evaluations), evaluations.valid))
         shares[step * factor] = (outcomes & valid).sum(axis=1) / np.maximum(valid.sum(axis=1), 1)
     return [Robustness({step: float(group[row]) for step, group in shares.items()}) for row in range(len(settings))]
 
@@ -127,12 +128,12 @@ def robustness(evaluator: Evaluator, settings: FloatArray, step: float, unsafe: 
 def smallest_robust(evaluator: Evaluator, failures: Evaluations, step: float, unsafe: Unsafe, limit: int) -> int | None:
     """The row of the smallest failure that is not borderline: of the fewest changes, then the smallest largest change.
 
-    They are tried in that order until one is robust or about `limit` simulations are spent; None if none is robust by then.
+    Failures are tried in that order until one is robust or about `limit` simulations are spent; None if no failure was robust by then.
     """
     order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])
-    most = max(TOGETHER, limit // (NEIGHBOURS * len(STEP_FACTORS)))
-    for first in range(0, min(len(order), most), TOGETHER):
-        rows = order[first:first + TOGETHER]
+    most = max(FAILURES_PER_BATCH, limit // (NEIGHBOURS * len(STEP_FACTORS)))
+    for first in range(0, min(len(order), most), FAILURES_PER_BATCH):
+        rows = order[first:first + FAILURES_PER_BATCH]
         for row, result in zip(rows.tolist(), robustness(evaluator, failures.settings[rows], step, unsafe), strict=True):
             if not result.borderline:
                 return int(row)

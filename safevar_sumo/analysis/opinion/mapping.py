@@ -1,6 +1,6 @@
-"""Which characteristic of our vehicles is which parameter of the second model, with units and equations.
+"""How each characteristic of our vehicles is represented by parameters of the second model, with units and equations.
 
-Every shipped vehicle has a declared table; what it has no row for, the second model cannot represent.
+Each shipped vehicle has a table; the second model cannot represent characteristics that have no row in it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SENSORS, SAME = "the same sensors before the driving system", "as here"
 
 
 class Row(NamedTuple):
-    """A characteristic with the parameter that it is in the second model, and how."""
+    """A characteristic, the parameter of the second model that represents it, and the equation between them."""
 
     characteristic: str
     unit: str
@@ -37,7 +37,7 @@ class Row(NamedTuple):
 
 
 class Represented(NamedTuple):
-    """Vehicles as the second model has them.
+    """Vehicles as parameters of the second model.
 
     `brake_delay` [s], `brake_rise`, `brake_fall` [1/s] and `brake_lag` [s] are the brake's way from command to torque: a dead time, rates,
     a first-order lag. Resistances beside those of the original vehicle: `drag` [N s/m], `air_drag` [N s^2/m^2] and `wheel_damping` of all
@@ -122,11 +122,11 @@ class Table(NamedTuple):
     Attributes
     ----------
     study
-        A shipped study with it: what a vehicle of your own leaves open is as there.
+        A shipped study with the vehicle; parameters that your own vehicle does not have are taken from there.
     rows
-        What the second model represents.
+        The characteristics that the second model represents.
     outside
-        What it does not, and why.
+        Characteristics that it cannot represent, each with the reason.
     represent
         The equations of the rows.
     """
@@ -182,11 +182,11 @@ TABLES: Mapping[str, Table] = {
         Row("reactionTime", "s", SENSORS, "s", SAME)),
         {"maxSpeed": "the model has no governor"}, _sumo),
 }
-"""By the vehicles' names."""
+"""Tables by the names of shipped vehicles."""
 
 
 class Declared(NamedTuple):
-    """How a study's vehicle is represented: its table, and the shipped vehicle that it is, or is one of, with its parameters."""
+    """How a study's vehicle is represented: by the table of a shipped vehicle, which it is or is made from, with its own parameters."""
 
     name: str
     vehicle: Any
@@ -194,28 +194,28 @@ class Declared(NamedTuple):
     foreign: tuple[str, ...]
 
     def outside(self, changes: Mapping[str, float]) -> list[str]:
-        """Why changes cannot be represented, by the characteristics that cannot; empty if all can."""
+        """The reason for each changed characteristic that cannot be represented; empty if all can."""
         return [f"{name}: {self.table.outside.get(name, 'no parameter of the second model is known for it')}" for name in changes
                 if name not in self.table.names or name in self.foreign]
 
 
 def declared_of(study: Study, vehicle: Any) -> Declared:
-    """The table that holds for a study's vehicle: a shipped one, one made from it, or one of yours with all of its characteristics.
+    """The table for a study's vehicle: a shipped vehicle, a class made from one, or your own with all characteristics of one.
 
     Raises
     ------
     InputError
-        If there is none.
+        If there is no table for it.
     """
     own = vehicle.model if isinstance(vehicle, GuardedVehicle) else vehicle
-    given = {name: row.unit for name, row in study.vehicle.characteristics.items()}
+    units = {name: row.unit for name, row in study.vehicle.characteristics.items()}
     for name, kind in [*((name, kind) for name, kind in VEHICLES.items() if isinstance(own, kind)),
-                       *((name, kind) for name, kind in VEHICLES.items() if kind.UNITS.items() <= given.items())]:
+                       *((name, kind) for name, kind in VEHICLES.items() if kind.UNITS.items() <= units.items())]:
         table = TABLES[name]
         shipped = load_study(table.study).vehicle.parameters
         parameters = {one.name: getattr(own, one.name, study.vehicle.parameters.get(one.name, shipped.get(one.name, one.default)))
                       for one in msgspec.structs.fields(kind)}
-        return Declared(name, kind(**parameters), table, tuple(key for key, unit in given.items() if kind.UNITS.get(key) != unit))
+        return Declared(name, kind(**parameters), table, tuple(key for key, unit in units.items() if kind.UNITS.get(key) != unit))
     known = f"one of {', '.join(TABLES)}, a class made from one, or one with the same characteristics in the same units"
-    problem = f"vehicle.model = {study.vehicle.model!r} with {', '.join(given)} is no vehicle that the second model can represent"
+    problem = f"vehicle.model = {study.vehicle.model!r} with {', '.join(units)} is no vehicle that the second model can represent"
     raise InputError(f"study {study.name!r}", problem, known)

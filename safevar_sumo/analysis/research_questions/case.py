@@ -37,9 +37,9 @@ class Case:
     Attributes
     ----------
     name
-        What tables call it.
+        Name of the case in tables.
     study
-        As it was run.
+        The study as it was run.
     original
         The original vehicle's metrics by name; NaN where undefined.
     solutions, evaluations
@@ -80,8 +80,8 @@ class Case:
     @property
     def algorithms(self) -> tuple[str, ...]:
         """Algorithms that have solutions or a finished run, in the study's order."""
-        there = {*self.solutions["algorithm"], *(algorithm for algorithm, _ in self.finished)}
-        return tuple(name for name in dict.fromkeys([*self.study.search.labels, *sorted(there)]) if name in there)
+        present = {*self.solutions["algorithm"], *(algorithm for algorithm, _ in self.finished)}
+        return tuple(name for name in dict.fromkeys([*self.study.search.labels, *sorted(present)]) if name in present)
 
     def solutions_of(self, algorithm: str) -> pd.DataFrame:
         """Pooled solutions of all finished runs of an algorithm.
@@ -92,8 +92,8 @@ class Case:
             If it has no finished run.
         """
         if algorithm not in self.algorithms:
-            there = ", ".join(self.algorithms) or "no algorithm"
-            raise Unanswerable(self.name, f"has no finished run of {algorithm}", f"results of {algorithm} (it has those of {there})")
+            present = ", ".join(self.algorithms) or "no algorithm"
+            raise Unanswerable(self.name, f"has no finished run of {algorithm}", f"results of {algorithm} (it has those of {present})")
         return self.solutions[self.solutions["algorithm"] == algorithm]
 
     def runs_of(self, algorithm: str) -> list[int]:
@@ -105,7 +105,7 @@ class Case:
             If the solutions are imported and belong to no run.
         """
         if not self.has_runs:
-            raise Unanswerable(self.name, "is imported: nobody knows which run a solution belongs to", "results of the command study")
+            raise Unanswerable(self.name, "is imported: the runs of its solutions are unknown", "results of the command study")
         return sorted(run for name, run in self.finished if name == algorithm)
 
     @property
@@ -119,7 +119,7 @@ class Case:
             planned = self.study.search.runs
             short = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.labels if done[name] < planned]
             if short:
-                lines.append(f"{self.name}: unfinished, {', '.join(short)}; made of what is finished.")
+                lines.append(f"{self.name}: unfinished ({', '.join(short)}); tables use the finished runs.")
         if self.failures:
             lines.append(f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) and are in no result: "
                         f"{'; '.join(failure_lines(self.failures))}. study --retry-failed simulates them again.")
@@ -127,12 +127,12 @@ class Case:
 
 
 def counted(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
-    """The solutions over which a metric is taken: TET and TIT over those without collision (method section 4)."""
+    """The solutions that count for a metric: for TET and TIT only those without collision (method section 4)."""
     return solutions if metric.over_collisions else solutions[~collided(solutions)]
 
 
 def values(solutions: pd.DataFrame, metric: MetricFacts) -> FloatArray:
-    """Where a metric counts, its values; undefined ones left out."""
+    """A metric's defined values over the solutions that count for it."""
     column = counted(solutions, metric)[metric.name].to_numpy(dtype=float)
     return np.asarray(column[~np.isnan(column)])
 
@@ -143,7 +143,7 @@ def collided(solutions: pd.DataFrame) -> pd.Series[bool]:
 
 
 def load_cases(directories: Iterable[str | Path]) -> list[Case]:
-    """Read results directories; cases of the same name are told apart by their directories.
+    """Read results directories; cases with the same name get their directories as part of their names.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def load_case(directory: Path) -> Case:
         raise invalid(directory / "manifest.json", manifest["study"], error, "study") from None
     original = manifest.get("original")
     if not isinstance(original, dict):
-        raise InputError(directory / "manifest.json", "tells nothing of the original vehicle", "what the command study has written")
+        raise InputError(directory / "manifest.json", "does not describe the original vehicle", "one written by the command study")
     try:
         scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else SAFEVAR
     except msgspec.ValidationError as error:

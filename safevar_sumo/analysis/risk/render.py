@@ -1,4 +1,4 @@
-"""How likely an unsafe outcome is, as text on the terminal and as a figure."""
+"""The result of `risk` as text on the terminal and as a figure."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def print_risk(console: Console, result: Risk) -> None:
-    """The probability with its interval, how vehicles vary, and what decides."""
+    """Print the probability with its interval, how vehicles vary, and which characteristics decide."""
     low, high = result.interval
     print_text(console, result.study.title)
     drawn = "" if result.method == "monte_carlo" else f", drawn by {result.method.replace('_', ' ')}"
@@ -40,7 +40,7 @@ def print_risk(console: Console, result: Risk) -> None:
                             f"{result.of_fleet(FLEET):.2g}.")
     if result.of_domain:
         print_text(console, "warning: no probability in the field: the study has no [variation] table that says how real vehicles vary.")
-    print_text(console, _variation(result.study))
+    print_text(console, _how_vehicles_vary(result.study))
     print_constraints(console, result.study)
     if result.sensitivity is None or result.sensitivity_of_unsafe is None:
         return
@@ -52,13 +52,13 @@ def print_risk(console: Console, result: Risk) -> None:
         table.add_row(row["characteristic"], *(_index(one, name) for one in (row, other) for name in ("first_order", "total")))
     console.print(table)
     if result.sensitivity_of_unsafe["total"].isna().all():
-        print_text(console, "Too few settings are unsafe, or safe, to tell what decides that; the safety degree tells more.")
+        print_text(console, "Too few settings are unsafe, or safe, for indices of being unsafe; see those of the safety degree.")
     print_meanings(console, CharacteristicSet.of(result.study.vehicle.characteristics))
     print_text(console, f"Sobol indices, first order and total, with half of their {result.confidence:.0%} intervals: estimates, which may "
                         "exceed 1 or fall below 0 by their error.")
 
 
-def _variation(study: Study) -> str:
+def _how_vehicles_vary(study: Study) -> str:
     """How vehicles vary, in a sentence."""
     laws = [f"{name} {law.__struct_config__.tag}" for name, law in study.variation.items() if law != Uniform()]
     correlated = ", ".join(f"{' with '.join(one.between)} {one.value:g}" for one in study.correlations)
@@ -72,12 +72,12 @@ def _index(row: object, name: str) -> str:
 
 
 def sensitivity_figure(result: Risk) -> Figure:
-    """First-order and total Sobol indices of every characteristic with their intervals, of the safety degree and of being unsafe.
+    """First-order and total Sobol indices of every characteristic with intervals: one panel for the safety degree, one for being unsafe.
 
     Raises
     ------
     InputError
-        If there are none, because characteristics are correlated or bound by constraints.
+        If characteristics are correlated or bound by constraints, so that there are no indices.
     """
     if result.sensitivity is None or result.sensitivity_of_unsafe is None:
         raise InputError("correlations", "there are no sensitivity indices of characteristics that are correlated or bound by constraints",
@@ -85,8 +85,8 @@ def sensitivity_figure(result: Risk) -> Figure:
     names = result.sensitivity.sort_values("total", kind="stable")["characteristic"].to_list()
     title = f"{result.study.name}: what decides ({result.confidence:.0%} intervals)"
     figure, (axes,) = new_figure(title, 1, 2, (7.2, 1.5 + 0.28 * max(len(names), 4)))
-    of_what = {"safety degree": result.sensitivity, f"unsafe ({result.unsafe})": result.sensitivity_of_unsafe}
-    for axis, (what, frame) in zip(axes, of_what.items(), strict=True):
+    frames = {"safety degree": result.sensitivity, f"unsafe ({result.unsafe})": result.sensitivity_of_unsafe}
+    for axis, (what, frame) in zip(axes, frames.items(), strict=True):
         rows = frame.set_index("characteristic").loc[names]
         for column, label, colour, shift in (("total", "total: with all others", CHANGED, 0.2), ("first_order", "alone", NECESSARY, -0.2)):
             width = (rows[f"{column}_upper"] - rows[column]).clip(lower=0)
