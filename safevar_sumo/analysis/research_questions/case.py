@@ -119,7 +119,7 @@ class Case:
             planned = self.study.search.runs
             short = [f"{name} {done[name]} of {planned} runs" for name in self.study.search.labels if done[name] < planned]
             if short:
-                lines.append(f"{self.name}: unfinished ({', '.join(short)}); tables use the finished runs.")
+                lines.append(f"{self.name}: unfinished, {', '.join(short)}; tables use the finished runs.")
         if self.failures:
             lines.append(f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) and are in no result: "
                         f"{'; '.join(failure_lines(self.failures))}. study --retry-failed simulates them again.")
