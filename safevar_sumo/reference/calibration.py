@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
+from functools import partial
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -82,6 +83,10 @@ NEAR = 0.02
 """Standard deviation of the first trials around known values, as a share of a parameter's bounds."""
 
 
+STAGES = (64, 16)
+"""Of 100 trials from scratch those of the first study alone, and those of what the others have of their own; the rest are of all."""
+
+
 MILLIMETRES = 3
 """Decimals of a study's model error."""
 
@@ -155,16 +160,17 @@ def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[
         rows = {name: np.arange(len(data.settings)) % study.fit.hold_out == study.fit.hold_out - 1 for name, data in references.items()}
         used.append({name: data.take(~rows[name]) for name, data in references.items()})
         held_back.append({name: data.take(rows[name]) for name, data in references.items()})
-    trial = _Trial(free, [_Fitted(study, data, pool) for study, data in zip(studies, used, strict=True)])
-    search = Search(trial, fit.population, fit.trials, done, fit.alike)
+    begin, trials, rng = studies, fit.trials, np.random.default_rng(fit.seed)
+    if staged := from_scratch and (len(studies) > 1 or fit.thinning > 1):
+        begin, trials = _by_stages(subjects, free, used, pool, rng, done)
+    trial = _Trial(free, [_Fitted(study, data, pool) for study, data in zip(begin, used, strict=True)])
+    search = Search(trial, fit.population, trials, done, fit.alike)
     if not from_scratch and search.tried([studies])[0] >= LARGEST:
         names = " and ".join(f"study {study.name!r}" for study in studies)
         raise SimulationError(f"{names} cannot be simulated with {'its' if len(studies) == 1 else 'their'} own values")
-    rng = np.random.default_rng(fit.seed)
-    keys = [one.key for one in free]  # what several studies have of their own begins at one place: it is one model in other conditions
-    searches = search.from_random_places([keys.index(key) for key in keys], fit.starts, fit.screened, fit.width, rng)
-    if not from_scratch:
-        searches.append(search.begun(trial.shares(studies), NEAR, fit.seed + 1))
+    searches = [] if staged else search.from_random_places(_same(free), fit.starts, fit.screened, fit.width, rng)
+    if staged or not from_scratch:
+        searches.append(search.begun(trial.shares(begin), NEAR, fit.seed + 1))
     search.race(searches)
     assert search.best is not None, "there is a trial at least"
     reached, results = [one.lowest for one in searches if one.lowest < np.inf], []
@@ -183,6 +189,51 @@ def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[
     return results
 
 
+def _same(free: Sequence[Free]) -> list[int]:
+    """What several studies have of their own begins at one place: it is one model in other conditions."""
+    keys = [one.key for one in free]
+    return [keys.index(key) for key in keys]
+
+
+def _by_stages(subjects: Sequence[Subject], free: Sequence[Free], used: Sequence[Mapping[str, ReferenceData]], pool: Pool,
+               rng: np.random.Generator, done: Callable[[float, Together], None]) -> tuple[Together, int]:
+    """On some rows the first study alone from random places, then with its values what only the others have; and the trials left."""
+    studies = tuple(subject.study for subject in subjects)
+    fit, left = studies[0].fit, studies[0].fit.trials
+    first = [one._replace(studies=(0,)) for one in free if 0 in one.studies]
+    others = [one._replace(studies=tuple(k - 1 for k in one.studies)) for one in free if 0 not in one.studies]
+    for mine, numbers, share in zip((first, others), ([0], list(range(1, len(studies)))), STAGES, strict=True):
+        trials = fit.trials * share // 100
+        if mine and trials:
+            some = [{name: _thinned(data, fit.thinning) for name, data in used[k].items()} for k in numbers]
+            trial = _Trial(mine, [_Fitted(studies[k], data, pool) for k, data in zip(numbers, some, strict=True)])
+            search = Search(trial, fit.population, trials, partial(_done_with_some, done, studies, numbers))
+            search.race(search.from_random_places(_same(mine), fit.starts, fit.screened, fit.width, rng))
+            assert search.best is not None, "there is a trial at least"
+            studies, left = _replaced(studies, numbers, search.best), left - trials
+            values = [(one, value_of(studies[0], one.key)) for one in free if 0 in one.studies]
+            studies = tuple(with_values(study, {one.key: value for one, value in values if k in one.studies})
+                            for k, study in enumerate(studies))
+    return studies, left
+
+
+def _done_with_some(done: Callable[[float, Together], None], studies: Together, numbers: Sequence[int], cost: float,
+                    best: Together) -> None:
+    done(cost, _replaced(studies, numbers, best))
+
+
+def _replaced(studies: Together, numbers: Sequence[int], some: Together) -> Together:
+    """Studies with those of some numbers replaced."""
+    return tuple(some[numbers.index(k)] if k in numbers else study for k, study in enumerate(studies))
+
+
+def _thinned(data: ReferenceData, thinning: int) -> ReferenceData:
+    """One row in so many, in the order of the safety degree, so that few rows are spread as all are."""
+    rows = np.zeros(len(data.settings), dtype=bool)
+    rows[np.argsort(data.metrics[SAFETY_DEGREE], kind="stable")[thinning // 2::thinning]] = True
+    return data.take(rows)
+
+
 def _check(subject: Subject) -> None:
     source = f"study {subject.study.name!r}"
     if not subject.references and not subject.study.published:
@@ -198,10 +249,16 @@ class _Trial:
     def __init__(self, free: Sequence[Free], fitted: Sequence[_Fitted]) -> None:
         self._free, self._fitted = free, fitted
         self._lower, self._upper = np.array([(one.bounds.lower, one.bounds.upper) for one in free]).T
+        self._log = np.array([one.bounds.log for one in free])
+        self._start, self._width = self._scaled(self._lower), self._scaled(self._upper) - self._scaled(self._lower)
+
+    def _scaled(self, values: FloatArray) -> FloatArray:
+        return np.log(values, out=values.copy(), where=self._log)
 
     def values(self, shares: FloatArray) -> FloatArray:
         """Values at places in the unit cube of the bounds, shape (..., parameters)."""
-        return np.asarray(self._lower + np.asarray(shares) * (self._upper - self._lower))
+        scaled = self._start + np.asarray(shares) * self._width
+        return np.asarray(np.clip(np.exp(scaled, out=scaled.copy(), where=self._log), self._lower, self._upper))
 
     def at(self, shares: FloatArray) -> Together:
         """The studies at a place in the unit cube of the bounds."""
@@ -213,7 +270,7 @@ class _Trial:
     def shares(self, studies: Together) -> FloatArray:
         """Where studies lie in the unit cube of the bounds."""
         values = np.array([value_of(studies[free.studies[0]], free.key) for free in self._free])
-        return np.asarray(np.clip((values - self._lower) / (self._upper - self._lower), 0, 1))
+        return np.asarray(np.clip((self._scaled(values) - self._start) / self._width, 0, 1))
 
     def costs(self, tried: Sequence[Together]) -> list[float]:
         submitted = [[one.submit(study) for one, study in zip(self._fitted, together, strict=True)] for together in tried]

@@ -62,6 +62,9 @@ def _shares(study: Study, key: str, value: float) -> bool:
 
 def check_bounds(study: Study, name: str, bounds: FreeParameter) -> None:
     """A search goes as far as its bounds: the models must take them."""
+    if bounds.log and bounds.lower <= 0:
+        raise InputError(f"study {study.name!r}", f"calibration.{name!r} has log = true and lower = {bounds.lower:g}",
+                         "a lower bound above 0")
     for side in ("lower", "upper"):
         bound = getattr(bounds, side)
         try:

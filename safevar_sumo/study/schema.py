@@ -173,7 +173,8 @@ class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A parameter to calibrate: its bounds in `unit`, and its meaning.
 
-    Studies that are fitted together share it as far as they give it one value, unless it is a study's `own`.
+    Studies that are fitted together share it as far as they give it one value, unless it is a study's `own`. A search takes equal
+    differences for equally far, with `log` equal ratios: rates and other positive quantities whose magnitude is not known.
     """
 
     lower: float
@@ -181,6 +182,7 @@ class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     unit: str
     meaning: str
     own: bool = False
+    log: bool = False
 
 
 class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -207,7 +209,9 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own values and from
     `starts` random places in the bounds, of which the worse half gives up after every round. With `screened` these are the best of so
     many random places, but no more than a quarter of the trials is spent on that. A search from a random place is `width` of the bounds
-    wide at first (standard deviation). `seed` is the seed of all that.
+    wide at first (standard deviation). `seed` is the seed of all that. From scratch, studies that are fitted together are searched in
+    stages: the first one alone, then what the others have of their own, and at last all from there. Stages but the last use one row in
+    `thinning`.
     """
 
     trials: PositiveInt = 1200
@@ -215,6 +219,7 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     starts: Annotated[int, Meta(ge=0, le=1000)] = 0
     screened: Annotated[int, Meta(ge=0, le=100_000)] = 0
     width: Annotated[float, Meta(gt=0, le=1)] = 0.3
+    thinning: Annotated[int, Meta(ge=1, le=100)] = 1
     population: Annotated[int, Meta(ge=4, le=1000)] = 14
     hold_out: Annotated[int, Meta(ge=2, le=1000)] = 2
     tolerance: Annotated[float, Meta(gt=0, le=1)] = 0.05

@@ -12,6 +12,7 @@ import pytest
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.reference import ReferenceData, Subject, agreement, calibrate, calibrate_together, with_values
+from safevar_sumo.reference.calibration import _thinned, _Trial
 from safevar_sumo.reference.effects import covered_by_spread, error_beyond_spread, linear_effects
 from safevar_sumo.reference.fit import Search, original_cost, reference_cost
 from safevar_sumo.reference.parameters import Free, free_parameters, value_of
@@ -82,6 +83,41 @@ def test_studies_that_are_fitted_together_share_what_is_not_their_own(data: Refe
     assert set(dry.values) == {GAP}
     assert (dry.shared, wet.shared) == ({GAP}, {GAP})
     assert dry.cost == wet.cost
+
+
+@pytest.mark.slow
+def test_from_scratch_the_first_study_is_fitted_alone_then_what_the_others_have_of_their_own_then_all(data: ReferenceData) -> None:
+    truth = load_study("sun").ads.parameters["brake_gap"]
+    own = FreeParameter(lower=0.0, upper=0.3, unit="s", meaning="pause", own=True)
+    sun = mine(0.4, trials=100, starts=1, thinning=3)
+    late = msgspec.structs.replace(with_hesitation(mine(0.4), 0.1), name="late", calibration={HESITATION: own})
+    there = dict(evaluate(assemble(with_hesitation(load_study("sun"), 0.2)), data.settings).metrics)
+    subjects = [Subject(sun, {"mine": data}), Subject(late, {"theirs": ReferenceData(data.settings, there, 0)})]
+    steps = list[tuple[float, float, float]]()
+    dry, wet = calibrate_together(subjects, Here(), lambda cost, best: steps.append(
+        (value_of(best[0], GAP), value_of(best[1], GAP), value_of(best[1], HESITATION))), from_scratch=True)
+    assert len(steps) == 100
+    assert {(theirs, hesitation) for _, theirs, hesitation in steps[:64]} == {(0.4 * truth, 0.1)}, "nothing of the others"
+    assert len({(gap, theirs) for gap, theirs, _ in steps[64:80]}) == 1, "only what is their own"
+    assert steps[64][0] == steps[64][1] == steps[63][0]
+    assert dry.values[GAP] == wet.values[GAP] == pytest.approx(truth, rel=0.05)
+    assert wet.values[HESITATION] == pytest.approx(0.2, abs=0.04)
+
+
+def test_a_search_by_logarithm_has_the_geometric_mean_in_the_middle_and_stays_in_its_bounds() -> None:
+    bounds = FreeParameter(lower=0.3, upper=30.0, unit="m", meaning="gap", log=True)
+    trial = _Trial([Free(GAP, (0,), bounds), Free(HESITATION, (0,), msgspec.structs.replace(bounds, log=False))], [])
+    assert trial.values(np.array([[0.5, 0.5], [0.75, 0.0]])) == pytest.approx(np.array([[3.0, 15.15], [3 * 10**0.5, 0.3]]))
+    assert trial.values(np.ones(2)).max() <= 30.0
+    study = msgspec.structs.replace(mine(1.0), calibration={GAP: msgspec.structs.replace(bounds, lower=0.0)})
+    with pytest.raises(InputError, match="log = true and lower = 0"):
+        free_parameters([study])
+
+
+def test_few_rows_are_spread_as_all_are(data: ReferenceData) -> None:
+    order = data._replace(metrics={"safety_degree": np.random.default_rng(1).permutation(24).astype(float)})
+    assert sorted(_thinned(order, 5).metrics["safety_degree"]) == [2, 7, 12, 17, 22]
+    assert _thinned(order, 1).metrics["safety_degree"].tolist() == order.metrics["safety_degree"].tolist()
 
 
 def with_hesitation(study: Study, hesitation: float) -> Study:
