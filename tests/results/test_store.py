@@ -230,7 +230,7 @@ def test_a_point_is_lost_to_six_decimals() -> None:
     unsafe = Unsafe.default({"rating_points": 34.899405, "safety_degree": -14.2}, FRAME["outcome"])
     rated = FRAME.head(2).assign(rating_points=[33.899405, 33.899406])
     assert unsafe.rows(rated).tolist() == [True, False]
-    assert str(unsafe) == "points=33.899405"
+    assert (str(unsafe), unsafe.in_words) == ("points=33.899405", "keeps at most 33.8994 points")
 
 
 STORED = Path(__file__).with_name("stored")
