@@ -11,6 +11,7 @@ import numpy as np
 
 from safevar_sumo.analysis.words import ENDS
 from safevar_sumo.api.simulation import assembled, changed
+from safevar_sumo.metrics import METRICS, RATING_POINTS, MetricFacts
 from safevar_sumo.records import STANDSTILL, Evaluations, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.replay.film import Film, film
 from safevar_sumo.results import UNKNOWN
@@ -18,7 +19,7 @@ from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.matrix import at_worst
 from safevar_sumo.sumo.staging import staged
-from safevar_sumo.sumo.system import System
+from safevar_sumo.sumo.system import Measuring, System
 from safevar_sumo.vehicles import CharacteristicSet
 
 APART = 0.1
@@ -68,7 +69,7 @@ class Comparison:
     """Runs of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is changed).
 
     `title` is the study's, `network` the scenario's, with the lanes that its parameters make; `evaluations` and `film` have one row for
-    each vehicle.
+    each vehicle. `objectives` are metrics beyond the paper's that the study searches.
     """
 
     title: str
@@ -77,6 +78,7 @@ class Comparison:
     network: str
     evaluations: Evaluations
     film: Film
+    objectives: tuple[MetricFacts, ...] = ()
 
     @property
     def rows(self) -> range:
@@ -99,9 +101,10 @@ class Comparison:
             return f"hits at {drives.collision_speed[row]:.1f} m/s"
         nearest = moments(drives, row).nearest
         word = ENDS[Outcome(str(drives.outcome[row]))]
-        if nearest is None or drives.outcome[row] != Outcome.STOPPED:
-            return word
-        return f"{word} with {drives.trace.gap[nearest, row]:.2f} m to spare"
+        if nearest is not None and drives.outcome[row] == Outcome.STOPPED:
+            word = f"{word} with {drives.trace.gap[nearest, row]:.2f} m to spare"
+        values = [(metric, self.evaluations.metrics[metric.name][row]) for metric in self.objectives]
+        return ", ".join([word, *(f"{metric.title} {value:.1f} {metric.unit}" for metric, value in values if np.isfinite(value))])
 
 
 def changes_in_words(characteristics: CharacteristicSet, setting: FloatArray) -> list[str]:
@@ -168,7 +171,13 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     return Comparison(title=study.title + "".join(where[:1]), characteristics=system.characteristics,
                       ttc_threshold=system.metrics.ttc_threshold, network=staged(there.scenario).folder,
                       evaluations=score(there, settings, recording.drives),
-                      film=replace(recording, drives=_up_to_impacts(recording.drives)))
+                      film=replace(recording, drives=_up_to_impacts(recording.drives)), objectives=_further_objectives(there.measuring))
+
+
+def _further_objectives(measuring: Measuring) -> tuple[MetricFacts, ...]:
+    """Metrics of one run beyond the paper's; the points of a rating are those of all its cells."""
+    searched = {objective.name for objective in measuring.scoring.objectives}
+    return tuple(metric for metric in measuring.scoring.metrics if metric.name in searched - {*METRICS, RATING_POINTS.name})
 
 
 def _up_to_impacts(drives: SimulationRuns) -> SimulationRuns:

@@ -225,3 +225,12 @@ def test_without_a_display_it_is_refused(slippery: Path, monkeypatch: pytest.Mon
     comparison = compare_setting(case.study, system, case.characteristics.original)
     with pytest.raises(InputError, match="no display"):
         show_in_gui(comparison, system.scenario.network)
+
+
+def test_a_run_is_told_with_the_comfort_that_its_study_searches() -> None:
+    study = load_study("comfort")
+    system = assemble(study)
+    comparison = compare_setting(study, system, system.characteristics.setting({"mass": 2105.0, "maxBrakeTorque": 1360.0}, "it"))
+    for row in comparison.rows:
+        jerk = comparison.evaluations.metrics["max_jerk"][row]
+        assert comparison.verdict(row).endswith(f" m to spare, jerk {jerk:.1f} m/s^3")
