@@ -20,6 +20,7 @@ from safevar_sumo.results import evaluations_frame, record
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.engine import Engine
+from safevar_sumo.sumo.matrix import at_worst
 from safevar_sumo.sumo.matrix import simulate as drive
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import shown
@@ -214,7 +215,7 @@ def assembled(study: StudyLike, source: str = "") -> tuple[Study, System]:
 def _simulated(study: Study, system: System, asked: FloatArray, setting: FloatArray, engine: Engine = Engine.LIBSUMO) -> Simulation:
     seen = RecordingAds(system.ads)
     rows = setting[np.newaxis]
-    drives = drive(replace(system, ads=seen), rows, engine)
+    drives = drive(replace(at_worst(system, rows), ads=seen), rows, engine)  # in SUMO itself
     return Simulation(
         study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
         put_back=_put_back(system, asked, setting), evaluation=score(system, rows, drives), drives=drives,

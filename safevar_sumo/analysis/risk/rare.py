@@ -160,9 +160,9 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
             probabilities.append(probability)
             variations.append(variation)
             number += 1
-            if number == 1 and method == "subset_simulation" and probability < RARER:
+            if number == REPEATS and method == "subset_simulation" and np.mean(probabilities) < RARER:
                 repeats = REPEATS_OF_RARER
-                response.expected = response.simulations * repeats
+                response.expected = response.simulations * repeats // REPEATS
     mean = float(np.mean(probabilities))
     if mean <= 0:
         return Estimate(probability=0.0, variation=math.nan, interval=(0.0, SMALLEST), failures=response.failed, errors=response.errors,
