@@ -90,7 +90,7 @@ def test_in_words(test: RatedTest) -> str:
 
 def _changed(result: Rating, variant: Rated) -> str:
     members = CharacteristicSet.of(result.study.vehicle.characteristics)
-    parts = [f"{member.short_name} {member.text(variant.setting[member.name])}{member.suffix}" for member in members
+    parts = [f"{member.short_name} {float(member.text(variant.setting[member.name])):g}{member.suffix}" for member in members
              if variant.setting[member.name] != member.original]
     return joined(parts) if parts else "no change at all"
 
