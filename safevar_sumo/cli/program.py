@@ -8,10 +8,11 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Iterable, Iterator
 from concurrent.futures.thread import _threads_queues
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 import click
 
@@ -88,6 +89,7 @@ def commands() -> None:
 def main() -> None:
     """Run the program; its exit code is 0, 1 (failed), 2 (bad input) or 130 (interrupted)."""
     _have_standard_streams()
+    warnings.showwarning = _tell
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -110,6 +112,12 @@ def main() -> None:
         _drop_output()
         _fail(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}", 1)
     _leave(code if isinstance(code, int) else 0)
+
+
+def _tell(message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None,
+          line: str | None = None) -> None:
+    """Show a warning without the place in the code that it comes from."""
+    click.echo(f"warning: {message}", err=True)
 
 
 @contextmanager

@@ -73,11 +73,12 @@ Frame = Owner | Batch | Result | Retry
 
 
 class Content(NamedTuple):
-    """The contents of a journal: evaluations (None if there is none), their positions, and results by budget."""
+    """The contents of a journal: evaluations (None if there is none), their positions, results by budget, and the bytes of a torn tail."""
 
     positions: list[int]
     evaluations: Evaluations | None
     results: Mapping[int, Result]
+    torn: int = 0
 
     def result(self, budget: int) -> Result | None:
         """The result of the run with a budget of evaluations; None if it is unfinished."""
@@ -301,24 +302,27 @@ def read_journal(path: Path, study: str, run: str) -> Content:
     InputError
         If it cannot be read, is damaged, or belongs to another study or run.
     """
-    frames = _frames_of(path)
+    frames, torn = _frames_of(path)
     if frames and not (isinstance(frames[0], Owner) and frames[0].format in READABLE):
         raise InputError(path, "is of a format that this version does not read", "the version that wrote it")
     if frames and frames[0] not in [Owner(format=number, study=study, run=run) for number in READABLE]:
         raise InputError(path, "belongs to another study, run or version than the manifest beside it", "the journals of this study alone")
-    return content_of(frames)
+    return content_of(frames)._replace(torn=torn)
 
 
 def owner_of(path: Path) -> str | None:
     """The study of a journal that another process has opened; None until that process has written it."""
-    frames = _frames_of(path)
+    frames, _ = _frames_of(path)
     return frames[0].study if frames and isinstance(frames[0], Owner) else None
 
 
-def _frames_of(path: Path) -> list[Frame]:
+def _frames_of(path: Path) -> tuple[list[Frame], int]:
+    """The frames of a journal, and how many bytes of a torn tail follow."""
     try:
         refuse_other_than_file(path)
-        return read_frames(path.read_bytes(), path)[0]
+        data = path.read_bytes()
+        frames, end = read_frames(data, path)
+        return frames, len(data) - end
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -140,7 +141,7 @@ def _journals(place: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str
 
 
 def load(directory: str | Path) -> StoredResults:
-    """Read a results directory, finished or not: the runs and evaluations that its manifest's study asks for.
+    """Read a results directory, finished or not: the runs and evaluations that its manifest's study asks for; warns of torn runs.
 
     Raises
     ------
@@ -157,6 +158,10 @@ def load(directory: str | Path) -> StoredResults:
         return StoredResults(manifest, none, read_imported(place, search.characteristics))
     everything, solved, positions, failures = [], [], [], []
     for algorithm, run, content in _journals(place, manifest, search.runs):
+        if content is not None and content.torn and content.result(search.budget) is None:
+            journal = place / RUNS / f"{algorithm}-{run:02d}.journal"
+            warnings.warn(f"{journal}: the last {content.torn} bytes are torn, so the run is left out; the same study again simulates what "
+                          "they held", stacklevel=2)
         if content is None or content.evaluations is None:
             continue
         asked = sorted((position, row) for row, position in enumerate(content.positions) if 0 <= position < search.budget)

@@ -93,6 +93,10 @@ class FmuVehicle:
                                     for name, unit in known.items() if isinstance(one := tabled.get(name), str) and one in units}
         tuned = {name: self._characteristic(description, name, unit) for name, unit in units.items()
                  if name in description.variables or name not in self._sensors.values()}
+        for quantity, port in given.items():
+            if port.variable.name in tuned:
+                raise InputError(source, f"vehicle.inputs.{quantity} = {port.variable.name!r}: that variable is a characteristic, too",
+                                 "a variable of its own for each")
         read = {name: one for name, one in self._type.items() if isinstance(one, str) and one not in units}
         types = ports_of(description, read, TYPE, READABLE, source, "vehicle.sumo_type")
         self._quantities, self._tuned, self._outputs = tuple(given), tuple(tuned), (*told, *types)

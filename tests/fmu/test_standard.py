@@ -139,6 +139,14 @@ def test_a_characteristic_reaches_its_fmu_in_the_unit_that_it_declares(cart: Pat
         assemble(load_study("cart.toml"))
 
 
+def test_a_characteristic_is_no_input_too(cart: Path) -> None:
+    """What the scenario or the weather says would be lost."""
+    text = CART_TABLE.replace("inputs = {{", 'inputs = {{ initial_speed = "top",')
+    (cart / "cart.toml").write_text(text.format(more="[vehicle.characteristics]\npower = { original = 10.8 }\ntop = { upper = 40 }"))
+    with pytest.raises(InputError, match=r"vehicle\.inputs\.initial_speed = 'top': that variable is a characteristic, too"):
+        assemble(load_study("cart.toml"))
+
+
 def test_a_vehicle_of_another_step_is_where_its_line_between_two_points_is_and_goes_back_to_where_it_was(cart: Path) -> None:
     """A step of 0.4 s in a simulation of 0.1 s; a second drive from a state in the middle is the same as the first."""
     (cart / "cart.toml").write_text(CART_TABLE.format(more="step = 0.4\n[vehicle.characteristics]\npower = { original = 10.8 }"))

@@ -61,7 +61,7 @@ def same(one: Evaluations, other: Evaluations) -> bool:
 
 def holds_the_first(batches: int, content: Content) -> bool:
     """Whether exactly what was written first is there."""
-    positions, evaluations, _ = content
+    positions, evaluations, *_ = content
     if not batches:
         return positions == [] and evaluations is None
     expected = Evaluations.concatenate([batch(number) for number in range(batches)])

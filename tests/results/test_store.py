@@ -322,6 +322,15 @@ def test_a_study_under_way(slippery: Path, tmp_path: Path) -> None:
     assert "collisions" in "".join(lines), "no word is cut in two"
 
 
+def test_who_reads_results_is_told_of_a_torn_run(slippery: Path, tmp_path: Path) -> None:
+    shutil.copytree(slippery, tmp_path / "it")
+    journal = tmp_path / "it/runs/nsga2-00.journal"
+    journal.write_bytes(journal.read_bytes()[:-7])
+    with pytest.warns(UserWarning, match=r"nsga2-00\.journal: the last \d+ bytes are torn, so the run is left out"):
+        (case,) = load_cases([tmp_path / "it"])
+    assert ("nsga2", 0) not in case.finished
+
+
 def test_watching_ends_with_the_study_and_json_is_json(slippery: Path) -> None:
     done = CliRunner().invoke(commands, ["status", str(slippery), "--watch"])
     assert done.exit_code == 0
