@@ -82,9 +82,9 @@ def run(*arguments: str, expect: int = 0) -> Done:
 
 
 def refused(*arguments: str, message: tuple[str, ...]) -> None:
-    """The command ends with exit code 2 and one or two lines that tell all of `message`, or a line for each of several mistakes."""
+    """The command ends with exit code 2 and, warnings apart, one or two lines that tell all of `message`, or a line for each mistake."""
     done = run(*arguments, expect=2)
     for part in message:
         assert part in done.stderr, done.stderr
-    lines = done.stderr.strip().splitlines()
+    lines = [line for line in done.stderr.strip().splitlines() if not line.startswith("warning: ")]
     assert len(lines) <= 2 or lines[0].startswith("Usage:") or lines[0].endswith("mistakes"), done.stderr

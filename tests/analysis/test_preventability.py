@@ -130,6 +130,7 @@ def test_points_in_words() -> None:
     assert points_in_words((), 9) == "Fails at 0 of 9 points."
 
 
+@pytest.mark.slow
 def test_the_summary_of_a_matrix_asks_why_at_the_worst_point_alone(system: System, weak: np.ndarray, failure: Where) -> None:
     study = load_study("euro_ncap_pedestrian", matrix={"tests": TESTS})
     solutions = solutions_frame(system.characteristics.names, [(("nsga2", 0), evaluate(system, weak))])

@@ -106,6 +106,7 @@ def refused(*words: str) -> str:
     return f"{result.problem}: {result.legal}"
 
 
+@pytest.mark.slow
 def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results_refuses_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     Path("mine.toml").write_text(STUDY.replace("evaluations = 30", "evaluations = 4\npopulation = 2") + MATRIX)
     files = {"my_test.py": TEST, "table.txt": "1", "near.txt": "2", "far.txt": "3"}

@@ -20,6 +20,7 @@ from tests.in_process import refused, run
 pytestmark = pytest.mark.usefixtures("small")
 
 
+@pytest.mark.slow
 def test_shards_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
     for k in (1, 2):
         study("--out", "out", "--shard", f"{k}/2")

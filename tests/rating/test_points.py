@@ -113,6 +113,7 @@ def test_faster_impacts_never_gain_points_in_a_matrix(seed: int, share: float, m
         assert not after.fails[0] or (after.tests[name] == 0).all()
 
 
+@pytest.mark.slow
 def test_cells_are_what_their_points_are_alone_and_in_any_batch() -> None:
     study = load_study("euro_ncap_rating")
     system = assemble(study)

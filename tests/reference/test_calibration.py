@@ -41,6 +41,7 @@ def mine(gap: float, **fit: object) -> Study:
     return with_values(study, {GAP: gap * truth})
 
 
+@pytest.mark.slow
 def test_a_fit_from_scratch_finds_the_truth_and_forgets_what_the_study_says(data: ReferenceData) -> None:
     truth = load_study("sun").ads.parameters["brake_gap"]
     fits = [calibrate(mine(gap, starts=1, trials=36), {"mine": data}, Here(), from_scratch=True) for gap in (0.4, 1.5)]

@@ -133,6 +133,7 @@ def dtlz2(characteristics: CharacteristicSet, settings: np.ndarray) -> Evaluatio
     return _Dtlz2(**vars(evaluated(characteristics, settings, settings[:, 0])))
 
 
+@pytest.mark.slow
 def test_hypervolumes_are_those_of_jmetalpy_on_dtlz2() -> None:
     """The package of the study used jMetalPy; ten runs each of the same settings do not differ significantly."""
     variables, evaluations = 7, 3000

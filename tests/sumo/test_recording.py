@@ -106,6 +106,7 @@ def test_contacts_are_those_that_sumo_finds() -> None:
     assert 40 < outcomes.count(Outcome.COLLISION) < 220
 
 
+@pytest.mark.slow
 def test_points_of_different_length_share_a_batch() -> None:
     system = assemble(load_study("euro_ncap_car_to_car"))
     lengths = {point.scenario.duration for point in system.points}
