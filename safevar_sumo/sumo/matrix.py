@@ -50,18 +50,18 @@ class AtPoint(NamedTuple):
     drives: SimulationRuns
 
 
-def point_record(found: AtPoint, row: int = 0) -> dict[str, Any]:
+def point_record(result: AtPoint, row: int = 0) -> dict[str, Any]:
     """One setting at one point as plain values: where that is, how it ended, speeds of the impact [m/s], the worst deviation from the
     test's speed before the system acted [km/h], the time to collision at the first warning [s], who was touched where [%]; None if
     undefined.
     """
-    evaluations, relative = found.evaluations, found.drives.relative_speed
+    evaluations, relative = result.evaluations, result.drives.relative_speed
     numbers = {"impact_speed": evaluations.collision_speed[row], "relative_impact_speed": relative[row],
                SAFETY_DEGREE: evaluations.f_safe[row],
-               "test_speed_error": np.broadcast_to(found.drives.test_speed_error, relative.shape)[row] / KMH,
-               "warning_ttc": np.broadcast_to(found.drives.warning_ttc, relative.shape)[row]}
-    side, place = (np.broadcast_to(values, relative.shape)[row] for values in found.drives.contact)
-    return {"point": found.point.name, **dict(found.point.place), "outcome": str(evaluations.outcome[row]),
+               "test_speed_error": np.broadcast_to(result.drives.test_speed_error, relative.shape)[row] / KMH,
+               "warning_ttc": np.broadcast_to(result.drives.warning_ttc, relative.shape)[row]}
+    side, place = (np.broadcast_to(values, relative.shape)[row] for values in result.drives.contact)
+    return {"point": result.point.name, **dict(result.point.place), "outcome": str(evaluations.outcome[row]),
             **{name: None if np.isnan(value) else float(value) for name, value in numbers.items()},
             **({"contact": {"side": str(side), "place": float(place)}} if side else {})}
 
@@ -94,8 +94,8 @@ def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     """
     most = _most_vehicles(system, engine)
     parts = [settings[first:first + most] for first in range(0, len(settings), most)] or [settings]
-    found = [_evaluated(system, part, engine) for part in parts]
-    return found[0] if len(found) == 1 else Evaluations.concatenate(found)
+    evaluations = [_evaluated(system, part, engine) for part in parts]
+    return evaluations[0] if len(evaluations) == 1 else Evaluations.concatenate(evaluations)
 
 
 def _evaluated(system: System, settings: FloatArray, engine: Engine) -> Evaluations:
@@ -116,18 +116,18 @@ def rated_settings(system: System, settings: FloatArray, engine: Engine = Engine
         for one in group:
             scored[one.point.name], columns[one.point.name] = Scored(one.point, one.evaluations), cell_columns(one.drives)
     cells = joined_cells([columns[point.name] for point in system.points])
-    found = aggregated([scored[point.name] for point in system.points])
+    evaluations = aggregated([scored[point.name] for point in system.points])
     if system.rater is None:  # in some of the cells
-        return found, cells
-    return replace(found, metrics={**found.metrics, RATING_POINTS.name: system.rater.points(cells).total}), cells
+        return evaluations, cells
+    return replace(evaluations, metrics={**evaluations.metrics, RATING_POINTS.name: system.rater.points(cells).total}), cells
 
 
 def in_cells(system: System, settings: FloatArray, part: tuple[int, int], engine: Engine = Engine.RECORDED) -> Evaluations:
     """Settings, shape (N, n), in the k-th of n parts of a protocol's cells, `part` being (k, n): evaluations with their `cells`."""
     assert system.rater is not None
     points = tuple(system.matrix[number] for number in part_of(system.rater.protocol, *part))
-    found, cells = rated_settings(replace(system, matrix=points, rater=None), settings, engine)
-    return replace(found, cells=cells)
+    evaluations, cells = rated_settings(replace(system, matrix=points, rater=None), settings, engine)
+    return replace(evaluations, cells=cells)
 
 
 def settings_per_batch(system: System, engine: Engine) -> int:
@@ -149,11 +149,11 @@ def _most_vehicles(system: System, engine: Engine) -> int:
     return min(max(LARGEST_ROADS // max(lanes, 1), 1), LARGEST_WORLD, largest_batch(system))
 
 
-def aggregated(found: Sequence[AtPoint | Scored]) -> Evaluations:
+def aggregated(at_points: Sequence[AtPoint | Scored]) -> Evaluations:
     """What settings that were simulated at every point are worth."""
-    settings = found[0].evaluations.settings
-    row_of, columns = worst_points(found), np.arange(len(settings))
-    every = Evaluations.concatenate([one.evaluations for one in found])
+    settings = at_points[0].evaluations.settings
+    row_of, columns = worst_points(at_points), np.arange(len(settings))
+    every = Evaluations.concatenate([one.evaluations for one in at_points])
     return every.take(row_of * len(settings) + columns)
 
 
@@ -175,14 +175,14 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
         return drive_all(system, settings, engine, options, watch)
     if watch is not None or engine is Engine.GUI:
         return drive_all(at_worst(system, settings), settings, engine, options, watch)
-    found = at_every_point(system, settings, engine, options)
-    return _picked([one.drives for one in found], worst_points(found))
+    at_points = at_every_point(system, settings, engine, options)
+    return _picked([one.drives for one in at_points], worst_points(at_points))
 
 
 def at_every_point(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = ()) -> list[AtPoint]:
     """Settings, shape (N, n), at every point, in the points' order; raises as `simulate`."""
-    found = {one.point.name: one for group in _groups(system, settings, engine, options) for one in group}
-    return [found[point.name] for point in system.points]
+    by_name = {one.point.name: one for group in _groups(system, settings, engine, options) for one in group}
+    return [by_name[point.name] for point in system.points]
 
 
 def _groups(system: System, settings: FloatArray, engine: Engine, options: tuple[str, ...] = ()) -> Iterator[list[AtPoint]]:
@@ -225,8 +225,8 @@ def _nearest(name: str, names: Sequence[str]) -> str:
         return "a study with a matrix"
     asked = {part.strip() for part in name.split(",")}
     order = sorted(names, key=lambda one: (-len(asked & set(one.split(", "))), -SequenceMatcher(None, one, name).ratio()))
-    told = "; ".join(order[:NEAREST])
-    return told if len(names) <= NEAREST else f"one of {len(names)} points, the nearest of them: {told}"
+    legal = "; ".join(order[:NEAREST])
+    return legal if len(names) <= NEAREST else f"one of {len(names)} points, the nearest of them: {legal}"
 
 
 def study_at(study: Study, name: str, source: object) -> Study:
@@ -255,18 +255,18 @@ def _together(points: Sequence[Point], most: int, options: Sequence[str]) -> Ite
             yield tuple(group[start:start + max(most, 1)])
 
 
-def worst_points(found: Sequence[AtPoint | Scored]) -> npt.NDArray[np.intp]:
+def worst_points(at_points: Sequence[AtPoint | Scored]) -> npt.NDArray[np.intp]:
     """For every setting the number of the point with the least safety degree; among equals the first by name.
 
     A collision at a valid point stands, whatever the others are. Without one, a single invalid test makes it unknown whether the
     setting is safe: then that point counts.
     """
-    order = sorted(range(len(found)), key=lambda k: found[k].point.name)
-    degrees = np.stack([found[k].evaluations.f_safe for k in order])
+    order = sorted(range(len(at_points)), key=lambda k: at_points[k].point.name)
+    degrees = np.stack([at_points[k].evaluations.f_safe for k in order])
     degrees = np.where(np.isnan(degrees), np.inf, degrees)
-    invalid = np.stack([found[k].evaluations.outcome == Outcome.INVALID_TEST for k in order])
+    invalid = np.stack([at_points[k].evaluations.outcome == Outcome.INVALID_TEST for k in order])
     if invalid.any():
-        collided = np.stack([found[k].evaluations.collided for k in order]).any(axis=0)
+        collided = np.stack([at_points[k].evaluations.collided for k in order]).any(axis=0)
         degrees = np.where(invalid & ~collided, -np.inf, degrees)
     return np.asarray(np.array(order)[np.argmin(degrees, axis=0)])
 

@@ -113,10 +113,10 @@ def _name(sources: Sources, n: int, files: Sequence[str]) -> str:
 
 
 @cache
-def _digest(contents: tuple[bytes, ...], made: str) -> str:
-    """Of all that copies are made from: sources, how they are `made`, netconvert and its recipe, and our code."""
+def _digest(contents: tuple[bytes, ...], build: str) -> str:
+    """Of all that copies come from: sources, how they are built (`build`), netconvert and its recipe, and our code."""
     code = b"".join(Path(str(module)).read_bytes() for module in (__file__, copies.__file__))
-    digest = hashlib.sha256(f"{made} {netconvert_version()} {RECIPE}".encode() + code)
+    digest = hashlib.sha256(f"{build} {netconvert_version()} {RECIPE}".encode() + code)
     for content in contents:
         digest.update(len(content).to_bytes(8, "big") + content)
     return digest.hexdigest()[:16]
@@ -156,18 +156,18 @@ def _run(sources: Sources, program: str, *arguments: str) -> tuple[int, str]:
 def _try(sources: Sources, into: Path) -> None:
     """Have SUMO load a network that somebody else built, in a process of its own: it dies of some that are broken."""
     _checked(sources.place / sources.built)
-    code, told = _run(sources, "sumo", "-n", sources.built, "--no-step-log", "true", "--end", "0")
+    code, errors = _run(sources, "sumo", "-n", sources.built, "--no-step-log", "true", "--end", "0")
     if code != 0:
-        raise InputError(sources.place / sources.built, f"SUMO cannot load it: {told or f'it dies with exit code {code}'}",
+        raise InputError(sources.place / sources.built, f"SUMO cannot load it: {errors or f'it dies with exit code {code}'}",
                          "a network of SUMO")
     (into / TRIED).write_text("SUMO loads it.\n", encoding="ascii")
 
 
 def _try_all(sources: Sources, built: Path, into: Path) -> None:
-    code, told = _run(sources, "sumo", "-c", OPTIONS, "-n", str(built.absolute()), "-r", TRAFFIC, "--begin", "0", "--end", "0",
+    code, errors = _run(sources, "sumo", "-c", OPTIONS, "-n", str(built.absolute()), "-r", TRAFFIC, "--begin", "0", "--end", "0",
                       "--no-step-log", "true")
-    if code != 0 or told:
-        raise InputError(sources.place, f"SUMO refuses {OPTIONS} or {TRAFFIC}: {told or f'it dies with exit code {code}'}",
+    if code != 0 or errors:
+        raise InputError(sources.place, f"SUMO refuses {OPTIONS} or {TRAFFIC}: {errors or f'it dies with exit code {code}'}",
                          "options and traffic that SUMO loads without an error")
     (into / TRIED).write_text("SUMO loads it.\n", encoding="ascii")
 
@@ -178,11 +178,11 @@ def _build(sources: Sources, into: Path) -> None:
         command += [f"--{option}", ",".join(names)]
     for option, value in sources.options:
         command += [f"--{option}", value]
-    code, told = _run(sources, "netconvert", *command, "-o", str(into / ROADS))
+    code, errors = _run(sources, "netconvert", *command, "-o", str(into / ROADS))
     if code != 0:
-        if code < 0 or not told or ("Could not" in told and "output" in told) or "bad_alloc" in told:
-            raise EnvironmentFault(f"{sources.place}: netconvert fails: {told or f'exit code {code}'}")
-        raise InputError(sources.place, f"netconvert refuses the network: {told}", "sources that netconvert builds a network from")
+        if code < 0 or not errors or ("Could not" in errors and "output" in errors) or "bad_alloc" in errors:
+            raise EnvironmentFault(f"{sources.place}: netconvert fails: {errors or f'exit code {code}'}")
+        raise InputError(sources.place, f"netconvert refuses the network: {errors}", "sources that netconvert builds a network from")
     _keep_the_net_alone(into / ROADS)
 
 
@@ -282,7 +282,7 @@ def _check_numbers(root: ElementTree.Element, file: Path, unsaid: str = "") -> N
 def _number(text: str) -> float:
     """A finite number, or -infinity for what is none."""
     try:
-        found = float(text)
+        number = float(text)
     except ValueError:
         return -math.inf
-    return found if math.isfinite(found) else -math.inf
+    return number if math.isfinite(number) else -math.inf

@@ -50,15 +50,15 @@ def options_of(file: Path) -> dict[str, str]:
         root = ElementTree.fromstring(file.read_bytes())
     except (OSError, ElementTree.ParseError) as error:
         raise InputError(file, f"cannot be read: {error}", "a configuration of SUMO") from None
-    found: dict[str, str] = {}
+    options: dict[str, str] = {}
     for element in root.iter():
         if "value" in element.attrib and element is not root:
-            if element.tag in found:
+            if element.tag in options:
                 raise InputError(file, f"sets {element.tag!r} twice", "each option once")
-            found[element.tag] = element.attrib["value"].strip()
+            options[element.tag] = element.attrib["value"].strip()
         elif element is not root and element.tag not in SECTIONS:
             raise InputError(file, f"sets SUMO's option {element.tag!r} without value=", f'<{element.tag} value="..."/>')
-    return found
+    return options
 
 
 def check_options(file: Path) -> None:
@@ -109,13 +109,13 @@ def own_files(file: Path, name: str, value: str) -> tuple[str, ...]:
     InputError
         If it names one that is not beside it.
     """
-    found = tuple(one.strip() for one in value.split(",") if one.strip())
-    for one in found:
+    files = tuple(one.strip() for one in value.split(",") if one.strip())
+    for one in files:
         if Path(one).name != one or "\\" in one:
             raise InputError(file, f"{name} = {one!r} is in another folder", "the name of a file beside it")
         if name in SOURCES and not (file.parent / one).is_file():
             raise InputError(file, f"{name}: {one} is missing", "a file beside it")
-    return found
+    return files
 
 
 OPTIONS = "scenario.sumocfg"
@@ -229,13 +229,13 @@ def _plain(place: Path) -> Sources | None:
             raise InputError(recipe, "names no sources", "node-files, edge-files and connection-files, or another network")
         return Sources(place, "", tuple(sources.items()), tuple(options.items()), recipe.name, builds)
     names = {option: f"network.{ending}.xml" for option, ending in PLAIN.items()}
-    found = {option: (name,) for option, name in names.items() if (place / name).is_file()}
-    if not found:
+    files = {option: (name,) for option, name in names.items() if (place / name).is_file()}
+    if not files:
         return None
     for name in REQUIRED[:3]:
         if not (place / name).is_file():
             raise InputError(place, f"{name} is missing", LEGAL)
-    return Sources(place, "", tuple(found.items()), tuple(PRECISION.items()), "", f"network{BUILT}")
+    return Sources(place, "", tuple(files.items()), tuple(PRECISION.items()), "", f"network{BUILT}")
 
 
 def _named(place: Path) -> str:
@@ -245,9 +245,9 @@ def _named(place: Path) -> str:
 
 def _only(place: Path) -> str:
     """The one network that has been built in a folder without sources."""
-    found = sorted(file.name for file in place.glob(f"*{BUILT}"))
-    if not found:
+    networks = sorted(file.name for file in place.glob(f"*{BUILT}"))
+    if not networks:
         raise InputError(place, f"{REQUIRED[0]} is missing", LEGAL)
-    if len(found) > 1:
-        raise InputError(place, f"has {' and '.join(found)}", f"one network, or net-file in {OPTIONS} that says which")
-    return found[0]
+    if len(networks) > 1:
+        raise InputError(place, f"has {' and '.join(networks)}", f"one network, or net-file in {OPTIONS} that says which")
+    return networks[0]

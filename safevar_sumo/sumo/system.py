@@ -66,7 +66,7 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     InputError
         If there is no such record, it is wrong, or its name is taken.
     """
-    metrics, found = {**METRICS, **({RATING_POINTS.name: RATING_POINTS} if is_rated(study) else {})}, list[Member]()
+    metrics, members = {**METRICS, **({RATING_POINTS.name: RATING_POINTS} if is_rated(study) else {})}, list[Member]()
     known = dict(metrics)
     changes = {name: change for name, change in CHANGES.items() if name not in TAKEN}
     by_name: dict[str, Metric | Change] = {}
@@ -80,7 +80,7 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
             if name in FURTHER:
                 metrics[name] = member.what
             return member.what  # type: ignore[no-any-return]
-        found.append(member)
+        members.append(member)
         foreign = isinstance(member.what, Change) and key == OBJECTIVES
         record = foreign_change(member.what, member.guard) if foreign else foreign_metric(member.what, member.guard)
         if record.name in (*TAKEN, *metrics, *FURTHER, *changes, *study.vehicle.characteristics):
@@ -98,7 +98,7 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     objectives = [_objective(taken_in(name, OBJECTIVES)) for name in names]
     _refuse_twice(objectives, lookup.source)
     scoring = Scoring(metrics=tuple(metric.facts for metric in metrics.values()), objectives=tuple(objectives))
-    return Measuring(metrics, changes, scoring, tuple(found))
+    return Measuring(metrics, changes, scoring, tuple(members))
 
 
 def _objective(record: Metric | Change) -> Objective:
@@ -168,17 +168,17 @@ class System:
         in_traci = isinstance(self.ads, TraciController)
         fmus = [remark for model in (self.vehicle, self.ads) for remark in getattr(model, "remarks", ())]
         networks = dict.fromkeys(point.scenario.network for point in self.points)
-        found = [remark for network in networks for remark in network_remarks(network, self.nominal.max_speed, sumo_drives=in_traci)]
-        found += fmus
+        remarks = [remark for network in networks for remark in network_remarks(network, self.nominal.max_speed, sumo_drives=in_traci)]
+        remarks += fmus
         hazy = {point.weather.name: point.weather.visibility for point in self.points if point.weather.visibility != 1}
         if in_traci and not self._sees_a_limited_way():
-            found += [f"weather {name!r}: visibility = {value:g} does nothing: the vehicle has no sensor range, and a controller written "
+            remarks += [f"weather {name!r}: visibility = {value:g} does nothing: the vehicle has no sensor range, and a controller written "
                       "for TraCI sees as far" for name, value in hazy.items()]
         if not any(getattr(self.ads, name, 0.0) for name in REACTIONS):
-            found += [f"weather {name!r} changes nothing: its road and its sight are those of clear weather, and nothing under "
+            remarks += [f"weather {name!r} changes nothing: its road and its sight are those of clear weather, and nothing under "
                       "[ads.parameters] says that the ADS reacts later in it"
                       for name in dict.fromkeys(point.weather.name for point in self.points if _as_clear(point.weather))]
-        return found
+        return remarks
 
     def _sees_a_limited_way(self) -> bool:
         sensors = getattr(self.vehicle, "sensors", None)
@@ -294,12 +294,12 @@ def _with_network(scenario: Any, places: Sequence[str]) -> Any:
     """
     folder = scenario.network
     there = [path for place in places if is_network(path := Path(place, folder))]
-    found = str(next((path for path in there if path.is_file() or any(path.glob("*.xml"))), there[0] if there else folder))
-    if found == folder or is_shipped(folder):
+    network = str(next((path for path in there if path.is_file() or any(path.glob("*.xml"))), there[0] if there else folder))
+    if network == folder or is_shipped(folder):
         return scenario
     if isinstance(scenario, msgspec.Struct):
-        return msgspec.structs.replace(scenario, network=found)
-    scenario.network = found
+        return msgspec.structs.replace(scenario, network=network)
+    scenario.network = network
     return scenario
 
 

@@ -136,15 +136,15 @@ class SumoWorld:
 
         Of two vehicles on a junction SUMO calls the collider who would have to yield (`MSLane::detectCollisions`): either may be ours.
         """
-        self._struck, found = {}, dict[int, float]()
+        self._struck, speeds = {}, dict[int, float]()
         for one in self._api.simulation.getCollisions():
             pairs = [(one.collider, one.colliderSpeed, one.victim)]
             if one.type == "junction":
                 pairs.append((one.victim, one.victimSpeed, one.collider))
             for name, speed, other in pairs:
                 if (copy := self._copy_of.get(name)) is not None and open_[copy]:
-                    found[copy], self._struck[copy] = speed, other
-        return found
+                    speeds[copy], self._struck[copy] = speed, other
+        return speeds
 
     def bodies(self, copies: Sequence[int]) -> tuple[Body, Body]:
         """Vehicles under test that collide in this step, and whom they collide with; in columns."""
@@ -183,11 +183,11 @@ class SumoWorld:
         """Positions in this step; whoever asks again gets the same array."""
         if actor not in self._positions:
             names = self._driving if actor == VUT else self.ids(actor)
-            found = np.fromiter(chain.from_iterable(map(position, names)), float, 2 * len(names)).reshape(-1, 2)
+            positions = np.fromiter(chain.from_iterable(map(position, names)), float, 2 * len(names)).reshape(-1, 2)
             if len(names) < self.n:
-                found, on_the_road = self._last_positions.copy(), found
-                found[self._rows] = on_the_road
-            self._positions[actor] = found
+                positions, on_the_road = self._last_positions.copy(), positions
+                positions[self._rows] = on_the_road
+            self._positions[actor] = positions
         return self._positions[actor]
 
     @property

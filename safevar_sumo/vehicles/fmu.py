@@ -17,7 +17,7 @@ from safevar_sumo.vehicles.sensors import Sensors, late_and_near
 PEDALS: Mapping[str, str] = {"throttle": "-", "brake": "-"}
 ROAD: Mapping[str, str] = {"road_friction": "-", "grade": "-", "wet": "-", "initial_speed": "m/s", "step": "s"}
 """What stays the same during a run: inputs, or parameters that are set at the start. A grade is rise over run."""
-TOLD: Mapping[str, str] = {"speed": "m/s", "throttle": "-", "brake": "-", "gear": "-"}
+RETURNED: Mapping[str, str] = {"speed": "m/s", "throttle": "-", "brake": "-", "gear": "-"}
 TYPE: Mapping[str, str] = {"mass": "kg", "accel": "m/s^2", "decel": "m/s^2", "max_speed": "m/s", "tau": "s"}
 USUAL_LAG = 0.1
 """Actuator lag that a driving system reckons with where the study gives none [s]."""
@@ -83,8 +83,8 @@ class FmuVehicle:
                 if name not in known:
                     raise unknown(source, f"vehicle.{key}.{name}: there is no such quantity", name, known)
         given = ports_of(description, table["inputs"], {**PEDALS, **ROAD}, ("input",), source, "vehicle.inputs", constant=ROAD)
-        told = ports_of(description, table["outputs"], TOLD, ("output",), source, "vehicle.outputs")
-        for key, there, needed in (("inputs", given, PEDALS), ("outputs", told, ("speed",)), ("sumo_type", self._type, TYPE)):
+        outputs = ports_of(description, table["outputs"], RETURNED, ("output",), source, "vehicle.outputs")
+        for key, there, needed in (("inputs", given, PEDALS), ("outputs", outputs, ("speed",)), ("sumo_type", self._type, TYPE)):
             for name in needed:
                 if name not in there:
                     raise InputError(source, f"vehicle.{key}.{name} is missing", NEEDED[key])
@@ -99,11 +99,11 @@ class FmuVehicle:
                                  "a variable of its own for each")
         read = {name: one for name, one in self._type.items() if isinstance(one, str) and one not in units}
         types = ports_of(description, read, TYPE, READABLE, source, "vehicle.sumo_type")
-        self._quantities, self._tuned, self._outputs = tuple(given), tuple(tuned), (*told, *types)
+        self._quantities, self._tuned, self._outputs = tuple(given), tuple(tuned), (*outputs, *types)
         self._reads_type = bool(types)
         inputs = [*given.values(), *tuned.values()]
         fixed = list(fixed_of(description, table["parameters"], [port.variable.name for port in inputs], source, "vehicle.parameters"))
-        self._instances = Instances(description, inputs, [*told.values(), *types.values()], fixed, limit)
+        self._instances = Instances(description, inputs, [*outputs.values(), *types.values()], fixed, limit)
         self.most_vehicles = self._instances.most_vehicles
         self.takes_slope, self.can_start_moving = "grade" in given, "initial_speed" in given
         self._takes_friction = "road_friction" in given
@@ -135,15 +135,15 @@ class FmuVehicle:
         given = {"throttle": nothing, "brake": nothing, "road_friction": nothing + road_friction, "wet": nothing + wet,
                  "grade": nothing + slope.back / slope.down, "step": nothing + step, "initial_speed": nothing}
         fleet = Fleet(self._instances, n, step, self._own_step)
-        told = {}
+        outputs = {}
         if self._reads_type:
-            told = dict(zip(self._outputs, self._start(fleet, self._stacked(given, characteristics))[0], strict=True))
+            outputs = dict(zip(self._outputs, self._start(fleet, self._stacked(given, characteristics))[0], strict=True))
 
         def value(one: str | float, name: str) -> FloatArray:
             if not isinstance(one, str):
                 return nothing + one
             if one not in characteristics:
-                return np.asarray(told[name])
+                return np.asarray(outputs[name])
             theirs, ours = self._of_characteristics[one]
             return np.asarray(theirs.to(ours, characteristics[one]))
 
@@ -189,9 +189,9 @@ class FmuVehicle:
             (now, smooth), past = prepared.fleet.advance(state.past, inputs)
         except Fault as fault:
             raise self._failed(fault) from None
-        told = dict(zip(self._outputs, now, strict=True))
-        told["speed"] = dict(zip(self._outputs, smooth, strict=True))["speed"]
-        after, most = self._state(told, command, state.seen, past), prepared.types.max_speed
+        outputs = dict(zip(self._outputs, now, strict=True))
+        outputs["speed"] = dict(zip(self._outputs, smooth, strict=True))["speed"]
+        after, most = self._state(outputs, command, state.seen, past), prepared.types.max_speed
         for i in np.flatnonzero(after.speed > np.maximum(most, state.speed) * (1 + ROUNDING))[:1]:
             raise self._guard.wrong("doStep", "speed", float(after.speed[i]), f"up to vehicle.sumo_type.max_speed = {most[i]:g}")
         return after
@@ -214,10 +214,10 @@ class FmuVehicle:
     def _stacked(self, given: Mapping[str, FloatArray], characteristics: Characteristics) -> FloatArray:
         return np.stack([*(given[name] for name in self._quantities), *(characteristics[name] for name in self._tuned)])
 
-    def _state(self, told: Mapping[str, FloatArray], command: Command, seen: FloatArray | None, past: Past) -> _State:
+    def _state(self, outputs: Mapping[str, FloatArray], command: Command, seen: FloatArray | None, past: Past) -> _State:
         n = command.throttle.shape
-        speed = np.where(np.abs(told["speed"]) < ROUNDING, 0.0, told["speed"])
-        values = {"gear": np.ones(n), **command._asdict(), **told, "speed": speed}
+        speed = np.where(np.abs(outputs["speed"]) < ROUNDING, 0.0, outputs["speed"])
+        values = {"gear": np.ones(n), **command._asdict(), **outputs, "speed": speed}
         bounds = {"speed": (0.0, FASTEST), "gear": (-np.inf, np.inf)}
         columns = {name: self._guard.numbers("doStep", name, values[name], n, *bounds.get(name, (0.0, 1.0))) for name in _State._fields[:4]}
         return _State(**columns, seen=seen, past=past)
