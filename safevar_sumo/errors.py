@@ -114,5 +114,5 @@ def refuse_other_than_file(path: Path, source: object = None, *, streams: bool =
     """
     handed_on = streams and (str(path) in HANDED_ON or str(path.parent) in HANDLES)
     if path.exists() and not path.is_file() and not handed_on:
-        problem = "is no regular file"
+        problem = "is no regular file but a directory" if path.is_dir() else "is no regular file"
         raise InputError(path if source is None else source, problem if source is None else f"{path} {problem}", "a file")

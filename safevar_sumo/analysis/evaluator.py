@@ -112,7 +112,7 @@ class Evaluator:
         SimulationError
             If a setting cannot be simulated.
         """
-        rater = rater_of(self.study, f"study {self.study.name!r}")
+        rater = rater_of(self.study, self.study.source)
         assert rater is not None
         number = len(rater.protocol.cells)
         parts = min(PARTS * self._pool.workers, number)
@@ -177,7 +177,7 @@ def open_evaluator(study: Study, pool: Pool | None = None, jobs: int | None = No
     if pool is not None:
         yield Evaluator(study, pool, progress)
         return
-    assemble(study)
+    assemble(study, study.source)
     with local_pool(jobs or available_cores(), study.search.time_limit) as own:
         yield Evaluator(study, own, progress)
 

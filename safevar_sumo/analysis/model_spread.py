@@ -109,7 +109,7 @@ def studies_of_sets(study: Study) -> list[Study]:
         If there are no sets, or a parameter of theirs is none of the study's.
     """
     if not study.spread:
-        raise InputError(f"study {study.name!r}", "has no table [spread]", "a study that `calibrate` has fitted, such as sun or rain")
+        raise InputError(study.source, "has no table [spread]", "a study that `calibrate` has fitted, such as sun or rain")
     sets = {key: values for key, values in study.spread.items() if np.isclose(value_of(study, key), values[0], rtol=AS_GIVEN, atol=0)}
     count = len(next(iter(study.spread.values())))
     return [study, *(with_values(study, {key: values[k] for key, values in sets.items()}) for k in range(1, count))]

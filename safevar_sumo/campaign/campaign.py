@@ -77,7 +77,7 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     persistent, work = RetryingPool(pool, study, results.note), packed(study, results.inputs, engine=engine)
     original = _original(study, work, characteristics, results, persistent, observer)
     if not original.valid[0]:
-        raise InputError(f"study {study.name!r}", "the original vehicle leaves the tolerance of a test's speed before the ADS acts "
+        raise InputError(study.source, "the original vehicle leaves the tolerance of a test's speed before the ADS acts "
                          "(invalid-test): nothing can be compared with it", "tests whose speed the vehicle can hold")
     if original.collided[0] and not is_rated(study):
         observer.warned(f"study {study.name!r}: the original vehicle itself collides, no change is needed for that")

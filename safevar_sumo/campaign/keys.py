@@ -37,7 +37,7 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     InputError
         If there is no such algorithm, it does not meet its contract, or does not take its parameters.
     """
-    source, search = f"study {study.name!r}", study.search
+    source, search = study.source, study.search
     name, key = search.labels.get(label, label), f"search.{label}"
     if len(search.labels) < len(set(search.algorithms)):
         raise InputError(source, f"search.algorithms = {search.algorithms}: two have one name", "algorithms of different names")
@@ -94,7 +94,7 @@ def _packages(study: Study) -> list[str]:
 
 def algorithm_member(name: str, study: Study) -> Member:
     """An algorithm of a study by its name."""
-    lookup = Lookup(f"study {study.name!r}", study.origin.places)
+    lookup = Lookup(study.source, study.origin.places)
     return lookup.class_of(ALGORITHMS, name, "search.algorithms", ALGORITHM_CONTRACT)
 
 

@@ -68,11 +68,13 @@ SWEPT = 11
 """Values of a sweep that does not say how many."""
 MOST = 10_000
 """Settings of all sweeps together."""
+ONE_VALUE = "one value for each: NAME=VALUE in the characteristic's unit, or NAME=+10% of the original"
 LEGAL = "NAME=VALUE in the characteristic's unit, NAME=+10% of the original, or NAME=FROM..TO, NAME=FROM..TO:NUMBER"
 
 
-def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, beyond: bool) -> dict[str, list[float]]:
-    """The values that each named characteristic is to take, one after the other.
+def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, beyond: bool, *, single: bool = False
+                 ) -> dict[str, list[float]]:
+    """The values that each named characteristic is to take, one after the other; `single`: one for each, of a command without --beyond.
 
     Raises
     ------
@@ -80,19 +82,22 @@ def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, b
         If a change has another form, a name is unknown or given twice, or a value is outside its domain.
     """
     values_by_name: dict[str, list[float]] = {}
+    legal = ONE_VALUE if single else LEGAL
     for change in changes:
         name, sign, text = (part.strip() for part in change.partition("="))
         if not sign:
-            raise InputError("--set", repr(change), LEGAL)
+            raise InputError("--set", repr(change), legal)
         if name in values_by_name:
             raise InputError("--set", f"{name} is set twice", "each characteristic once")
         if name not in characteristics.names:
             raise unknown("--set", f"there is no characteristic {name!r}", name, characteristics.names)
         member = characteristics.members[characteristics.names.index(name)]
-        values_by_name[name] = _values(change, text, member.original)
+        values_by_name[name] = _values(change, text, member.original, legal)
+        if single and len(values_by_name[name]) > 1:
+            raise InputError("--set", f"{change!r} is a sweep", legal)
         for value in values_by_name[name]:
             share = f", or {name}={text}% of the original" if SIGNED.fullmatch(text) else ""
-            member.check(value, "--set", beyond=beyond, otherwise=share, switch="--beyond")
+            member.check(value, "--set", beyond=beyond, otherwise=share, switch="" if single else "--beyond")
     if np.prod([len(values) for values in values_by_name.values()], dtype=float) > MOST:
         raise InputError("--set", f"{' '.join(changes)}: more than {MOST} settings", "shorter sweeps, FROM..TO:NUMBER")
     return values_by_name
@@ -109,7 +114,7 @@ def settings_of(changes: dict[str, list[float]], base: FloatArray, characteristi
     return np.array(rows)
 
 
-def _values(change: str, text: str, original: float) -> list[float]:
+def _values(change: str, text: str, original: float, legal: str) -> list[float]:
     if share := SHARE.fullmatch(text):
         return [original + abs(original) * float(share[1]) / 100]
     if sweep := SWEEP.fullmatch(text):
@@ -117,7 +122,7 @@ def _values(change: str, text: str, original: float) -> list[float]:
     try:
         return [float(text)]
     except ValueError:
-        raise InputError("--set", repr(change), LEGAL) from None
+        raise InputError("--set", repr(change), legal) from None
 
 
 def complete_study(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:

@@ -44,8 +44,29 @@ COMMANDS = {
 """Every command in the order of the help, with its module in this folder and its sentence in the help."""
 
 
+class OneOfEach(click.Command):
+    """A command that refuses options of which the last alone would count: one that is given twice, two of one choice."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if not ctx.resilient_parsing:
+            values, _, order = self.make_parser(ctx).parse_args(list(args))
+            flags: dict[str, str] = {}
+            for one in order:
+                if not isinstance(one, click.Option) or one.multiple or one.name is None:
+                    continue
+                flag, other = one.opts[-1], flags.get(one.name)
+                if other not in (None, flag):
+                    raise InputError(flag, f"{other} is given too", "one of them")
+                if other == flag and not one.is_flag:
+                    raise InputError(flag, f"is given twice, the last time as {values[one.name]!r}", "one value")
+                flags[one.name] = flag
+        return super().parse_args(ctx, args)
+
+
 class OnDemand(click.Group):
     """Loads the module of a command when the command is called: modules of other commands take long to load."""
+
+    command_class = OneOfEach
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)

@@ -69,10 +69,7 @@ def rating(place: str, changes: tuple[str, ...], solution: str | None, matrix: b
 
 def _changes(study: Study, changes: tuple[str, ...]) -> dict[str, float]:
     """Values by characteristic, one for each."""
-    values = read_changes(changes, CharacteristicSet.of(study.vehicle.characteristics), False)
-    for name, several in values.items():
-        if len(several) > 1:
-            raise InputError("--set", f"{name} takes {len(several)} values", "one value: one variant stands beside the original")
+    values = read_changes(changes, CharacteristicSet.of(study.vehicle.characteristics), False, single=True)
     return {name: value for name, (value,) in values.items()}
 
 

@@ -86,7 +86,7 @@ def report(directories: tuple[str, ...], out: Path, only: str | None, point: str
     sections = [name.strip() for name in only.split(",")] if only is not None else []
     with stages(Console(stderr=True)) as progress, warnings.catch_warnings(record=True) as otherwise:
         warnings.simplefilter("always", UserWarning)
-        page = make_report(directories, sections, jobs, progress, point=point or "", as_it_is_now=as_it_is_now())
+        page = make_report(directories, sections, jobs, progress, point=point, as_it_is_now=as_it_is_now())
     for one in otherwise:
         click.echo(f"warning: {one.message}", err=True)
     write_whole(out, page)

@@ -46,7 +46,7 @@ class Probe(ABC):
     def system(self) -> System:
         """The system of the subject's study, with all foreign modules loaded anew."""
         forget_foreign()
-        system = assemble(self.subject.study)
+        system = assemble(self.subject.study, self.subject.study.source)
         return replace(system, matrix=system.matrix[::max(len(system.matrix) // POINTS, 1)], rater=None)
 
     @abstractmethod

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, get_args
 import msgspec
 
 from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, FmuAds, ScalarAds
-from safevar_sumo.errors import InputError, SafevarError, unknown
+from safevar_sumo.errors import InputError, SafevarError, refuse_other_than_file, unknown
 from safevar_sumo.fmu import file_of
 from safevar_sumo.metrics import FURTHER, METRICS, Metric
 from safevar_sumo.plugins import Contract, Guard, Lookup, Member
@@ -101,18 +101,19 @@ def subject_of(name: str, study: str | None = None) -> Subject:
 
 def _fmu_of(name: str, chosen: Study | None) -> Subject:
     """An FMU in a study that maps its variables."""
+    refuse_other_than_file(Path(name))
     for study in [chosen] if chosen else _studies_beside(Path(name).name, str(Path(name).absolute().parent)):
         for key, model in fmus_of(study):
             if file_of(model, study.origin.places) == str(Path(name).absolute()):
                 remarks = () if chosen else (f"tried in {study.origin.called}, which names it",)
                 return _fmu(study, key.partition(".")[0], model)._replace(remarks=remarks)
-    problem = f"no study says what the variables of {name!r} stand for"
+    problem = f"no study says what the variables of {name!r} stand for" if Path(name).exists() else f"there is no file {name!r}"
     raise InputError("check", problem, '--study STUDY, whose [ads] or [vehicle] has kind = "fmu" and that model')
 
 
 def subjects_of(study: Study) -> Iterator[Subject]:
     """Everything that a study names, once."""
-    lookup = Lookup(f"study {study.name!r}", study.origin.places)
+    lookup = Lookup(study.source, study.origin.places)
     named = {"vehicle": [study.vehicle.model], "traci" if study.ads.kind == "traci" else "ads": [study.ads.model],
              "scenario": [study.scenario.model, *(test.model for test in _tests(study) if test.model)],
              "metric": study.metrics.also, "objective": study.search.objectives, "algorithm": study.search.algorithms}
@@ -133,7 +134,7 @@ def subjects_of(study: Study) -> Iterator[Subject]:
 
 
 def _fmu(study: Study, kind: str, name: str) -> Subject:
-    guard, file = Guard(f"study {study.name!r}", f"{kind}.model = {name!r}"), file_of(name, study.origin.places)
+    guard, file = Guard(study.source, f"{kind}.model = {name!r}"), file_of(name, study.origin.places)
     return Subject(name, kind, Member(FmuAds if kind == "ads" else FmuVehicle, guard, file=file), study, _parameters(study, kind, name))
 
 

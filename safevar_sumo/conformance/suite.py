@@ -81,7 +81,7 @@ def refuse_defects(study: Study) -> list[str]:
             problem = f"{report.key} {finding.got}{'' if place in finding.got else f' ({place})'}"
             if finding.check in REFUSED:
                 again = f"python -m safevar_sumo check {shlex.quote(study.origin.called or study.name)}"
-                raise ForeignError(f"study {study.name!r}", f"{problem}; again by: {again}", f"{finding.expected}; {finding.advice}")
+                raise ForeignError(study.source, f"{problem}; again by: {again}", f"{finding.expected}; {finding.advice}")
             remarks.append(f"{problem}; expected: {finding.expected}")
     return remarks
 

@@ -142,7 +142,8 @@ def description_of(model: str, places: Sequence[str], source: str, key: str) -> 
     path = file_of(model, places)
     if not path:
         where = places[0] if places else os.getcwd()
-        raise InputError(source, f"{key} = {model!r}: there is no such file in {where}", LEGAL)
+        problem = "is a directory" if os.path.isdir(os.path.join(where, model)) else f"there is no such file in {where}"
+        raise InputError(source, f"{key} = {model!r}: {problem}", LEGAL)
     at = os.stat(path)
     try:
         return _read(path, at.st_mtime_ns, at.st_size, at.st_ino)

@@ -9,10 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.errors import InputError, unknown
-from safevar_sumo.fmu.description import NUMBERS, Description, Variable
+from safevar_sumo.fmu.description import CONVERTIBLE, NUMBERS, Description, Variable
 from safevar_sumo.fmu.units import SI, Unit
 
 FloatArray = npt.NDArray[np.float64]
+PYTHON_TYPES = {"String": (str,), "Boolean": (bool,), **dict.fromkeys(CONVERTIBLE, (int, float))}
+"""Types of values that a study gives a parameter; others take whole numbers."""
 
 
 class Port(NamedTuple):
@@ -67,8 +69,9 @@ def ports_of(description: Description, named: Mapping[str, str], units: Mapping[
             raise unknown(source, f"{key}.{quantity}: there is no such quantity", quantity, units)
         fitting = (*causalities, "parameter") if quantity in constant else causalities
         variable = description.variable(name, fitting, source, f"{key}.{quantity}")
-        if any(port.variable.name == name for port in found.values()) and "input" in causalities:
-            raise InputError(source, f"{key}.{quantity} = {name!r}: that variable already has another value", "each variable once")
+        other = next((one for one, port in found.items() if port.variable.name == name), None)
+        if other and "parameter" not in causalities:  # one that is only read may be the bound of several
+            raise InputError(source, f"{key}.{quantity} = {name!r}: that variable is {key}.{other} already", "each variable once")
         ours = SI[units[quantity]]
         found[quantity] = Port(variable, description.converted(variable, ours, units[quantity], source, f"{key}.{quantity}"), ours)
     return found
@@ -79,8 +82,7 @@ def fixed_of(description: Description, values: Mapping[str, Any], taken: Collect
     """Parameters of an FMU that a study sets, with their values in the FMU's units; raises as `ports_of`."""
     for name, value in values.items():
         variable = description.variable(name, ("parameter", "structuralParameter"), source, key, (*NUMBERS, "String"))
-        text = isinstance(value, str)
-        if not isinstance(value, str | bool | int | float) or text != (variable.type == "String"):
+        if type(value) not in PYTHON_TYPES.get(variable.type, (int,)):
             raise InputError(source, f"{key}.{name} = {value!r}", f"a value of type {variable.type}")
         if name in taken:
             raise InputError(source, f"{key}.{name}: the same parameter has its value from elsewhere in the study", "each parameter once")

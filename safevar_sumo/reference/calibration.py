@@ -149,12 +149,12 @@ def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[
     """
     studies = tuple(subject.study for subject in subjects)
     if not any(study.calibration for study in studies):
-        raise InputError(f"study {studies[0].name!r}", "has no table [calibration]", "the free parameters with bounds, unit and meaning")
+        raise InputError(studies[0].source, "has no table [calibration]", "the free parameters with bounds, unit and meaning")
     for subject in subjects:
         _check(subject)
     fit, free = studies[0].fit, free_parameters(studies)
     if from_scratch and not fit.starts:
-        raise InputError(f"study {studies[0].name!r}", "fit.starts = 0", "at least 1 for a fit from scratch")
+        raise InputError(studies[0].source, "fit.starts = 0", "at least 1 for a fit from scratch")
     used, held_back = [], []
     for study, references in subjects:
         rows = {name: np.arange(len(data.settings)) % study.fit.hold_out == study.fit.hold_out - 1 for name, data in references.items()}
@@ -235,7 +235,7 @@ def _thinned(data: ReferenceData, thinning: int) -> ReferenceData:
 
 
 def _check(subject: Subject) -> None:
-    source = f"study {subject.study.name!r}"
+    source = subject.study.source
     if not subject.references and not subject.study.published:
         raise InputError(source, "has no table [published] and there is no reference file", "something to fit to")
     for name in subject.study.fit.weights:

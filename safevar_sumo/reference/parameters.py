@@ -42,7 +42,7 @@ def free_parameters(studies: Sequence[Study]) -> list[Free]:
             value = value_of(study, key)
             if not bounds.lower <= value <= bounds.upper:
                 legal = f"a value in its bounds, [{bounds.lower:g}, {bounds.upper:g}]"
-                raise InputError(f"study {study.name!r}", f"{key} = {value}", legal)
+                raise InputError(study.source, f"{key} = {value}", legal)
             check_bounds(study, key, bounds)
             others = () if bounds.own else (k for k, other in enumerate(studies) if k > number and _shares(other, key, value))
             free.append(Free(key, (number, *others), bounds))
@@ -63,7 +63,7 @@ def _shares(study: Study, key: str, value: float) -> bool:
 def check_bounds(study: Study, name: str, bounds: FreeParameter) -> None:
     """A search goes as far as its bounds: the models must take them."""
     if bounds.log and bounds.lower <= 0:
-        raise InputError(f"study {study.name!r}", f"calibration.{name!r} has log = true and lower = {bounds.lower:g}",
+        raise InputError(study.source, f"calibration.{name!r} has log = true and lower = {bounds.lower:g}",
                          "a lower bound above 0")
     for side in ("lower", "upper"):
         bound = getattr(bounds, side)
@@ -71,4 +71,4 @@ def check_bounds(study: Study, name: str, bounds: FreeParameter) -> None:
             models_of(with_values(study, {name: bound}), name)
         except InputError as error:
             legal = error.legal or error.problem
-            raise InputError(f"study {study.name!r}", f"calibration.{name!r}.{side} = {bound:g}", legal) from None
+            raise InputError(study.source, f"calibration.{name!r}.{side} = {bound:g}", legal) from None

@@ -176,7 +176,7 @@ class ReportInput:
         return "".join(sign if sign.isascii() and sign.isalnum() else "-" for sign in words)
 
 
-def gather(directories: Iterable[str | Path], point: str = "", *, as_it_is_now: bool = False) -> list[ReportInput]:
+def gather(directories: Iterable[str | Path], point: str | None = None, *, as_it_is_now: bool = False) -> list[ReportInput]:
     """Read results directories, or what their solutions are at one point of a matrix, where they are simulated once more.
 
     Raises
@@ -195,11 +195,11 @@ def gather(directories: Iterable[str | Path], point: str = "", *, as_it_is_now: 
             lacking = f"What this study is about cannot be simulated here: {error.source}: {error.problem}."
         else:
             changed = changes_since(place, case, as_it_is_now=as_it_is_now)
-        if point:
+        if point is not None:
             case = _at_point(case, point)
             system = assemble(case.study, str(place))
         inputs.append(ReportInput(number=number, place=place, case=case, manifest=read_manifest(place), system=system, lacking=lacking,
-                              point=point, changed=changed))
+                              point=point or "", changed=changed))
     return inputs
 
 

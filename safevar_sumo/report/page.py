@@ -158,13 +158,13 @@ PARTS = {"causes": "explain", **{name: name for name in LIMITS}}
 
 
 def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), jobs: int | None = None, progress: Progress = silent,
-                *, point: str = "", as_it_is_now: bool = False) -> str:
+                *, point: str | None = None, as_it_is_now: bool = False) -> str:
     """The page about results in directories; parameters, warnings and errors are those of `safevar_sumo.report`."""
     unknown = [name for name in only if name not in SECTIONS]
     if unknown:
         raise InputError("only", f"there is no section {unknown[0]!r}{did_you_mean(unknown[0], SECTIONS)}", f"some of {','.join(SECTIONS)}")
     wanted = [name for name in SECTIONS if not only or name in only]
-    if point:
+    if point is not None:
         if "questions" in only:
             raise InputError("only", "the research questions are about whole studies", "sections other than questions with --point")
         wanted = [name for name in wanted if name != "questions"]
@@ -172,7 +172,7 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     for material in materials:
         for change in material.changed:
             warnings.warn(f"{material.place}: {change}", stacklevel=2)
-    are_rated = [is_rated(material.case.study) and not point for material in materials]
+    are_rated = [is_rated(material.case.study) and point is None for material in materials]
     if any(are_rated):
         if not all(are_rated):
             raise InputError("directories", "some hold results of rated studies, others do not", "a report for each kind")

@@ -128,7 +128,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     legal = "a directory that the command study has written"
     try:
         refuse_other_than_file(file)
-        manifest = json.loads(file.read_text(encoding="utf-8"))
+        manifest = json.loads(file.read_text(encoding="utf-8", errors="replace"))
         readable = isinstance(manifest["study"], dict) and isinstance(manifest["versions"], dict) \
             and manifest.get("format", FORMAT) in READABLE and isinstance(manifest.get(DIGESTS, {}), dict)
     except FileNotFoundError:
@@ -137,6 +137,9 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         raise InputError(directory, f"is no results directory: there is no {MANIFEST}{hint}", legal) from None
     except OSError as error:
         raise InputError(file, f"cannot be read: {error.strerror}") from None
+    except json.JSONDecodeError as error:
+        raise InputError(file, f"is torn or was edited, line {error.lineno} is no JSON: {error.msg}",
+                         "the file as it was, or none: the same command again writes it anew") from None
     except (ValueError, KeyError, TypeError, RecursionError):
         readable = False
     if not readable:

@@ -52,7 +52,7 @@ def load_study(study: StudyLike, **changes: Any) -> Study:
 
 def _given(study: StudyLike) -> _Raw:
     if isinstance(study, Study):
-        return _Raw(f"study {study.name!r}", without_nothing(tables_of(study)), study.origin)
+        return _Raw(study.source, without_nothing(tables_of(study)), study.origin)
     if isinstance(study, Mapping):
         return _extended(_Raw("study", dict(study)), Path("."), ())
     return _read(study_path(str(study)), seen=())

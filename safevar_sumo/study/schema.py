@@ -69,8 +69,8 @@ class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """The vehicle under test: its model, the model's parameters, and the characteristics that vary.
 
     One of the kind `fmu` is an FMU by its path, with `inputs`, `outputs` and `step` as an ADS has them. Its parameters are the
-    characteristics, whose rows need to say only what it does not declare; `sensors` and `sumo_type` are characteristics, its variables,
-    or numbers, by what they say of the sensors and of the vehicle.
+    characteristics, whose rows need to say only what it does not declare; `sensors` and `sumo_type` are characteristics or numbers,
+    `sumo_type` its variables, too, by what they say of the sensors and of the vehicle.
     """
 
     model: str
@@ -270,6 +270,11 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     correlations: list[Correlation] = []
     constraints: list[Constraint] = []
     origin: Origin = Origin()
+
+    @property
+    def source(self) -> str:
+        """How errors call it: by its file, or by its name if it has none of its own."""
+        return self.origin.called or f"study {self.name!r}"
 
 
 def tables_of(study: Study) -> dict[str, Any]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import datetime
 import math
+import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from types import UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 from msgspec import Struct
@@ -54,7 +56,7 @@ def mistakes(source: object, raw: Any, kind: Any, where: str = "") -> Iterator[I
     if isinstance(kind, type) and issubclass(kind, Struct) and isinstance(raw, Mapping):
         fields = _fields(kind)
         for key in raw:
-            if key not in fields:
+            if key not in fields and key != kind.__struct_config__.tag_field:
                 yield unknown(source, f"{_inside(where, key)}: there is no such key", key, fields)
         for name, field in fields.items():
             if name in raw:
@@ -64,8 +66,19 @@ def mistakes(source: object, raw: Any, kind: Any, where: str = "") -> Iterator[I
     elif get_origin(kind) is dict and isinstance(raw, Mapping):
         for key, value in raw.items():
             yield from mistakes(source, value, get_args(kind)[1], _inside(where, str(key)))
-    elif get_origin(kind) in (Union, UnionType) and isinstance(raw, Mapping) and len(tables := _tables(kind)) == 1:
-        yield from mistakes(source, raw, tables[0], where)
+    elif get_origin(kind) in (Union, UnionType) and isinstance(raw, Mapping) and (tables := _tables(kind)):
+        field = tables[0].__struct_config__.tag_field
+        by_tag = {table.__struct_config__.tag: table for table in tables}
+        if len(tables) == 1 or raw.get(field) in by_tag:
+            yield from mistakes(source, raw, by_tag.get(raw.get(field), tables[0]), where)
+        else:
+            yield _no_choice(source, _inside(where, field), raw.get(field), by_tag)
+    elif get_origin(kind) is Literal:
+        if raw not in get_args(kind):
+            yield _no_choice(source, where, raw, get_args(kind))
+    elif isinstance(raw, list) and get_origin(bare := get_args(kind)[0] if get_origin(kind) is Annotated else kind) is list and (
+            of_members := [one for i, value in enumerate(raw) for one in mistakes(source, value, get_args(bare)[0], f"{where}[{i}]")]):
+        yield from of_members
     else:
         try:
             msgspec.convert(raw, kind)
@@ -83,6 +96,12 @@ def _tables(kind: Any) -> list[Any]:
     return [option for option in get_args(kind) if isinstance(option, type) and issubclass(option, Struct)]
 
 
+def _no_choice(source: object, where: str, value: object, names: Iterable[str]) -> InputError:
+    """The error for a value that is none of `names`, of which "" stands for leaving the key out."""
+    problem = f"{where} is missing" if value is None else f"{where} = {_short(value)}"
+    return unknown(source, problem, value, filter(None, names), ", or no such key" * ("" in names))
+
+
 def _inside(where: str, key: str) -> str:
     shown = repr(key) if "." in key or not key.isprintable() else key
     return f"{where}.{shown}" if where else shown
@@ -97,9 +116,20 @@ def invalid(source: object, raw: object, error: msgspec.ValidationError, prefix:
         exists = exists and isinstance(value, dict) and key in value
         value = value[key] if exists and isinstance(value, dict) else None
     where = ".".join([*([prefix] if prefix else []), *keys])
-    if exists and where and not isinstance(value, dict):
-        return InputError(source, f"{where} = {_short(value)}", problem)
+    if exists and where:
+        return InputError(source, f"{where} is a table" if isinstance(value, dict) else f"{where} = {_short(value)}", _legal(problem))
     return InputError(source, f"{where}: {problem}" if where else problem)
+
+
+WORDS_OF_TYPES = {"float": "a number", "int": "a whole number", "str": "a text", "bool": "true or false", "array": "a list",
+                  "object": "a table", "null": ""}
+
+
+def _legal(problem: str) -> str:
+    """What is expected, from msgspec's words, such as "Expected `int | null`, got `str`"."""
+    expected = re.sub(r"^Expected |, got `[^`]*`$", "", problem)
+    return re.sub(r"`([a-z| ]+)`", lambda types: " or ".join(filter(None, (WORDS_OF_TYPES.get(one, one) for one in types[1].split(" | ")))),
+                  expected)
 
 
 def _short(value: object) -> str:
@@ -162,6 +192,9 @@ def implausible(source: object, study: Study) -> Iterator[InputError]:
     if study.matrix is not None and study.matrix.aggregate == "mean":
         yield InputError(source, "matrix.aggregate = 'mean' would average distances [m] with minus the speeds of collisions [m/s]",
                          "'worst', the point in which a setting comes off worst")
+    for name, times in Counter(study.metrics.also).items():
+        if times > 1:
+            yield InputError(source, f"metrics.also = {study.metrics.also}: {name!r} stands there {times} times", "each metric once")
     for name, number in study.published.items():
         if number == 0:
             yield InputError(source, f"published.{name} = 0", "a number other than 0")

@@ -30,7 +30,7 @@ def with_values(study: Study, values: Mapping[str, float]) -> Study:
     try:
         return msgspec.convert(raw, Study)
     except msgspec.ValidationError as error:
-        raise invalid(f"study {study.name!r}", raw, error) from None
+        raise invalid(study.source, raw, error) from None
 
 
 def value_of(study: Study, name: str) -> float:
@@ -41,12 +41,12 @@ def value_of(study: Study, name: str) -> float:
 
 def _raw(study: Study) -> Any:
     """The study as tables; a weather that is given by its name as the table behind it."""
-    return msgspec.to_builtins(msgspec.structs.replace(study, weather=weather_of(study.weather, f"study {study.name!r}")))
+    return msgspec.to_builtins(msgspec.structs.replace(study, weather=weather_of(study.weather, study.source)))
 
 
 def _place(study: Study, raw: Any, name: str) -> tuple[Any, Any]:
     """The table or list that a parameter stands in, and its key or index there."""
-    refused = InputError(f"study {study.name!r}", f"calibration.{name!r} is no parameter of the study",
+    refused = InputError(study.source, f"calibration.{name!r} is no parameter of the study",
                          f"a number that is given under {', '.join(prefix.rstrip('.') for prefix in FITTED)}")
     if not name.startswith(FITTED):
         raise refused

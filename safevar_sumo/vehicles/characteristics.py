@@ -76,7 +76,7 @@ class Characteristic:
               switch: str = "beyond=True") -> None:
         """Refuse a value that is no legal number (`is_legal`).
 
-        `otherwise` describes further legal values, `switch` is how a caller allows values beyond the domain.
+        `otherwise` describes further legal values, `switch` is how a caller allows values beyond the domain; empty if it does not.
 
         Raises
         ------
@@ -87,8 +87,9 @@ class Characteristic:
             above = " above 0" if self.lower > 0 else ""
             farther, within = f"a finite number{above}, up to {self.farthest:g}", f"a number in [{self.lower:g}, {self.upper:g}]"
             may_be_beyond = not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
+            any_with = f", or any with {switch}" if may_be_beyond and switch else ""
             raise InputError(source, f"{self.name} = {value}{' is outside its domain' if may_be_beyond else ''}",
-                             f"{farther if beyond else within}{self.suffix}{otherwise}{f', or any with {switch}' if may_be_beyond else ''}")
+                             f"{farther if beyond else within}{self.suffix}{otherwise}{any_with}")
 
     def is_legal(self, values: Any, *, beyond: bool = False) -> Any:
         """Whether values, a number or an array, are in the domain; with `beyond`, whether they are plausible.
@@ -163,8 +164,10 @@ class CharacteristicSet:
         """f_numDiff, the number of characteristics changed, shape (N,) (method section 3)."""
         return np.asarray(np.count_nonzero(self.changed(filtered), axis=1), dtype=float)
 
-    def setting(self, values: Mapping[str, float], source: object, *, beyond: bool = False) -> FloatArray:
+    def setting(self, values: Mapping[str, float], source: object, *, beyond: bool = False, switch: str = "beyond=True") -> FloatArray:
         """The original setting with some values replaced, shape (n,); with `beyond`, plausible values outside the domain are legal.
+
+        `switch` is that of `Characteristic.check`.
 
         Raises
         ------
@@ -178,7 +181,7 @@ class CharacteristicSet:
             if name not in self.names:
                 raise unknown(source, f"there is no characteristic {name!r}", name, self.names)
             column = self.names.index(name)
-            self.members[column].check(value, source, beyond=beyond)
+            self.members[column].check(value, source, beyond=beyond, switch=switch)
             setting[column] = value
         return setting
 

@@ -11,6 +11,7 @@ from safevar_sumo.errors import ForeignError, InputError, unknown
 from safevar_sumo.fmu import CONVERTIBLE, SI, USUAL, Description, Fault, Fleet, Instances, Past, Port, Unit, fixed_of, ports_of
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
+from safevar_sumo.study import CharacteristicTable
 from safevar_sumo.vehicles.base import FASTEST, LEVEL, ROUNDING, Characteristics, Slope, SumoType
 from safevar_sumo.vehicles.sensors import Sensors, late_and_near
 
@@ -79,9 +80,12 @@ class FmuVehicle:
         self.UNITS = dict(units)
         self._sensors, self._type = dict(table["sensors"]), {"tau": USUAL_LAG, **table["sumo_type"]}
         for key, tabled, known in (("sensors", self._sensors, SENSED), ("sumo_type", self._type, TYPE)):
-            for name in tabled:
+            for name, one in tabled.items():
                 if name not in known:
                     raise unknown(source, f"vehicle.{key}.{name}: there is no such quantity", name, known)
+                if key == "sensors" and isinstance(one, str) and one not in units:
+                    raise unknown(source, f"vehicle.{key}.{name} = {one!r}: there is no such characteristic", one, units, ", or a number")
+                self._refuse_least(table["characteristics"], f"vehicle.{key}.{name}", one, may_be_0=name == "latency")
         given = ports_of(description, table["inputs"], {**PEDALS, **ROAD}, ("input",), source, "vehicle.inputs", constant=ROAD)
         outputs = ports_of(description, table["outputs"], RETURNED, ("output",), source, "vehicle.outputs")
         for key, there, needed in (("inputs", given, PEDALS), ("outputs", outputs, ("speed",)), ("sumo_type", self._type, TYPE)):
@@ -107,6 +111,13 @@ class FmuVehicle:
         self.most_vehicles = self._instances.most_vehicles
         self.takes_slope, self.can_start_moving = "grade" in given, "initial_speed" in given
         self._takes_friction = "road_friction" in given
+
+    def _refuse_least(self, rows: Mapping[str, CharacteristicTable], key: str, one: str | float, *, may_be_0: bool) -> None:
+        """Refuse a number, or the least value of a characteristic, that a quantity which is above 0 cannot have."""
+        least = rows[one].lower if isinstance(one, str) and one in rows else one
+        if not isinstance(least, str) and (least < 0 or (least == 0 and not may_be_0)):
+            problem = f"{key} = {least:g}" if least is one else f"vehicle.characteristics.{one}.lower = {least:g}, and it is {key}"
+            raise InputError(self._guard.source, problem, "a number of at least 0" if may_be_0 else "a number above 0")
 
     def _characteristic(self, description: Description, name: str, unit: str) -> Port:
         key = f"vehicle.characteristics.{name}"

@@ -38,7 +38,7 @@ _read: dict[tuple[bytes, str], Files] = {}
 
 def batches_of(study: Study) -> tuple[int, bool]:
     """How many settings a batch pays to have, and whether they are driven in a recorded scene."""
-    system = assemble(study)
+    system = assemble(study, study.source)
     return settings_per_batch(system, Engine.RECORDED), not reason_for_sumo(system)
 
 

@@ -95,6 +95,8 @@ def test_what_the_library_says_of_a_parameter_is_said_of_its_flag(in_tmp: Path) 
     ("simulate rain --set mass=+8", "is outside its domain\nexpected: a number in [2040, 2700] kg, or mass=+8% of the original, or any "
                                     "with --beyond"),
     ("simulate rain --set mass=2000", "a number in [2040, 2700] kg, or any with --beyond"),
+    ("rating euro_ncap_rating --set treadDepth=300", "is outside its domain\nexpected: a number in [1.6, 8] mm\n"),
+    ("rating euro_ncap_rating --set treadDepth", "NAME=+10% of the original\n"),
     ("tables smoke", "did you mean results/smoke?"), ("status smoke", "did you mean results/smoke?"),
 ])
 def test_an_error_names_what_was_probably_meant(typed: str, says: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch,

@@ -147,6 +147,21 @@ def test_a_characteristic_is_no_input_too(cart: Path) -> None:
         assemble(load_study("cart.toml"))
 
 
+@pytest.mark.parametrize(("old", "new", "problem"), [
+    ("[vehicle.ch", "sensors = { range = 0.0 }\n[vehicle.ch", "vehicle.sensors.range = 0\nexpected: a number above 0"),
+    ("[vehicle.ch", "sensors = { latency = -1 }\n[vehicle.ch", "vehicle.sensors.latency = -1\nexpected: a number of at least 0"),
+    ("[vehicle.ch", 'sensors = { range = "v" }\n[vehicle.ch', "vehicle.sensors.range = 'v': there is no such characteristic"),
+    ("mass = 1500", "mass = 0.0", "vehicle.sumo_type.mass = 0"),
+    ("10.8", "10.8, lower = 0", "vehicle.characteristics.power.lower = 0, and it is vehicle.sumo_type.accel\nexpected: a number above 0"),
+])
+def test_what_no_vehicle_has_is_refused(old: str, new: str, problem: str, cart: Path) -> None:
+    text = CART_TABLE.format(more="[vehicle.characteristics]\npower = { original = 10.8 }")
+    (cart / "cart.toml").write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError) as error:
+        assemble(load_study("cart.toml"), "cart.toml")
+    assert str(error.value).startswith(f"cart.toml: {problem}")
+
+
 def test_a_vehicle_of_another_step_is_where_its_line_between_two_points_is_and_goes_back_to_where_it_was(cart: Path) -> None:
     """A step of 0.4 s in a simulation of 0.1 s; a second drive from a state in the middle is the same as the first."""
     (cart / "cart.toml").write_text(CART_TABLE.format(more="step = 0.4\n[vehicle.characteristics]\npower = { original = 10.8 }"))

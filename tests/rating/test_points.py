@@ -177,6 +177,8 @@ def test_what_a_command_cannot_write_or_read_is_refused_before_anything_is_simul
             (["--xlsx", new], "--template FILE"), (["--template", str(there)], "--xlsx FILE"),
             (["--template", str(there), "--xlsx", str(there)], "--force"), (["--preprocessed", str(there)], "--force"),
             (["--template", str(there), "--preprocessed", str(there), "--xlsx", new], "one of them"),
+            (["--template", "nothing.xlsx", "--xlsx", new], "nothing.xlsx: there is no such file"),
+            (["--template", str(tmp_path), "--xlsx", new], ": is a directory"),
             (["--template", str(text), "--xlsx", new], "text.xlsx"), (["--template", str(there), "--xlsx", new], "has no sheet 'Version'"),
             (["--set", "treadDepth=1.6..8:3"], "one value"), (["--solution", "nsga2:0:0"], "has no solutions"),
             (["--set", "treadDepth=1"], "treadDepth"), (["--plot", str(there)], ".png")):

@@ -283,6 +283,11 @@ def test_a_chart_puts_its_points_where_they_belong_and_escapes_their_words() -> 
     assert "<b>" not in chart
 
 
+def test_an_empty_point_is_no_point(slippery: Path) -> None:
+    with pytest.raises(InputError, match="--point: ''"):
+        make_report([slippery], only=["verdict"], point="")
+
+
 def point(name: str, **place: Any) -> Point:
     return Point(None, None, name, tuple(place.items()))  # type: ignore[arg-type]
 

@@ -270,6 +270,14 @@ def test_a_format_of_the_future_is_refused(tmp_path: Path) -> None:
         load(tmp_path / "out")
 
 
+def test_a_torn_manifest_is_called_torn(tmp_path: Path) -> None:
+    shutil.copytree(STORED / f"format-{FORMAT}", tmp_path / "out")
+    manifest = tmp_path / "out" / "manifest.json"
+    manifest.write_text(text := manifest.read_text()[:300])
+    with pytest.raises(InputError, match=rf"manifest\.json: is torn or was edited, line {len(text.splitlines())} is no JSON"):
+        load(tmp_path / "out")
+
+
 def test_an_edited_manifest_is_refused_until_it_is_removed(tmp_path: Path, study: Study) -> None:
     directory = written(tmp_path, study)
     directory.journal("original").close()

@@ -218,4 +218,4 @@ def declared_of(study: Study, vehicle: Any) -> Declared:
         return Declared(name, kind(**parameters), table, tuple(key for key, unit in units.items() if kind.UNITS.get(key) != unit))
     known = f"one of {', '.join(TABLES)}, a class made from one, or one with the same characteristics in the same units"
     problem = f"vehicle.model = {study.vehicle.model!r} with {', '.join(units)} is no vehicle that the second model can represent"
-    raise InputError(f"study {study.name!r}", problem, known)
+    raise InputError(study.source, problem, known)

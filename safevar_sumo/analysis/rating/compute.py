@@ -192,7 +192,7 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
         row = subject.solutions.iloc[position_of(subject.solutions, SolutionId.parse(options.solution))]
         values, name = {one: float(row[one]) for one in characteristics.names}, options.solution
     if options.changes:
-        characteristics.setting(options.changes, "changes")  # refuses what is none
+        characteristics.setting(options.changes, "changes", switch="")  # refuses what is none
         values, name = {**values, **options.changes}, f"{name} changed" if values else name
     variants = {name: characteristics.setting(values, "changes")} if values else {}
     return rate(study, variants, pool=pool, jobs=jobs, progress=progress)
@@ -215,7 +215,7 @@ def rate(study: Study, settings: Mapping[str, FloatArray], *, pool: Pool | None 
 
 def rate_on(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
     """The same on an evaluator of the rated study."""
-    rater = rater_of(evaluator.study, f"study {evaluator.study.name!r}")
+    rater = rater_of(evaluator.study, evaluator.study.source)
     assert rater is not None
     names = CharacteristicSet.of(evaluator.study.vehicle.characteristics).names
     rows = {"original": evaluator.characteristics.original, **settings}

@@ -34,6 +34,8 @@ class _Book:
 
     def __init__(self, source: Path, output: Path) -> None:
         self.source, self.output, self.protocol = source, output, protocol_of(EURO_NCAP_2026)
+        if not source.is_file():
+            raise InputError(source, "is a directory" if source.is_dir() else "there is no such file", self._legal)
         try:
             self._book = openpyxl.load_workbook(source)
         except (OSError, InvalidFileException, zipfile.BadZipFile, KeyError, ValueError) as error:

@@ -53,7 +53,7 @@ class VariationModel:
 
     def __init__(self, study: Study) -> None:
         self._members = CharacteristicSet.of(study.vehicle.characteristics)
-        self._source = f"study {study.name!r}"
+        self._source = study.source
         self._quantiles = [self._quantile(member, study.variation.get(member.name, Uniform())) for member in self._members]
         self._factor = self._cholesky(study.correlations)
 
@@ -330,7 +330,7 @@ def _feasible_vehicles(evaluator: Evaluator, model: VariationModel, number: int,
     """Random vehicles that satisfy the constraints, shape (number, n)."""
     settings = evaluator.region.sampled(lambda count: model.settings(rng.random((count, len(evaluator.characteristics)))), number)
     if len(settings) < number:
-        raise InputError(f"study {evaluator.study.name!r}", f"fewer than 1 in {REJECTIONS} random vehicles satisfy the constraints: "
+        raise InputError(evaluator.study.source, f"fewer than 1 in {REJECTIONS} random vehicles satisfy the constraints: "
                          f"{evaluator.region}", "a [variation] and [[constraints]] that agree")
     return settings
 
