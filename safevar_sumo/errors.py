@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import warnings
 from collections.abc import Iterable
 from difflib import get_close_matches
 from pathlib import Path
@@ -50,6 +52,14 @@ class SimulationError(SafevarError):
 
 class EnvironmentFault(SafevarError):
     """What a simulation needs beside its setting failed: a disk, memory, netconvert, SUMO's start."""
+
+
+def warn(message: str) -> None:
+    """Warn with the line that called this package: its author can do something about it."""
+    frame, level = inspect.currentframe(), 1
+    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == __name__.partition(".")[0]:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level)
 
 
 def first_line(error: BaseException) -> str:

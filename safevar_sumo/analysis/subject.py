@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from safevar_sumo.analysis.options import Options
-from safevar_sumo.errors import InputError, did_you_mean, one_of
+from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
 from safevar_sumo.results import MANIFEST, comparable_inputs, differences_now, manifest_of, read_later, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
 from safevar_sumo.terminal import shown
@@ -113,7 +112,7 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False) ->
             raise InputError(source, problem, legal)
     if isinstance(source, Results):
         for change in changes_since(source.directory, source.case, as_it_is_now=as_it_is_now):
-            warnings.warn(f"{source.directory}: {change}", stacklevel=3)
+            warn(f"{source.directory}: {change}")
         return source.case
     return load_study(source)
 

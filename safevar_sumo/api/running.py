@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -13,7 +12,7 @@ from rich.console import Console
 from safevar_sumo.analysis.subject import Results, load
 from safevar_sumo.api.simulation import assembled
 from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, read_by_algorithms, run_campaign
-from safevar_sumo.errors import InputError, SafevarError, one_of
+from safevar_sumo.errors import InputError, SafevarError, one_of, warn
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
@@ -150,7 +149,7 @@ class NullObserver:
 
     def warned(self, message: str) -> None:
         """The campaign warns."""
-        warnings.warn(message, stacklevel=2)
+        warn(message)
 
 
 class CallingObserver(NullObserver):

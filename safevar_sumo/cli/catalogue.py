@@ -12,18 +12,18 @@ from rich.console import Console
 
 from safevar_sumo.ads import ADS
 from safevar_sumo.cli.program import commands
-from safevar_sumo.metrics import FURTHER, METRICS
+from safevar_sumo.metrics import FURTHER, METRICS, OBJECTIVES, RATING_POINTS
 from safevar_sumo.scenarios import SCENARIOS, WEATHERS
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, load_study, study_names
 from safevar_sumo.terminal import print_meanings, print_names
-from safevar_sumo.vehicles import VEHICLES, CharacteristicSet
+from safevar_sumo.vehicles import CHANGES, VEHICLES, CharacteristicSet
 
 
 @commands.command(name="list")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def list_command(as_json: bool) -> None:
-    """List studies, vehicles, ADSs, scenarios, weathers, algorithms and metrics."""
+    """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives."""
     studies = [load_study(name) for name in study_names()]
     if as_json:
         click.echo(json.dumps(_catalogue(studies), indent=2))
@@ -47,6 +47,10 @@ def _catalogue(studies: list[Study]) -> dict[str, Any]:
         "weathers": [msgspec.to_builtins(weather) for weather in WEATHERS.values()],
         "algorithms": [_described(name, cls) for name, cls in ALGORITHMS.items()],
         "metrics": [{"name": name, "description": metric.description} for name, metric in {**METRICS, **FURTHER}.items()],
+        "objectives": [
+            *({"name": name, "description": f"The metric {metric.name}, as unsafe as possible."} for name, metric in OBJECTIVES.items()),
+            *({"name": change.name, "description": f"{change.title.capitalize()} [{change.unit}]."} for change in CHANGES.values()),
+            {"name": RATING_POINTS.name, "description": f"Of studies that a protocol rates: {RATING_POINTS.description}"}],
     }
 
 
@@ -76,5 +80,6 @@ def _print_catalogue(console: Console, studies: list[Study]) -> None:
     weathers = [(row["name"], *(f"{row[key]:g}" for key in numbers), row["light"], "wet" if row["wet"] else "dry")
                 for row in catalogue["weathers"]]
     print_names(console, "Weathers", weathers, ("name", "friction", "sight", "delay, s", "light", "road"))
-    for title, key in (("ADSs", "ads"), ("Scenarios", "scenarios"), ("Algorithms", "algorithms"), ("Metrics", "metrics")):
+    for title, key in (("ADSs", "ads"), ("Scenarios", "scenarios"), ("Algorithms", "algorithms"), ("Metrics", "metrics"),
+                       ("Objectives, beside all metrics", "objectives")):
         print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "what"))

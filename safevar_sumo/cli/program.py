@@ -26,7 +26,7 @@ COMMANDS = {
     "status": ("study", "Show the progress of a study running in another process: runs, front, collisions, time left."),
     "simulate": ("simulate", "Simulate a study once: how it ends, its safety metrics and objectives."),
     "check": ("check", "Check your own driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller."),
-    "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms and metrics."),
+    "list": ("catalogue", "List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives."),
     "explain": ("questions", "Explain failures: which changes cause them, how small a change is enough, and why."),
     "opinion": ("questions", "Have another vehicle model confirm or contradict the causes of failures."),
     "tolerance": ("questions", "Find how far each characteristic may go: alone, in pairs, and all together."),

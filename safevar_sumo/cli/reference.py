@@ -13,7 +13,7 @@ from rich.console import Console
 
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.options import PICTURES, check_output, complete_study, refuse_inputs
-from safevar_sumo.cli.program import commands, tell_remarks
+from safevar_sumo.cli.program import OneOfEach, commands, tell_remarks
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.progress import counted
@@ -245,7 +245,7 @@ SEVERAL = ("--published", "--reference")
 """Options that take all words up to the next option."""
 
 
-class _TakesSeveral(click.Command):
+class _TakesSeveral(OneOfEach):
     """`--published A B` as `--published A --published B`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:

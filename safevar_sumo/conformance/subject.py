@@ -15,7 +15,7 @@ import msgspec
 from safevar_sumo.ads import ADS, ADS_CONTRACT, SCALAR_ADS_CONTRACT, FmuAds, ScalarAds
 from safevar_sumo.errors import InputError, SafevarError, refuse_other_than_file, unknown
 from safevar_sumo.fmu import file_of
-from safevar_sumo.metrics import FURTHER, METRICS, Metric
+from safevar_sumo.metrics import FURTHER, METRICS, OBJECTIVES, Metric
 from safevar_sumo.plugins import Contract, Guard, Lookup, Member
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS
 from safevar_sumo.search import ALGORITHM_CONTRACT, ALGORITHMS
@@ -77,6 +77,7 @@ def subject_of(name: str, study: str | None = None) -> Subject:
         If there is nothing of that name, or it is nothing that can be checked.
     """
     chosen = None if study is None else load_study(study)
+    name = OBJECTIVES[name].name if name in OBJECTIVES else name
     kinds = [kind for kind, members in KINDS.items() if name in members]
     if kinds:
         shipped = chosen or next((one for one in map(load_study, study_names()) if _named(one, kinds[0], name)), load_study("smoke"))
@@ -84,7 +85,7 @@ def subject_of(name: str, study: str | None = None) -> Subject:
     if name.endswith(".fmu"):
         return _fmu_of(name, chosen)
     if ":" not in name:
-        everything = [*study_names(), *(one for members in KINDS.values() for one in members)]
+        everything = [*study_names(), *OBJECTIVES, *(one for members in KINDS.values() for one in members)]
         raise unknown("check", f"there is nothing called {name!r}", name, everything, ", package.module:Name, or the path of a study file")
     places = () if chosen is None else chosen.origin.places
     with importable():

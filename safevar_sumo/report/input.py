@@ -22,7 +22,7 @@ from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.subject import changes_since
 from safevar_sumo.analysis.tolerance import ToleranceOptions
-from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.errors import InputError, SafevarError, warn
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
 from safevar_sumo.replay.page import player_data
@@ -193,6 +193,7 @@ def gather(directories: Iterable[str | Path], point: str | None = None, *, as_it
             system = assemble(case.study, str(place))
         except InputError as error:
             lacking = f"What this study is about cannot be simulated here: {error.source}: {error.problem}."
+            warn(f"{place}: {lacking}")
         else:
             changed = changes_since(place, case, as_it_is_now=as_it_is_now)
         if point is not None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shlex
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
@@ -21,7 +20,7 @@ from safevar_sumo.analysis.research_questions.answer import answer
 from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
 from safevar_sumo.analysis.research_questions.gallery import draw
 from safevar_sumo.analysis.research_questions.layout import Bold, Table, lay_out
-from safevar_sumo.errors import InputError, did_you_mean
+from safevar_sumo.errors import InputError, did_you_mean, warn
 from safevar_sumo.replay.comparison import raised
 from safevar_sumo.replay.page import environment, player_parts
 from safevar_sumo.report.findings import best_of, causes, evenly, explanations, necessity_chart, no_opinion, replays
@@ -171,7 +170,7 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
     materials = gather(directories, point, as_it_is_now=as_it_is_now)
     for material in materials:
         for change in material.changed:
-            warnings.warn(f"{material.place}: {change}", stacklevel=2)
+            warn(f"{material.place}: {change}")
     are_rated = [is_rated(material.case.study) and point is None for material in materials]
     if any(are_rated):
         if not all(are_rated):
@@ -212,8 +211,8 @@ def _study(material: ReportInput, wanted: Sequence[str], jobs: int | None, show:
         "trust": lambda: trust(material, explained)}
     otherwise = [one["handle"] for one in shown if one.get("differences")]
     if otherwise:
-        warnings.warn(f"{material.place}: {', '.join(otherwise)}: simulated again not what the results say; other versions or code than "
-                      "those of the study?", stacklevel=2)
+        warn(f"{material.place}: {', '.join(otherwise)}: simulated again not what the results say; other versions or code than "
+             "those of the study?")
     return {"name": material.case.name, "title": material.case.study.title, "anchor": material.anchor(), "replays": shown,
             "otherwise": otherwise,
             "lacking": material.lacking, "changed": material.changed, "original_fails": material.original_fails,

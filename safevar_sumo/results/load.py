@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, warn
 from safevar_sumo.results.imported import read_imported
 from safevar_sumo.results.journal import Content, read_journal
 from safevar_sumo.results.manifest import MANIFEST, RUNS, is_edited, owner, read_manifest, refuse_edited_table
@@ -160,8 +159,8 @@ def load(directory: str | Path) -> StoredResults:
     for algorithm, run, content in _journals(place, manifest, search.runs):
         if content is not None and content.torn and content.result(search.budget) is None:
             journal = place / RUNS / f"{algorithm}-{run:02d}.journal"
-            warnings.warn(f"{journal}: the last {content.torn} bytes are torn, so the run is left out; the same study again simulates what "
-                          "they held", stacklevel=2)
+            warn(f"{journal}: the last {content.torn} bytes are torn, so the run is left out; the same study again simulates what "
+                 "they held")
         if content is None or content.evaluations is None:
             continue
         asked = sorted((position, row) for row, position in enumerate(content.positions) if 0 <= position < search.budget)

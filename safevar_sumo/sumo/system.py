@@ -74,7 +74,7 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     def taken_in(name: str, key: str) -> Metric | Change:
         if name in by_name:
             return by_name[name]
-        own = {**known, **FURTHER, **(CHANGES if key == OBJECTIVES else {})}
+        own = {**known, **FURTHER, **({**CHANGES, **BY_OBJECTIVE} if key == OBJECTIVES else {})}
         member = lookup.find(own, name, key)
         if member.guard is None:
             if name in FURTHER:

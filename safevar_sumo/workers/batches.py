@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from safevar_sumo.errors import warn
 from safevar_sumo.plugins import Files, digest_of, digests, located, named_files
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, fmus_of, foreign_names
@@ -50,7 +50,7 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     """
     persistent, work = RetryingPool(pool, study), packed(study, inputs := inputs_of(study, pool))
     for remark in check_code(study, inputs, persistent):
-        warnings.warn(remark, stacklevel=2)
+        warn(remark)
     unique, row_of = np.unique(settings, axis=0, return_inverse=True)
     if work not in _batches:
         _batches[work] = batches_of(study)

@@ -21,7 +21,9 @@ from rich.console import Console
 
 from safevar_sumo import cli
 from safevar_sumo.cli.program import COMMANDS, commands, main
+from safevar_sumo.conformance.subject import subject_of
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import FURTHER
 from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study import load_study, study_names
 from safevar_sumo.terminal import WholeTable
@@ -158,6 +160,9 @@ def test_every_name_of_the_list_can_be_read_and_typed() -> None:
     output = CliRunner(env={"COLUMNS": "80"}).invoke(commands, ["list"]).stdout
     assert "┃ name            ┃ friction ┃ sight ┃ delay, s ┃ light ┃ road ┃" in output
     assert "…" not in output
+    for name in ("f_safe", "f_comfort", "f_diff", "rating_points"):
+        assert f"│ {name} " in output.partition("Objectives")[2]
+    assert subject_of("f_comfort").member.what is FURTHER["max_jerk"]
     for name in study_names():
         study = load_study(name)
         for text in (name, study.vehicle.model, study.ads.model, study.scenario.model, *study.vehicle.characteristics):

@@ -315,7 +315,8 @@ def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path:
     manifest = json.loads((slippery / "manifest.json").read_text())
     manifest["study"]["scenario"]["parameters"] = {"network": "/nowhere/gone"}
     write_manifest(tmp_path / "copy", manifest)
-    page = make_report([tmp_path / "copy"], only=["tested", "verdict", *PARTS, "trust", "reproduce"], jobs=1)
+    with pytest.warns(UserWarning, match="copy: What this study is about cannot be simulated here: .*gone"):
+        page = make_report([tmp_path / "copy"], only=["tested", "verdict", *PARTS, "trust", "reproduce"], jobs=1)
     result = re.findall(r"slippery: What this study is about cannot be simulated here: .*gone", page)
     assert len(result) == 1 + len(LIMITS), "each section that would take simulations says so"
     assert '<details class="replay"' in page
