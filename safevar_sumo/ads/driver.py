@@ -43,7 +43,7 @@ class Late(NamedTuple):
         if self.part:
             with np.errstate(invalid="ignore"):  # what appears or vanishes between the two is still as it was
                 between = after + (before - after) * self.part
-            after = np.where(np.isfinite(between), between, before)
+            after = between if np.count_nonzero(here := np.isfinite(between)) == here.size else np.where(here, between, before)
         return after, self._replace(past=past)
 
 

@@ -76,11 +76,11 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
                        Late.by(self.hesitation, step))
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        (gap, lateral), recognised = memory.recognised.shown(np.stack([seen.gap, seen.lateral]))
+        (gap, lateral), recognised = memory.recognised.shown(np.array([seen.gap, seen.lateral]))
         brakes = self._brakes(seen._replace(gap=gap, lateral=lateral), memory.brakes)
         waits = (seen.speed == 0) & (seen.time < self.first_command)
         throttle = np.where(brakes | waits | (seen.speed > SPEED_LIMIT), 0.0, self._throttle(seen.speed))
-        command, *under_way = (*memory.under_way, Command(throttle, np.where(brakes, 1.0, 0.0)))
+        command, *under_way = (*memory.under_way, Command(throttle, brakes.astype(float)))
         delayed_brake, brake_delay_line = memory.brake_delay_line.shown(command.brake)
         memory = _Memory(brakes, tuple(under_way), recognised, brake_delay_line)
         return Command(command.throttle, np.minimum(command.brake, delayed_brake)), memory

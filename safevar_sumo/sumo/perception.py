@@ -61,9 +61,8 @@ class Parts:
         """Where the obstacles of all vehicles are now; where they were in a recorded scene in which no run is open any more."""
         if self._meetings is not None:
             return self._meetings.scene(open_)
-        goes_on = [bool(open_[rows].any()) for rows in self._rows]
         for k, (point, world) in enumerate(zip(self._points, self._worlds, strict=True)):
-            if goes_on[k] or not self._rests or k >= len(self._scenes):
+            if not self._rests or k >= len(self._scenes) or np.count_nonzero(open_[self._rows[k]]):
                 scene, self._memories[k] = point.scenario.observe(world, self._step, self._memories[k])
                 self._scenes[k:k + 1] = [scene]
         return self._scenes[0] if len(self._scenes) == 1 else _joined(self._scenes, [self._size] * len(self._scenes))

@@ -24,6 +24,8 @@ from safevar_sumo.vehicles import Sensors, SumoType
 
 NUMERICAL_EPS = 0.001
 """SUMO, utils/common/StdDefs.h [m]."""
+NOBODY = np.empty((0, 2), dtype=np.intp)
+"""No pairs of a scene and somebody in it."""
 PARALLEL = 1 - 1e-9
 """Cosine of the angle between two vehicles from which on they are in one direction."""
 
@@ -69,10 +71,10 @@ class RecordedWorld:
     def __init__(self, recordings: Sequence[Recording], n: int, whole: RecordedWorld | None = None, first: int = 0) -> None:
         self._recordings, self._size, self._whole, self._first = recordings, n, whole, first
         self.n, self.step_length = n * len(recordings), recordings[0].step_length
-        self._way, self._sample = recordings[0].way, 0
+        self._sample = 0
         self._speeds = np.repeat([one.speed for one in recordings], n)
         self._lane, self._place = np.zeros(self.n, dtype=np.intp), np.repeat([one.start for one in recordings], n)
-        self._left = np.zeros(self.n, dtype=bool)
+        self._lanes, self._left = recordings[0].way.at(self._lane), np.zeros(self.n, dtype=bool)
         self._front: FloatArray | None = None
         self._struck: dict[int, Body] = {}
         self.sensors = Sensors.perfect(self.n)
@@ -121,16 +123,17 @@ class RecordedWorld:
         """
         self._front_before, self._speeds_before = self.vehicle_positions(VUT), self._speeds
         way = distance(self._speeds, speeds, self.step_length)
-        if self._left.any():
+        if np.count_nonzero(self._left):
             speeds, way = np.where(self._left, self._speeds, speeds), np.where(self._left, 0.0, way)
         self._place = self._place + way
         self._speeds, self._front, self._sample = speeds, None, self._sample + 1
-        end = self._way.end
-        while (beyond := self._place > end[self._lane]).any():
-            if (self._lane[beyond] == len(end) - 1).any():
+        while np.count_nonzero(beyond := self._place > self._lanes.end):
+            way_ahead = self._recordings[0].way
+            if (self._lane[beyond] == len(way_ahead.end) - 1).any():
                 raise SimulationError("SUMO failed: a vehicle under test drives beyond the end of its route")
-            self._place = np.where(beyond, self._place - end[self._lane], self._place)
+            self._place = np.where(beyond, self._place - self._lanes.end, self._place)
             self._lane = self._lane + beyond
+            self._lanes = way_ahead.at(self._lane)
 
     def speeds(self) -> FloatArray:
         return self._speeds if self._whole is None else self._whole.speeds()[self._rows]
@@ -141,7 +144,7 @@ class RecordedWorld:
         if self._whole is not None:
             return self._whole.vehicle_positions(VUT)[self._rows]
         if self._front is None:
-            self._front = self._way.positions(self._lane, self._place)
+            self._front = self._lanes.positions(self._place)
         return self._front
 
     person_positions = vehicle_positions
@@ -244,13 +247,15 @@ class RecordedWorld:
 
     def _near(self, open_: BoolArray) -> Any:
         """Scenes, and somebody in each by number, beside whom a vehicle of an open run is or was a step ago; shape (M, 2)."""
-        ahead = self.vehicle_positions(VUT) @ self._recordings[0].along
-        foremost = np.where(open_, ahead, -np.inf).reshape(-1, self._size).max(axis=1)
-        rearmost = np.where(open_, self._ahead_before, np.inf).reshape(-1, self._size).min(axis=1)
+        ahead, before = self.vehicle_positions(VUT) @ self._recordings[0].along, self._ahead_before
         self._ahead_before = ahead
         if self._sample >= self._extents.shape[1]:
-            return np.empty((0, 2), dtype=np.intp)
+            return NOBODY
         rears, fronts = self._extents[:, self._sample]
+        if not np.count_nonzero(rears < np.maximum.reduce(ahead.reshape(-1, self._size), axis=1)[:, np.newaxis]):
+            return NOBODY
+        foremost = np.where(open_, ahead, -np.inf).reshape(-1, self._size).max(axis=1)
+        rearmost = np.where(open_, before, np.inf).reshape(-1, self._size).min(axis=1)
         return np.argwhere((rears < foremost[:, np.newaxis]) & (fronts > rearmost[:, np.newaxis]))
 
     def bodies(self, copies: Sequence[int]) -> tuple[Body, Body]:

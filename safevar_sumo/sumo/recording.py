@@ -65,10 +65,14 @@ class Way(NamedTuple):
     stretch: FloatArray
     shape_length: FloatArray
 
-    def positions(self, lane: Any, place: FloatArray) -> FloatArray:
-        """Front bumpers, shape (N, 2) [m], at a place on a lane; shapes (N,)."""
-        share = place * self.stretch[lane] / self.shape_length[lane]
-        return np.asarray(self.first[lane] + self.vector[lane] * share[:, np.newaxis])
+    def at(self, lane: Any) -> Way:
+        """Of each of N vehicles the lane that it is on, by its number; then L is N."""
+        return Way._make(column[lane] for column in self)
+
+    def positions(self, place: FloatArray) -> FloatArray:
+        """Front bumpers, shape (N, 2) [m], of vehicles at a place on their lanes, shape (N,)."""
+        share = place * self.stretch / self.shape_length
+        return np.asarray(self.first + self.vector * share[:, np.newaxis])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -65,6 +65,7 @@ class _Prepared(NamedTuple):
     grip: FloatArray
     slip_stiffness: FloatArray  # K / (3 |slip|)
     clutch: FloatArray
+    engine_torque: FloatArray
     engine_limit: FloatArray
     damping_full: FloatArray
     damping_engaged: FloatArray
@@ -96,6 +97,24 @@ class CarlaState(NamedTuple):
     since_shift: FloatArray
     throttle: FloatArray
     brake: FloatArray
+
+
+class _Driveline(NamedTuple):
+    """What the gears of N vehicles make of engine, clutch and wheels; arrays of shape (N,)."""
+
+    clutch: FloatArray
+    through_clutch: FloatArray
+    wheel_by_engine: FloatArray  # ratio^2 of the clutch's strength
+    engine: FloatArray  # inertia over a tyre's step and damping without throttle
+    damping_by_throttle: FloatArray
+
+    @classmethod
+    def of(cls, p: _Prepared, gear: FloatArray) -> _Driveline:
+        in_gear, ratio = gear > NEUTRAL, OVERALL_RATIOS[gear.astype(np.intp)]
+        clutch = p.clutch * in_gear
+        closed = np.where(in_gear, p.damping_engaged, p.damping_neutral)
+        through_clutch = ratio * clutch
+        return cls(clutch, through_clutch, through_clutch * ratio, p.engine_inertia_per_step + closed, p.damping_full - closed)
 
 
 class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -162,8 +181,9 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             wheel_coasts=wheel_inertia / tyre_step + wheel_damping,
             wheel_damping=wheel_damping, brake_torque=WHEELS * c["maxBrakeTorque"],
             grip=grip, slip_stiffness=WHEELS * GRAVITY * self.longitudinal_stiffness / (3 * grip),
-            clutch=c["clutchStrength"], engine_limit=c["max_rpm"] * RPM, damping_full=c["dampRateFullT"],
-            damping_engaged=c["dampRateZeroT_CE"], damping_neutral=c["dampRateZeroT_CD"], shift_time=c["gearSwitchTime"],
+            clutch=c["clutchStrength"], engine_torque=np.array(self.engine_torque),
+            engine_limit=c["max_rpm"] * RPM, damping_full=c["dampRateFullT"], damping_engaged=c["dampRateZeroT_CE"],
+            damping_neutral=c["dampRateZeroT_CD"], shift_time=c["gearSwitchTime"],
             shift_ends=c["gearSwitchTime"] - TIME_ROUNDING, shift_latency=np.array(self.shift_latency),
             shift_up=np.array(self.shift_up), shift_down=np.array(self.shift_down),
             air_drag=air_drag, speed_by_force=speed_by_force, speed_by_air=speed_by_force * air_drag,
@@ -240,17 +260,20 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return seen._replace(gap=seen.gap * prepared.assumed_height), state
 
     def advance(self, prepared: _Prepared, state: CarlaState, command: Command) -> CarlaState:
-        p, s = prepared, state
+        p, s, driveline = prepared, state, None
         for _ in range(p.substeps):
             throttle = _follows(command.throttle, s.throttle, p.throttle_rates)
             brake = _follows(command.brake, s.brake, p.brake_rates)
-            gears = _shift(p, s, throttle)
-            s = CarlaState(*self._roll(p, s, gears[0], throttle, brake), *gears, throttle, brake)
+            gear, target, since_shift = _shift(p, s, throttle)
+            if driveline is None or gear is not s.gear:
+                driveline = _Driveline.of(p, gear)
+            s = CarlaState(*self._roll(p, s, driveline, throttle, brake), gear, target, since_shift, throttle, brake)
         held = (s.brake > p.nothing) & (s.speed < p.standstill)
-        s.speed[held] = s.wheel_speed[held] = NEUTRAL
+        if np.count_nonzero(held):
+            s.speed[held] = s.wheel_speed[held] = NEUTRAL
         return s
 
-    def _roll(self, p: _Prepared, s: CarlaState, gear: FloatArray, throttle: FloatArray,
+    def _roll(self, p: _Prepared, s: CarlaState, driveline: _Driveline, throttle: FloatArray,
               brake: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Engine, clutch, wheels, tyres and body over one substep: speeds of the vehicle, its wheels and its engine.
 
@@ -260,13 +283,9 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
         The force F is explicit. It ends the slip within a step at most, and never reverses it: so it cannot ring.
         """
-        in_gear = gear > NEUTRAL
-        ratio = OVERALL_RATIOS[gear.astype(np.intp)]
-        clutch = p.clutch * in_gear
-        through_clutch = ratio * clutch
-        closed = np.where(in_gear, p.damping_engaged, p.damping_neutral)
-        engine = p.engine_inertia_per_step + closed + (p.damping_full - closed) * throttle + clutch
-        wheel = p.wheel_coasts + through_clutch * ratio * (ONE - clutch / engine)
+        clutch, through_clutch = driveline.clutch, driveline.through_clutch
+        engine = driveline.engine + driveline.damping_by_throttle * throttle + clutch
+        wheel = p.wheel_coasts + driveline.wheel_by_engine * (ONE - clutch / engine)
         # What a step makes of each speed (that of a wheel at its rim), of torques and of the tyres' force:
         engine_keeps, engine_gains = p.engine_inertia_per_step / engine, throttle * self._torque(p, s.engine_speed) / engine
         rim_by_torque = p.radius / wheel
@@ -277,16 +296,16 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         slip_by_force = rim_by_force + speed_by_force
         engine_by_rim = through_clutch / (engine * p.radius)
 
-        speed, rim, engine_speed = s.speed, p.radius * s.wheel_speed, s.engine_speed
+        speed, rim, engine_speed, nothing = s.speed, p.radius * s.wheel_speed, s.engine_speed, p.nothing
         for _ in range(TYRE_STEPS):
             engine_free = engine_keeps * engine_speed + engine_gains
             rim_free = rim_keeps * rim + rim_by_engine * engine_free - rim_loses
             ends_slip = (rim_free - speed) / slip_by_force
             force = self._tyre_force(p, speed, rim)
-            force = np.minimum(np.maximum(force, np.minimum(ends_slip, p.nothing)), np.maximum(ends_slip, p.nothing))
-            rim = np.maximum(rim_free - rim_by_force * force, p.nothing)
+            force = np.minimum(np.maximum(force, np.minimum(ends_slip, nothing)), np.maximum(ends_slip, nothing))
+            rim = np.maximum(rim_free - rim_by_force * force, nothing)
             engine_speed = np.minimum(engine_free + engine_by_rim * rim, p.engine_limit)
-            speed = np.maximum(speed + speed_by_force * force - speed_loses, p.nothing)
+            speed = np.maximum(speed + speed_by_force * force - speed_loses, nothing)
         return speed, rim / p.radius, engine_speed
 
     def _tyre_force(self, p: _Prepared, speed: FloatArray, rim: FloatArray) -> FloatArray:
@@ -300,13 +319,11 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return np.asarray(np.copysign(p.grip - p.grip * left * left * left, slides))
 
     def _torque(self, p: _Prepared, engine_speed: FloatArray) -> FloatArray:
-        """Engine torque at full throttle [N m]: linear between the points of the curve, zero above its end."""
+        """Engine torque at full throttle [N m]: linear between the points of the curve; no engine is faster than its limit."""
         x = engine_speed / p.engine_limit
         rising = TORQUE_IDLE + TORQUE_RISE * x
         falling = TORQUE_PEAK - TORQUE_FALL * (x - PEAK_AT)
-        torque = np.asarray(self.engine_torque * np.minimum(rising, falling))
-        torque[x > ONE] = NEUTRAL
-        return torque
+        return np.asarray(p.engine_torque * np.minimum(rising, falling))
 
 
 def _follows(commanded: FloatArray, pedal: FloatArray, rates: tuple[FloatArray, FloatArray]) -> FloatArray:
@@ -317,17 +334,17 @@ def _follows(commanded: FloatArray, pedal: FloatArray, rates: tuple[FloatArray, 
 
 def _shift(p: _Prepared, s: CarlaState, throttle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Automatic gearbox: gear, target gear, time since a shift. A switch, the first one out of neutral included, is spent in neutral."""
-    settled = s.gear == s.target_gear
+    relative, since_shift = s.engine_speed / p.engine_limit, s.since_shift + p.step
+    if not (np.count_nonzero(s.gear <= NEUTRAL) or np.count_nonzero(relative > p.shift_up)
+            or np.count_nonzero((s.gear > FIRST) & (relative < p.shift_down))):
+        return s.gear, s.target_gear, since_shift  # as in nearly every step: nobody is on the way to a gear or could set off for one
+    settled, target = s.gear == s.target_gear, s.target_gear
     automatic = settled & (s.since_shift >= p.shift_latency)
-    relative = s.engine_speed / p.engine_limit
     sets_off = settled & (s.gear <= NEUTRAL) & (throttle > p.nothing)
     up = sets_off | automatic & (relative > p.shift_up) & (s.gear > NEUTRAL) & (s.gear < TOP)
     down = automatic & (relative < p.shift_down) & (s.gear > FIRST)
     switches = up | down
-    target, since_shift = s.target_gear, s.since_shift + p.step
     if np.count_nonzero(switches):
         target = target + up - down
         since_shift[switches] = NEUTRAL
-    elif np.count_nonzero(settled) == len(settled):
-        return s.gear, target, since_shift
     return np.where((target == s.gear) | (since_shift >= p.shift_ends), target, NEUTRAL), target, since_shift

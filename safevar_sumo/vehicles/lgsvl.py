@@ -253,7 +253,9 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
     push = p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body * moving / body
     wheel_speed = np.maximum(push, NOTHING) / (p.damped_inertia + pull * p.radius - pull * pull / body)
     speed = np.maximum((p.body * moving + pull * wheel_speed) / body, NOTHING)
-    speed[(wheel_speed <= NOTHING) & (speed < p.standstill)] = NOTHING
+    held = (wheel_speed <= NOTHING) & (speed < p.standstill)
+    if np.count_nonzero(held):
+        speed[held] = NOTHING
     return s._replace(speed=speed, wheel_speed=wheel_speed, engine_rpm=engine_rpm,
                       traction_torque=np.minimum(np.maximum(traction, NOTHING), p.motor_torque))
 
@@ -261,7 +263,9 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
 def _torque_share(share: FloatArray) -> FloatArray:
     """Engine torque over the largest one, at a share of maxRpm: a parabola, zero from maxRpm on (assumption)."""
     torque = TORQUE_IDLE + TORQUE_BEND * share * (ONE - share)
-    torque[share >= ONE] = NOTHING
+    overspeed = share >= ONE
+    if np.count_nonzero(overspeed):
+        torque[overspeed] = NOTHING
     return torque
 
 
