@@ -14,8 +14,8 @@ from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.result import Explained
 from safevar_sumo.analysis.research_questions.case import load_cases
+from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.study import load_study, study_names
-from safevar_sumo.sumo.rater import is_rated
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers import local
 from tests.in_process import Here, searched

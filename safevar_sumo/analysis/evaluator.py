@@ -12,9 +12,9 @@ import numpy as np
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.protocol import part_of
+from safevar_sumo.protocol.rater import rater_of
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.rater import rater_of
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from safevar_sumo.workers.batches import evaluate_all, inputs_of

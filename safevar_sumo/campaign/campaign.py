@@ -15,13 +15,13 @@ from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.campaign.verification import Verification
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import SAFEVAR, Scoring
+from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ORIGINAL, Failure, JournalBusy, ResultsDirectory
 from safevar_sumo.search import Problem, Search
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.matrix import LARGEST_WORLD
-from safevar_sumo.sumo.rater import is_rated
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.interrupts import first_of, result_of

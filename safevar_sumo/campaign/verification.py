@@ -12,13 +12,13 @@ from safevar_sumo.campaign.keys import RunKey, run_generator
 from safevar_sumo.campaign.run import Observer, Run
 from safevar_sumo.errors import ForeignError
 from safevar_sumo.plugins import forget_foreign
+from safevar_sumo.protocol.rater import driven_in_sumo
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.search import Search
 from safevar_sumo.study import Study, foreign_names
 from safevar_sumo.sumo import Engine, assemble, evaluate
 from safevar_sumo.sumo.matrix import LARGEST_WORLD
-from safevar_sumo.sumo.rater import driven_in_sumo
 from safevar_sumo.workers.evaluation import packed
 from safevar_sumo.workers.identity import networks_of
 from safevar_sumo.workers.isolation import refuse_difference, refuse_unlike_sumo

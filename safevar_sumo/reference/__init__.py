@@ -1,5 +1,6 @@
 """Reference data: read, compared with a study, fitted to, and imported as results."""
 
+from safevar_sumo.analysis.parameters import with_values
 from safevar_sumo.reference.calibration import (
     Calibration,
     Subject,
@@ -13,7 +14,6 @@ from safevar_sumo.reference.calibration import (
 from safevar_sumo.reference.effects import Coverage, Effect, covered_by_spread, effects_of
 from safevar_sumo.reference.rows import ReferenceData, evaluations_of, original_metrics, package_filter, read_reference
 from safevar_sumo.reference.validation import Agreement, Totals, agreement, keep_totals, plot_agreement, quoted
-from safevar_sumo.sumo.parameters import with_values
 
 __all__ = [
     "Agreement", "Calibration", "Coverage", "Effect", "ReferenceData", "Subject", "Totals", "agreement", "calibrate", "calibrate_together",

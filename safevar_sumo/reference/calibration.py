@@ -12,6 +12,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from safevar_sumo.analysis.parameters import value_of, with_values
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
@@ -23,7 +24,6 @@ from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.reference.validation import Agreement, agreement
 from safevar_sumo.study import SAFETY_DEGREE, FitTable, FreeParameter, Study
 from safevar_sumo.sumo import Engine, settings_per_batch
-from safevar_sumo.sumo.parameters import value_of, with_values
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import evaluate_all, inputs_of

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from safevar_sumo.analysis.parameters import value_of, with_values
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import FreeParameter, Study
-from safevar_sumo.sumo.parameters import value_of, with_values
 from safevar_sumo.sumo.system import models_of
 
 

@@ -12,8 +12,8 @@ from safevar_sumo.replay.animation import OTHER, PERSON, VEHICLES, quad, stripes
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison
 from safevar_sumo.replay.film import Lane
 from safevar_sumo.replay.scene import FlatScene, scene_of
+from safevar_sumo.replay.window import Colour, Place, Window, open_window
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.sumo.window import Colour, Place, Window, open_window
 
 NAMES = {ORIGINAL: "blue", CHANGED: "orange"}
 REST = 2.0

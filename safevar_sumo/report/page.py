@@ -21,6 +21,7 @@ from safevar_sumo.analysis.research_questions.case import Case, Unanswerable
 from safevar_sumo.analysis.research_questions.gallery import draw
 from safevar_sumo.analysis.research_questions.layout import Bold, Table, lay_out
 from safevar_sumo.errors import InputError, did_you_mean, warn
+from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.replay.comparison import raised
 from safevar_sumo.replay.page import environment, player_parts
 from safevar_sumo.report.findings import best_of, causes, evenly, explanations, necessity_chart, no_opinion, replays
@@ -31,7 +32,6 @@ from safevar_sumo.report.svg import Dot, scatter
 from safevar_sumo.report.verdict import tested, trust, verdict
 from safevar_sumo.shipped import RUN
 from safevar_sumo.study import Study, load_study, study_names
-from safevar_sumo.sumo.rater import is_rated
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,12 +10,12 @@ import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import guard_process_state
+from safevar_sumo.protocol.driving_robot import DrivingRobot
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, Evaluations, FloatArray, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios import VUT, Lane, Point
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.scenarios.frame import Frame
 from safevar_sumo.sumo.contact import Contacts
-from safevar_sumo.sumo.driving_robot import DrivingRobot
 from safevar_sumo.sumo.engine import Engine, open_world
 from safevar_sumo.sumo.network import copied_network
 from safevar_sumo.sumo.perception import Parts
@@ -130,7 +130,7 @@ def _driven(system: System, settings: FloatArray, world: Any, watch: Watcher | N
         log.write(sample, place=world.vehicle_positions(VUT), speed=speed, gap=scene.gap, lateral=scene.lateral,
                   lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active,
                   obstacle_speed=scene.obstacle_speed, pedal=state.brake)
-        if not verdict.open.any():
+        if not np.count_nonzero(verdict.open):
             break
         if watch is None:
             world.leave(verdict.ended)

@@ -14,6 +14,7 @@ from msgspec.structs import replace as replace_in
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.protocol import part_of
+from safevar_sumo.protocol.rater import cell_columns, in_some_cells, joined_cells
 from safevar_sumo.records import CellResults, Contact, Encounter, Evaluations, FloatArray, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
@@ -21,7 +22,6 @@ from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.batch import Watcher, drive_all, reason_for_sumo, score, step_options
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.network import lanes_of
-from safevar_sumo.sumo.rater import cell_columns, in_some_cells, joined_cells
 from safevar_sumo.sumo.recording import Recording, recorded_scenes
 from safevar_sumo.sumo.system import System, assemble
 

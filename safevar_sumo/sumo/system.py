@@ -21,11 +21,11 @@ from safevar_sumo.fmu import LONGEST, description_of
 from safevar_sumo.metrics import FURTHER, METRICS, RATING_POINTS, Metric, Objective, Scoring, foreign_metric
 from safevar_sumo.metrics import OBJECTIVES as BY_OBJECTIVE
 from safevar_sumo.plugins import Guard, Lookup, Member, OwnModules, check_parameters, guard_process_state, instance_of
+from safevar_sumo.protocol.rater import Rater, is_rated, rated, rater_of
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import SCENARIO_CONTRACT, SCENARIOS, WEATHERS, GuardedScenario, Point, Scenario, weather_of
 from safevar_sumo.study import MatrixTest, MetricsTable, ModelTable, Study, VehicleTable, Weather, foreign_names
 from safevar_sumo.sumo.network import check_network, network_remarks
-from safevar_sumo.sumo.rater import Rater, is_rated, rated, rater_of
 from safevar_sumo.sumo.sources import is_network, is_shipped
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.traci_module import importable

@@ -11,10 +11,10 @@ import numpy as np
 
 from safevar_sumo.errors import warn
 from safevar_sumo.plugins import Files, digest_of, digests, located, named_files
+from safevar_sumo.protocol.rater import driven_in_sumo
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, fmus_of, foreign_names
 from safevar_sumo.sumo import Engine, assemble, reason_for_sumo, settings_per_batch
-from safevar_sumo.sumo.rater import driven_in_sumo
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.identity import Inputs, networks_of

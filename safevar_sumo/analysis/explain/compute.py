@@ -17,11 +17,11 @@ from safevar_sumo.analysis.preventability import preventability, preventable_by
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles, position_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import AtPoint, at_every_point, worst_points
-from safevar_sumo.sumo.rater import is_rated
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers.evaluation import Pool
 

@@ -16,7 +16,7 @@ from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explain
 from safevar_sumo.analysis.explain.summary import LABELS, Finding, in_short
 from safevar_sumo.analysis.figures import CHANGED, FONT, INVOLVED, NECESSARY, literal, new_figure
 from safevar_sumo.analysis.words import ask, changes, command, decimal, number_of
-from safevar_sumo.sumo.rater import is_rated
+from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, print_constraints, print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet

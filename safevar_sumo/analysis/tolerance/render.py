@@ -13,8 +13,8 @@ from safevar_sumo.analysis.tolerance.joint import Pair
 from safevar_sumo.analysis.words import decimal
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS
+from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.study import SAFETY_DEGREE
-from safevar_sumo.sumo.rater import is_rated
 from safevar_sumo.terminal import WholeTable, print_constraints, print_meanings, print_text
 from safevar_sumo.vehicles import Characteristic
 
