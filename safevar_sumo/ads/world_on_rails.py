@@ -48,7 +48,7 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         The policy brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s] for an obstacle at `brake_place`.
     brake_place, brake_gap_before, brake_gap_past
         The braking gap shrinks by `brake_gap_before` for each metre that the obstacle is short of `brake_place`, and by `brake_gap_past`
-        for each metre past it [m, -, -]: the policy brakes later for obstacles that enter or leave the way. What remains of the gap is
+        for each metre past it [m, -, -]: the policy brakes later for obstacles that enter or leave its path. What remains of the gap is
         multiplied by the visibility.
     throttle
         Throttle at the policy's speed levels 0, 2.7 and 5.3 m/s.

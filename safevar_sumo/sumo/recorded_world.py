@@ -25,37 +25,37 @@ from safevar_sumo.vehicles import Sensors, SumoType
 NUMERICAL_EPS = 0.001
 """SUMO, utils/common/StdDefs.h [m]."""
 NOBODY = np.empty((0, 2), dtype=np.intp)
-"""No pairs of a scene and somebody in it."""
+"""An empty array of (scene, actor) pairs."""
 PARALLEL = 1 - 1e-9
-"""Cosine of the angle between two vehicles from which on they are in one direction."""
+"""Cosine of the angle between two vehicles, above which they count as having the same direction."""
 
 
 class UnknownActorError(Exception):
-    """A scenario asks for somebody or a lane that a scene does not have."""
+    """A scenario asks for an actor or a lane that a scene does not have."""
 
 
 def distance(before: FloatArray, after: FloatArray, step: float) -> FloatArray:
-    """Way in a step from one speed to another at a constant acceleration [m], in SUMO's operations (`MSVehicle::getDeltaPos`)."""
+    """Distance covered in a step between two speeds at constant acceleration [m], with SUMO's operations (`MSVehicle::getDeltaPos`)."""
     acceleration = (after - before) / step
     return np.asarray((before + 0.5 * (acceleration * step)) * step)
 
 
 def not_on_the_road(actor: str, time: float) -> SimulationError:
-    """The error for somebody who has not departed, or has arrived, at a time [s]."""
+    """The error for an actor that has not departed, or has arrived, at a time [s]."""
     return SimulationError(f"SUMO failed: {actor!r} is not on the road at {time:g} s")
 
 
 class Samples:
-    """A recorded scene in which everybody else is at all of the scene's samples, as if each were a copy of the network.
+    """A recorded scene at all of its samples at once, as if each sample were a copy of the network.
 
-    `absent`, shape (T,), is where somebody who was asked for is not on the road; there it is where it was last.
+    `absent`, shape (T,), is true where the actor last asked for is not on the road; the actor then keeps its last position.
     """
 
     def __init__(self, tracks: Mapping[str, Track]) -> None:
         self._tracks, self.actor, self.absent = tracks, "", np.zeros(0, dtype=bool)
 
     def vehicle_positions(self, actor: str) -> FloatArray:
-        """Fronts; shape (T, 2) [m]."""
+        """Positions of the front; shape (T, 2) [m]."""
         positions = self._tracks[actor].position
         self.actor, self.absent = actor, np.isnan(positions[:, 0])
         return positions[np.maximum.accumulate(np.where(self.absent, 0, np.arange(len(positions))))]
@@ -64,7 +64,7 @@ class Samples:
 
 
 class RecordedWorld:
-    """N vehicles in each of several recorded scenes of one network; for a drive what `SumoWorld` is, of shapes (N,) and (N, 2)."""
+    """N vehicles in each of several recorded scenes of one network, with the methods of `SumoWorld`; shapes (N,) and (N, 2)."""
 
     lookup_errors = (UnknownActorError,)
 
@@ -84,33 +84,33 @@ class RecordedWorld:
             self._extents, self._others = _joined_extents(recordings), [[*one.tracks.values()] for one in recordings]
 
     def set_types(self, types: SumoType) -> None:
-        """SUMO obeys every speed that it is given: types have no part in how vehicles move."""
+        """Do nothing: SUMO obeys every speed that is set, so types do not affect how vehicles move."""
 
     def set_decelerations(self, decel: FloatArray) -> None:
-        """Nor have these."""
+        """Do nothing: decelerations do not affect how vehicles move either."""
 
     def depart(self) -> None:
-        """Everybody has departed."""
+        """Do nothing: everybody has departed."""
 
     def leave(self, copies: Sequence[int]) -> None:
-        """Vehicles whose runs are over are told to be where and as fast as they were."""
+        """Freeze position and speed of vehicles whose runs are over."""
         self._left[copies] = True
 
     def walk(self, person: str, speed: float) -> None:
-        """Everybody else moves as recorded."""
+        """Do nothing: all other actors move as recorded."""
 
     def drive(self, vehicle: str, speed: float) -> None:
-        """As recorded."""
+        """Do nothing: as recorded."""
 
     def turn_back(self, person: str) -> None:
-        """As recorded."""
+        """Do nothing: as recorded."""
 
     def part(self, first: int, n: int) -> RecordedWorld:
-        """The world of the `n` vehicles from the `first`, in one of the scenes."""
+        """The world of `n` vehicles of one scene, from row `first` on."""
         return RecordedWorld([self._recordings[first // self._size]], n, self, first)
 
     def samples(self) -> Samples:
-        """The one scene with everybody else at all of its samples."""
+        """The only scene, at all of its samples."""
         return Samples(self._recordings[0].tracks)
 
     def advance(self, speeds: FloatArray) -> None:
@@ -150,7 +150,7 @@ class RecordedWorld:
     person_positions = vehicle_positions
 
     def _recorded(self, actor: str) -> FloatArray:
-        """Where one is whom a scene has, for all vehicles in it; there is one scene."""
+        """Position of a recorded actor, repeated for all vehicles; there must be one scene only."""
         positions = self._track(actor).position
         position = positions[min(self._now, len(positions) - 1)]  # of a batch in which other scenes last longer
         if math.isnan(position[0]):
@@ -198,8 +198,8 @@ class RecordedWorld:
     def collisions(self, open_: BoolArray) -> dict[int, float]:
         """Vehicles of open runs whose body overlaps another, and their speeds [m/s].
 
-        SUMO looks twice in a step: when persons have moved, while vehicles are where and as fast as they were, and when vehicles have
-        moved too (`MSNet::simulationStep`: `STAGE_EVENTS`, `STAGE_MOVEMENTS`).
+        SUMO checks twice in a step: after persons have moved but before vehicles have, and after vehicles have
+        moved (`MSNet::simulationStep`: `STAGE_EVENTS`, `STAGE_MOVEMENTS`).
         """
         self._struck, found = {}, dict[int, float]()
         near = self._near(open_)
@@ -219,9 +219,9 @@ class RecordedWorld:
 
     def _overlaps(self, fronts: FloatArray, open_: BoolArray, scenes: Any, others: Body, persons: BoolArray, *,
                   still: bool) -> Iterator[tuple[int, int]]:
-        """Pairs of a body, by its number, and a vehicle, by its row, whose rectangles overlap: no side of either parts them.
+        """Pairs of a body, by its number, and a vehicle, by its row, whose rectangles overlap: no side of either separates them.
 
-        Two vehicles in one direction overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
+        Two vehicles with the same direction must overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
         """
         own, length, width = self._recordings[0].along, self._recordings[0].length, self._recordings[0].width
         across, other_across = _left(own), np.stack([-others.along[:, 1], others.along[:, 0]], axis=1)
@@ -246,7 +246,7 @@ class RecordedWorld:
         yield from zip(pair[~apart].tolist(), row[~apart].tolist(), strict=True)
 
     def _near(self, open_: BoolArray) -> Any:
-        """Scenes, and somebody in each by number, beside whom a vehicle of an open run is or was a step ago; shape (M, 2)."""
+        """Pairs (scene, actor), by number, with a vehicle of an open run beside the actor now or a step ago; shape (M, 2)."""
         ahead, before = self.vehicle_positions(VUT) @ self._recordings[0].along, self._ahead_before
         self._ahead_before = ahead
         if self._sample >= self._extents.shape[1]:
@@ -259,7 +259,7 @@ class RecordedWorld:
         return np.argwhere((rears < foremost[:, np.newaxis]) & (fronts > rearmost[:, np.newaxis]))
 
     def bodies(self, copies: Sequence[int]) -> tuple[Body, Body]:
-        """Vehicles under test that collide in this step, and whom they collide with; in columns."""
+        """Vehicles under test that collide in this step, and the bodies that they collide with; in columns."""
         road, n = self._recordings[0], len(copies)
         own = Body.behind(self.vehicle_positions(VUT)[copies], road.along, road.length, road.width, self._speeds[copies])
         return (own._replace(along=np.tile(road.along, (n, 1)), length=np.full(n, road.length), width=np.full(n, road.width)),
@@ -267,7 +267,7 @@ class RecordedWorld:
 
 
 def _joined_extents(recordings: Sequence[Recording]) -> FloatArray:
-    """Those of several scenes, shape (2, T, K, A); NaN where nobody is."""
+    """Extents of several scenes in one array, shape (2, T, K, A); NaN where nobody is."""
     _, length, most = np.max([one.extents.shape for one in recordings], axis=0)
     joined = np.full((2, length, len(recordings), most), np.nan)
     for k, one in enumerate(recordings):

@@ -1,8 +1,8 @@
 """LincolnMkz2017 of CARLA 0.9.10: NVIDIA PhysX 3.4, PxVehicleDrive4W, along its path.
 
-The equations are those of `PxVehicleUpdate.cpp` and `PxVehicleDefaultTireShader` (PhysX 3.4), with one equivalent
-wheel for the four, and so is the order of integration: the tyres' force from the slip at the beginning of a step,
-then engine, clutch and wheels implicitly and in closed form, so that the stiff clutch does not limit the step.
+Equations and order of integration are those of `PxVehicleUpdate.cpp` and `PxVehicleDefaultTireShader` (PhysX 3.4), with one
+equivalent wheel for the four: a step computes the tyre force from the slip at its beginning, then engine, clutch and wheels
+implicitly and in closed form, so that the stiff clutch does not limit the step.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from safevar_sumo.vehicles.sensors import Sensors
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 Share = Annotated[float, Meta(gt=0, le=1)]
-# Numbers that meet arrays in every step are arrays themselves: numpy would convert a float each time, which takes as long again.
+# Constants used with arrays in every step are arrays themselves: numpy would convert a float each time, which doubles the cost.
 ONE, NEUTRAL, FIRST = map(np.array, (1.0, 0.0, 1.0))
 RPM = 2 * math.pi / 60  # rad/s per r/min
 ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default
 # Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) r/min, N m, stretched over max_rpm.
 TORQUE_IDLE, TORQUE_PEAK, TORQUE_END = map(np.array, (400.0, 500.0, 400.0))  # N m
-PEAK_AT, END_AT = map(np.array, (1890 / 5800, 5730 / 5800))  # of the maximum speed; the falling line goes on to it
+PEAK_AT, END_AT = map(np.array, (1890 / 5800, 5730 / 5800))  # relative to the maximum engine speed; the falling line extends to 1
 TORQUE_RISE = np.array((TORQUE_PEAK - TORQUE_IDLE) / PEAK_AT)
 TORQUE_FALL = np.array((TORQUE_PEAK - TORQUE_END) / (END_AT - PEAK_AT))
 GEAR_RATIOS = np.array([0.0, 2.85, 2.02, 1.35, 1.0])  # neutral first; blueprint of the LincolnMkz2017
@@ -36,18 +36,18 @@ WHEELS = 4
 WHEEL_MASS = 20.0  # kg each; PxVehicleWheelData.mMass
 AIR_DENSITY = 1.2  # kg/m^3
 FRONTAL_AREA = 2.2  # m^2, of the LincolnMkz2017
-HELD_BELOW = np.array(0.03)  # m/s, below which a braked vehicle is held by its tyres (PxVehicle sticky tires)
+HELD_BELOW = np.array(0.03)  # m/s; below it the tyres hold a braked vehicle (PxVehicle sticky tires)
 SUBSTEP = 1 / 60  # s at most; CARLA 0.9.10 (MaxSubstepDeltaTime)
-NEWTON_STEPS = 8  # from 1 to a cube root near 1: the last ones change nothing
-TYRE_STEPS = 3  # in a substep; what PhysX takes below 5 m/s (setSubStepCount), here at any speed
+NEWTON_STEPS = 8  # to a cube root near 1, starting at 1; the last ones change nothing
+TYRE_STEPS = 3  # per substep; PhysX's number below 5 m/s (setSubStepCount), here used at every speed
 
 
 class _Prepared(NamedTuple):
     """Constants of a run, SI; arrays of shape (N,).
 
-    `throttle_rates` and `brake_rates` are the most that a pedal falls and rises in a substep; with `per_step`, divided by
-    the tyres' step; `speed_by_force` and `speed_by_air` are what a force, and the square of a speed, make of a speed in it,
-    `speed_by_slope` what the slope's `pull` takes from it. Below `standstill` a braked vehicle is held.
+    `throttle_rates` and `brake_rates` are the largest fall and rise of a pedal in a substep; names with `per_step` are divided by
+    the tyre step. In a tyre step the speed changes by `speed_by_force` per unit of force and by `speed_by_air` per unit of squared
+    speed, and the slope's `pull` [N] takes `speed_by_slope`. Below `standstill` a braked vehicle is held.
     """
 
     substeps: int
@@ -100,12 +100,12 @@ class CarlaState(NamedTuple):
 
 
 class _Driveline(NamedTuple):
-    """What the gears of N vehicles make of engine, clutch and wheels; arrays of shape (N,)."""
+    """Coefficients of engine, clutch and wheels that depend on the gears of N vehicles; arrays of shape (N,)."""
 
     clutch: FloatArray
     through_clutch: FloatArray
-    wheel_by_engine: FloatArray  # ratio^2 of the clutch's strength
-    engine: FloatArray  # inertia over a tyre's step and damping without throttle
+    wheel_by_engine: FloatArray  # ratio^2 times the clutch strength
+    engine: FloatArray  # inertia over a tyre step, plus damping without throttle
     damping_by_throttle: FloatArray
 
     @classmethod
@@ -125,20 +125,20 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     tyre_friction
         Friction coefficient of a tyre on a dry road per unit of tireFric [-].
     longitudinal_stiffness
-        Of a tyre, over gravity [N s^2/m per unit slip] (PxVehicleTireData.mLongitudinalStiffnessPerUnitGravity).
+        Longitudinal stiffness of a tyre, over gravity [N s^2/m per unit slip] (PxVehicleTireData.mLongitudinalStiffnessPerUnitGravity).
     slip_offset
-        Speed that is added to the one that a slip is relative to [m/s] (0.1 in PxVehicle's `computeTireSlips`).
+        Speed added to the denominator of a slip [m/s] (0.1 in PxVehicle's `computeTireSlips`).
     engine_torque
-        Engine torque over that of CARLA's default car [-].
+        Engine torque relative to that of CARLA's default car [-].
     throttle_rise, throttle_fall, brake_rise, brake_fall
         Rates of the pedals [1/s] (PxVehiclePadSmoothingData: 6 up, 10 down).
     shift_up, shift_down
         Engine speeds over max_rpm above and below which the automatic gearbox shifts [-] (PxVehicleAutoBoxData: 0.65 and 0.5).
     shift_latency
-        Least time from the beginning of a shift to that of the next [s] (PxVehicleAutoBoxData: 2).
+        Minimum time between the beginnings of two shifts [s] (PxVehicleAutoBoxData: 2).
     camera_height, camera_design_radius
-        Height of the camera above the road on wheels of the radius that its model was made for [m, m]: on another
-        radius a gap that is measured down to the road comes out in proportion to the height that is assumed.
+        Height of the camera above the road with wheels of the design radius [m, m]. With wheels of another radius, measured
+        gaps scale by the assumed over the actual height of the camera.
     """
 
     UNITS = {
@@ -208,9 +208,9 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return CarlaState(*(nothing for _ in CarlaState._fields))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> CarlaState:
-        """What stays as it is under the pedals that hold the speed: every equation of `_roll` with its change set to zero.
+        """The steady state with the pedals that hold the speed: every equation of `_roll` with its rate of change set to zero.
 
-        The gear is the one that the gearbox has when it comes from below; a switch that it would take back is just over.
+        The gear is the one in which the gearbox arrives while accelerating; where it would shift down, a shift has just ended.
         """
         p, nothing = prepared, np.zeros_like(prepared.mass)
         rim, force = self._rim_at(p, speed)
@@ -218,8 +218,8 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         resists = p.wheel_damping * wheel_speed + p.radius * force
 
         def engine_in(ratio: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-            """Torque through the clutch, what is left of it for the brake, and the engine's speed."""
-            # Downhill the engine brakes, and the brake takes what is left; then w_e = G w_w + m / k_c with m = -c_e w_e.
+            """Torque through the clutch, torque left for the brake, and engine speed."""
+            # Downhill the engine brakes and the brake supplies the rest; then w_e = G w_w + m / k_c with m = -c_e w_e.
             dragged = -p.damping_engaged * ratio * wheel_speed / (1 + p.damping_engaged / p.clutch)
             through_clutch = np.maximum(resists / ratio, dragged)
             return (through_clutch, ratio * (dragged - resists / ratio),
@@ -238,12 +238,12 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return state._replace(throttle=throttle, brake=brake, since_shift=np.where(lugs, p.shift_time, p.shift_latency))
 
     def hold_gear(self, prepared: _Prepared, state: CarlaState, holds: BoolArray) -> CarlaState:
-        """Keep the gear of vehicles, shape (N,), as a lever does; where it is let go again the last shift is long over."""
+        """Hold the gear where `holds`, shape (N,), is true, as a selector lever does; after its release the gearbox may shift at once."""
         free = np.where(state.since_shift < 0, prepared.shift_latency, state.since_shift)
         return state._replace(since_shift=np.where(holds, -np.inf, free))
 
     def _rim_at(self, p: _Prepared, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Speed of the wheels' rim at which the tyres push as hard as air and slope resist [m/s], and that force [N]."""
+        """Rim speed at which the tyre force balances air drag and slope [m/s], and that force [N]."""
         force = np.minimum(np.maximum(p.air_drag * speed * speed + p.pull, -p.grip), p.grip)
         share = np.abs(force) / p.grip
         left = np.ones_like(speed)
@@ -256,7 +256,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return Sensors.perfect(len(prepared.mass))._replace(scale=prepared.assumed_height)
 
     def sense(self, prepared: _Prepared, state: CarlaState, seen: Observation) -> tuple[Observation, CarlaState]:
-        """The camera stands where the wheels put it."""
+        """The gap as the camera measures it: the wheel radius sets the height of the camera."""
         return seen._replace(gap=seen.gap * prepared.assumed_height), state
 
     def advance(self, prepared: _Prepared, state: CarlaState, command: Command) -> CarlaState:
@@ -281,12 +281,12 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         I_w dw_w/dt = G k_c (w_e - G w_w) - d w_w - T_brake - r F
         m dv/dt = F - D v |v| - m g sin
 
-        The force F is explicit. It ends the slip within a step at most, and never reverses it: so it cannot ring.
+        The force F is explicit. It may end the slip within a step but never reverse it, so it cannot oscillate.
         """
         clutch, through_clutch = driveline.clutch, driveline.through_clutch
         engine = driveline.engine + driveline.damping_by_throttle * throttle + clutch
         wheel = p.wheel_coasts + driveline.wheel_by_engine * (ONE - clutch / engine)
-        # What a step makes of each speed (that of a wheel at its rim), of torques and of the tyres' force:
+        # Coefficients of a tyre step for each speed (a wheel's at its rim), for torques and for the tyre force:
         engine_keeps, engine_gains = p.engine_inertia_per_step / engine, throttle * self._torque(p, s.engine_speed) / engine
         rim_by_torque = p.radius / wheel
         rim_keeps, rim_by_engine = p.wheel_inertia_per_step / wheel, through_clutch * rim_by_torque
@@ -309,7 +309,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return speed, rim / p.radius, engine_speed
 
     def _tyre_force(self, p: _Prepared, speed: FloatArray, rim: FloatArray) -> FloatArray:
-        """Force of the tyres along the way [N] (`PxVehicleComputeTireForceDefault` without lateral slip).
+        """Longitudinal force of the tyres [N] (`PxVehicleComputeTireForceDefault` without lateral slip).
 
         With slip = (rim - speed) / (max(rim, speed) + offset) and K = C |slip| / (mu load):
         F = mu load (K - K^2 / 3 + K^3 / 27) = mu load (1 - (1 - K / 3)^3) up to K = 3, mu load beyond.
@@ -327,17 +327,17 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def _follows(commanded: FloatArray, pedal: FloatArray, rates: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """Where a pedal is that follows its command at finite rates."""
+    """Position of a pedal that follows its command at limited rates."""
     falls, rises = rates
     return pedal + np.minimum(np.maximum(commanded - pedal, falls), rises)
 
 
 def _shift(p: _Prepared, s: CarlaState, throttle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Automatic gearbox: gear, target gear, time since a shift. A switch, the first one out of neutral included, is spent in neutral."""
+    """Automatic gearbox: gear, target gear, time since a shift. During a shift, including the first out of neutral, the gear is neutral."""
     relative, since_shift = s.engine_speed / p.engine_limit, s.since_shift + p.step
     if not (np.count_nonzero(s.gear <= NEUTRAL) or np.count_nonzero(relative > p.shift_up)
             or np.count_nonzero((s.gear > FIRST) & (relative < p.shift_down))):
-        return s.gear, s.target_gear, since_shift  # as in nearly every step: nobody is on the way to a gear or could set off for one
+        return s.gear, s.target_gear, since_shift  # the usual case: no vehicle is shifting or about to shift
     settled, target = s.gear == s.target_gear, s.target_gear
     automatic = settled & (s.since_shift >= p.shift_latency)
     sets_off = settled & (s.gear <= NEUTRAL) & (throttle > p.nothing)
