@@ -21,14 +21,14 @@ KEEPS_GAP, KEEPS_SPEED = 0.2, 0.1  # m, m/s: errors below which the gap is kept
 
 
 class Acc(Following, frozen=True, kw_only=True):
-    """Holds a speed, or a time headway to a leader.
+    """Holds a speed, or a time headway behind a leader.
 
     Parameters
     ----------
     cruise_speed
-        Speed that it holds [m/s].
+        Speed to hold [m/s].
     headway, standing_gap
-        Desired time headway [s], and the gap on top of it [m].
+        Desired time headway [s], and additional gap [m].
     corridor
         Half the width of the corridor that it watches [m].
     """
@@ -39,13 +39,13 @@ class Acc(Following, frozen=True, kw_only=True):
     corridor: Positive = 1.4
 
     def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
-        """Acceleration asked for [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""
-        too_fast, slower = speed - self.cruise_speed, leader_speed - speed
+        """Commanded acceleration [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""
+        excess_speed, relative_speed = speed - self.cruise_speed, leader_speed - speed
         error = gap - self.standing_gap - _standing_distance(speed) - self.headway * speed
-        keeps = (np.abs(error) < KEEPS_GAP) & (np.abs(too_fast) < KEEPS_SPEED)
-        following = np.where(keeps, _law(KEEPING, slower, error),
-                             np.where(error < 0, _law(AVOIDING, slower, error), _law(CLOSING, slower, error)))
-        return np.where(gap - self.standing_gap > FOLLOWS_BELOW, SPEED_GAIN * too_fast, following)
+        keeps = (np.abs(error) < KEEPS_GAP) & (np.abs(excess_speed) < KEEPS_SPEED)
+        following = np.where(keeps, _law(KEEPING, relative_speed, error),
+                             np.where(error < 0, _law(AVOIDING, relative_speed, error), _law(CLOSING, relative_speed, error)))
+        return np.where(gap - self.standing_gap > FOLLOWS_BELOW, SPEED_GAIN * excess_speed, following)
 
 
 def _standing_distance(speed: FloatArray) -> FloatArray:

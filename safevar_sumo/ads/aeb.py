@@ -1,4 +1,4 @@
-"""Automatic emergency braking by braking distance, as production systems and Autoware have it, on top of a cruise control."""
+"""Automatic emergency braking by braking distance, as in production systems and Autoware, on top of a cruise control."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from safevar_sumo.ads.driver import Trim, in_the_way, pedals, time_to_reach, tri
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 LEAST_DECELERATION = 0.5
-"""Least deceleration of an obstacle that counts as braking [m/s^2]."""
+"""Smallest deceleration of an obstacle that counts as braking [m/s^2]."""
 
 
 class _Memory(NamedTuple):
-    """The original vehicle; time between calls [s]; initial speed and the pedals that hold it; stage 0 to 2; whether it has ever braked;
-    the obstacle's speed at the last call [m/s]; whether it warns.
+    """The original vehicle; time between calls [s]; initial speed and the pedals that hold it; braking stage 0 to 2; whether it has ever
+    braked; the obstacle's speed at the last call [m/s]; whether it warns.
     """
 
     nominal: Nominal
@@ -35,17 +35,17 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     distance = v rt + max(v_rel^2 / (2 b), v^2 / (2 b) - u^2 / (2 b_u)) + margin, with b_u the deceleration of the obstacle.
     After braking it never accelerates again.
 
-    It warns its driver while gap / closing speed of an obstacle in its way is below `warning_time`, and while it brakes. Warnings change
-    nothing of how it drives: who is warned here does nothing.
+    It warns its driver while gap / closing speed of an obstacle in its way is below `warning_time`, and while it brakes. The simulated
+    driver does not react to warnings.
 
     Parameters
     ----------
     cruise_speed, cruise_gain
-        Speed that it holds [m/s], by default its initial speed, and acceleration per error of that speed [1/s].
+        Speed to hold [m/s], by default the initial speed, and acceleration per speed error [1/s].
     response_time
-        Response time that it plans with [s].
+        Response time assumed in planning [s].
     braking_share
-        Share of the original's greatest deceleration that it plans with [-].
+        Share of the original vehicle's greatest deceleration assumed in planning [-].
     margin
         Gap to keep at the stop [m].
     partial_share, partial_time
@@ -53,15 +53,15 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     corridor
         Half the width of the corridor that it watches [m].
     reach
-        Its sensors' range in clear weather [m].
+        Range of its sensors in clear weather [m].
     warning_time
-        Time to collision at which it warns [s]; 0 for warnings from braking alone. The default is chosen: Euro NCAP judges a warning by
-        1.7 s, and 0.3 s are for sensors that are late.
+        Time to collision at which it warns [s]; with 0 it warns only while it brakes. The default is an assumption: Euro NCAP requires
+        a warning by 1.7 s, and 0.3 s allow for late sensors.
 
     Notes
     -----
-    The defaults are chosen, not measured: the original vehicle of `carla` then just avoids the standard points of Euro NCAP's
-    pedestrian and car-to-car tests. docs/scenarios.md lists the exceptions.
+    The defaults are assumptions, not measurements: with them the original vehicle of `carla` just avoids a collision at the standard
+    points of Euro NCAP's pedestrian and car-to-car tests. docs/scenarios.md lists the exceptions.
     """
 
     cruise_speed: Positive | None = None
@@ -76,8 +76,8 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     warning_time: NotNegative = 2.0
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        nothing = np.zeros(n)
-        return _Memory(nominal, step, None, nothing, nothing > 0, nothing, nothing > 0)
+        zeros = np.zeros(n)
+        return _Memory(nominal, step, None, zeros, zeros > 0, zeros, zeros > 0)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         nominal = memory.nominal
@@ -93,20 +93,21 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return command, _Memory(nominal, memory.step, (speed, pedal), stage, intervened, _obstacle_speed(seen), warns)
 
     def warns(self, memory: _Memory) -> BoolArray:
-        """Whether the drivers are warned now."""
+        """Whether each driver is warned now."""
         return memory.warns
 
     def _speed_to_hold(self, seen: Observation) -> FloatArray:
         return seen.speed if self.cruise_speed is None else np.full_like(seen.speed, self.cruise_speed)
 
     def _stage(self, seen: Observation, memory: _Memory, threat: BoolArray) -> FloatArray:
-        """The stage; once begun, it lasts until the obstacle has left the way."""
+        """The braking stage; it never falls before the obstacle has left the way."""
         speed, obstacle_speed = seen.speed, _obstacle_speed(seen)
         deceleration = self.braking_share * memory.nominal.decel
-        theirs = (memory.obstacle_speed - obstacle_speed) / memory.step
-        both = speed * speed / (2 * deceleration) - obstacle_speed * obstacle_speed / (2 * np.maximum(theirs, LEAST_DECELERATION))
+        obstacle_deceleration = (memory.obstacle_speed - obstacle_speed) / memory.step
+        both = speed * speed / (2 * deceleration) - obstacle_speed * obstacle_speed / (
+            2 * np.maximum(obstacle_deceleration, LEAST_DECELERATION))
         closing = np.maximum(seen.closing_speed, 0.0)
-        braking = np.maximum(closing * closing / (2 * deceleration), np.where(theirs > LEAST_DECELERATION, both, 0.0))
+        braking = np.maximum(closing * closing / (2 * deceleration), np.where(obstacle_deceleration > LEAST_DECELERATION, both, 0.0))
         full = speed * self.response_time + braking + self.margin
         wanted = np.where(threat & (seen.gap < full), 2.0, np.where(threat & (seen.gap < full + speed * self.partial_time), 1.0, 0.0))
         stays = np.isfinite(seen.gap) & (seen.gap > 0) & (closing > 0) & (

@@ -11,47 +11,47 @@ from safevar_sumo.ads.driver import looked_up
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
-HOLDING_DECELERATION = 2.0  # m/s^2, asked for to stand and to stay
+HOLDING_DECELERATION = 2.0  # m/s^2, commanded to hold at standstill
 TAPER_TIME = 0.3  # s, over which the deceleration fades into the creep
-CREEP_MARGIN = 0.1  # m/s, above the creep's speed where the creep begins
-LEAST_DISTANCE = 0.05  # m, least distance that a deceleration is planned over
+CREEP_MARGIN = 0.1  # m/s, above the creep speed, where the creep begins
+LEAST_DISTANCE = 0.05  # m, smallest distance over which a deceleration is planned
 FIRST_COMMAND_ROUNDING = 1e-9  # s
 
 
 class _Memory(NamedTuple):
-    """The original vehicle, time between calls [s]; whether it stops, planned and asked accelerations [m/s^2], time crept [s]."""
+    """The original vehicle; time between calls; whether it stops; planned deceleration and commanded acceleration; time crept [SI]."""
 
     nominal: Nominal
     step: float
     stops: BoolArray
     planned: FloatArray
-    asked: FloatArray
+    commanded: FloatArray
     crept: FloatArray
 
 
 class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Cruises, plans a comfortable stop before the obstacle, creeps to the end of it and holds.
+    """Cruises, plans a comfortable stop before the obstacle, creeps to the end of the stop and holds.
 
     Parameters
     ----------
     first_command
-        Time from the run's start to the first command, of a vehicle that stands [s].
+        Time from the start of the run to the first command to a standing vehicle [s].
     perception_range
         Largest gap at which it detects obstacles, in clear weather [m].
     cruise_speed, cruise_gain, cruise_acceleration
-        Speed that it accelerates to [m/s], acceleration per error of that speed [1/s], and the largest one [m/s^2].
+        Speed to accelerate to [m/s], acceleration per speed error [1/s], and largest acceleration [m/s^2].
     jerk
         Limit on the change of the commanded acceleration [m/s^3].
     stop_gap
         Gap at which the planned deceleration ends [m].
     comfortable_deceleration
-        It begins to brake when stopping there needs this deceleration [m/s^2].
+        It begins to brake when stopping at `stop_gap` requires this deceleration [m/s^2].
     largest_deceleration
         Largest deceleration that it commands [m/s^2].
     creep_speed, creep_time
-        Speed and duration of the last creep, a soft stop with the brake released [m/s, s].
+        Speed and duration of the final creep, a soft stop with the brake released [m/s, s].
     pedal_lag
-        Lag of the pedals that it allows for [s].
+        Lag of the pedals assumed in planning [s].
     """
 
     first_command: Annotated[float, Meta(ge=0)]
@@ -68,8 +68,8 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     perception_range: Positive = 100.0
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        nothing = np.zeros(n)
-        return _Memory(nominal, step, nothing > 0, nothing, nothing, nothing)
+        zeros = np.zeros(n)
+        return _Memory(nominal, step, zeros > 0, zeros, zeros, zeros)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         planned = self._plan(seen, memory)
@@ -77,43 +77,43 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         if seen.time >= self.first_command - FIRST_COMMAND_ROUNDING:
             return command, planned
         waits = seen.speed == 0
-        kept = (np.where(waits, old, new) for old, new in zip(memory[2:], planned[2:], strict=True))
-        return Command(*(np.where(waits, 0.0, pedal) for pedal in command)), _Memory(memory.nominal, memory.step, *kept)
+        columns = (np.where(waits, old, new) for old, new in zip(memory[2:], planned[2:], strict=True))
+        return Command(*(np.where(waits, 0.0, pedal) for pedal in command)), _Memory(memory.nominal, memory.step, *columns)
 
     def _plan(self, seen: Observation, memory: _Memory) -> _Memory:
-        """The commanded acceleration: cruise, or v^2 / (2 d) to stand before the obstacle; then creep and hold."""
+        """The commanded acceleration: cruise, or brake with v^2 / (2 d) to stop before the obstacle; then creep and hold."""
         v = seen.speed
         detected = seen.gap <= self.perception_range * seen.visibility
         distance = np.where(detected, np.minimum(seen.gap, self.perception_range) - self.stop_gap, np.inf)
         needed = v * v / (2 * np.maximum(distance, LEAST_DISTANCE))
-        # The way lost in the pedals, and while the deceleration rises at the jerk limit, counts for the onset.
+        # The onset allows for the distance lost by the lag of the pedals and while the deceleration rises at the jerk limit.
         lost = v * (self.pedal_lag + 0.5 * self.comfortable_deceleration / self.jerk)
         planned = v * v / (2 * np.maximum(distance - lost, LEAST_DISTANCE))
         begins = (planned > self.comfortable_deceleration) & ~memory.stops
         stops = memory.stops | begins
-        base, most = memory.asked, np.array(self.jerk * memory.step)
+        base, most = memory.commanded, np.array(self.jerk * memory.step)
         if np.count_nonzero(begins):
-            # A plan is continuous in time: it began within the last step, when the needed deceleration passed the limit.
+            # Planning is continuous in time: braking began within the last step, when the needed deceleration passed the limit.
             rise = np.maximum(planned - memory.planned, 1e-9)
-            part = np.where(begins, np.minimum((planned - self.comfortable_deceleration) / rise, 1.0), 1.0)
-            base, most = np.where(begins, np.minimum(base, 0.0), base), most * part
+            share = np.where(begins, np.minimum((planned - self.comfortable_deceleration) / rise, 1.0), 1.0)
+            base, most = np.where(begins, np.minimum(base, 0.0), base), most * share
 
         braking = np.minimum(needed, self.largest_deceleration)
         braking = np.minimum(braking, np.maximum(v - self.creep_speed, 0.0) / TAPER_TIME)
         cruising = np.minimum(self.cruise_gain * (self.cruise_speed - v), self.cruise_acceleration)
-        asked = base + np.minimum(np.maximum(np.where(stops, -braking, cruising) - base, -most), most)
+        commanded = base + np.minimum(np.maximum(np.where(stops, -braking, cruising) - base, -most), most)
 
         creeps = stops & (v < self.creep_speed + CREEP_MARGIN)
         crept = memory.crept + memory.step * creeps
-        asked[creeps] = 0.0
-        asked[crept > self.creep_time] = -HOLDING_DECELERATION
-        return memory._replace(stops=stops, planned=planned, asked=asked, crept=crept)
+        commanded[creeps] = 0.0
+        commanded[crept > self.creep_time] = -HOLDING_DECELERATION
+        return memory._replace(stops=stops, planned=planned, commanded=commanded, crept=crept)
 
     def _pedals(self, seen: Observation, memory: _Memory) -> Command:
-        """Through the calibration table of the original vehicle."""
+        """Pedals for the commanded acceleration, from the calibration table of the original vehicle."""
         nominal = memory.nominal
         coasting, full = looked_up(nominal.speeds, seen.speed, nominal.coasting, nominal.full_throttle)
-        beyond = memory.asked + coasting
+        beyond = memory.commanded + coasting
         throttle = np.minimum(np.maximum(beyond / (full + coasting), 0.0), 1.0)
         brake = np.minimum(np.maximum(-beyond / nominal.braking, 0.0), 1.0)
         throttle[memory.stops], brake[~memory.stops] = 0.0, 0.0

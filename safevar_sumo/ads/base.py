@@ -20,23 +20,23 @@ NotNegative = Annotated[float, Meta(ge=0, le=1e3)]
 
 
 REACTIONS = ("recognition_delay", "hesitation")
-"""Parameters of an ADS that say how late it reacts in a weather [s]."""
+"""Parameters of an ADS that delay its reaction, such as in bad weather [s]."""
 
 
 class Ads(Protocol):
     """An ADS that drives N vehicles at once. Its fields are the parameters of `ads.parameters`.
 
-    It sees an `Observation` and knows the original vehicle (`Nominal`), never the setting.
+    It gets an `Observation` and knows the original vehicle (`Nominal`), never the setting.
     Element i of a command depends on element i of the observations alone, to the bit.
 
-    A class with a method `warns(memory) -> BoolArray` warns its drivers, shape (N,), where that is true after `drive`.
+    Optional: a method `warns(memory) -> BoolArray`, called after `drive`, returns which drivers are warned, shape (N,).
     """
 
     def start(self, n: int, nominal: Nominal, step: float) -> Any:
         """Memory at the start of a run of `n` vehicles with `step` seconds between two calls of `drive`."""
 
     def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
-        """Command the pedals for the coming step; returns the memory to pass in at the next one."""
+        """Command the pedals for the coming step; returns the memory for the next call."""
 
 
 class ScalarAds(ABC):
@@ -102,7 +102,7 @@ class PerVehicle:
         return drivers
 
     def drive(self, seen: Observation, memory: list[ScalarAds]) -> tuple[Command, list[ScalarAds]]:
-        pedals = [self._pedals(self._guard.call("drive", driver.drive, one)) for driver, one in zip(memory, _each(seen), strict=True)]
+        pedals = [self._pedals(self._guard.call("drive", driver.drive, own)) for driver, own in zip(memory, _each(seen), strict=True)]
         return Command(*np.array(pedals, dtype=float).reshape(len(memory), 2).T.copy()), memory
 
     def warns(self, memory: list[ScalarAds]) -> BoolArray:

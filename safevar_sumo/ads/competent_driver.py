@@ -14,7 +14,9 @@ from safevar_sumo.records import TIME_ROUNDING, BoolArray, Command, FloatArray, 
 
 
 class _Memory(NamedTuple):
-    """Reaction; the obstacle's first lateral position, infinite before [m]; whether it was in the way then; time since it strayed [s]."""
+    """Reaction; the obstacle's first lateral position [m], infinite before any; whether it was in the way then; time since it strayed [s],
+    negative before.
+    """
 
     reaction: Reaction
     first: FloatArray
@@ -31,13 +33,13 @@ class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     Parameters
     ----------
     cruise_speed
-        Speed that it holds [m/s], by default its initial speed.
+        Speed to hold [m/s], by default the initial speed.
     critical_ttc, reaction_time
         Time to collision that counts as a danger, and reaction time before braking [s].
     stray, perception_time
         An obstacle that enters the way is perceived `perception_time` after it has moved `stray` from its first lateral position [m, s].
     lets_go
-        Coasting deceleration, while it reacts or drops back [m/s^2].
+        Coasting deceleration while it reacts or increases its gap [m/s^2].
     headway
         Time headway at which it follows [s].
     corridor

@@ -1,4 +1,4 @@
-"""What drivers share: pedals for an acceleration, perception of an obstacle in the way, reaction to a danger, and car following."""
+"""Parts of several drivers: pedals for an acceleration, perception of an obstacle in the way, reaction to a danger, car following."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ def looked_up(speeds: FloatArray, speed: FloatArray, *tables: FloatArray) -> lis
     row = place.astype(np.intp)
     share, next_row = place - row, row + 1
     values = ((table[row], table[next_row]) for table in tables)
-    return [here + (there - here) * share for here, there in values]
+    return [low + (high - low) * share for low, high in values]
 
 
 STEP_DECIMALS = 6
-"""Of a delay in steps: a whole number of steps is whole."""
+"""Decimals to which a delay in steps is rounded, so that a whole number of steps is exact."""
 
 
 class Late(NamedTuple):
-    """Values that are told a delay late: it in whole steps and a part of one, and what has been shown, oldest first."""
+    """A delay line: the delay as whole steps and a part of a step, and the past values, oldest first."""
 
     whole: int
     part: float
@@ -32,18 +32,18 @@ class Late(NamedTuple):
 
     @classmethod
     def by(cls, delay: float, step: float) -> Late:
-        """By a delay [s], at steps of so many seconds."""
+        """The delay line for a delay [s] at a time step [s]."""
         whole, part = divmod(round(delay / step, STEP_DECIMALS), 1)
         return cls(int(whole), part)
 
     def shown(self, now: FloatArray) -> tuple[FloatArray, Late]:
-        """What was there a delay ago, linear between two steps; before the first one nothing was different; then the next state."""
+        """The values of a delay ago, linear between two steps, and the next state; before the first step the first values hold."""
         past = (*(self.past[1:] or (now,) * (self.whole + 1)), now)
         before, after = past[0], past[1]
         if self.part:
-            with np.errstate(invalid="ignore"):  # what appears or vanishes between the two is still as it was
+            with np.errstate(invalid="ignore"):  # a value that appears or vanishes in between keeps its old value
                 between = after + (before - after) * self.part
-            after = between if np.count_nonzero(here := np.isfinite(between)) == here.size else np.where(here, between, before)
+            after = between if np.count_nonzero(finite := np.isfinite(between)) == finite.size else np.where(finite, between, before)
         return after, self._replace(past=past)
 
 
@@ -89,14 +89,14 @@ def time_to_reach(seen: Observation) -> FloatArray:
 
 
 def in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> BoolArray:
-    """Whether a detected obstacle ahead is within `corridor` of the lane's middle [m], or will be when the vehicle gets there.
+    """Whether a detected obstacle ahead is within `corridor` of the lane's middle [m], or will be when the vehicle reaches it.
 
     `reach` is the sensors' range in clear weather [m].
     """
     detected = np.isfinite(seen.gap) & (seen.gap <= reach * seen.visibility) & (seen.gap > 0)
     lateral = np.where(detected, seen.lateral, FARTHEST)
-    then = lateral + seen.lateral_speed * time_to_reach(seen)
-    return np.asarray(detected & ((np.abs(lateral) <= corridor) | (np.abs(then) <= corridor)))
+    lateral_then = lateral + seen.lateral_speed * time_to_reach(seen)
+    return np.asarray(detected & ((np.abs(lateral) <= corridor) | (np.abs(lateral_then) <= corridor)))
 
 
 def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
@@ -108,24 +108,24 @@ def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
 HARDEST = 0.774 * GRAVITY
 """Deceleration of the competent and careful driver [m/s^2] (UN R157, annex 4, appendix 3)."""
 JERK = 12.65
-"""Rise of that deceleration per second [m/s^3] (ibid.)."""
+"""Jerk limit of that deceleration [m/s^3] (ibid.)."""
 CRUISE_GAIN = 1.0
-"""Acceleration per error of the speed to hold [1/s]."""
+"""Acceleration per speed error [1/s]."""
 Start = tuple[Annotated[float, Meta(ge=0, le=1)], ...]
 """Throttle in the run's first steps, one value per step [-]: the replayed start of another driver."""
 
 
 class Reaction(NamedTuple):
-    """The original vehicle; time between calls [s]; speed to hold [m/s] and the pedals' trim, of the first look.
+    """The original vehicle; time between calls [s]; speed to hold [m/s] and trim, both from the first observation.
 
-    `waited` is the time since the danger was first seen, negative before [s]; `asked` the deceleration [m/s^2], both (N,).
+    `waited` is the time since the danger was first seen, negative before [s]; `commanded` is the deceleration [m/s^2]; both shape (N,).
     """
 
     nominal: Nominal
     step: float
     held: tuple[FloatArray, Trim] | None
     waited: FloatArray
-    asked: FloatArray
+    commanded: FloatArray
 
 
 def unaware(n: int, nominal: Nominal, step: float) -> Reaction:
@@ -136,14 +136,14 @@ def unaware(n: int, nominal: Nominal, step: float) -> Reaction:
 def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration: FloatArray, *, reaction_time: float, corridor: float,
           jerk: float = JERK, coasting_deceleration: float = 0.0, cruise_speed: float | None = None, start: Start = (),
           following: FloatArray | float = np.inf) -> tuple[Command, Reaction]:
-    """Pedals of drivers who may face a danger; it is over when no obstacle ahead comes nearer or blocks the way.
+    """Pedals of drivers who may face a danger; the danger is over when no obstacle ahead approaches or blocks the way.
 
     Parameters
     ----------
     danger
         Whether the driver sees a danger now; shape (N,).
     deceleration
-        Braking after the reaction time, shape (N,) [m/s^2]; it rises at `jerk` [m/s^3].
+        Deceleration after the reaction time, shape (N,) [m/s^2]; it rises at `jerk` [m/s^3].
     reaction_time
         Time from the first sight of the danger to braking [s].
     corridor
@@ -166,19 +166,19 @@ def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration
     aware = reaction.waited >= 0
     waited = np.where(aware, np.where(lasts, reaction.waited + reaction.step, -1.0), np.where(danger, 0.0, -1.0))
     brakes = waited >= reaction_time - TIME_ROUNDING
-    asked = np.where(brakes, np.minimum(reaction.asked + jerk * reaction.step, deceleration), 0.0)
+    commanded = np.where(brakes, np.minimum(reaction.commanded + jerk * reaction.step, deceleration), 0.0)
     holding = np.minimum(CRUISE_GAIN * (held[0] - seen.speed), following)
-    acceleration = np.where(brakes, -asked, np.where((waited >= 0) & (coasting_deceleration > 0), -coasting_deceleration, holding))
+    acceleration = np.where(brakes, -commanded, np.where((waited >= 0) & (coasting_deceleration > 0), -coasting_deceleration, holding))
     command = pedals(reaction.nominal, seen.speed, acceleration, held[1])
     sample = round(seen.time / reaction.step)
     if sample < len(start):
         starts = waited < 0
         command = Command(np.where(starts, start[sample], command.throttle), np.where(starts, 0.0, command.brake))
-    return command, reaction._replace(held=held, waited=waited, asked=asked)
+    return command, reaction._replace(held=held, waited=waited, commanded=commanded)
 
 
 class FollowingMemory(NamedTuple):
-    """The original vehicle; time between calls [s]; trim of the pedals, of the first look."""
+    """The original vehicle; time between calls [s]; trim of the pedals at the first observation."""
 
     nominal: Nominal
     step: float
@@ -186,9 +186,9 @@ class FollowingMemory(NamedTuple):
 
 
 class Following(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of a car-following model as a driver: an acceleration from gap and speeds, through the pedals.
+    """Base of car-following models: an acceleration from gap and speeds, converted to pedals.
 
-    An obstacle beside the way is no leader.
+    Obstacles beside the way are ignored.
 
     Parameters
     ----------
@@ -208,5 +208,5 @@ class Following(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return pedals(memory.nominal, seen.speed, wanted, trimmed), memory._replace(trimmed=trimmed)
 
     def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
-        """Acceleration asked for [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""
+        """Commanded acceleration [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""
         raise NotImplementedError

@@ -9,7 +9,7 @@ from safevar_sumo.ads.base import Positive
 from safevar_sumo.ads.driver import Reaction, Start, in_the_way, react, unaware
 from safevar_sumo.records import Command, Nominal, Observation
 
-AS_HARD_AS_CAN_BE = 1e6
+UNLIMITED = 1e6
 """Deceleration beyond any brake [m/s^2], so that the pedal is fully pressed."""
 
 
@@ -19,7 +19,7 @@ class FullBraking(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     Parameters
     ----------
     cruise_speed
-        Speed that it holds [m/s], by default its initial speed.
+        Speed to hold [m/s], by default the initial speed.
     corridor
         Half the width of the corridor that it watches [m].
     start_throttle
@@ -34,6 +34,6 @@ class FullBraking(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return unaware(n, nominal, step)
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
-        hardest = np.full_like(seen.speed, AS_HARD_AS_CAN_BE)
-        return react(seen, memory, in_the_way(seen, self.corridor), hardest, reaction_time=0.0, jerk=AS_HARD_AS_CAN_BE / memory.step,
+        hardest = np.full_like(seen.speed, UNLIMITED)
+        return react(seen, memory, in_the_way(seen, self.corridor), hardest, reaction_time=0.0, jerk=UNLIMITED / memory.step,
                      corridor=self.corridor, cruise_speed=self.cruise_speed, start=self.start_throttle)

@@ -23,18 +23,18 @@ class _Memory(NamedTuple):
 
 
 class FuzzySafety(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Holds its speed; brakes as hard as its fuzzy metrics say: PFS, whether a stop is still safe, and CFS, whether a crash is ahead.
+    """Holds its speed; brakes according to two fuzzy metrics: PFS, whether a stop is still safe, and CFS, whether a collision is imminent.
 
     Parameters
     ----------
     cruise_speed
-        Speed that it holds [m/s], by default its initial speed.
+        Speed to hold [m/s], by default the initial speed.
     reaction_time
-        rt [s].
+        Reaction time rt [s].
     comfortable, hardest, leader_deceleration
-        b_min, b_max, b_u [m/s^2].
+        Decelerations b_min and b_max of its own braking, b_u of the leader's braking [m/s^2].
     margin
-        To the safe distance, and to the gap itself [m].
+        Added to the safe distance and subtracted from the gap [m].
     corridor
         Half the width of the corridor that it watches [m].
     """
@@ -69,7 +69,7 @@ class FuzzySafety(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return _share(gap - self.margin, unsafe, safe)
 
     def critical(self, gap: FloatArray, v: FloatArray, u: FloatArray, a: FloatArray) -> FloatArray:
-        """CFS in [0, 1], with the own acceleration a [m/s^2] too."""
+        """CFS in [0, 1] at a gap [m], speeds [m/s] and the own acceleration a [m/s^2], shape (N,)."""
         bounded = np.maximum(a, -self.comfortable)
         later = v + self.reaction_time * bounded
         closing = (v + bounded * self.reaction_time / 2 - u) * self.reaction_time

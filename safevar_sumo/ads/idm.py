@@ -42,5 +42,5 @@ class Idm(Following, frozen=True, kw_only=True):
         share = speed / self.cruise_speed
         closing = speed * (speed - leader_speed) / (2 * math.sqrt(self.acceleration * self.deceleration))
         desired = self.standing_gap + np.maximum(speed * self.headway + closing, 0.0)
-        there = np.maximum(gap, LEAST_GAP)
-        return np.asarray(self.acceleration * (1 - share * share * share * share - desired * desired / (there * there)))
+        positive_gap = np.maximum(gap, LEAST_GAP)
+        return np.asarray(self.acceleration * (1 - share * share * share * share - desired * desired / (positive_gap * positive_gap)))

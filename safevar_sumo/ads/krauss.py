@@ -43,7 +43,7 @@ class Krauss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         """Aim at v_safe = -b t + sqrt((b t)^2 + 2 b gap), t being the reaction time.
 
-        That is the speed from which the vehicle comes to rest behind a standing obstacle.
+        From v_safe the vehicle comes to rest behind a standing obstacle.
         """
         nominal = memory.nominal
         planned = self.braking_share * nominal.decel

@@ -1,4 +1,4 @@
-"""The braking that UN Regulation No. 157 asks of an automated lane keeping system, 5.2.5.2."""
+"""The braking that UN Regulation No. 157, 5.2.5.2, requires of an automated lane keeping system."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class R157(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     Parameters
     ----------
     cruise_speed
-        Speed that it holds [m/s], by default its initial speed.
+        Speed to hold [m/s], by default the initial speed.
     deceleration, reaction_time, margin
         6 m/s^2, 0.35 s and 0.1 s in the regulation.
     corridor

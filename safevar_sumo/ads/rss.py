@@ -18,11 +18,11 @@ class Rss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     Parameters
     ----------
     cruise_speed
-        Speed that it holds [m/s], by default its initial speed.
+        Speed to hold [m/s], by default the initial speed.
     reaction_time
         rt [s].
     acceleration, deceleration, leader_deceleration
-        a while it reacts, b of its own braking, b_u of the leader's braking [m/s^2].
+        Acceleration a while it reacts, deceleration b of its own braking and b_u of the leader's braking [m/s^2].
     corridor
         Half the width of the corridor that it watches [m].
     """

@@ -1,4 +1,4 @@
-"""What an FMU says of itself in its `modelDescription.xml`: version, variables, units, and how it may be simulated."""
+"""An FMU's `modelDescription.xml`: version, variables, units, and how the FMU may be simulated."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from safevar_sumo.fmu.units import BASES, USUAL, Unit
 CONVERTIBLE = ("Real", "Float64", "Float32")
 """Types of variables that have units."""
 NUMBERS = (*CONVERTIBLE, "Integer", "Boolean", "Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64", "Enumeration")
-"""Types of variables that numbers can be put into and read from."""
+"""Types of variables that hold numbers."""
 LEGAL = "an FMU of FMI 2.0 or 3.0 for co-simulation"
 LONGEST_MEANING = 200
-"""Characters of a description that a study takes over."""
+"""Longest description of a variable that becomes a characteristic's meaning [characters]."""
 MOST_LISTED = 12
-"""Variables that an error lists."""
+"""Largest number of variables that an error lists."""
 
 
 class Variable(NamedTuple):
-    """A variable; `unit` is None if nobody says what its unit stands for, `start`, `lower` and `upper` if it declares none."""
+    """A variable; `unit` is None if its unit is not defined, `start`, `lower` and `upper` are None if not declared."""
 
     name: str
     reference: int
@@ -44,7 +44,7 @@ class Variable(NamedTuple):
 
     @property
     def is_tunable(self) -> bool:
-        """Whether it is a real parameter with an original and a domain, as a characteristic needs them."""
+        """Whether it is a real parameter with the original value and the domain that a characteristic needs."""
         return self.causality == "parameter" and self.variability != "constant" and self.type in CONVERTIBLE and None not in (
             self.start, self.lower, self.upper) and self.lower < self.upper and self.start != 0  # type: ignore[operator]
 
@@ -53,8 +53,7 @@ class Variable(NamedTuple):
 class Description:
     """An FMU: its file, its digest, and what it declares.
 
-    `step` is the step that it needs [s], None if it takes any; `alone` if a process may hold one instance; `named` is how errors call
-    it, such as `ads.model = 'controller.fmu'`.
+    `step` is the step that it requires [s], None if any step will do; `single_instance` is true if a process may hold only one instance.
     """
 
     path: str
@@ -63,7 +62,7 @@ class Description:
     identifier: str
     token: str
     step: float | None
-    alone: bool
+    single_instance: bool
     units: Mapping[str, Unit] = field(compare=False, repr=False)
     variables: Mapping[str, Variable] = field(compare=False, repr=False)
 
@@ -73,45 +72,45 @@ class Description:
         Raises
         ------
         InputError
-            If there is none, or it is of another causality or type.
+            If the variable does not exist, or has another causality or type.
         """
-        fitting = [one.name for one in self.variables.values() if one.causality in causalities and one.type in types]
+        fitting = [variable.name for variable in self.variables.values() if variable.causality in causalities and variable.type in types]
         listed = ", ".join(fitting[:MOST_LISTED]) + ", ..." * (len(fitting) > MOST_LISTED)
         legal = f"{_article(' or '.join(causalities))} of the FMU: {listed or 'it has none'}"
         if name not in self.variables:
             raise InputError(source, f"{key} = {name!r}: {Path(self.path).name} has no such variable{did_you_mean(name, fitting)}", legal)
-        found = self.variables[name]
-        if found.causality not in causalities:
-            raise InputError(source, f"{key} = {name!r}: that variable is {_article(found.causality)}", legal)
-        if found.type not in types:
-            raise InputError(source, f"{key} = {name!r}: that variable is of type {found.type}", f"one of type {', '.join(types)}")
-        return found
+        variable = self.variables[name]
+        if variable.causality not in causalities:
+            raise InputError(source, f"{key} = {name!r}: that variable is {_article(variable.causality)}", legal)
+        if variable.type not in types:
+            raise InputError(source, f"{key} = {name!r}: that variable is of type {variable.type}", f"one of type {', '.join(types)}")
+        return variable
 
     def rows(self, fixed: Collection[str]) -> dict[str, dict[str, Any]]:
-        """What it declares of its parameters, as rows of the characteristics' table: those that lack nothing, but not those in `fixed`."""
-        return {name: self.row(name) for name, one in self.variables.items() if one.is_tunable and name not in fixed}
+        """Rows of the characteristics' table for all tunable parameters that are not in `fixed`."""
+        return {name: self.row(name) for name, variable in self.variables.items() if variable.is_tunable and name not in fixed}
 
     def row(self, name: str, unit: str = "") -> dict[str, Any]:
-        """What it declares of a parameter, in its own unit or in another one."""
-        one = self.variables.get(name)
-        if one is None or one.causality != "parameter":
+        """The characteristic that a parameter declares, in its own unit or in another one; empty if it is no parameter."""
+        variable = self.variables.get(name)
+        if variable is None or variable.causality != "parameter":
             return {}
-        said = {"unit": one.unit_name or "-", "original": one.start, "lower": one.lower, "upper": one.upper,
-                "meaning": one.meaning if len(one.meaning) <= LONGEST_MEANING else ""}
-        theirs, ours = one.unit, self.units.get(unit) or USUAL.get(unit)
-        if unit and unit != said["unit"] and one.unit_name:
-            if theirs is None or ours is None or not theirs.fits(ours):
-                return {}  # whoever uses the unit refuses it
-            said |= {key: theirs.to(ours, said[key]) for key in ("original", "lower", "upper") if said[key] is not None}
-        return {key: value for key, value in said.items() if value not in (None, "")}
+        row = {"unit": variable.unit_name or "-", "original": variable.start, "lower": variable.lower, "upper": variable.upper,
+               "meaning": variable.meaning if len(variable.meaning) <= LONGEST_MEANING else ""}
+        declared, wanted = variable.unit, self.units.get(unit) or USUAL.get(unit)
+        if unit and unit != row["unit"] and variable.unit_name:
+            if declared is None or wanted is None or not declared.fits(wanted):
+                return {}  # the user of the unit refuses it
+            row |= {key: declared.to(wanted, row[key]) for key in ("original", "lower", "upper") if row[key] is not None}
+        return {key: value for key, value in row.items() if value not in (None, "")}
 
     def converted(self, variable: Variable, unit: Unit, unit_name: str, source: str, key: str) -> Unit:
-        """The unit of a variable that is to hold a quantity in another one; the same if the variable has none.
+        """The unit of a variable that is to hold a quantity given in `unit`; `unit` itself if the variable has none.
 
         Raises
         ------
         InputError
-            If its unit is of another kind, or nobody says what it stands for.
+            If its unit measures another kind of quantity or is not defined.
         """
         if variable.type not in CONVERTIBLE or not variable.unit_name:
             return unit
@@ -124,29 +123,30 @@ class Description:
 
 
 def file_of(model: str, places: Sequence[str]) -> str:
-    """The path of an FMU that a study names: relative to the folders of its files, or to the working directory for one without a file."""
+    """The path of the FMU that a study names: relative to the folders of the study's files, else to the working directory."""
     try:
         return next((os.path.abspath(path) for place in (places or (os.getcwd(),)) if (path := Path(place, model)).is_file()), "")
-    except (OSError, ValueError):  # the text is no path
+    except (OSError, ValueError):  # not a valid path
         return ""
 
 
 def description_of(model: str, places: Sequence[str], source: str, key: str) -> Description:
-    """What the FMU that a study names says of itself.
+    """The description of the FMU that a study names.
 
     Raises
     ------
     InputError
-        In one line each: no such file, no FMU, another version or kind, nothing for this machine, FMPy is not installed.
+        If there is no such file, it is not an FMU, its version or kind is not supported, it has no binary for this machine, or FMPy
+        is not installed.
     """
     path = file_of(model, places)
     if not path:
         where = places[0] if places else os.getcwd()
         problem = "is a directory" if os.path.isdir(os.path.join(where, model)) else f"there is no such file in {where}"
         raise InputError(source, f"{key} = {model!r}: {problem}", LEGAL)
-    at = os.stat(path)
+    status = os.stat(path)
     try:
-        return _read(path, at.st_mtime_ns, at.st_size, at.st_ino)
+        return _read(path, status.st_mtime_ns, status.st_size, status.st_ino)
     except InputError as error:
         raise InputError(source, f"{key} = {model!r} {error.problem}", error.legal) from None
 
@@ -162,50 +162,52 @@ def _read(path: str, *_: int) -> Description:
         with zipfile.ZipFile(path) as archive:
             files = set(archive.namelist())
             version = ElementTree.fromstring(archive.read("modelDescription.xml")).get("fmiVersion", "")
-    except Exception as error:  # whatever is wrong with somebody's file
+    except Exception as error:  # any error in a user's file
         raise InputError("fmu", f"is no FMU that can be read: {first_line(error)}", LEGAL) from None
     if not version.startswith(("2.", "3.")):
         raise InputError("fmu", f"is of FMI {version}", LEGAL)
     try:
-        said = read_model_description(path, validate=False)
-    except Exception as error:  # whatever FMPy stumbles over in somebody's file
+        model = read_model_description(path, validate=False)
+    except Exception as error:  # any error of FMPy about a user's file
         raise InputError("fmu", f"is no FMU that can be read: {first_line(error)}", LEGAL) from None
-    way = said.coSimulation
-    if way is None:
-        kind = "model exchange" if said.modelExchange is not None else "scheduled execution"
+    simulation = model.coSimulation
+    if simulation is None:
+        kind = "model exchange" if model.modelExchange is not None else "scheduled execution"
         raise InputError("fmu", f"is for {kind} only, without a solver of its own", LEGAL)
-    folder = platform_tuple if said.fmiVersion.startswith("3") else platform
-    if f"binaries/{folder}/{way.modelIdentifier}{sharedLibraryExtension}" not in files:
-        there = sorted({name.split("/")[1] for name in files if name.startswith("binaries/") and name.count("/") > 1 and name[-1] != "/"})
-        raise InputError("fmu", f"has no binary for this machine ({folder}), but {', '.join(there) or 'none at all'}", f"binaries/{folder}")
+    folder = platform_tuple if model.fmiVersion.startswith("3") else platform
+    if f"binaries/{folder}/{simulation.modelIdentifier}{sharedLibraryExtension}" not in files:
+        platforms = sorted({name.split("/")[1] for name in files
+                            if name.startswith("binaries/") and name.count("/") > 1 and name[-1] != "/"})
+        raise InputError("fmu", f"has no binary for this machine ({folder}), but {', '.join(platforms) or 'none at all'}",
+                         f"binaries/{folder}")
     units = {unit.name: Unit(tuple(int(getattr(unit.baseUnit, base)) for base in BASES), float(unit.baseUnit.factor),
-                             float(unit.baseUnit.offset)) for unit in said.unitDefinitions if unit.baseUnit is not None}
+                             float(unit.baseUnit.offset)) for unit in model.unitDefinitions if unit.baseUnit is not None}
     return Description(
-        path, sha256(Path(path).read_bytes()).hexdigest(), said.fmiVersion, way.modelIdentifier, said.guid or "", _step(said),
-        way.canBeInstantiatedOnlyOncePerProcess, units,
-        {one.name: _variable(one, units) for one in said.modelVariables if not one.dimensions})
+        path, sha256(Path(path).read_bytes()).hexdigest(), model.fmiVersion, simulation.modelIdentifier, model.guid or "", _step(model),
+        simulation.canBeInstantiatedOnlyOncePerProcess, units,
+        {variable.name: _variable(variable, units) for variable in model.modelVariables if not variable.dimensions})
 
 
-def _step(said: Any) -> float | None:
-    """The step that an FMU needs [s]: one that it has inside, or the usual one of an FMU that cannot change it."""
-    way, usual = said.coSimulation, getattr(said.defaultExperiment, "stepSize", None)
-    fixed = way.fixedInternalStepSize or (None if way.canHandleVariableCommunicationStepSize else usual)
+def _step(model: Any) -> float | None:
+    """The step that an FMU requires [s]: its internal step, or its default step if it cannot change the step."""
+    simulation, usual = model.coSimulation, getattr(model.defaultExperiment, "stepSize", None)
+    fixed = simulation.fixedInternalStepSize or (None if simulation.canHandleVariableCommunicationStepSize else usual)
     return float(fixed) if fixed and float(fixed) > 0 else None
 
 
-def _variable(said: Any, units: Mapping[str, Unit]) -> Variable:
+def _variable(variable: Any, units: Mapping[str, Unit]) -> Variable:
     def declared(name: str) -> Any:
-        own = getattr(said, name, None)
-        return getattr(said.declaredType, name, None) if own is None else own
+        own = getattr(variable, name, None)
+        return getattr(variable.declaredType, name, None) if own is None else own
 
-    unit_name, start = declared("unit") or "", said.start
+    unit_name, start = declared("unit") or "", variable.start
     unit = units.get(unit_name) or USUAL.get(unit_name)
     if unit is not None and declared("relativeQuantity"):
         unit = unit._replace(offset=0.0)
-    variability = said.variability or ("continuous" if said.type in CONVERTIBLE else "discrete")
-    return Variable(said.name, said.valueReference, said.type, said.causality or "local", variability, unit_name, unit,
-                    _number(start) if said.type in CONVERTIBLE else start, _number(declared("min")), _number(declared("max")),
-                    " ".join((said.description or "").split()))
+    variability = variable.variability or ("continuous" if variable.type in CONVERTIBLE else "discrete")
+    return Variable(variable.name, variable.valueReference, variable.type, variable.causality or "local", variability, unit_name, unit,
+                    _number(start) if variable.type in CONVERTIBLE else start, _number(declared("min")), _number(declared("max")),
+                    " ".join((variable.description or "").split()))
 
 
 def _number(text: Any) -> float | None:

@@ -1,6 +1,6 @@
-"""The program in whose process an FMU runs: it answers over its standard streams, and may crash or hang without harm to who asks.
+"""The program that runs an FMU in a separate process, where a crash or a hang does no harm; it answers over its standard streams.
 
-It is started by its path and imports nothing of this package. A request is a tuple of a name and arguments, pickled; so is an answer.
+It is started by its path and imports nothing of this package. Requests and answers are pickled tuples: a name and arguments.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from zipfile import ZipFile
 
 import numpy as np
 
-LOOKS = 0.1
-"""Time between two looks at what takes too long [s]."""
+CHECK_INTERVAL = 0.1
+"""Time between two checks for requests that take too long [s]."""
 GROUPS = {"Real": "Real", "Integer": "Integer", "Enumeration": "Integer", "Boolean": "Boolean", "String": "String"}
-"""FMI 2.0's functions by the type of a variable; FMI 3.0's are called like the types, but for enumerations."""
+"""Names of FMI 2.0's functions by the type of a variable; FMI 3.0's are named after the types, except for enumerations."""
 
 
 class Setting(NamedTuple):
-    """What every instance of an FMU has in common, as the first request has it.
+    """Facts that all instances of an FMU share, the arguments of the first request.
 
-    `path` and `digest` are those of its file; `inputs`, `parameters` and `outputs` are types and value references; `limit` is how long one
-    instance may take for a request [s].
+    `path` and `digest` are those of the FMU's file; `inputs`, `parameters` and `outputs` are types and value references; `limit` is the
+    longest time that one instance may take for a request [s].
     """
 
     path: str
@@ -48,11 +48,11 @@ class Setting(NamedTuple):
 
 
 class Failure(Exception):
-    """What an FMU could not do."""
+    """An FMU could not carry out a request."""
 
 
 class Instances:
-    """All instances in this process, by numbers that the other side gives them."""
+    """All instances in this process, by numbers that the requests give them."""
 
     def __init__(self, setting: Setting, folder: str) -> None:
         from fmpy.fmi2 import FMU2Slave
@@ -60,99 +60,99 @@ class Instances:
 
         self._is_3 = setting.version.startswith("3")
         self._logged, self._setting = list[str](), setting
-        known = {"guid": setting.token, "unzipDirectory": folder, "modelIdentifier": setting.identifier}
-        self._library = (FMU3Slave if self._is_3 else FMU2Slave)(instanceName=setting.identifier, **known)
+        arguments = {"guid": setting.token, "unzipDirectory": folder, "modelIdentifier": setting.identifier}
+        self._library = (FMU3Slave if self._is_3 else FMU2Slave)(instanceName=setting.identifier, **arguments)
         self._callbacks = None if self._is_3 else self._callbacks_2()
-        self._of: dict[int, Any] = {}
+        self._instances: dict[int, Any] = {}
         self._inputs, self._parameters, self._outputs = map(self._grouped, (setting.inputs, setting.parameters, setting.outputs))
         self.busy: tuple[float, int, str] | None = None
-        """Since when which instance has been doing what."""
+        """Start time [s], place and activity of the request in progress."""
 
     def start(self, numbers: list[int], parameters: list[list[Any]], inputs: list[list[float]]) -> np.ndarray:
-        """Initialised instances, new or reset; returns outputs, shape (N, m)."""
-        return self._each(numbers, "is initialised", lambda place, one: self._started(one, parameters[place], inputs[place]))
+        """Initialise instances, new or reset; returns the outputs, shape (N, m)."""
+        return self._each(numbers, "is initialised", lambda place, instance: self._start(instance, parameters[place], inputs[place]))
 
-    def step(self, numbers: list[int], times: list[tuple[float, float]], inputs: list[list[float]], kept: int) -> np.ndarray:
-        """Instances some steps on, with the same inputs: outputs after the last `kept` steps, shape (N, kept, m)."""
-        def stepped(place: int, one: Any) -> list[list[float]]:
-            self._set(one, self._inputs, inputs[place])
-            told = []
-            for number, (at, step) in enumerate(times, 1):
-                self._step(one, at, step)
-                if number > len(times) - kept:
-                    told.append(self._told(one))
-            return told
+    def step(self, numbers: list[int], times: list[tuple[float, float]], inputs: list[list[float]], kept_steps: int) -> np.ndarray:
+        """Advance instances by some steps with constant inputs; returns outputs after the last `kept_steps`, shape (N, kept_steps, m)."""
+        def advance(place: int, instance: Any) -> list[list[float]]:
+            self._set(instance, self._inputs, inputs[place])
+            outputs = []
+            for number, (time_, step) in enumerate(times, 1):
+                self._step(instance, time_, step)
+                if number > len(times) - kept_steps:
+                    outputs.append(self._read_outputs(instance))
+            return outputs
 
-        return self._each(numbers, f"is at {times[0][0]:g} s", stepped)
+        return self._each(numbers, f"is at {times[0][0]:g} s", advance)
 
     def _each(self, numbers: list[int], doing: str, work: Callable[[int, Any], Any]) -> np.ndarray:
         results = []
         for place, number in enumerate(numbers):
             self.busy = (time.monotonic(), place, doing)
             try:
-                one = self._of.get(number)
-                if one is None:
-                    one = self._of[number] = self._instance()
-                results.append(work(place, one))
-            except Exception as error:  # whatever FMPy raises about an FMU
+                instance = self._instances.get(number)
+                if instance is None:
+                    instance = self._instances[number] = self._new_instance()
+                results.append(work(place, instance))
+            except Exception as error:  # any error of FMPy about an FMU
                 self._drop(number)
                 raise Failure(f"{self._reason(error)} while it {doing}") from error
             finally:
                 self.busy = None
         return np.array(results, dtype=float)
 
-    def _instance(self) -> Any:
-        one = copy.copy(self._library)  # shares the library and its functions
-        one.component, one.used = None, False
+    def _new_instance(self) -> Any:
+        instance = copy.copy(self._library)  # shares the library and its functions
+        instance.component, instance.used = None, False
         if self._is_3:
-            one.instantiate(loggingOn=True, logMessage=lambda _, status, category, message: self._note(status, message))
+            instance.instantiate(loggingOn=True, logMessage=lambda _, status, category, message: self._note(status, message))
         else:
-            one.instantiate(callbacks=self._callbacks, loggingOn=True)
-        return one
+            instance.instantiate(callbacks=self._callbacks, loggingOn=True)
+        return instance
 
-    def _started(self, one: Any, parameters: list[Any], inputs: list[float]) -> list[float]:
-        if one.used:
-            one.terminate()
-            one.reset()
-        one.used = True
-        self._set(one, self._parameters, parameters)
+    def _start(self, instance: Any, parameters: list[Any], inputs: list[float]) -> list[float]:
+        if instance.used:
+            instance.terminate()
+            instance.reset()
+        instance.used = True
+        self._set(instance, self._parameters, parameters)
         if self._is_3:
-            one.enterInitializationMode(startTime=0.0)
+            instance.enterInitializationMode(startTime=0.0)
         else:
-            one.setupExperiment(startTime=0.0)
-            one.enterInitializationMode()
-        self._set(one, self._inputs, inputs)
-        one.exitInitializationMode()
-        return self._told(one)
+            instance.setupExperiment(startTime=0.0)
+            instance.enterInitializationMode()
+        self._set(instance, self._inputs, inputs)
+        instance.exitInitializationMode()
+        return self._read_outputs(instance)
 
-    def _step(self, one: Any, at: float, step: float) -> None:
-        ended = one.doStep(at, step)
+    def _step(self, instance: Any, time_: float, step: float) -> None:
+        result = instance.doStep(time_, step)
         if not self._is_3:
             return
-        _, terminated, early, reached = ended
+        _, terminated, early, reached = result
         if terminated:
-            raise Failure("it asks for the end of the simulation")
+            raise Failure("it requests the end of the simulation")
         if early:
             raise Failure(f"it returned early, at {reached:g} s")
 
-    def _set(self, one: Any, groups: list[tuple[str, list[int], list[int]]], values: list[Any]) -> None:
+    def _set(self, instance: Any, groups: list[tuple[str, list[int], list[int]]], values: list[Any]) -> None:
         for kind, references, columns in groups:
             chosen = [values[column] for column in columns]
             if kind == "Boolean":
                 chosen = [bool(value) for value in chosen]
             elif kind not in ("Real", "Float64", "Float32", "String"):
                 chosen = [round(value) for value in chosen]
-            getattr(one, f"set{kind}")(references, chosen)
+            getattr(instance, f"set{kind}")(references, chosen)
 
-    def _told(self, one: Any) -> list[float]:
-        told = [0.0] * len(self._setting.outputs)
+    def _read_outputs(self, instance: Any) -> list[float]:
+        outputs = [0.0] * len(self._setting.outputs)
         for kind, references, columns in self._outputs:
-            for column, value in zip(columns, getattr(one, f"get{kind}")(references), strict=True):
-                told[column] = float(value)
-        return told
+            for column, value in zip(columns, getattr(instance, f"get{kind}")(references), strict=True):
+                outputs[column] = float(value)
+        return outputs
 
     def _grouped(self, ports: tuple[tuple[str, int], ...]) -> list[tuple[str, list[int], list[int]]]:
-        """Value references and columns by the function that sets or gets them."""
+        """Value references and columns, grouped by the FMI function that sets or gets them."""
         groups: dict[str, tuple[list[int], list[int]]] = {}
         for column, (kind, reference) in enumerate(ports):
             name = ("Int64" if kind == "Enumeration" else kind) if self._is_3 else GROUPS[kind]
@@ -162,8 +162,8 @@ class Instances:
         return [(name, *group) for name, group in groups.items()]
 
     def _drop(self, number: int) -> None:
-        """Forget an instance that failed: what it would do next is undefined, even to be freed."""
-        self._of.pop(number, None)
+        """Forget an instance that failed: any further call, even freeing it, is undefined."""
+        self._instances.pop(number, None)
 
     def _callbacks_2(self) -> Any:
         from fmpy.fmi2 import defaultCallbacks, fmi2CallbackFunctions, fmi2CallbackLoggerTYPE
@@ -186,8 +186,8 @@ class Instances:
         return f"{text}: {logged[-1]}" if logged else text
 
 
-def unpacked(setting: Setting) -> str:
-    """A new folder with what is in the FMU."""
+def unpack(setting: Setting) -> str:
+    """Unpack the FMU into a new folder."""
     content = Path(setting.path).read_bytes()
     if sha256(content).hexdigest() != setting.digest:
         raise Failure("its file was changed meanwhile")
@@ -198,9 +198,9 @@ def unpacked(setting: Setting) -> str:
 
 
 def watch(instances: Instances, limit: float, folder: str, parent: int, answers: BinaryIO) -> None:
-    """End the process when an instance takes too long, or when nobody asks any more."""
+    """End the process when an instance takes too long, or when the parent process has ended."""
     while os.getppid() == parent:
-        time.sleep(LOOKS)
+        time.sleep(CHECK_INTERVAL)
         busy = instances.busy
         if busy is not None and time.monotonic() - busy[0] > limit:
             send(answers, ("hangs", f"takes longer than {limit:g} s while it {busy[2]}"))
@@ -209,13 +209,13 @@ def watch(instances: Instances, limit: float, folder: str, parent: int, answers:
 
 
 def end(folder: str) -> NoReturn:
-    """End at once, without what an FMU would do when its library is unloaded."""
+    """End at once, without running the code of an FMU that unloading its library would run."""
     shutil.rmtree(folder, ignore_errors=True)
     os._exit(1)
 
 
-def send(stream: BinaryIO, what: Any) -> None:
-    pickle.dump(what, stream, protocol=pickle.HIGHEST_PROTOCOL)
+def send(stream: BinaryIO, message: Any) -> None:
+    pickle.dump(message, stream, protocol=pickle.HIGHEST_PROTOCOL)
     stream.flush()
 
 
@@ -223,9 +223,9 @@ def main() -> None:
     """Answer requests until there are no more."""
     requests = os.fdopen(os.dup(0), "rb")
     answers = os.fdopen(os.dup(1), "wb")
-    nothing = os.open(os.devnull, os.O_RDWR)
-    for descriptor in range(3):  # what an FMU prints must not pass for an answer
-        os.dup2(nothing, descriptor)
+    null = os.open(os.devnull, os.O_RDWR)
+    for descriptor in range(3):  # output that an FMU prints must not be read as an answer
+        os.dup2(null, descriptor)
     sys.stdin, sys.stdout, sys.stderr = (os.fdopen(number, mode) for number, mode in enumerate("rww"))
     parent, folder, instances = os.getppid(), "", None
     while True:
@@ -236,7 +236,7 @@ def main() -> None:
         try:
             if instances is None:
                 setting = Setting(*arguments)
-                folder = unpacked(setting)
+                folder = unpack(setting)
                 send(answers, ("done", folder))
                 instances = Instances(setting, folder)
                 threading.Thread(target=watch, args=(instances, setting.limit, folder, parent, answers), daemon=True).start()
@@ -245,7 +245,7 @@ def main() -> None:
                 send(answers, ("done", getattr(instances, name)(*arguments)))
         except Failure as failure:
             send(answers, ("failed", str(failure)))
-        except Exception as error:  # the other side tells it
+        except Exception as error:  # the parent process reports it
             send(answers, ("failed", f"{type(error).__name__}: {error}"))
 
 

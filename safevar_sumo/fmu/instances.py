@@ -1,4 +1,4 @@
-"""Instances of an FMU for N vehicles, in a process beside this one, and vehicles that can be taken up again at any step they were at."""
+"""Instances of an FMU for N vehicles, in a separate process, and vehicles that can be resumed from any earlier step."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from safevar_sumo.fmu.host import Setting
 from safevar_sumo.fmu.ports import FloatArray, Port
 
 LONGEST = 10.0
-"""How long an instance may take for one step of a simulation before it counts as hung [s]."""
-MOST, MOST_ALONE = 200, 4
-"""Vehicles of a simulation: in one process of an FMU, and in processes of their own."""
+"""Longest time that an instance may take for one simulation step; beyond it the instance counts as hung [s]."""
+MOST, MOST_PROCESSES = 200, 4
+"""Largest number of vehicles of a simulation: with all instances in one process, and with one process for each."""
 EXACT = 1e-9
-"""Share of a step by which a time may miss a communication point and be there."""
+"""Share of a step within which a time counts as being at a communication point [-]."""
 
 
 class Fault(SafevarError):
-    """An FMU crashed, hung or refused; in words that follow its name."""
+    """An FMU crashed, hung or failed; the message continues a sentence that begins with its name."""
 
 
-class Past(NamedTuple):
-    """What a vehicle has been given so far: `inputs` after all `before`, in the `number`-th step; the first are those of its start."""
+class History(NamedTuple):
+    """All inputs so far: `inputs` of step `number` after those of `previous`; the first ones are those of the initialisation."""
 
-    before: Past | None
+    previous: History | None
     inputs: FloatArray
     number: int
 
@@ -52,7 +52,7 @@ class _Host:
         except OSError as error:
             raise EnvironmentFault(f"no process for an FMU can be started: {error.strerror}") from None
         self._folder = list[str]()
-        self.end = weakref.finalize(self, _ended, self._process, self._folder)
+        self.end = weakref.finalize(self, _end_process, self._process, self._folder)
         self.doing = "is loaded"
         self.send(("open", *setting))
         self._folder.append(self.receive())
@@ -62,24 +62,24 @@ class _Host:
         try:
             pickle.dump(request, self._process.stdin, protocol=pickle.HIGHEST_PROTOCOL)  # type: ignore[arg-type]
             self._process.stdin.flush()  # type: ignore[union-attr]
-        except OSError:  # it is gone, which its answer tells
+        except OSError:  # the process has ended, which `receive` reports
             return
 
     def receive(self) -> Any:
         try:
-            how, answer = pickle.load(self._process.stdout)  # type: ignore[arg-type]
+            status, answer = pickle.load(self._process.stdout)  # type: ignore[arg-type]
         except (EOFError, OSError, pickle.UnpicklingError):
             self._process.wait()
             raise Fault(f"crashed {_cause(self._process.returncode)} while it {self.doing}") from None
-        if how == "hangs":
+        if status == "hangs":
             self.end()
             raise Fault(answer)
-        if how == "failed":
+        if status == "failed":
             raise Fault(f"failed: {answer}")
         return answer
 
 
-def _ended(process: subprocess.Popen[bytes], folders: list[str]) -> None:
+def _end_process(process: subprocess.Popen[bytes], folders: list[str]) -> None:
     process.kill()
     for folder in folders:
         shutil.rmtree(folder, ignore_errors=True)
@@ -87,7 +87,7 @@ def _ended(process: subprocess.Popen[bytes], folders: list[str]) -> None:
         if stream is not None:
             try:
                 stream.close()
-            except OSError:  # what was still to be written is of no use
+            except OSError:  # data still to be written is of no use
                 continue
     process.wait()
 
@@ -100,16 +100,16 @@ def _cause(code: int) -> str:
 
 
 class Instances:
-    """The instances of one FMU with the same inputs and outputs: they are made when needed, and given back to be reset.
+    """The instances of one FMU with the same inputs and outputs: created when needed, and returned for reuse after a reset.
 
     Parameters
     ----------
     inputs, outputs
-        Its ports, in the order in which values are given and told. Those for parameters are set once, at the start.
+        The FMU's ports, in the order of the values. Ports for parameters are set once, at the start.
     fixed
         Further parameters and their values.
     limit
-        How long an instance may take for one request [s].
+        Longest time that an instance may take for one request [s].
     """
 
     def __init__(self, description: Description, inputs: Sequence[Port], outputs: Sequence[Port],
@@ -119,16 +119,16 @@ class Instances:
         self._set_once = [k for k, port in enumerate(inputs) if not port.is_input]
         self._set_always = [k for k, port in enumerate(inputs) if port.is_input]
         self._slots = (tuple(inputs[k].slot for k in self._set_always),
-                       (*(inputs[k].slot for k in self._set_once), *((one.type, one.reference) for one, _ in fixed)),
+                       (*(inputs[k].slot for k in self._set_once), *((variable.type, variable.reference) for variable, _ in fixed)),
                        tuple(port.slot for port in outputs))
         self._limit, self._hosts = limit, dict[int, _Host]()
         self._free, self._next = list[int](), 0
         self.generation = 0
-        """How often all instances were lost."""
+        """Number of times that all instances were lost."""
 
     @property
     def most_vehicles(self) -> int:
-        return MOST_ALONE if self.description.alone else MOST
+        return MOST_PROCESSES if self.description.single_instance else MOST
 
     def lease(self, n: int) -> list[int]:
         """Numbers of n instances."""
@@ -143,30 +143,31 @@ class Instances:
 
     def start(self, numbers: Sequence[int], values: FloatArray) -> FloatArray:
         """Initialise instances with values of the inputs, shape (k, N); returns the outputs, shape (m, N)."""
-        given = [port.given(values[k]) for k, port in enumerate(self.inputs)]
-        once = [[*(float(given[k][i]) for k in self._set_once), *self._fixed] for i in range(len(numbers))]
-        always = [[float(given[k][i]) for k in self._set_always] for i in range(len(numbers))]
-        answers = self._asked("start", numbers, "is initialised", lambda rows: ([once[i] for i in rows], [always[i] for i in rows]))
-        return np.asarray(self._read(answers[:, np.newaxis])[-1])
+        converted = [port.to_fmu(values[k]) for k, port in enumerate(self.inputs)]
+        parameters = [[*(float(converted[k][i]) for k in self._set_once), *self._fixed] for i in range(len(numbers))]
+        inputs = [[float(converted[k][i]) for k in self._set_always] for i in range(len(numbers))]
+        answers = self._request("start", numbers, "is initialised", lambda rows: ([parameters[i] for i in rows], [inputs[i] for i in rows]))
+        return np.asarray(self._converted(answers[:, np.newaxis])[-1])
 
     def step(self, numbers: Sequence[int], times: Sequence[tuple[float, float]], values: FloatArray) -> FloatArray:
-        """Instances after steps that begin at times and are so long [s], one of them at least; outputs after the last two, or the one,
-        shape (1 or 2, m, N).
+        """Advance instances by one or more steps, given by start and length [s]; returns the outputs after the last two steps, or after
+        the only one, shape (1 or 2, m, N).
         """
-        given = [self.inputs[k].given(values[k]).tolist() for k in self._set_always]
-        always = list(map(list, zip(*given, strict=True))) or [[] for _ in numbers]
-        kept = min(len(times), 2)
-        return self._read(self._asked("step", numbers, f"is at {times[0][0]:g} s", lambda rows: (times, [always[i] for i in rows], kept)))
+        converted = [self.inputs[k].to_fmu(values[k]).tolist() for k in self._set_always]
+        inputs = list(map(list, zip(*converted, strict=True))) or [[] for _ in numbers]
+        kept_steps = min(len(times), 2)
+        return self._converted(self._request("step", numbers, f"is at {times[0][0]:g} s",
+                                             lambda rows: (times, [inputs[i] for i in rows], kept_steps)))
 
-    def _read(self, answers: FloatArray) -> FloatArray:
-        """Answers, shape (N, steps, m), in our units as (steps, m, N)."""
-        told = np.ascontiguousarray(answers.transpose(1, 2, 0))
-        return np.stack([port.told(told[:, k]) for k, port in enumerate(self.outputs)], axis=1)
+    def _converted(self, answers: FloatArray) -> FloatArray:
+        """Answers, shape (N, steps, m), converted to the ports' outer units, shape (steps, m, N)."""
+        outputs = np.ascontiguousarray(answers.transpose(1, 2, 0))
+        return np.stack([port.from_fmu(outputs[:, k]) for k, port in enumerate(self.outputs)], axis=1)
 
-    def _asked(self, name: str, numbers: Sequence[int], doing: str, arguments: Any) -> FloatArray:
-        """What instances answer, shape (N, ...): all in one process, or each in its own."""
+    def _request(self, name: str, numbers: Sequence[int], doing: str, arguments: Any) -> FloatArray:
+        """Answers of instances, shape (N, ...), which run in one process or each in its own."""
         places = range(len(numbers))
-        groups = {numbers[place]: [place] for place in places} if self.description.alone else {0: [*places]}
+        groups = {numbers[place]: [place] for place in places} if self.description.single_instance else {0: [*places]}
         hosts = {}
         try:
             for key, rows in groups.items():
@@ -175,17 +176,17 @@ class Instances:
                 host.send((name, [numbers[i] for i in rows], *arguments(rows)))
             return np.concatenate([host.receive() for host in hosts.values()])
         except Fault:
-            self.close()  # instances elsewhere have answers under way
+            self.close()  # answers of other processes may be pending
             raise
 
     def _host(self, key: int) -> _Host:
         if key not in self._hosts:
-            said = self.description
-            self._hosts[key] = _Host(Setting(said.path, said.digest, said.version, said.identifier, said.token, *self._slots, self._limit))
+            d = self.description
+            self._hosts[key] = _Host(Setting(d.path, d.digest, d.version, d.identifier, d.token, *self._slots, self._limit))
         return self._hosts[key]
 
     def close(self) -> None:
-        """End the processes; whoever goes on begins anew."""
+        """End the processes; a vehicle that continues starts anew."""
         for host in self._hosts.values():
             host.end()
         self._hosts = {}
@@ -193,68 +194,68 @@ class Instances:
 
 
 class Fleet:
-    """N vehicles with an instance each. Any step that they were at can be gone on from: they then drive there once more.
+    """N vehicles with one instance each. They can continue from any earlier step, which they reach by simulating up to it again.
 
     Parameters
     ----------
     step
         Time between two calls [s].
     own_step
-        Time between two communication points [s]; the same if None.
+        Time between two communication points [s]; `step` if None.
     """
 
     def __init__(self, instances: Instances, n: int, step: float, own_step: float | None) -> None:
         self._instances, self._step, self._own_step = instances, step, own_step
         self._numbers = instances.lease(n)
         weakref.finalize(self, instances.give_back, self._numbers)
-        self._at: Past | None = None
+        self._position: History | None = None
         self._generation = instances.generation
         self._last: FloatArray
         """Outputs at the last two communication points, shape (2, m, N)."""
 
-    def start(self, inputs: FloatArray) -> tuple[FloatArray, Past]:
+    def start(self, inputs: FloatArray) -> tuple[FloatArray, History]:
         """Initialise the vehicles with inputs of shape (k, N); returns the outputs, shape (m, N)."""
         outputs = self._instances.start(self._numbers, inputs)
         self._generation = self._instances.generation
-        self._last, self._at = np.stack([outputs, outputs]), Past(None, inputs, -1)
-        return outputs, self._at
+        self._last, self._position = np.stack([outputs, outputs]), History(None, inputs, -1)
+        return outputs, self._position
 
-    def advance(self, past: Past, inputs: FloatArray) -> tuple[FloatArray, Past]:
-        """Drive one step on from a past with inputs of shape (k, N); returns the outputs then, and those in between before, (2, m, N).
+    def advance(self, history: History, inputs: FloatArray) -> tuple[FloatArray, History]:
+        """Advance by one step after `history` with inputs of shape (k, N); returns outputs of shape (2, m, N), and the new history.
 
-        The first are at the last communication point, the second interpolated to the end of the step.
+        The first outputs are those at the last communication point, the second are interpolated to the end of the step.
         """
-        if self._at is not past or self._generation != self._instances.generation:
-            self._go_back(past)
-        number = past.number + 1
-        self._at = None
+        if self._position is not history or self._generation != self._instances.generation:
+            self._go_back(history)
+        number = history.number + 1
+        self._position = None
         self._drive(number, inputs)
-        self._at = Past(past, inputs, number)
-        return np.stack([self._last[1], self._at_end_of(number)]), self._at
+        self._position = History(history, inputs, number)
+        return np.stack([self._last[1], self._at_end_of(number)]), self._position
 
-    def _go_back(self, past: Past) -> None:
-        way = [past]
-        while way[-1].before is not None:
-            way.append(way[-1].before)
-        self.start(way.pop().inputs)
-        for one in reversed(way):
-            self._drive(one.number, one.inputs)
+    def _go_back(self, history: History) -> None:
+        steps = [history]
+        while steps[-1].previous is not None:
+            steps.append(steps[-1].previous)
+        self.start(steps.pop().inputs)
+        for step in reversed(steps):
+            self._drive(step.number, step.inputs)
 
     def _drive(self, number: int, inputs: FloatArray) -> None:
-        """Past the communication points of a step, if there is one."""
+        """Advance to the last communication point of a step, if it has any."""
         own = self._own_step or self._step
         times = [(point * own, own) for point in range(self._points(number), self._points(number + 1))]
         if times:
-            told = self._instances.step(self._numbers, times, inputs)
-            self._last = told if len(told) == 2 else np.stack([self._last[1], told[0]])
+            outputs = self._instances.step(self._numbers, times, inputs)
+            self._last = outputs if len(outputs) == 2 else np.stack([self._last[1], outputs[0]])
 
     def _points(self, number: int) -> int:
-        """Number of the first own communication point that is not before the start of a step."""
+        """Number of the first communication point at or after the start of a step."""
         return math.ceil(number * self._step / (self._own_step or self._step) - EXACT)
 
     def _at_end_of(self, number: int) -> FloatArray:
         own = self._own_step or self._step
-        after = self._points(number + 1) - (number + 1) * self._step / own  # by how many own steps it is ahead
+        after = self._points(number + 1) - (number + 1) * self._step / own  # from the step's end to the last point, in own steps
         if abs(after) <= EXACT:
             return np.asarray(self._last[1])
         return np.asarray(self._last[1] - (self._last[1] - self._last[0]) * after)

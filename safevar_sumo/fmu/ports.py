@@ -1,4 +1,4 @@
-"""The variables of an FMU that a study maps: each with the unit that it has and the one that its values are given or wanted in."""
+"""The variables of an FMU that a study maps: each with its own unit and the unit of its values outside the FMU."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from safevar_sumo.fmu.units import SI, Unit
 
 FloatArray = npt.NDArray[np.float64]
 PYTHON_TYPES = {"String": (str,), "Boolean": (bool,), **dict.fromkeys(CONVERTIBLE, (int, float))}
-"""Types of values that a study gives a parameter; others take whole numbers."""
+"""Python types that a study may give parameters of an FMI type; other FMI types take whole numbers."""
 
 
 class Port(NamedTuple):
-    """A variable of an FMU, its unit, and that of its values outside."""
+    """A variable of an FMU, its unit, and the unit of its values outside the FMU."""
 
     variable: Variable
-    theirs: Unit
-    ours: Unit
+    fmu_unit: Unit
+    outer_unit: Unit
 
     @property
     def is_input(self) -> bool:
@@ -32,15 +32,15 @@ class Port(NamedTuple):
     def slot(self) -> tuple[str, int]:
         return self.variable.type, self.variable.reference
 
-    def given(self, values: FloatArray) -> FloatArray:
-        """Values in the FMU's unit, within the bounds that an input declares: a gap to nobody is as large as it takes."""
-        theirs = np.asarray(self.ours.to(self.theirs, values))
+    def to_fmu(self, values: FloatArray) -> FloatArray:
+        """Values in the FMU's unit, clipped to the bounds that an input declares, such as an infinite gap."""
+        converted = np.asarray(self.outer_unit.to(self.fmu_unit, values))
         lower, upper = (self.variable.lower, self.variable.upper) if self.is_input else (None, None)
-        return np.asarray(np.clip(theirs, -np.inf if lower is None else lower, np.inf if upper is None else upper))
+        return np.asarray(np.clip(converted, -np.inf if lower is None else lower, np.inf if upper is None else upper))
 
-    def told(self, values: FloatArray) -> FloatArray:
-        """The FMU's values outside of it."""
-        return np.asarray(self.theirs.to(self.ours, values))
+    def from_fmu(self, values: FloatArray) -> FloatArray:
+        """Values of the FMU in the outer unit."""
+        return np.asarray(self.fmu_unit.to(self.outer_unit, values))
 
 
 def ports_of(description: Description, named: Mapping[str, str], units: Mapping[str, str], causalities: Collection[str], source: str,
@@ -50,40 +50,41 @@ def ports_of(description: Description, named: Mapping[str, str], units: Mapping[
     Parameters
     ----------
     named
-        Variables by quantity, as the study has them.
+        Names of variables by quantity, from the study.
     units
-        The unit of every quantity that there is.
+        Unit of every legal quantity.
     key
         The table's key in the study.
     constant
-        Quantities that stay the same during a run: parameters take them, too.
+        Quantities that are constant during a run: parameters may take them, too.
 
     Raises
     ------
     InputError
-        If there is no such quantity or variable, or the variable cannot hold it.
+        If a quantity or variable does not exist, or the variable cannot hold the quantity.
     """
-    found: dict[str, Port] = {}
+    ports: dict[str, Port] = {}
     for quantity, name in named.items():
         if quantity not in units:
             raise unknown(source, f"{key}.{quantity}: there is no such quantity", quantity, units)
         fitting = (*causalities, "parameter") if quantity in constant else causalities
         variable = description.variable(name, fitting, source, f"{key}.{quantity}")
-        other = next((one for one, port in found.items() if port.variable.name == name), None)
-        if other and "parameter" not in causalities:  # one that is only read may be the bound of several
+        other = next((mapped for mapped, port in ports.items() if port.variable.name == name), None)
+        if other and "parameter" not in causalities:  # an output may hold several quantities
             raise InputError(source, f"{key}.{quantity} = {name!r}: that variable is {key}.{other} already", "each variable once")
-        ours = SI[units[quantity]]
-        found[quantity] = Port(variable, description.converted(variable, ours, units[quantity], source, f"{key}.{quantity}"), ours)
-    return found
+        outer_unit = SI[units[quantity]]
+        ports[quantity] = Port(variable, description.converted(variable, outer_unit, units[quantity], source, f"{key}.{quantity}"),
+                               outer_unit)
+    return ports
 
 
 def fixed_of(description: Description, values: Mapping[str, Any], taken: Collection[str], source: str,
              key: str) -> Iterator[tuple[Variable, Any]]:
-    """Parameters of an FMU that a study sets, with their values in the FMU's units; raises as `ports_of`."""
+    """Parameters of an FMU that a study sets, with their values in the FMU's units; raises the errors of `ports_of`."""
     for name, value in values.items():
         variable = description.variable(name, ("parameter", "structuralParameter"), source, key, (*NUMBERS, "String"))
         if type(value) not in PYTHON_TYPES.get(variable.type, (int,)):
             raise InputError(source, f"{key}.{name} = {value!r}", f"a value of type {variable.type}")
         if name in taken:
-            raise InputError(source, f"{key}.{name}: the same parameter has its value from elsewhere in the study", "each parameter once")
+            raise InputError(source, f"{key}.{name}: another key of the study sets the same parameter", "each parameter once")
         yield variable, value

@@ -18,11 +18,11 @@ class Unit(NamedTuple):
     offset: float = 0.0
 
     def fits(self, other: Unit) -> bool:
-        """Whether both are of one kind; radians count as plain numbers."""
+        """Whether both measure the same kind of quantity; radians count as plain numbers."""
         return self.exponents[:-1] == other.exponents[:-1]
 
     def to(self, other: Unit, value: Any) -> Any:
-        """A value, or an array of them, in another unit of its kind; as it is where both are the same."""
+        """A value or an array converted to another unit of the same kind; unchanged where both units are equal."""
         if (self.factor, self.offset) == (other.factor, other.offset):
             return value
         return (self.factor * value + (self.offset - other.offset)) / other.factor
@@ -34,7 +34,7 @@ def _unit(factor: float = 1.0, offset: float = 0.0, **exponents: int) -> Unit:
 
 SI: Mapping[str, Unit] = {
     "-": _unit(), "s": _unit(s=1), "m": _unit(m=1), "m/s": _unit(m=1, s=-1), "m/s^2": _unit(m=1, s=-2), "kg": _unit(kg=1)}
-"""Units of what vehicles and driving systems exchange."""
+"""Units of the quantities that vehicles and driving systems exchange."""
 _FORCE, _TORQUE = {"kg": 1, "m": 1, "s": -2}, {"kg": 1, "m": 2, "s": -2}
 _POWER, _PRESSURE = {"kg": 1, "m": 2, "s": -3}, {"kg": 1, "m": -1, "s": -2}
 USUAL: Mapping[str, Unit] = {
@@ -47,4 +47,4 @@ USUAL: Mapping[str, Unit] = {
     "N": _unit(**_FORCE), "kN": _unit(1e3, **_FORCE), "N.m": _unit(**_TORQUE), "Nm": _unit(**_TORQUE), "J": _unit(**_TORQUE),
     "W": _unit(**_POWER), "kW": _unit(1e3, **_POWER), "Pa": _unit(**_PRESSURE), "kPa": _unit(1e3, **_PRESSURE),
     "bar": _unit(1e5, **_PRESSURE), "K": _unit(K=1), "degC": _unit(1.0, 273.15, K=1)}
-"""Units by the names that models usually give them, for those whose description does not say more of them."""
+"""Units by their usual names, for models whose description does not define them."""

@@ -1,4 +1,4 @@
-"""Vehicle models by name, and what a setting of vehicle characteristics is."""
+"""Vehicle models by name, and their characteristics."""
 
 from collections.abc import Mapping
 from typing import Any

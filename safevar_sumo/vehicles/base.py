@@ -108,13 +108,13 @@ def at_start(vehicle: Vehicle, prepared: Any, speed: FloatArray) -> Any:
     if not rolls.any():
         return rest
     steady = vehicle.at_speed(prepared, np.where(rolls, speed, 1.0))
-    return steady if rolls.all() else _joined(rolls, steady, rest)
+    return steady if rolls.all() else _selected(rolls, steady, rest)
 
 
-def _joined(rolls: BoolArray, steady: Any, rest: Any) -> Any:
-    """For every vehicle its part of one of two states, which may have states as parts."""
+def _selected(rolls: BoolArray, steady: Any, rest: Any) -> Any:
+    """`steady` for vehicles where `rolls` is true, `rest` for the others; a state may consist of states."""
     if isinstance(steady, tuple):
-        parts = [_joined(rolls, *pair) for pair in zip(steady, rest, strict=True)]
+        parts = [_selected(rolls, *pair) for pair in zip(steady, rest, strict=True)]
         return type(steady)(*parts) if hasattr(steady, "_fields") else tuple(parts)
     return steady if steady is None else np.where(rolls, steady, rest)
 
@@ -126,23 +126,25 @@ ROUNDING = 1e-9
 PROBE_STEP = 0.1  # s
 _BOUNDS = {"speed": (0.0, FASTEST), "throttle": (0.0, 1.0), "brake": (0.0, 1.0)}
 _INFINITE = ("gap", "lateral")
-"""Quantities that are infinite while nobody is detected."""
+"""Quantities that are infinite while no obstacle is detected."""
 
 
 class _Prepared(NamedTuple):
+    """The model's own constants `inner`, and the SUMO types checked."""
+
     n: int
-    theirs: Any
+    inner: Any
     types: SumoType
 
 
 class _State(NamedTuple):
-    """The checked columns of a model's state, and the state itself."""
+    """The checked columns of a model's state, and the model's own state `inner`."""
 
     speed: FloatArray
     throttle: FloatArray
     brake: FloatArray
     gear: FloatArray
-    theirs: Any
+    inner: Any
 
 
 class GuardedVehicle:
@@ -153,7 +155,7 @@ class GuardedVehicle:
     def __init__(self, vehicle: Any, guard: Guard) -> None:
         self.model, self._guard = vehicle, guard
         units = guard.field("__init__", vehicle, "UNITS")
-        if not isinstance(units, Mapping) or not all(isinstance(word, str) for pair in units.items() for word in pair):
+        if not isinstance(units, Mapping) or not all(isinstance(text, str) for pair in units.items() for text in pair):
             raise guard.wrong("__init__", "UNITS", units, "a mapping from names of characteristics to their units")
         self.UNITS = dict(units)
         self.takes_slope = accepts(vehicle.prepare, 4)
@@ -170,9 +172,9 @@ class GuardedVehicle:
             arguments = (*arguments, read_only_copy(slope), read_only_copy(wet))
         elif slope is not LEVEL:
             arguments = (*arguments, read_only_copy(slope))
-        theirs = self._guard.call("prepare", method, *arguments)
-        types = self._guard.call("sumo_type", self.model.sumo_type, theirs)
-        return _Prepared(n, theirs, SumoType(*(
+        inner = self._guard.call("prepare", method, *arguments)
+        types = self._guard.call("sumo_type", self.model.sumo_type, inner)
+        return _Prepared(n, inner, SumoType(*(
             self._guard.numbers("sumo_type", name, self._guard.field("sumo_type", types, name), (n,), 0.0, above=True)
             for name in SumoType._fields)))
 
@@ -180,7 +182,7 @@ class GuardedVehicle:
         return prepared.types
 
     def at_rest(self, prepared: _Prepared) -> _State:
-        state = self._state("at_rest", prepared.n, self._guard.call("at_rest", self.model.at_rest, prepared.theirs))
+        state = self._state("at_rest", prepared.n, self._guard.call("at_rest", self.model.at_rest, prepared.inner))
         self._guard.numbers("at_rest", "speed", state.speed, (prepared.n,), 0.0, 0.0)
         return state
 
@@ -188,41 +190,41 @@ class GuardedVehicle:
         if not self.can_start_moving:
             problem = f"{self._guard.name} has no method at_speed(prepared, speed), and the traffic puts it onto the road in motion"
             raise ForeignError(self._guard.source, problem, "a vehicle with it, or traffic that departs with speed 0")
-        state = self._guard.call("at_speed", self.model.at_speed, prepared.theirs, read_only_copy(speed))
+        state = self._guard.call("at_speed", self.model.at_speed, prepared.inner, read_only_copy(speed))
         return self._state("at_speed", prepared.n, state)
 
     def hold_gear(self, prepared: _Prepared, state: _State, holds: BoolArray) -> _State:
         if not hasattr(self.model, "hold_gear"):
             return state
         return self._state("hold_gear", prepared.n,
-                           self._guard.call("hold_gear", self.model.hold_gear, prepared.theirs, state.theirs, read_only_copy(holds)))
+                           self._guard.call("hold_gear", self.model.hold_gear, prepared.inner, state.inner, read_only_copy(holds)))
 
     def sensors(self, prepared: _Prepared) -> Sensors | None:
         """The model's sensors; None for a model without that method."""
         if not hasattr(self.model, "sensors"):
             return None
-        theirs = self._guard.call("sensors", self.model.sensors, prepared.theirs)
-        return Sensors(*(self._guard.numbers("sensors", name, self._guard.field("sensors", theirs, name), (prepared.n,), 0.0,
+        inner = self._guard.call("sensors", self.model.sensors, prepared.inner)
+        return Sensors(*(self._guard.numbers("sensors", name, self._guard.field("sensors", inner, name), (prepared.n,), 0.0,
                                              above=name == "scale", infinite=name == "reach") for name in Sensors._fields))
 
     def refuse_unknown_sensors(self, characteristics: Characteristics) -> None:
-        """Refuse a model without a method `sensors` whose `sense` changes observations: a TraCI controller does not go through `sense`."""
+        """Refuse a model whose `sense` changes observations but that has no method `sensors`: a TraCI controller bypasses `sense`."""
         if hasattr(self.model, "sensors"):
             return
         prepared = self.prepare(characteristics, 1.0, PROBE_STEP)
-        state, nothing = self.at_rest(prepared), np.zeros(prepared.n)
+        state, zeros = self.at_rest(prepared), np.zeros(prepared.n)
         for sample, gap in enumerate((60.0, 5.0, 2000.0)):
-            seen = Observation(sample * PROBE_STEP, nothing, nothing + gap, nothing + sample, nothing - 1 - sample, nothing + sample, 0.5,
-                               nothing - sample, nothing, nothing)
+            seen = Observation(sample * PROBE_STEP, zeros, zeros + gap, zeros + sample, zeros - 1 - sample, zeros + sample, 0.5,
+                               zeros - sample, zeros, zeros)
             sensed, state = self.sense(prepared, state, seen)
             for name, value in seen._asdict().items():
                 if not np.array_equal(getattr(sensed, name), value):
-                    problem = f"{self._guard.name} changes {name} in sense, which nothing that a controller reads through TraCI passes"
+                    problem = f"{self._guard.name} changes {name} in sense, but a controller that reads through TraCI bypasses sense"
                     raise ForeignError(self._guard.source, problem, "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors("
-                                       "latency, reach, scale); or an ADS that is given what is sensed, without ads.kind = \"traci\"")
+                                       "latency, reach, scale); or an ADS that gets the sensed values, without ads.kind = \"traci\"")
 
     def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
-        result = self._guard.call("sense", self.model.sense, prepared.theirs, state.theirs, read_only_copy(seen))
+        result = self._guard.call("sense", self.model.sense, prepared.inner, state.inner, read_only_copy(seen))
         sensed, after = self._guard.parts("sense", result, "(Observation, state)")
         values: dict[str, Any] = {}
         for name, value in seen._asdict().items():
@@ -232,13 +234,13 @@ class GuardedVehicle:
         return Observation(**values), self._state("sense", prepared.n, after)
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
-        result = self._guard.call("advance", self.model.advance, prepared.theirs, state.theirs, read_only_copy(command))
-        state, most = self._state("advance", prepared.n, result), prepared.types.max_speed
-        for i in np.flatnonzero(state.speed > most * (1 + ROUNDING))[:1]:  # SUMO itself accepts any speed that it is given
-            raise self._guard.wrong("advance", "speed", float(state.speed[i]), f"up to max_speed = {most[i]:g} of its sumo_type")
+        result = self._guard.call("advance", self.model.advance, prepared.inner, state.inner, read_only_copy(command))
+        state, max_speed = self._state("advance", prepared.n, result), prepared.types.max_speed
+        for i in np.flatnonzero(state.speed > max_speed * (1 + ROUNDING))[:1]:  # SUMO itself accepts any speed
+            raise self._guard.wrong("advance", "speed", float(state.speed[i]), f"up to max_speed = {max_speed[i]:g} of its sumo_type")
         return state
 
-    def _state(self, method: str, n: int, theirs: Any) -> _State:
-        read = {name: self._guard.numbers(method, name, self._guard.field(method, theirs, name), (n,), *_BOUNDS.get(name, ()))
+    def _state(self, method: str, n: int, inner: Any) -> _State:
+        columns = {name: self._guard.numbers(method, name, self._guard.field(method, inner, name), (n,), *_BOUNDS.get(name, ()))
                 for name in _State._fields[:-1]}
-        return _State(**read, theirs=theirs)
+        return _State(**columns, inner=inner)

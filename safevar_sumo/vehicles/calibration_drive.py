@@ -11,15 +11,15 @@ from safevar_sumo.vehicles.base import Vehicle
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
 STEP = 0.1  # s
-SPEEDS = np.arange(0.0, 20.5, 0.5)  # m/s, at which the tables hold
+SPEEDS = np.arange(0.0, 20.5, 0.5)  # m/s, of the tables
 LONGEST = 60.0  # s, longest drive
-LIGHT_BRAKE = 0.1  # pedal of the braking drive, far from the limit of the tyres
+LIGHT_BRAKE = 0.1  # pedal position while braking, far from the limit of the tyres
 
 
 def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> Nominal:
-    """The original vehicle on a dry road; its tables are driven when first needed."""
+    """The original vehicle on a dry road; its tables are simulated when first needed."""
     types = vehicle.sumo_type(vehicle.prepare(_original(characteristics), 1.0, STEP))
-    tables = cache(partial(_driven, vehicle, characteristics))  # type: ignore[arg-type]
+    tables = cache(partial(_simulated_tables, vehicle, characteristics))  # type: ignore[arg-type]
     mass, accel, decel, max_speed, lag = (float(values[0]) for values in types)
     return Nominal(mass=mass, accel=accel, decel=decel, max_speed=max_speed, actuator_lag=lag, tables=tables)
 
@@ -29,13 +29,13 @@ def _original(characteristics: CharacteristicSet) -> dict[str, FloatArray]:
 
 
 @lru_cache(maxsize=4)
-def _driven(vehicle: Vehicle, characteristics: CharacteristicSet) -> Tables:
-    """Full throttle up, coasting down, braking lightly down."""
+def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> Tables:
+    """Accelerate at full throttle, then from the speed reached coast, and from it again brake lightly."""
     prepared = vehicle.prepare(_original(characteristics), 1.0, STEP)
     rest = vehicle.at_rest(prepared)
 
     def drive(state: object, throttle: float, brake: float) -> tuple[list[float], object]:
-        """Speeds until the tables' end, and the last state."""
+        """Speeds until the end of the tables, and the last state."""
         speeds = [float(state.speed[0])]  # type: ignore[attr-defined]
         command = Command(np.full(1, throttle), np.full(1, brake))
         for _ in range(round(LONGEST / STEP)):
@@ -45,20 +45,20 @@ def _driven(vehicle: Vehicle, characteristics: CharacteristicSet) -> Tables:
                 break
         return speeds, state
 
-    up, fast = drive(rest, 1.0, 0.0)
-    coasting = _changes(drive(fast, 0.0, 0.0)[0][::-1])
-    braking = _changes(drive(fast, 0.0, LIGHT_BRAKE)[0][::-1])
-    tables = Tables(speeds=SPEEDS, full_throttle=_changes(up), coasting=coasting,
+    speeding_up, fast = drive(rest, 1.0, 0.0)
+    coasting = _accelerations(drive(fast, 0.0, 0.0)[0][::-1])
+    braking = _accelerations(drive(fast, 0.0, LIGHT_BRAKE)[0][::-1])
+    tables = Tables(speeds=SPEEDS, full_throttle=_accelerations(speeding_up), coasting=coasting,
                     braking=float(np.median(braking - coasting)) / LIGHT_BRAKE)
     for table in tables[:3]:
         table.flags.writeable = False  # many ADSs read them
     return tables
 
 
-def _changes(speeds: list[float]) -> FloatArray:
-    """Speed gained per time between one grid speed and the next, of a drive that gains speed [m/s^2].
+def _accelerations(speeds: list[float]) -> FloatArray:
+    """Acceleration between each grid speed and the next, of a drive that gains speed [m/s^2].
 
-    Speeds that the drive does not reach get its last value; zero for a drive at constant speed.
+    Beyond the speeds that the drive reaches its last value holds; zero for a drive at constant speed.
     """
     highest = np.maximum.accumulate(np.array(speeds))
     reached, first = np.unique(highest, return_index=True)

@@ -21,7 +21,7 @@ from safevar_sumo.study import CharacteristicTable
 
 FARTHEST = 1000.0
 """Largest magnitude of a value over that of its domain; beyond it a typo is assumed."""
-# beta of method section 2, by the least width of the domain that it holds for.
+# beta of method section 2, by the smallest width of a domain that it applies to.
 FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
 
 
@@ -64,19 +64,19 @@ class Characteristic:
         return FARTHEST * max(abs(self.lower), abs(self.upper))
 
     def text(self, value: float) -> str:
-        """A value with its significant digits: the last is worth between 1/40 and 1/4 of the threshold."""
+        """A value with so many decimals that the last digit is worth between 1/40 and 1/4 of the threshold."""
         return f"{value:.{max(0, math.ceil(-math.log10(self.threshold / 4)))}f}"
 
     @property
     def suffix(self) -> str:
-        """The unit as it follows a number; nothing for a pure number."""
+        """The unit as text behind a number; empty for a pure number."""
         return "" if self.unit == "-" else f" {self.unit}"
 
     def check(self, value: float, source: object, *, beyond: bool = False, otherwise: str = "",
               switch: str = "beyond=True") -> None:
-        """Refuse a value that is no legal number (`is_legal`).
+        """Refuse a value that is not a legal number (`is_legal`).
 
-        `otherwise` describes further legal values, `switch` is how a caller allows values beyond the domain; empty if it does not.
+        `otherwise` describes further legal values; `switch` names how a caller allows values beyond the domain, empty if it cannot.
 
         Raises
         ------
@@ -85,11 +85,11 @@ class Characteristic:
         """
         if not isinstance(value, Real) or not self.is_legal(value, beyond=beyond):
             above = " above 0" if self.lower > 0 else ""
-            farther, within = f"a finite number{above}, up to {self.farthest:g}", f"a number in [{self.lower:g}, {self.upper:g}]"
+            plausible, in_domain = f"a finite number{above}, up to {self.farthest:g}", f"a number in [{self.lower:g}, {self.upper:g}]"
             may_be_beyond = not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
             any_with = f", or any with {switch}" if may_be_beyond and switch else ""
             raise InputError(source, f"{self.name} = {value}{' is outside its domain' if may_be_beyond else ''}",
-                             f"{farther if beyond else within}{self.suffix}{otherwise}{any_with}")
+                             f"{plausible if beyond else in_domain}{self.suffix}{otherwise}{any_with}")
 
     def is_legal(self, values: Any, *, beyond: bool = False) -> Any:
         """Whether values, a number or an array, are in the domain; with `beyond`, whether they are plausible.
@@ -143,7 +143,7 @@ class CharacteristicSet:
         return self._column("weight")
 
     def _column(self, attribute: str) -> FloatArray:
-        """One number of every characteristic; read-only."""
+        """One attribute of all characteristics as a read-only array, shape (n,)."""
         values = np.array([getattr(member, attribute) for member in self.members], dtype=float)
         values.flags.writeable = False
         return values
@@ -167,7 +167,7 @@ class CharacteristicSet:
     def setting(self, values: Mapping[str, float], source: object, *, beyond: bool = False, switch: str = "beyond=True") -> FloatArray:
         """The original setting with some values replaced, shape (n,); with `beyond`, plausible values outside the domain are legal.
 
-        `switch` is that of `Characteristic.check`.
+        `switch` is passed to `Characteristic.check`.
 
         Raises
         ------

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import ForeignError, InputError, unknown
-from safevar_sumo.fmu import CONVERTIBLE, SI, USUAL, Description, Fault, Fleet, Instances, Past, Port, Unit, fixed_of, ports_of
+from safevar_sumo.fmu import CONVERTIBLE, SI, USUAL, Description, Fault, Fleet, History, Instances, Port, Unit, fixed_of, ports_of
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study import CharacteristicTable
@@ -17,23 +17,23 @@ from safevar_sumo.vehicles.sensors import Sensors, late_and_near
 
 PEDALS: Mapping[str, str] = {"throttle": "-", "brake": "-"}
 ROAD: Mapping[str, str] = {"road_friction": "-", "grade": "-", "wet": "-", "initial_speed": "m/s", "step": "s"}
-"""What stays the same during a run: inputs, or parameters that are set at the start. A grade is rise over run."""
+"""Quantities that are constant during a run: inputs, or parameters that are set at the start. A grade is rise over run."""
 RETURNED: Mapping[str, str] = {"speed": "m/s", "throttle": "-", "brake": "-", "gear": "-"}
 TYPE: Mapping[str, str] = {"mass": "kg", "accel": "m/s^2", "decel": "m/s^2", "max_speed": "m/s", "tau": "s"}
 USUAL_LAG = 0.1
-"""Actuator lag that a driving system reckons with where the study gives none [s]."""
+"""Actuator lag that a driving system assumes where the study gives none [s]."""
 SENSED: Mapping[str, str] = {"latency": "s", "range": "m"}
 NEEDED = {
-    "inputs": "the input that takes that pedal", "outputs": "the output that tells the speed",
+    "inputs": "the input for that pedal", "outputs": "the output that holds the speed",
     "sumo_type": "a number in SI units; or a characteristic, or an output or parameter of the FMU"}
 READABLE = ("output", "calculatedParameter", "parameter", "local")
 
 
 class _Prepared(NamedTuple):
-    """Constants of a run: what every vehicle is given, its type and sensors, and its instances."""
+    """Constants of a run: inputs, characteristics, types and sensors of the vehicles, and their FMU instances."""
 
     fleet: Fleet
-    given: Mapping[str, FloatArray]
+    inputs: Mapping[str, FloatArray]
     characteristics: Characteristics
     types: SumoType
     sensors: Sensors
@@ -41,14 +41,14 @@ class _Prepared(NamedTuple):
 
 
 class _State(NamedTuple):
-    """State of N vehicles; `seen` is what the sensors have under way, `past` how the instances got here."""
+    """State of N vehicles; `seen` is the history of sensed values, `history` that of the instances."""
 
     speed: FloatArray
     throttle: FloatArray
     brake: FloatArray
     gear: FloatArray
     seen: FloatArray | None
-    past: Past
+    history: History
 
 
 class FmuVehicle:
@@ -63,14 +63,14 @@ class FmuVehicle:
     table
         Keys `inputs`, `outputs`, `parameters`, `sensors`, `sumo_type` and `step` of the study.
     guard
-        Checks what comes of it.
+        Checks the results of the FMU.
     limit
-        How long an instance may take for one step [s].
+        Longest time that an instance may take for one step [s].
 
     Raises
     ------
     InputError
-        If what the study says does not fit the FMU.
+        If the study does not fit the FMU.
     """
 
     UNITS: Mapping[str, str]
@@ -79,44 +79,46 @@ class FmuVehicle:
         source, self._guard, self._own_step = guard.source, guard, table["step"] or description.step
         self.UNITS = dict(units)
         self._sensors, self._type = dict(table["sensors"]), {"tau": USUAL_LAG, **table["sumo_type"]}
-        for key, tabled, known in (("sensors", self._sensors, SENSED), ("sumo_type", self._type, TYPE)):
-            for name, one in tabled.items():
-                if name not in known:
-                    raise unknown(source, f"vehicle.{key}.{name}: there is no such quantity", name, known)
-                if key == "sensors" and isinstance(one, str) and one not in units:
-                    raise unknown(source, f"vehicle.{key}.{name} = {one!r}: there is no such characteristic", one, units, ", or a number")
-                self._refuse_least(table["characteristics"], f"vehicle.{key}.{name}", one, may_be_0=name == "latency")
-        given = ports_of(description, table["inputs"], {**PEDALS, **ROAD}, ("input",), source, "vehicle.inputs", constant=ROAD)
+        for key, entries, quantities in (("sensors", self._sensors, SENSED), ("sumo_type", self._type, TYPE)):
+            for name, entry in entries.items():
+                if name not in quantities:
+                    raise unknown(source, f"vehicle.{key}.{name}: there is no such quantity", name, quantities)
+                if key == "sensors" and isinstance(entry, str) and entry not in units:
+                    raise unknown(source, f"vehicle.{key}.{name} = {entry!r}: there is no such characteristic", entry, units,
+                                  ", or a number")
+                self._refuse_too_small(table["characteristics"], f"vehicle.{key}.{name}", entry, may_be_0=name == "latency")
+        inputs = ports_of(description, table["inputs"], {**PEDALS, **ROAD}, ("input",), source, "vehicle.inputs", constant=ROAD)
         outputs = ports_of(description, table["outputs"], RETURNED, ("output",), source, "vehicle.outputs")
-        for key, there, needed in (("inputs", given, PEDALS), ("outputs", outputs, ("speed",)), ("sumo_type", self._type, TYPE)):
-            for name in needed:
-                if name not in there:
+        for key, entries, required in (("inputs", inputs, PEDALS), ("outputs", outputs, ("speed",)), ("sumo_type", self._type, TYPE)):
+            for name in required:
+                if name not in entries:
                     raise InputError(source, f"vehicle.{key}.{name} is missing", NEEDED[key])
-        self._of_characteristics = {one: self._unit(description, one, units[one], unit, f"vehicle.{key}.{name}")
-                                    for key, tabled, known in (("sensors", self._sensors, SENSED), ("sumo_type", self._type, TYPE))
-                                    for name, unit in known.items() if isinstance(one := tabled.get(name), str) and one in units}
-        tuned = {name: self._characteristic(description, name, unit) for name, unit in units.items()
-                 if name in description.variables or name not in self._sensors.values()}
-        for quantity, port in given.items():
-            if port.variable.name in tuned:
-                raise InputError(source, f"vehicle.inputs.{quantity} = {port.variable.name!r}: that variable is a characteristic, too",
-                                 "a variable of its own for each")
-        read = {name: one for name, one in self._type.items() if isinstance(one, str) and one not in units}
-        types = ports_of(description, read, TYPE, READABLE, source, "vehicle.sumo_type")
-        self._quantities, self._tuned, self._outputs = tuple(given), tuple(tuned), (*outputs, *types)
+        self._characteristic_units = {entry: self._units(description, entry, units[entry], unit, f"vehicle.{key}.{name}")
+                                      for key, entries, quantities in (("sensors", self._sensors, SENSED), ("sumo_type", self._type, TYPE))
+                                      for name, unit in quantities.items()
+                                      if isinstance(entry := entries.get(name), str) and entry in units}
+        characteristics = {name: self._characteristic(description, name, unit) for name, unit in units.items()
+                           if name in description.variables or name not in self._sensors.values()}
+        for quantity, port in inputs.items():
+            if port.variable.name in characteristics:
+                raise InputError(source, f"vehicle.inputs.{quantity} = {port.variable.name!r}: that variable is also a characteristic",
+                                 "a separate variable for each")
+        variables = {name: entry for name, entry in self._type.items() if isinstance(entry, str) and entry not in units}
+        types = ports_of(description, variables, TYPE, READABLE, source, "vehicle.sumo_type")
+        self._quantities, self._characteristics, self._outputs = tuple(inputs), tuple(characteristics), (*outputs, *types)
         self._reads_type = bool(types)
-        inputs = [*given.values(), *tuned.values()]
-        fixed = list(fixed_of(description, table["parameters"], [port.variable.name for port in inputs], source, "vehicle.parameters"))
-        self._instances = Instances(description, inputs, [*outputs.values(), *types.values()], fixed, limit)
+        ports = [*inputs.values(), *characteristics.values()]
+        fixed = list(fixed_of(description, table["parameters"], [port.variable.name for port in ports], source, "vehicle.parameters"))
+        self._instances = Instances(description, ports, [*outputs.values(), *types.values()], fixed, limit)
         self.most_vehicles = self._instances.most_vehicles
-        self.takes_slope, self.can_start_moving = "grade" in given, "initial_speed" in given
-        self._takes_friction = "road_friction" in given
+        self.takes_slope, self.can_start_moving = "grade" in inputs, "initial_speed" in inputs
+        self._takes_friction = "road_friction" in inputs
 
-    def _refuse_least(self, rows: Mapping[str, CharacteristicTable], key: str, one: str | float, *, may_be_0: bool) -> None:
-        """Refuse a number, or the least value of a characteristic, that a quantity which is above 0 cannot have."""
-        least = rows[one].lower if isinstance(one, str) and one in rows else one
+    def _refuse_too_small(self, rows: Mapping[str, CharacteristicTable], key: str, entry: str | float, *, may_be_0: bool) -> None:
+        """Refuse a number, or the lower end of a characteristic, below what a positive quantity may be."""
+        least = rows[entry].lower if isinstance(entry, str) and entry in rows else entry
         if not isinstance(least, str) and (least < 0 or (least == 0 and not may_be_0)):
-            problem = f"{key} = {least:g}" if least is one else f"vehicle.characteristics.{one}.lower = {least:g}, and it is {key}"
+            problem = f"{key} = {least:g}" if least is entry else f"vehicle.characteristics.{entry}.lower = {least:g}, and it is {key}"
             raise InputError(self._guard.source, problem, "a number of at least 0" if may_be_0 else "a number above 0")
 
     def _characteristic(self, description: Description, name: str, unit: str) -> Port:
@@ -124,44 +126,44 @@ class FmuVehicle:
         variable = description.variable(name, ("parameter",), self._guard.source, key, CONVERTIBLE)
         if unit == (variable.unit_name or unit) or (unit == "-" and variable.unit_name in ("", "1")):
             return Port(variable, SI["-"], SI["-"])
-        ours = description.units.get(unit) or USUAL.get(unit)
-        if ours is None:
-            raise InputError(self._guard.source, f"{key}.unit = {unit!r}: nobody says what it stands for", repr(variable.unit_name))
-        return Port(variable, description.converted(variable, ours, unit, self._guard.source, f"{key}.unit"), ours)
+        defined = description.units.get(unit) or USUAL.get(unit)
+        if defined is None:
+            raise InputError(self._guard.source, f"{key}.unit = {unit!r}: the unit is not defined", repr(variable.unit_name))
+        return Port(variable, description.converted(variable, defined, unit, self._guard.source, f"{key}.unit"), defined)
 
-    def _unit(self, description: Description, name: str, unit: str, wanted: str, key: str) -> tuple[Unit, Unit]:
-        """The unit of a characteristic that stands for a quantity, and that of the quantity."""
-        theirs = description.units.get(unit) or USUAL.get(unit)
-        if theirs is None or not theirs.fits(SI[wanted]):
+    def _units(self, description: Description, name: str, unit: str, wanted: str, key: str) -> tuple[Unit, Unit]:
+        """The units of a characteristic that sets a quantity, and of the quantity."""
+        given = description.units.get(unit) or USUAL.get(unit)
+        if given is None or not given.fits(SI[wanted]):
             raise InputError(self._guard.source, f"{key} = {name!r}: the unit of that characteristic is {unit!r}", f"a unit of {wanted}")
-        return theirs, SI[wanted]
+        return given, SI[wanted]
 
     def prepare(self, characteristics: Characteristics, road_friction: float | FloatArray, step: float, slope: Slope = LEVEL,
                 wet: bool | BoolArray = False) -> _Prepared:
         n = len(next(iter(characteristics.values())))
         if slope is not LEVEL and not self.takes_slope:
             raise ForeignError(self._guard.source, f"{self._guard.name} has no vehicle.inputs.grade, and the road has a grade",
-                               "a variable that takes it, or scenarios with grade 0")
-        nothing = np.zeros(n)
-        given = {"throttle": nothing, "brake": nothing, "road_friction": nothing + road_friction, "wet": nothing + wet,
-                 "grade": nothing + slope.back / slope.down, "step": nothing + step, "initial_speed": nothing}
+                               "a variable for it, or scenarios with grade 0")
+        zeros = np.zeros(n)
+        inputs = {"throttle": zeros, "brake": zeros, "road_friction": zeros + road_friction, "wet": zeros + wet,
+                  "grade": zeros + slope.back / slope.down, "step": zeros + step, "initial_speed": zeros}
         fleet = Fleet(self._instances, n, step, self._own_step)
         outputs = {}
         if self._reads_type:
-            outputs = dict(zip(self._outputs, self._start(fleet, self._stacked(given, characteristics))[0], strict=True))
+            outputs = dict(zip(self._outputs, self._start(fleet, self._stacked(inputs, characteristics))[0], strict=True))
 
-        def value(one: str | float, name: str) -> FloatArray:
-            if not isinstance(one, str):
-                return nothing + one
-            if one not in characteristics:
+        def value(entry: str | float, name: str) -> FloatArray:
+            if not isinstance(entry, str):
+                return zeros + entry
+            if entry not in characteristics:
                 return np.asarray(outputs[name])
-            theirs, ours = self._of_characteristics[one]
-            return np.asarray(theirs.to(ours, characteristics[one]))
+            unit, quantity_unit = self._characteristic_units[entry]
+            return np.asarray(unit.to(quantity_unit, characteristics[entry]))
 
         types = SumoType(*(self._guard.numbers("sumo_type", name, value(self._type[name], name), (n,), 0.0, above=True) for name in TYPE))
-        sensors = Sensors.perfect(n)._replace(**{{"latency": "latency", "range": "reach"}[name]: value(one, name)
-                                                 for name, one in self._sensors.items()})
-        return _Prepared(fleet, given, characteristics, types, sensors, step)
+        sensors = Sensors.perfect(n)._replace(**{{"latency": "latency", "range": "reach"}[name]: value(entry, name)
+                                                 for name, entry in self._sensors.items()})
+        return _Prepared(fleet, inputs, characteristics, types, sensors, step)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         return prepared.types
@@ -176,44 +178,45 @@ class FmuVehicle:
         """The initial state at a speed [m/s], shape (N,)."""
         if np.any(speed > 0) and not self.can_start_moving:
             problem = f"{self._guard.name} has no vehicle.inputs.initial_speed, and the traffic puts it onto the road in motion"
-            raise ForeignError(self._guard.source, problem, "a variable that takes it, or traffic that departs with speed 0")
-        given = self._stacked({**prepared.given, "initial_speed": speed}, prepared.characteristics)
-        outputs, past = self._start(prepared.fleet, given)
-        state = self._state(dict(zip(self._outputs, outputs, strict=True)), Command(np.zeros_like(speed), np.zeros_like(speed)), None, past)
+            raise ForeignError(self._guard.source, problem, "a variable for it, or traffic that departs with speed 0")
+        inputs = self._stacked({**prepared.inputs, "initial_speed": speed}, prepared.characteristics)
+        outputs, history = self._start(prepared.fleet, inputs)
+        released = Command(np.zeros_like(speed), np.zeros_like(speed))
+        state = self._state(dict(zip(self._outputs, outputs, strict=True)), released, None, history)
         for i in np.flatnonzero(np.abs(state.speed - speed) > 1e-6)[:1]:
-            raise self._guard.wrong("initialisation", "speed", float(state.speed[i]), f"{speed[i]:g} m/s, at which it begins")
+            raise self._guard.wrong("initialisation", "speed", float(state.speed[i]), f"{speed[i]:g} m/s, the initial speed")
         return state._replace(speed=np.asarray(speed, dtype=float))
 
     def sensors(self, prepared: _Prepared) -> Sensors:
         return prepared.sensors
 
     def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
-        """Sensors report what was their latency ago, and nothing beyond their range times the visibility."""
+        """Sensors report the scene of their latency ago, and nothing beyond their range times the visibility."""
         if not self._sensors:
             return seen, state
-        late, past = late_and_near(seen, state.seen, prepared.sensors.latency, prepared.sensors.reach, prepared.step)
-        return late, state._replace(seen=past)
+        late, history = late_and_near(seen, state.seen, prepared.sensors.latency, prepared.sensors.reach, prepared.step)
+        return late, state._replace(seen=history)
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
-        inputs = self._stacked({**prepared.given, **command._asdict()}, prepared.characteristics)
+        inputs = self._stacked({**prepared.inputs, **command._asdict()}, prepared.characteristics)
         try:
-            (now, smooth), past = prepared.fleet.advance(state.past, inputs)
+            (now, smooth), history = prepared.fleet.advance(state.history, inputs)
         except Fault as fault:
             raise self._failed(fault) from None
         outputs = dict(zip(self._outputs, now, strict=True))
         outputs["speed"] = dict(zip(self._outputs, smooth, strict=True))["speed"]
-        after, most = self._state(outputs, command, state.seen, past), prepared.types.max_speed
-        for i in np.flatnonzero(after.speed > np.maximum(most, state.speed) * (1 + ROUNDING))[:1]:
-            raise self._guard.wrong("doStep", "speed", float(after.speed[i]), f"up to vehicle.sumo_type.max_speed = {most[i]:g}")
+        after, max_speed = self._state(outputs, command, state.seen, history), prepared.types.max_speed
+        for i in np.flatnonzero(after.speed > np.maximum(max_speed, state.speed) * (1 + ROUNDING))[:1]:
+            raise self._guard.wrong("doStep", "speed", float(after.speed[i]), f"up to vehicle.sumo_type.max_speed = {max_speed[i]:g}")
         return after
 
     @property
     def remarks(self) -> list[str]:
-        """What a user should know of it."""
+        """Remarks for the user."""
         return [] if self._takes_friction else [
-            f"{self._guard.name} has no vehicle.inputs.road_friction: a weather changes nothing of how it accelerates and brakes"]
+            f"{self._guard.name} has no vehicle.inputs.road_friction: weather has no effect on how it accelerates and brakes"]
 
-    def _start(self, fleet: Fleet, inputs: FloatArray) -> tuple[FloatArray, Past]:
+    def _start(self, fleet: Fleet, inputs: FloatArray) -> tuple[FloatArray, History]:
         try:
             return fleet.start(inputs)
         except Fault as fault:
@@ -222,13 +225,13 @@ class FmuVehicle:
     def _failed(self, fault: Fault) -> ForeignError:
         return ForeignError(self._guard.source, f"{self._guard.name} {fault}")
 
-    def _stacked(self, given: Mapping[str, FloatArray], characteristics: Characteristics) -> FloatArray:
-        return np.stack([*(given[name] for name in self._quantities), *(characteristics[name] for name in self._tuned)])
+    def _stacked(self, inputs: Mapping[str, FloatArray], characteristics: Characteristics) -> FloatArray:
+        return np.stack([*(inputs[name] for name in self._quantities), *(characteristics[name] for name in self._characteristics)])
 
-    def _state(self, outputs: Mapping[str, FloatArray], command: Command, seen: FloatArray | None, past: Past) -> _State:
+    def _state(self, outputs: Mapping[str, FloatArray], command: Command, seen: FloatArray | None, history: History) -> _State:
         n = command.throttle.shape
         speed = np.where(np.abs(outputs["speed"]) < ROUNDING, 0.0, outputs["speed"])
         values = {"gear": np.ones(n), **command._asdict(), **outputs, "speed": speed}
         bounds = {"speed": (0.0, FASTEST), "gear": (-np.inf, np.inf)}
         columns = {name: self._guard.numbers("doStep", name, values[name], n, *bounds.get(name, (0.0, 1.0))) for name in _State._fields[:4]}
-        return _State(**columns, seen=seen, past=past)
+        return _State(**columns, seen=seen, history=history)

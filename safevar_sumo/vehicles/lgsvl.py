@@ -1,7 +1,7 @@
 """Lincoln2017MKZ of LGSVL 2021.1: VehicleSMI on Unity's WheelColliders, along its path.
 
 The equations are those of the simulator's `VehicleSMI.cs` and of Unity's WheelCollider friction, with one equivalent
-wheel for the four. Wheel and body are one linear system in a substep, with the tyre's secant stiffness; it is solved
+wheel for the four. In a substep wheel and body form one linear system, with the tyre's secant stiffness, which is solved
 implicitly and in closed form.
 """
 
@@ -16,29 +16,29 @@ from msgspec import Meta, Struct
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType
 
-# Numbers that meet arrays in every step are arrays themselves: numpy would convert a float each time, which takes as long again.
-NOTHING, ONE, TWO, HALF = map(np.array, (0.0, 1.0, 2.0, 0.5))
+# Constants used with arrays in every step are arrays themselves: numpy would convert a float each time, which doubles the cost.
+ZERO, ONE, TWO, HALF = map(np.array, (0.0, 1.0, 2.0, 0.5))
 RPM = np.array(30 / math.pi)  # r/min per rad/s
 RADIANS = math.pi / 180  # rad per degree
 WHEELS = 4
 GEAR_RATIOS = np.array([4.17, 3.14, 2.11, 1.67, 1.28, 1.0, 0.84, 0.67])  # VehicleSMI
 FIRST, LAST = map(np.array, (1.0, len(GEAR_RATIOS)))
 FINAL_RATIO = np.array(2.56)  # VehicleSMI
-SHIFT_DELAY = np.array(0.7)  # s, least time between two changes of gear; VehicleSMI
+SHIFT_DELAY = np.array(0.7)  # s, minimum time between two shifts; VehicleSMI
 SHIFT_UP, SHIFT_DOWN = map(np.array, (0.33, 0.13))  # of maxRpm (assumption)
 RPM_RATE = 20.0  # 1/s, the engine speed follows the wheels with a lag of 1/20 s; VehicleSMI
-TRACTION_START = 1 - 0.675  # of maxMotorTorque, the traction control's torque at the start; VehicleSMI
-TRACTION_RATE = 6.75 / 0.02  # N m/s, by which it rises and falls; VehicleSMI, at 50 Hz
+TRACTION_START = 1 - 0.675  # share of maxMotorTorque that the traction control allows at the start; VehicleSMI
+TRACTION_RATE = 6.75 / 0.02  # N m/s, rate at which that torque rises and falls; VehicleSMI, at 50 Hz
 AIR_DRAG, DOWNFORCE = map(np.array, (1.0, 2.0))  # N s^2/m^2; VehicleSMI
 # Unity's WheelCollider: forward friction rises to its extremum and falls to its asymptote.
 PEAK_SLIP, SLIDING_SLIP, SLIDING_FRICTION = map(np.array, (0.4, 0.8, 0.5))
 SLIPS_BEYOND, FRICTION_LOST = map(np.array, (SLIDING_SLIP - PEAK_SLIP, 1 - SLIDING_FRICTION))
 FRICTION = 1.0  # at the extremum
-SLIP_FLOOR = np.array(4.0)  # m/s, least speed that a slip is relative to (assumption, as PhysX has it)
-LEAST_RIM = np.array(1e-3)  # m/s, that a slip limit is relative to
+SLIP_FLOOR = np.array(4.0)  # m/s, smallest denominator of a slip (assumption, as in PhysX)
+LEAST_RIM = np.array(1e-3)  # m/s, smallest rim speed that a slip limit is relative to
 HELD_BELOW = np.array(0.05)  # m/s, below which locked wheels hold the vehicle (assumption)
 WHEELBASE = np.array(2.85)  # m
-# The lane keeping has an error to correct: assumption, so that the steering angle has something to act on.
+# Initial errors for the lane keeping to correct (assumption), so that the steering angle has an effect.
 LATERAL_ERROR, HEADING_ERROR = 0.10, 0.01  # m, rad
 LATERAL_GAIN, HEADING_GAIN = map(np.array, (0.02, 0.35))  # rad/m, rad/rad
 TORQUE_IDLE, TORQUE_BEND = map(np.array, (0.4, 2.4))  # of maxMotorTorque (assumption)
@@ -46,9 +46,9 @@ SUBSTEPS = 2
 
 
 class _Prepared(NamedTuple):
-    """Constants of a run, SI but engine speeds in r/min, shape (N,) or ().
+    """Constants of a run, SI except engine speeds in r/min; shape (N,) or ().
 
-    `pedals_follow` and `engine_follows` are the shares of an error that a step, and a substep, removes; `traction_change` is
+    `pedals_follow` is the share of an error that a step removes, `engine_follows` the share that a substep removes; `traction_change` is
     the torque by which the traction control rises or falls in a substep [N m].
     """
 
@@ -108,7 +108,7 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     wheel_damping_share
         Share of wheelDamping that acts on a rolling wheel [-]; the published data shows little of it.
     steering_design_angle
-        maxSteeringAngle of the vehicle that the lane keeping was made for [deg].
+        maxSteeringAngle of the vehicle for which the lane keeping was designed [deg].
     """
 
     UNITS = {
@@ -151,23 +151,23 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             tau=np.full_like(p.mass, p.step + self.pedal_lag))
 
     def at_rest(self, prepared: _Prepared) -> LgsvlState:
-        p, nothing = prepared, np.zeros_like(prepared.mass)
-        first = nothing + GEAR_RATIOS[0]
+        p, zeros = prepared, np.zeros_like(prepared.mass)
+        first = zeros + GEAR_RATIOS[0]
         return LgsvlState(
-            speed=nothing, wheel_speed=nothing, engine_rpm=p.least_rpm, gear=nothing + 1, old_ratio=first, new_ratio=first,
-            since_shift=nothing + SHIFT_DELAY, traction_torque=TRACTION_START * p.motor_torque, lateral=nothing + LATERAL_ERROR,
-            heading=nothing + HEADING_ERROR, throttle=nothing, brake=nothing)
+            speed=zeros, wheel_speed=zeros, engine_rpm=p.least_rpm, gear=zeros + 1, old_ratio=first, new_ratio=first,
+            since_shift=zeros + SHIFT_DELAY, traction_torque=TRACTION_START * p.motor_torque, lateral=zeros + LATERAL_ERROR,
+            heading=zeros + HEADING_ERROR, throttle=zeros, brake=zeros)
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> LgsvlState:
         """The steady state at a speed: every equation with its rate of change set to zero.
 
-        The lane keeping has no error left; the gear is the one in which the gearbox arrives while accelerating.
+        The vehicle keeps its lane without error; the gear is the one in which the gearbox arrives while accelerating.
         """
-        p, nothing = prepared, np.zeros_like(prepared.mass)
+        p, zeros = prepared, np.zeros_like(prepared.mass)
         force = (AIR_DRAG * speed + p.rolling_drag) * speed + p.body * p.back
         rim = _rim_at(p, speed, force)
         wheel_speed = rim / p.radius
-        gear = nothing + 1
+        gear = zeros + 1
         for step_ratio in GEAR_RATIOS[:-1]:
             gear += p.least_rpm + wheel_speed * (step_ratio * FINAL_RATIO * RPM) > SHIFT_UP * p.largest_rpm
         ratio = GEAR_RATIOS[gear.astype(np.intp) - 1]
@@ -179,7 +179,7 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         brake = np.minimum(np.maximum(-needed, 0.0) / p.brake_torque, 1.0)
         return LgsvlState(
             speed=speed, wheel_speed=wheel_speed, engine_rpm=engine_rpm, gear=gear, old_ratio=ratio, new_ratio=ratio,
-            since_shift=nothing + SHIFT_DELAY, traction_torque=p.motor_torque, lateral=nothing, heading=nothing,
+            since_shift=zeros + SHIFT_DELAY, traction_torque=p.motor_torque, lateral=zeros, heading=zeros,
             throttle=throttle, brake=brake)
 
     def sense(self, prepared: _Prepared, state: LgsvlState, seen: Observation) -> tuple[Observation, LgsvlState]:
@@ -197,9 +197,9 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return state._replace(since_shift=state.since_shift + p.step)
 
     def _steer(self, p: _Prepared, s: LgsvlState) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Lane keeping, a kinematic bicycle at small angles: lateral place, heading, and the cornering drag [N s/m].
+        """Lane keeping, a kinematic bicycle at small angles: lateral position, heading, and cornering drag [N s/m].
 
-        The lane keeping commands a share of the full angle that is right for the vehicle that it was made for.
+        The lane keeping commands a share of the full steering angle, computed for the vehicle for which it was designed.
         """
         share = -(LATERAL_GAIN * s.lateral + HEADING_GAIN * s.heading) / (self.steering_design_angle * RADIANS)
         angle = np.minimum(np.maximum(share, -ONE), ONE) * p.steering
@@ -210,7 +210,7 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def _shifted(p: _Prepared, s: LgsvlState) -> LgsvlState:
-    """Automatic gearbox by engine speed; during shiftTime the ratio goes over from the old one to the new."""
+    """Automatic gearbox by engine speed; during shiftTime the ratio moves linearly from the old one to the new."""
     share = s.engine_rpm / p.largest_rpm
     free = s.since_shift >= SHIFT_DELAY
     up = free & (share > SHIFT_UP) & (s.gear < LAST)
@@ -222,7 +222,7 @@ def _shifted(p: _Prepared, s: LgsvlState) -> LgsvlState:
     return s._replace(
         gear=gear, old_ratio=np.where(changes, _ratio(p, s), s.old_ratio),
         new_ratio=np.where(changes, GEAR_RATIOS[gear.astype(np.intp) - 1], s.new_ratio),
-        since_shift=np.where(changes, NOTHING, s.since_shift))
+        since_shift=np.where(changes, ZERO, s.since_shift))
 
 
 def _ratio(p: _Prepared, s: LgsvlState) -> FloatArray:
@@ -251,26 +251,26 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
     body = p.body + h * (stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag)
     moving = s.speed - p.slowed
     push = p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body * moving / body
-    wheel_speed = np.maximum(push, NOTHING) / (p.damped_inertia + pull * p.radius - pull * pull / body)
-    speed = np.maximum((p.body * moving + pull * wheel_speed) / body, NOTHING)
-    held = (wheel_speed <= NOTHING) & (speed < p.standstill)
+    wheel_speed = np.maximum(push, ZERO) / (p.damped_inertia + pull * p.radius - pull * pull / body)
+    speed = np.maximum((p.body * moving + pull * wheel_speed) / body, ZERO)
+    held = (wheel_speed <= ZERO) & (speed < p.standstill)
     if np.count_nonzero(held):
-        speed[held] = NOTHING
+        speed[held] = ZERO
     return s._replace(speed=speed, wheel_speed=wheel_speed, engine_rpm=engine_rpm,
-                      traction_torque=np.minimum(np.maximum(traction, NOTHING), p.motor_torque))
+                      traction_torque=np.minimum(np.maximum(traction, ZERO), p.motor_torque))
 
 
 def _torque_share(share: FloatArray) -> FloatArray:
-    """Engine torque over the largest one, at a share of maxRpm: a parabola, zero from maxRpm on (assumption)."""
+    """Engine torque over the largest one, at a share of maxRpm: a parabola below maxRpm, zero from there on (assumption)."""
     torque = TORQUE_IDLE + TORQUE_BEND * share * (ONE - share)
     overspeed = share >= ONE
     if np.count_nonzero(overspeed):
-        torque[overspeed] = NOTHING
+        torque[overspeed] = ZERO
     return torque
 
 
 def _rim_at(p: _Prepared, speed: FloatArray, force: FloatArray) -> FloatArray:
-    """Speed of the wheels' rim at which the tyres push with `force` [m/s]: the rising part of `_tyre_stiffness` solved for it."""
+    """Rim speed at which the tyre force is `force` [m/s]: the rising part of `_tyre_stiffness` solved for the rim speed."""
     share = np.minimum(np.abs(force) / (p.friction * (p.weight + DOWNFORCE * speed * speed)), 1.0)
     slip = PEAK_SLIP * share / (1 + np.sqrt(1 - share))
     slow = speed + SLIP_FLOOR * slip

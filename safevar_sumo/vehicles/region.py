@@ -16,19 +16,19 @@ from safevar_sumo.study import Constraint, Study
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
 SLACK = 1e-9
-"""By how much of its range over the domains a quantity may miss its bounds: rounding."""
+"""Tolerated violation of a bound, over the range of the quantity in the domains [-]; covers rounding."""
 STEPS_BACK = 64
-"""Places on the way to the original that are tried for a setting that is not feasible."""
+"""Number of points tried between an infeasible setting and the original."""
 REJECTIONS = 1000
-"""Settings that are drawn at the most for each feasible one."""
+"""Maximum number of settings drawn for each feasible setting."""
 PROBES = 512
-"""Settings that look for a feasible change, beside vertices and ends of the domains."""
+"""Number of settings searched for a feasible change, in addition to vertices and ends of the domains."""
 Draw = Callable[[int], FloatArray]
-"""Draws so many settings."""
+"""Draws the given number of settings."""
 
 
 class _Bounds(NamedTuple):
-    """A constraint that can be computed: `quantity` takes settings, shape (N, n); `range` is the quantity's over the domains."""
+    """A constraint that can be computed: `quantity` takes settings, shape (N, n); `range` is its range over the domains."""
 
     constraint: Constraint
     legal: str
@@ -39,7 +39,7 @@ class _Bounds(NamedTuple):
     range: float
 
     def excess(self, settings: FloatArray) -> FloatArray:
-        """By how much of its range each setting misses the bounds, shape (N,)."""
+        """Violation of the bounds by each setting, over the range of the quantity, shape (N,)."""
         values = self.quantity(settings)
         return np.asarray(np.maximum(np.maximum(self.at_least - values, values - self.at_most), 0.0) / self.range)
 
@@ -51,7 +51,7 @@ class _Bounds(NamedTuple):
 class FeasibleRegion:
     """Settings that satisfy all constraints of a study; without constraints, all of them.
 
-    `vertices` are settings at the ends of the linear constraints' polytope, shape (V, n); without linear constraints there are none.
+    `vertices` are vertices of the polytope of the linear constraints, shape (V, n); empty without linear constraints.
     """
 
     characteristics: CharacteristicSet
@@ -66,10 +66,10 @@ class FeasibleRegion:
         return "; ".join(map(str, self.bounds))
 
     def violation(self, settings: FloatArray) -> FloatArray:
-        """Sum over the constraints of by how much settings miss them, in ranges of their quantities; 0 if feasible; shape (N,)."""
+        """Sum of the violations of all constraints, each over the range of its quantity; 0 if feasible; shape (N,)."""
         excess = np.zeros(len(settings))
-        for one in self.bounds:
-            excess = excess + one.excess(settings)
+        for bound in self.bounds:
+            excess = excess + bound.excess(settings)
         return np.where(excess <= SLACK, 0.0, excess)
 
     def feasible(self, settings: FloatArray) -> BoolArray:
@@ -82,44 +82,47 @@ class FeasibleRegion:
         Raises
         ------
         InputError
-            Naming the constraint that the first such one violates, and its values.
+            Naming the constraint that the first infeasible setting violates, and its values.
         """
         for setting in settings[~self.feasible(settings)][:1]:
-            for one in self.bounds:
-                if one.excess(setting[np.newaxis])[0] > SLACK / len(self.bounds):
-                    quantity = f"{one.constraint.quantity} = {one.quantity(setting[np.newaxis])[0]:g}{one.suffix}"
-                    raise InputError(source, f"violates a constraint: {quantity} ({self._values(one, setting)})", one.legal + otherwise)
+            for bound in self.bounds:
+                if bound.excess(setting[np.newaxis])[0] > SLACK / len(self.bounds):
+                    quantity = f"{bound.constraint.quantity} = {bound.quantity(setting[np.newaxis])[0]:g}{bound.suffix}"
+                    raise InputError(source, f"violates a constraint: {quantity} ({self._values(bound, setting)})", bound.legal + otherwise)
 
-    def _values(self, one: _Bounds, setting: FloatArray) -> str:
-        return ", ".join(f"{member.name} = {value:g}{member.suffix}" for member, value in zip(self.characteristics, setting, strict=True)
-                         if member.name in one.constraint.sum or (one.constraint.function and value != member.original)) or "the original"
+    def _values(self, bound: _Bounds, setting: FloatArray) -> str:
+        return ", ".join(f"{member.name} = {value:g}{member.suffix}"
+                         for member, value in zip(self.characteristics, setting, strict=True)
+                         if member.name in bound.constraint.sum
+                         or (bound.constraint.function and value != member.original)) or "the original"
 
     def repaired(self, settings: FloatArray, *, filtered: bool = True) -> FloatArray:
-        """Settings moved towards the original as far as it takes to be feasible, once filtered if they are to be; shape (N, n)."""
+        """Settings moved towards the original until they are feasible, if `filtered` after the filter; shape (N, n)."""
         result = settings.copy()
-        wrong = np.flatnonzero(~self._accepted(settings, filtered))
+        infeasible = np.flatnonzero(~self._accepted(settings, filtered))
         for share in np.arange(STEPS_BACK - 1, -1, -1) / STEPS_BACK:
-            if not len(wrong):
+            if not len(infeasible):
                 break
             original = self.characteristics.original
-            result[wrong] = original + share * (settings[wrong] - original)
-            wrong = wrong[~self._accepted(result[wrong], filtered)]
+            result[infeasible] = original + share * (settings[infeasible] - original)
+            infeasible = infeasible[~self._accepted(result[infeasible], filtered)]
         return result
 
     def sampled(self, draw: Draw, number: int, rng: np.random.Generator | None = None, *, filtered: bool = False,
                 rejections: int = REJECTIONS) -> FloatArray:
-        """The first `number` feasible settings that are drawn, shape (number, n).
+        """The first `number` feasible settings drawn, shape (number, n).
 
-        Where fewer than one in `rejections` is, mixtures of the region's vertices by `rng` follow; without it there are fewer settings.
+        Where fewer than one setting in `rejections` is feasible, random mixtures of the region's vertices follow; without `rng` the
+        result has fewer settings.
         """
         batches, drawn = [np.zeros((0, len(self.characteristics)))], 0
-        while (lacking := number - sum(map(len, batches))) and drawn < rejections * number:
-            settings = draw(max(lacking, min(drawn, 10_000)))
+        while (missing := number - sum(map(len, batches))) and drawn < rejections * number:
+            settings = draw(max(missing, min(drawn, 10_000)))
             drawn += len(settings)
-            batches.append(settings[self._accepted(settings, filtered)][:lacking])
-        if lacking and rng is not None:
+            batches.append(settings[self._accepted(settings, filtered)][:missing])
+        if missing and rng is not None:
             corners = np.concatenate([self.vertices, self.characteristics.original[np.newaxis]])
-            mixtures = rng.dirichlet(np.full(len(corners), 0.5), lacking) @ corners
+            mixtures = rng.dirichlet(np.full(len(corners), 0.5), missing) @ corners
             mixtures = np.clip(mixtures, self.characteristics.lower, self.characteristics.upper)
             batches.append(self.repaired(mixtures, filtered=filtered))
         return np.concatenate(batches)
@@ -134,21 +137,21 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
     Raises
     ------
     InputError
-        If a function cannot be loaded, the original vehicle is not feasible, or no change is.
+        If a function cannot be loaded, or if the original vehicle or every change is infeasible.
     """
     source = source or f"study {study.name!r}"
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     if not study.constraints:
         return FeasibleRegion(characteristics, (), np.zeros((0, len(characteristics))))
     lookup, members = Lookup(source, study.origin.places), list[Member]()
-    bounds = tuple(_bounds(one, study, characteristics, lookup, f"constraints[{number}]", members)
-                   for number, one in enumerate(study.constraints))
-    linear = [(tuple(one.sum.get(name, 0.0) for name in characteristics.names), some.at_least, some.at_most)
-              for one, some in zip(study.constraints, bounds, strict=True) if one.sum]
+    bounds = tuple(_bounds(constraint, study, characteristics, lookup, f"constraints[{number}]", members)
+                   for number, constraint in enumerate(study.constraints))
+    linear = [(tuple(bound.constraint.sum.get(name, 0.0) for name in characteristics.names), bound.at_least, bound.at_most)
+              for bound in bounds if bound.constraint.sum]
     ends = tuple(characteristics.lower.tolist()), tuple(characteristics.upper.tolist())
-    for one, some in zip(study.constraints, bounds, strict=True):
-        if one.sum:
-            _refuse_unreachable(source, some, characteristics)
+    for bound in bounds:
+        if bound.constraint.sum:
+            _refuse_unreachable(source, bound, characteristics)
     vertices = _vertices(tuple(linear), *ends) if linear else np.zeros((0, len(characteristics)))
     if vertices is None:
         raise InputError(source, f"constraints: no setting in the domains satisfies all of them: {'; '.join(map(str, bounds))}",
@@ -157,21 +160,23 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
     region.check(characteristics.original[np.newaxis], f"{source}: the original vehicle",
                  otherwise="; the original vehicle must satisfy every constraint")
     if not _leaves_a_change(region):
-        raise InputError(source, f"constraints leave the original vehicle alone, no change that the filter keeps: {region}",
+        raise InputError(source, f"constraints leave only the original vehicle, no change that the filter keeps: {region}",
                          "constraints that leave a region around it")
     return region
 
 
-def _bounds(one: Constraint, study: Study, characteristics: CharacteristicSet, lookup: Lookup, key: str, members: list[Member]) -> _Bounds:
-    least, most = -np.inf if one.at_least is None else one.at_least, np.inf if one.at_most is None else one.at_most
-    legal, unit = one.legal(study.vehicle.characteristics), one.unit_of(study.vehicle.characteristics)
+def _bounds(constraint: Constraint, study: Study, characteristics: CharacteristicSet, lookup: Lookup, key: str,
+            members: list[Member]) -> _Bounds:
+    least = -np.inf if constraint.at_least is None else constraint.at_least
+    most = np.inf if constraint.at_most is None else constraint.at_most
+    legal, unit = constraint.legal(study.vehicle.characteristics), constraint.unit_of(study.vehicle.characteristics)
     suffix = "" if unit == "-" else f" {unit}"
-    if one.sum:
-        weights = [(characteristics.names.index(name), weight) for name, weight in one.sum.items()]
+    if constraint.sum:
+        weights = [(characteristics.names.index(name), weight) for name, weight in constraint.sum.items()]
         width = sum(abs(weight) * (characteristics.upper - characteristics.lower)[column] for column, weight in weights)
-        return _Bounds(one, legal, suffix, lambda settings: _weighted(settings, weights), least, most, float(width))
-    member = lookup.find({}, one.function, f"{key}.function")
-    guard = member.guard or Guard(lookup.source, f"{key}.function = {one.function!r}")
+        return _Bounds(constraint, legal, suffix, lambda settings: _weighted(settings, weights), least, most, float(width))
+    member = lookup.find({}, constraint.function, f"{key}.function")
+    guard = member.guard or Guard(lookup.source, f"{key}.function = {constraint.function!r}")
     if not callable(member.what):
         raise InputError(lookup.source, f"{guard.name} is of type {type(member.what).__name__}", "a function of a mapping of arrays")
     members.append(member)
@@ -181,29 +186,29 @@ def _bounds(one: Constraint, study: Study, characteristics: CharacteristicSet, l
         return guard.numbers("its call", "values", guard.call("its call", member.what, columns), (len(settings),))
 
     ends = quantity(np.stack([characteristics.original, characteristics.lower, characteristics.upper]))
-    return _Bounds(one, legal, suffix, quantity, least, most, float(np.ptp(ends)) or max(1.0, abs(float(ends[0]))))
+    return _Bounds(constraint, legal, suffix, quantity, least, most, float(np.ptp(ends)) or max(1.0, abs(float(ends[0]))))
 
 
 def _weighted(settings: FloatArray, weights: Sequence[tuple[int, float]]) -> FloatArray:
-    """A weighted sum, one term after the other: it does not depend on how many settings there are."""
+    """A weighted sum, added term by term so that it does not depend on the number of settings."""
     total = np.zeros(len(settings))
     for column, weight in weights:
         total = total + weight * settings[:, column]
     return total
 
 
-def _refuse_unreachable(source: str, one: _Bounds, characteristics: CharacteristicSet) -> None:
+def _refuse_unreachable(source: str, bound: _Bounds, characteristics: CharacteristicSet) -> None:
     ends = np.array([[getattr(characteristics, side)[characteristics.names.index(name)] * weight for side in ("lower", "upper")]
-                     for name, weight in one.constraint.sum.items()])
+                     for name, weight in bound.constraint.sum.items()])
     least, most = (float(side(ends, axis=1).sum()) for side in (np.min, np.max))
-    if most < one.at_least or least > one.at_most:
-        raise InputError(source, f"constraints: {one.constraint.quantity} is between {least:g} and {most:g} in the domains", one.legal)
+    if most < bound.at_least or least > bound.at_most:
+        raise InputError(source, f"constraints: {bound.constraint.quantity} is between {least:g} and {most:g} in the domains", bound.legal)
 
 
 @lru_cache(maxsize=16)
 def _vertices(linear: tuple[Any, ...], lower: tuple[float, ...], upper: tuple[float, ...]) -> FloatArray | None:
-    """Settings that satisfy the linear constraints, one at the least and one at the greatest value of every characteristic; or None."""
-    from scipy.optimize import linprog  # takes half a second to load
+    """Two settings per characteristic, with its least and its greatest value under the linear constraints; None if none satisfies them."""
+    from scipy.optimize import linprog  # loading takes half a second
 
     rows = [(sign * np.array(weights), sign * bound) for weights, least, most in linear for sign, bound in ((-1, least), (1, most))
             if np.isfinite(bound)]
@@ -219,7 +224,7 @@ def _vertices(linear: tuple[Any, ...], lower: tuple[float, ...], upper: tuple[fl
 
 
 def _leaves_a_change(region: FeasibleRegion) -> bool:
-    """Whether a setting is feasible that differs from the original once it is filtered."""
+    """Whether a feasible setting still differs from the original after the filter."""
     characteristics = region.characteristics
     for settings in _candidates(region):
         filtered = characteristics.filter(settings)
@@ -235,5 +240,5 @@ def _candidates(region: FeasibleRegion) -> Iterator[FloatArray]:
                                              for end in (characteristics.lower, characteristics.upper))])
     rng = np.random.default_rng(0)
     probes = rng.uniform(characteristics.lower, characteristics.upper, (PROBES, size))
-    some = np.where(rng.random((PROBES, size)) < 2 / size, probes, original)
-    yield region.repaired(np.concatenate([probes, some]))
+    sparse = np.where(rng.random((PROBES, size)) < 2 / size, probes, original)
+    yield region.repaired(np.concatenate([probes, sparse]))

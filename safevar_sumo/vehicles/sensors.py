@@ -28,7 +28,7 @@ def history(longest: float, step: float, sample: FloatArray) -> FloatArray:
 
 
 def remembered(past: FloatArray, sample: FloatArray) -> FloatArray:
-    """The history with a new sample first, without the oldest."""
+    """The history with a new sample at its front and the oldest one dropped."""
     return np.concatenate([sample[np.newaxis], past[:-1]])
 
 
@@ -40,7 +40,7 @@ def delayed(past: FloatArray, delay: FloatArray, step: float) -> FloatArray:
     signals = past[0].size
     place = newer.astype(np.intp) * signals + np.arange(signals).reshape(past.shape[1:])
     after, before = past.take(place), past.take(place + signals)
-    with np.errstate(invalid="ignore"):  # infinite when out of sight, finite a step later
+    with np.errstate(invalid="ignore"):  # infinite while out of sight, finite a step later
         between = after * (1 - share) + before * share
     return np.asarray(np.where(np.isnan(between), after, between))
 
@@ -48,7 +48,7 @@ def delayed(past: FloatArray, delay: FloatArray, step: float) -> FloatArray:
 class Sensors(NamedTuple):
     """Sensors of N vehicles, each of shape (N,): latency [s], range in clear weather [m], factor on distances [-].
 
-    A vehicle's method `sensors(prepared)` returns them; `Vehicle.sense` applies the same to an observation.
+    A vehicle's method `sensors(prepared)` returns them; `Vehicle.sense` applies the same sensors to an observation.
     """
 
     latency: FloatArray

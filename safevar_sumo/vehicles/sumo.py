@@ -30,7 +30,7 @@ class _Prepared(NamedTuple):
 
 
 class SumoState(NamedTuple):
-    """State of N vehicles: m/s, m/s^2 that the wheels give, pedals as the actuators have them, and what is still under way."""
+    """State of N vehicles: speed [m/s], acceleration by the wheels [m/s^2], actuator positions, and the histories of delayed signals."""
 
     speed: FloatArray
     acceleration: FloatArray
@@ -42,14 +42,14 @@ class SumoState(NamedTuple):
 
 
 class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A SUMO vehicle type: greatest accelerations, top speed, and delays on the way from sensor to road.
+    """A SUMO vehicle type: greatest accelerations, top speed, and delays of sensors and actuators.
 
     Parameters
     ----------
     reference_mass
-        Mass at which accel and decel hold [kg]; at another mass the same forces accelerate another mass.
+        Mass to which accel and decel refer [kg]; at another mass the forces stay the same.
     tyre_friction
-        Friction coefficient of the tyres on a dry road, the limit of every acceleration over g [-].
+        Friction coefficient of the tyres on a dry road [-]; it limits every acceleration over g.
     """
 
     UNITS = {
@@ -77,12 +77,12 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
                         tau=p.actuator_lag)
 
     def at_rest(self, prepared: _Prepared) -> SumoState:
-        nothing = np.zeros_like(prepared.mass)
-        commands = history(float(np.max(prepared.brake_delay)), prepared.step, nothing)
-        return SumoState(nothing, nothing, nothing, nothing, nothing + 1, None, commands)
+        zeros = np.zeros_like(prepared.mass)
+        commands = history(float(np.max(prepared.brake_delay)), prepared.step, zeros)
+        return SumoState(zeros, zeros, zeros, zeros, zeros + 1, None, commands)
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> SumoState:
-        """Only a slope resists: the pedals hold against it, and are released on a level road."""
+        """The pedals balance the slope, the only resistance; on a level road they are released."""
         p, rest = prepared, self.at_rest(prepared)
         brake = np.minimum(np.maximum(-p.back / (p.brake_gain * p.decel), 0.0), 1.0)
         throttle = np.minimum(np.maximum(p.back / p.accel, 0.0), 1.0)
@@ -93,19 +93,19 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return Sensors(prepared.reaction_time, prepared.sensor_range, np.ones_like(prepared.sensor_range))
 
     def sense(self, prepared: _Prepared, state: SumoState, seen: Observation) -> tuple[Observation, SumoState]:
-        """Sensors report what was `reactionTime` ago, and nothing beyond `sensorRange` times the visibility."""
+        """Sensors report the scene of `reactionTime` ago, and nothing beyond `sensorRange` times the visibility."""
         late, past = late_and_near(seen, state.seen, prepared.reaction_time, prepared.sensor_range, prepared.step)
         return late, state._replace(seen=past)
 
     def advance(self, prepared: _Prepared, state: SumoState, command: Command) -> SumoState:
-        """What the wheels do follows the pedals with the actuator lag T; dv/dt = a - g sin, da/dt = (wanted - a) / T."""
+        """The wheels follow the pedals with the actuator lag T: dv/dt = a - g sin, da/dt = (wanted - a) / T."""
         p = prepared
         commands = remembered(state.brake_commands, command.brake)
         brake = delayed(commands, p.brake_delay, p.step)
         wanted = np.where(brake > 0, -brake * p.brake_gain * p.decel, command.throttle * p.accel)
         wanted = np.minimum(np.maximum(wanted, -p.grip), p.grip)
         acceleration = state.acceleration + (wanted - state.acceleration) * (p.step / (p.actuator_lag + p.step))
-        # Braking ends what is left of an acceleration at once.
+        # Braking ends a remaining positive acceleration at once.
         acceleration = np.where(brake > 0, np.minimum(acceleration, 0.0), acceleration)
         speed = np.minimum(np.maximum(state.speed + (acceleration - p.back) * p.step, 0.0), np.maximum(p.max_speed, state.speed))
         return state._replace(

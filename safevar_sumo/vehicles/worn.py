@@ -12,13 +12,13 @@ from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType
 from safevar_sumo.vehicles.sensors import Sensors, delayed, history, late_and_near, remembered
 
 DEEP_TREAD, HALF_WORN_TREAD, LEGAL_TREAD = 6.7, 3.0, 1.6
-"""Tread depths with published stopping distances; the last is the least that is legal in Europe [mm]."""
+"""Tread depths with published stopping distances; the last is the legal minimum in Europe [mm]."""
 FROM_DEEP = 1.368
 """Stopping distance at 1.6 mm over that at 6.7 mm on wet hot rolled asphalt (MIRA for RoSPA) [-]."""
 FROM_HALF_WORN = 39.9 / 31.7
-"""The same over that at 3 mm, from 50 mph on a wet road (MIRA for Continental; both in m) [-]."""
+"""Stopping distance at 1.6 mm over that at 3 mm, from 50 mph on a wet road (MIRA for Continental; both in m) [-]."""
 LOST_HALF_WORN = (1 - FROM_HALF_WORN / FROM_DEEP) / (1 - 1 / FROM_DEEP)
-"""Share of the loss of friction at 1.6 mm that tyres of 3 mm have: friction goes as one over the distance [-]."""
+"""Loss of friction at 3 mm over the loss at 1.6 mm [-]; friction is proportional to 1 / stopping distance."""
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 
 
@@ -39,7 +39,7 @@ class _Prepared(NamedTuple):
 
 
 class WornState(NamedTuple):
-    """State of N vehicles: m/s, pedals as the actuators have them, and what is still under way."""
+    """State of N vehicles: speed [m/s], actuator positions, and the histories of delayed signals."""
 
     speed: FloatArray
     throttle: FloatArray
@@ -50,32 +50,32 @@ class WornState(NamedTuple):
 
 
 class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A car on two axles whose brakes lock neither: each brakes up to the friction on the load that it carries.
+    """A car with two axles that never lock: each axle brakes up to the friction that its load allows.
 
     Parameters
     ----------
     kerb_mass, kerb_centre, wheelbase, centre_height
-        Of the empty car: mass [kg], its centre behind the front axle, wheelbase, height of the centre [m].
+        Of the empty car: mass [kg], distance of its centre from the front axle, wheelbase, height of its centre [m].
     drive_force, brake_force, front_share
-        Largest forces of engine and brakes [N], and the front axle's share of the brakes' [-].
+        Largest forces of engine and brakes [N], and the front axle's share of the brake force [-].
     tyre_friction
         Friction coefficient on a dry road [-].
     tread_loss
-        Share of the friction that tyres worn down to 1.6 mm have lost on a wet road [-]. By default 1 - 1 / 1.368: they took 36.8 %
-        more way to stop than tyres of 6.7 mm (MIRA for RoSPA, hot rolled asphalt). See the notes for other depths.
+        Share of the friction that tyres worn down to 1.6 mm have lost on a wet road [-]. By default 1 - 1 / 1.368: their stopping
+        distance was 36.8 % longer than with 6.7 mm (MIRA for RoSPA, hot rolled asphalt). See the notes for other depths.
     max_speed
-        [m/s]
+        Top speed [m/s].
 
     Notes
     -----
-    The loss of friction on a wet road by tread depth goes through published points: none from 6.7 mm on, at 3 mm as much as makes the
-    way at 1.6 mm 39.9 / 31.7 times as long (MIRA for Continental, from 50 mph), at 1.6 mm `tread_loss`; straight lines between, the last
-    one goes on below 1.6 mm (assumption). Measured from 50 mph, it acts at every speed (assumption; slower, tyres lose less). Whether a
-    road is wet, the weather says; on a dry one tread does nothing.
+    The loss of friction on a wet road is linear in tread depth between published points: none from 6.7 mm on, `tread_loss` at 1.6 mm,
+    and at 3 mm the loss for which stopping at 1.6 mm takes 39.9 / 31.7 times the distance (MIRA for Continental, from 50 mph). The last
+    line extends below 1.6 mm (assumption). The loss, measured from 50 mph, acts at every speed (assumption; slower, tyres lose less). The
+    weather determines whether a road is wet; on a dry road the tread has no effect.
 
-    Deceleration a: of a = F / m, of an axle at its limit
-    mu m (g x -+ a h) / L with the other braking its share, and of a = mu g, the least holds. On a slope g is what presses onto the
-    road, and its component along the road acts beside a. The vehicle never rolls back.
+    The deceleration a is the smallest of a = F / m, a = mu g, and, for each axle, the a at which that axle is at its limit
+    mu m (g x -+ a h) / L while the other brakes with its share. On a slope g is the component onto the
+    road, and the component along the road acts in addition to a. The vehicle never rolls back.
     """
 
     UNITS = {
@@ -99,10 +99,10 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         c = characteristics
         mass = self.kerb_mass + c["payload"]
         centre = (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"]) / mass / self.wheelbase
-        held = np.where(wet, 1 - self.tread_loss * _worn(np.maximum(c["treadDepth"], 0.0)), 1.0)
+        grip_kept = np.where(wet, 1 - self.tread_loss * _share_of_loss(np.maximum(c["treadDepth"], 0.0)), 1.0)
         return _Prepared(
             step=step, mass=mass, drive=self.drive_force / mass, brake=c["brakeTorque"] * (self.brake_force / mass),
-            grip=self.tyre_friction * road_friction * held, front_load=1 - centre, rear_load=centre, response=c["brakeResponse"],
+            grip=self.tyre_friction * road_friction * grip_kept, front_load=1 - centre, rear_load=centre, response=c["brakeResponse"],
             sensor_range=c["sensorRange"], latency=c["sensorLatency"], slope=slope)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
@@ -112,11 +112,11 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
                         max_speed=np.full_like(p.mass, self.max_speed), tau=p.response + p.step)
 
     def at_rest(self, prepared: _Prepared) -> WornState:
-        nothing = np.zeros_like(prepared.mass)
-        return WornState(nothing, nothing, nothing, nothing + 1, None, history(float(np.max(prepared.response)), prepared.step, nothing))
+        zeros = np.zeros_like(prepared.mass)
+        return WornState(zeros, zeros, zeros, zeros + 1, None, history(float(np.max(prepared.response)), prepared.step, zeros))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> WornState:
-        """Only a slope resists: the pedals hold against it, and are released on a level road."""
+        """The pedals balance the slope, the only resistance; on a level road they are released."""
         p, rest = prepared, self.at_rest(prepared)
         brake = np.minimum(np.maximum(-p.slope.back / p.brake, 0.0), 1.0)
         throttle = np.minimum(np.maximum(p.slope.back / p.drive, 0.0), 1.0)
@@ -126,7 +126,7 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return Sensors(prepared.latency, prepared.sensor_range, np.ones_like(prepared.sensor_range))
 
     def sense(self, prepared: _Prepared, state: WornState, seen: Observation) -> tuple[Observation, WornState]:
-        """Dirty sensors report what was `sensorLatency` ago, and nothing beyond `sensorRange` times the visibility."""
+        """Dirty sensors report the scene of `sensorLatency` ago, and nothing beyond `sensorRange` times the visibility."""
         late, past = late_and_near(seen, state.seen, prepared.latency, prepared.sensor_range, prepared.step)
         return late, state._replace(seen=past)
 
@@ -139,15 +139,15 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return state._replace(speed=speed, throttle=np.where(brake > 0, 0.0, command.throttle), brake=brake, brake_commands=commands)
 
     def _deceleration(self, p: _Prepared, pedal: FloatArray) -> FloatArray:
-        """Of both axles together [m/s^2]."""
+        """Deceleration by both axles together [m/s^2]."""
         wanted, lever = pedal * p.brake, p.grip * (self.centre_height / self.wheelbase)
         rear_slides = (self.front_share * wanted + p.grip * p.slope.down * p.rear_load) / (1 + lever)
         front_slides = ((1 - self.front_share) * wanted + p.grip * p.slope.down * p.front_load) / (1 - lever)
         return np.minimum(np.minimum(wanted, p.grip * p.slope.down), np.minimum(rear_slides, front_slides))
 
 
-def _worn(depth: FloatArray) -> FloatArray:
-    """How much of the loss at 1.6 mm tyres of a tread depth [mm] have on a wet road [-], shape (N,)."""
+def _share_of_loss(depth: FloatArray) -> FloatArray:
+    """Loss of friction on a wet road at a tread depth [mm] over the loss at 1.6 mm [-], shape (N,)."""
     first = np.minimum(np.maximum((DEEP_TREAD - depth) / (DEEP_TREAD - HALF_WORN_TREAD), 0.0), 1.0)
     second = np.maximum((HALF_WORN_TREAD - depth) / (HALF_WORN_TREAD - LEGAL_TREAD), 0.0)
     return np.asarray(LOST_HALF_WORN * first + (1 - LOST_HALF_WORN) * second)

@@ -143,7 +143,7 @@ def test_a_characteristic_is_no_input_too(cart: Path) -> None:
     """What the scenario or the weather says would be lost."""
     text = CART_TABLE.replace("inputs = {{", 'inputs = {{ initial_speed = "top",')
     (cart / "cart.toml").write_text(text.format(more="[vehicle.characteristics]\npower = { original = 10.8 }\ntop = { upper = 40 }"))
-    with pytest.raises(InputError, match=r"vehicle\.inputs\.initial_speed = 'top': that variable is a characteristic, too"):
+    with pytest.raises(InputError, match=r"vehicle\.inputs\.initial_speed = 'top': that variable is also a characteristic"):
         assemble(load_study("cart.toml"))
 
 

@@ -141,7 +141,7 @@ MASS = {"sum": {"mass": 1.0}}
     ([{**MASS, "at_least": 2404.0}, {"sum": {"mass": 2.0, "tireFric": 1.0}, "unit": "kg", "at_most": 4800.0}],
      "no setting in the domains satisfies all of them: mass at least 2404 kg; 2 mass + tireFric at most 4800 kg"),
     ([{"sum": {name: 1.0}, "at_least": float(value), "at_most": float(value)} for name, value in zip(SUN.names, SUN.original, strict=True)],
-     "leave the original vehicle alone"),
+     "leave only the original vehicle"),
     ([{"sum": {"mas": 1.0}, "at_least": 1.0}], "constraints[0].sum.mas: there is no such characteristic; did you mean 'mass'?"),
     ([{**MASS, "at_least": 1.0, "unit": "t"}], "constraints[0].unit = 't'\nexpected: 'kg', the unit of mass, or '-'"),
     ([{"sum": {"mass": 1.0, "radius": 1.0}, "at_least": 1.0}], "constraints[0].sum adds mass [kg], radius [cm]"),
