@@ -1,7 +1,7 @@
 """SafeVar on SUMO: which smallest variations of a vehicle make its automated driving system unsafe?
 
-`import safevar_sumo as sv`, and then `sv.simulate("rain", {"tireFric": 1.1})`. Every name below is loaded when it is used
-first, so importing the package costs next to nothing.
+`import safevar_sumo as sv`, and then `sv.simulate("rain", {"tireFric": 1.1})`. Every name below is loaded on first
+use, so importing the package is fast.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     __version__: str
 
-_ROOMS = {
+_MODULES = {
     "metrics": ("Criterion", "Unsafe"),
     "study": ("load_study", "study_names", "Study", "StudyLike", "Weather"),
     "api": ("simulate", "Simulation", "evaluate", "run", "load", "Results", "tables", "Tables", "figures", "Figures"),
@@ -72,8 +72,8 @@ _ROOMS = {
     "results": ("status", "Status"),
     "errors": ("SafevarError", "InputError", "SimulationError"),
 }
-"""Every room with the public names that come from it."""
-_ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
+"""Modules, each with the public names that it provides."""
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = [
     "Cause", "Comparison", "Criterion", "Explained", "Explanation", "Figures", "InputError", "Observer", "Opinion", "Opinions",
@@ -83,9 +83,9 @@ __all__ = [
     "show_in_gui", "simulate", "status", "study_names", "tables", "tolerance",
 ]
 
-if not TYPE_CHECKING:  # a type checker is to know the names above, and no others
+if not TYPE_CHECKING:  # a type checker sees the names above and no others
     def __getattr__(name: str) -> Any:
-        if sys.version_info < (3, 11):  # noqa: UP036 (this file and __main__ alone can be read by older versions)
+        if sys.version_info < (3, 11):  # noqa: UP036 (older versions can parse this file and __main__)
             raise ImportError("safevar_sumo needs Python 3.11 or newer")
         if name == "__version__":
             from importlib.metadata import version
@@ -93,9 +93,9 @@ if not TYPE_CHECKING:  # a type checker is to know the names above, and no other
             return version("safevar_sumo")
         if name == "report":  # the package is callable: function and package share the name
             return importlib.import_module(f"{__name__}.report")
-        if name not in _ROOM_OF:
+        if name not in _MODULE_OF:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(f"{__name__}.{_ROOM_OF[name]}"), name)
+        return getattr(importlib.import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
 
     def __dir__() -> list[str]:
         return sorted(__all__)

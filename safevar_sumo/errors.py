@@ -1,4 +1,4 @@
-"""Errors that a user can mend: one or two lines, never a traceback."""
+"""Errors that a user can fix: one or two lines, never a traceback."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it: 128 and the signal's number."""
+"""Exit code after Ctrl-C, as in shells: 128 plus the signal's number."""
 
 
 class SafevarError(Exception):
@@ -19,16 +19,16 @@ class SafevarError(Exception):
 
 
 class InputError(SafevarError):
-    """A value that the user gave and that cannot be used.
+    """The user gave a value that cannot be used.
 
     Parameters
     ----------
     source
-        Where the value stands: a file, a flag or a command's argument.
+        Where the value comes from: a file, a flag or a command's argument.
     problem
         The key and the value, and what is wrong with them.
     legal
-        What would be right.
+        The values that are accepted.
     """
 
     exit_code = 2
@@ -43,7 +43,7 @@ class InputError(SafevarError):
 
 
 class ForeignError(InputError):
-    """Code from outside the package, which a study names, failed or returned what it must not."""
+    """User code that a study names failed or returned an illegal value."""
 
 
 class SimulationError(SafevarError):
@@ -51,11 +51,11 @@ class SimulationError(SafevarError):
 
 
 class EnvironmentFault(SafevarError):
-    """What a simulation needs beside its setting failed: a disk, memory, netconvert, SUMO's start."""
+    """A simulation failed for a reason outside its setting: a disk, memory, netconvert, SUMO's start."""
 
 
 def warn(message: str) -> None:
-    """Warn with the line that called this package: its author can do something about it."""
+    """Warn, and name the line of user code that called this package."""
     frame, level = inspect.currentframe(), 1
     while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == __name__.partition(".")[0]:
         frame, level = frame.f_back, level + 1
@@ -72,25 +72,25 @@ def first_line(error: BaseException) -> str:
 
 
 def unknown(source: object, problem: str, given: object, names: Iterable[str], otherwise: str = "") -> InputError:
-    """The error for a name that there is not: it asks whether the nearest one is meant, and lists all of them.
+    """The error for an unknown name: it suggests the nearest known name and lists all of them.
 
     Parameters
     ----------
     source, problem
-        As those of `InputError`.
+        As in `InputError`.
     given
         The name that the user gave.
     names
-        The names that there are.
+        The known names.
     otherwise
-        What would be right beside the names.
+        What is accepted besides the names.
     """
     options = list(names)
     return InputError(source, f"{problem}{did_you_mean(given, options)}", f"{one_of(options)}{otherwise}")
 
 
 def did_you_mean(given: object, names: Iterable[str]) -> str:
-    """`; did you mean 'rain'?`, or nothing where no name is near what was given; upper and lower case are near."""
+    """`; did you mean 'rain'?` with the nearest name, upper and lower case ignored; empty if no name is near."""
     by_lower = {name.lower(): name for name in names}
     near = get_close_matches(str(given).lower(), by_lower, n=1)
     return f"; did you mean {by_lower[near[0]]!r}?" if near else ""
@@ -101,28 +101,28 @@ def one_of(names: Iterable[str]) -> str:
     return "one of " + ", ".join(sorted(names))
 
 
-HANDED_ON = ("/dev/stdin", "/dev/stdout", "/dev/stderr", "/dev/null")
-HANDLES = ("/dev/fd", "/proc/self/fd")
+STREAMS = ("/dev/stdin", "/dev/stdout", "/dev/stderr", "/dev/null")
+DESCRIPTOR_FOLDERS = ("/dev/fd", "/proc/self/fd")
 
 
 def refuse_other_than_file(path: Path, source: object = None, *, streams: bool = False) -> None:
-    """Refuse what exists and is no regular file: a pipe would be waited for, for ever.
+    """Refuse an existing path that is no regular file: reading from a pipe may never end.
 
     Parameters
     ----------
     path
-        What is to be read or written.
+        The file to be read or written.
     source
-        What the error names; by default the path.
+        The source that the error names; by default the path.
     streams
-        Whether what a shell hands on counts as a file, such as `/dev/stdout` and `<(zcat data.csv.gz)`.
+        Whether to accept a shell's streams, such as `/dev/stdout` and `<(zcat data.csv.gz)`.
 
     Raises
     ------
     InputError
-        If it is something else.
+        If the path is a directory, a pipe or a device.
     """
-    handed_on = streams and (str(path) in HANDED_ON or str(path.parent) in HANDLES)
-    if path.exists() and not path.is_file() and not handed_on:
+    is_stream = streams and (str(path) in STREAMS or str(path.parent) in DESCRIPTOR_FOLDERS)
+    if path.exists() and not path.is_file() and not is_stream:
         problem = "is no regular file but a directory" if path.is_dir() else "is no regular file"
         raise InputError(path if source is None else source, problem if source is None else f"{path} {problem}", "a file")

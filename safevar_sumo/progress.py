@@ -1,4 +1,4 @@
-"""Progress: bars on a terminal, a line now and then elsewhere."""
+"""Progress: bars on a terminal, a line every half minute elsewhere."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study
 from safevar_sumo.terminal import SECONDS_BETWEEN_LINES, print_text, stages
 
-SETTLED = 5.0
-"""Seconds of work after which a throughput is shown: batches that end together make the first ones meaningless."""
-BAR = 10
-"""Letters that a bar takes."""
-LEAST_ROOM = 26
-"""Letters beside the bar, below which there is none."""
+SETTLING_TIME = 5.0
+"""Seconds of work before throughput is shown: batches that end together make earlier values meaningless."""
+BAR_WIDTH = 10
+"""Width of the bar [characters]."""
+MIN_TEXT_WIDTH = 26
+"""Narrowest text beside the bar [characters]; if there is less space, the bar is left out."""
 
 
 class CampaignProgress:
@@ -30,14 +30,14 @@ class CampaignProgress:
     def __init__(self, console: Console, study: Study, keys: list[RunKey], quiet: bool) -> None:
         self._console, self._quiet, self._name = console, quiet, study.name
         shown = console.is_terminal and not quiet
-        self._room = console.width - len(study.name) - 1
-        bar = [BarColumn(bar_width=BAR)] if self._room - BAR - 1 >= LEAST_ROOM else []
-        self._room -= len(bar) * (BAR + 1)
+        self._text_width = console.width - len(study.name) - 1
+        bar = [BarColumn(bar_width=BAR_WIDTH)] if self._text_width - BAR_WIDTH - 1 >= MIN_TEXT_WIDTH else []
+        self._text_width -= len(bar) * (BAR_WIDTH + 1)
         self._bar = Progress(TextColumn("{task.description}", markup=False), *bar, TextColumn("{task.fields[summary]}", markup=False),
                              console=console, disable=not shown)
         self._tally = _Tally(len(keys), study.search.evaluations)
         self._task = self._bar.add_task(study.name, total=self._tally.total, summary="waiting")
-        self._spoke = time.monotonic()
+        self._last_line = time.monotonic()
 
     def __enter__(self) -> CampaignProgress:
         self._bar.start()
@@ -47,7 +47,7 @@ class CampaignProgress:
         self._bar.stop()
 
     def evaluated(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
-        self._tally.take_in(key, evaluations, simulated)
+        self._tally.add(key, evaluations, simulated)
         self._show()
 
     def finished(self, key: RunKey, asked: int) -> None:
@@ -59,58 +59,58 @@ class CampaignProgress:
 
     def _show(self) -> None:
         tally = self._tally
-        self._bar.update(self._task, completed=tally.done, total=tally.total, summary=tally.text(self._room))
+        self._bar.update(self._task, completed=tally.done, total=tally.total, summary=tally.text(self._text_width))
         now = time.monotonic()
-        if not self._console.is_terminal and not self._quiet and now - self._spoke >= SECONDS_BETWEEN_LINES:
-            self._spoke = now
+        if not self._console.is_terminal and not self._quiet and now - self._last_line >= SECONDS_BETWEEN_LINES:
+            self._last_line = now
             print_text(self._console, f"{self._name}: {tally.text()}")
 
 
 class _Tally:
-    """How far all runs of a study are together."""
+    """Progress of all runs of a study together."""
 
     def __init__(self, runs: int, evaluations: int) -> None:
         self.done, self.total = 0, runs * evaluations
         self._evaluations, self._runs = evaluations, runs
-        self._finished = self._simulated = self._answered = self._collisions = 0
+        self._finished = self._simulated = self._evaluated = self._collisions = 0
         self._best = np.inf
         self._first: float | None = None
         self._last = 0.0
-        self._seen: dict[RunKey, tuple[int, set[bytes]]] = {}
+        self._by_run: dict[RunKey, tuple[int, set[bytes]]] = {}  # evaluations, and settings that collide
 
-    def take_in(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
-        """Count evaluations of a run; a collision counts once, however often the run asks for its setting, as in `status`."""
+    def add(self, key: RunKey, evaluations: Evaluations, simulated: int) -> None:
+        """Count evaluations of a run; a setting that collides counts once per run, as in `status`."""
         self._last = time.monotonic()
         if simulated and self._first is None:
-            self._first = self._last  # how long the first ones took, with the start of the workers, nobody knows
+            self._first = self._last  # the first batch includes the start of the workers: it does not count
         elif simulated:
             self._simulated += simulated
-            self._answered += len(evaluations)
+            self._evaluated += len(evaluations)
         self.done += len(evaluations)
-        asked, collided = self._seen.get(key, (0, set()))
+        evaluated, collided = self._by_run.get(key, (0, set()))
         before = len(collided)
         collided.update(setting.tobytes() for setting in evaluations.settings[evaluations.collided])
-        self._seen[key] = asked + len(evaluations), collided
+        self._by_run[key] = evaluated + len(evaluations), collided
         self._collisions += len(collided) - before
         if evaluations.valid.any():
             self._best = min(self._best, float(np.min(evaluations.f_safe[evaluations.valid])))
 
     def close_run(self, key: RunKey, asked: int) -> None:
-        """A run that ends early asks for less than its budget."""
-        seen, _ = self._seen.pop(key, (0, set()))
+        """Count a run as finished after `asked` evaluations, which may be fewer than its budget."""
+        evaluated, _ = self._by_run.pop(key, (0, set()))
         self._finished += 1
-        self.done += asked - seen
+        self.done += asked - evaluated
         self.total -= self._evaluations - asked
 
-    def text(self, room: int | None = None) -> str:
-        """The progress in words, cut to `room` letters; the most important parts come first."""
+    def text(self, width: int | None = None) -> str:
+        """The progress in at most `width` characters; the most important parts come first."""
         collisions = [] if np.isinf(self._best) else [f"{self._collisions} collisions"]
         best = [] if np.isinf(self._best) else [f"best SD {self._best:.2f}"]
-        rate = [f"{self._simulated / self._seconds:.0f}/s"] if self._simulated and self._seconds >= SETTLED else []
+        rate = [f"{self._simulated / self._seconds:.0f}/s"] if self._simulated and self._seconds >= SETTLING_TIME else []
         text = ""
-        for part in (*rate, self._left(), *collisions, f"runs {self._finished}/{self._runs}", *best):
+        for part in (*rate, self._time_left(), *collisions, f"runs {self._finished}/{self._runs}", *best):
             longer = f"{text}, {part}" if text else part
-            if room is not None and len(longer) > room:
+            if width is not None and len(longer) > width:
                 break
             text = longer
         return text
@@ -119,18 +119,18 @@ class _Tally:
     def _seconds(self) -> float:
         return 0.0 if self._first is None else self._last - self._first
 
-    def _left(self) -> str:
-        """Hours, minutes and seconds, from the throughput of all runs together once it has settled."""
+    def _time_left(self) -> str:
+        """Hours, minutes and seconds at the throughput of all runs together, after `SETTLING_TIME`."""
         if self.done >= self.total:
             return "0:00:00 left"
-        if not self._answered or self._seconds < SETTLED:
+        if not self._evaluated or self._seconds < SETTLING_TIME:
             return "time left not known yet"
-        return f"{timedelta(seconds=round((self.total - self.done) * self._seconds / self._answered))} left"
+        return f"{timedelta(seconds=round((self.total - self.done) * self._seconds / self._evaluated))} left"
 
 
 @contextmanager
 def counted(console: Console, what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar that counts up to `total`; yields what to call with every number that is done."""
+    """Show a bar that counts up to `total`; yields the function that adds to the count."""
     done = 0
     with stages(console) as show:
         show(what, done, total)

@@ -23,11 +23,11 @@ KMH_PER_MS = 3.6
 GRAVITY = 9.81
 """Acceleration of gravity [m/s^2]."""
 TIME_ROUNDING = 1e-9
-"""Sums of steps with a smaller difference are the same time [s]."""
+"""Sums of time steps that differ by less are the same time [s]."""
 TOUCH = 2e-3
-"""Bodies that overlap by less may just touch: SUMO takes a millimetre for nothing [m]."""
+"""Bodies that overlap by less may only touch: SUMO ignores an overlap of a millimetre [m]."""
 TIME_DECIMALS = 9
-"""Rounds sums of steps: 0.15 s, not 0.15000000000000002 s."""
+"""Decimals to which sums of time steps are rounded: 0.15 s, not 0.15000000000000002 s."""
 
 
 class Outcome(StrEnum):
@@ -43,11 +43,11 @@ class Outcome(StrEnum):
     INFEASIBLE = "infeasible"
 
 
-NOTHING: FloatArray = np.zeros(())
+ZERO: FloatArray = np.zeros(())
 """Scalar zero, broadcast to all N vehicles."""
 EVERYWHERE: BoolArray = np.ones((), dtype=bool)
-"""Boolean scalar, broadcast to all N vehicles."""
-for _constant in (NOTHING, EVERYWHERE):
+"""Scalar True, broadcast to all N vehicles."""
+for _constant in (ZERO, EVERYWHERE):
     _constant.flags.writeable = False
 
 
@@ -56,9 +56,9 @@ class Observation(NamedTuple):
 
     `gap` is the distance along the vehicle's path from its front bumper to the obstacle, infinite
     while the obstacle is not detected [m]; `lateral` is the obstacle's offset from the middle of the
-    vehicle's lane, negative on the side that it comes from, infinite while it is out of sight [m].
-    `closing_speed` is by how much the gap shrinks, `obstacle_speed` the obstacle's own speed along the vehicle's way [m/s];
-    `throttle` and `brake` are where the pedals stand [-].
+    vehicle's lane, negative on the side that the obstacle comes from, infinite while it is out of sight [m].
+    `closing_speed` is the rate at which the gap shrinks, `obstacle_speed` the obstacle's own speed along the vehicle's path [m/s];
+    `throttle` and `brake` are the pedals' positions [-].
     """
 
     time: float
@@ -68,9 +68,9 @@ class Observation(NamedTuple):
     lateral: FloatArray
     lateral_speed: FloatArray
     visibility: float | FloatArray
-    obstacle_speed: FloatArray = NOTHING
-    throttle: FloatArray = NOTHING
-    brake: FloatArray = NOTHING
+    obstacle_speed: FloatArray = ZERO
+    throttle: FloatArray = ZERO
+    brake: FloatArray = ZERO
 
 
 class Command(NamedTuple):
@@ -81,10 +81,10 @@ class Command(NamedTuple):
 
 
 class Tables(NamedTuple):
-    """What the original vehicle's pedals do on a dry road, at `speeds` [m/s].
+    """How the original vehicle's pedals act on a dry road, at `speeds` [m/s].
 
-    What it gains at `full_throttle` and what it loses `coasting` [m/s^2]; `braking` is what the brake adds per unit of pedal,
-    far from the limit of the tyres [m/s^2].
+    Acceleration at `full_throttle` and deceleration when `coasting` [m/s^2]; `braking` is the deceleration that the brake adds per
+    unit of pedal, far from the limit of the tyres [m/s^2].
     """
 
     speeds: FloatArray
@@ -97,8 +97,8 @@ class Nominal(NamedTuple):
     """The original vehicle on a dry road: all that an ADS knows of the vehicle.
 
     `mass` [kg], `accel`, `decel` [m/s^2] and `max_speed` [m/s] are those of its SUMO type; `actuator_lag` [s] is the time constant
-    with which its wheels follow the pedals, which its SUMO type has as `tau`. `tables` drives it, once somebody asks, and returns
-    what `speeds`, `full_throttle`, `coasting` and `braking` are of.
+    with which its wheels follow the pedals (`tau` of its SUMO type). `tables` drives the vehicle when it is first needed, and returns
+    `speeds`, `full_throttle`, `coasting` and `braking`.
     """
 
     mass: float
@@ -133,8 +133,8 @@ class Nominal(NamedTuple):
 class Encounter(NamedTuple):
     """The geometry of N vehicles and their obstacle; shape (T, N).
 
-    `separation` counts for the safety degree, `distance` and `closing_speed` for the time to
-    collision [m, m, m/s]; `in_conflict` tells when they count at all.
+    The safety degree uses `separation`, the time to collision `distance` and `closing_speed`
+    [m, m, m/s]; both only while `in_conflict`.
     """
 
     separation: FloatArray
@@ -147,9 +147,9 @@ class Encounter(NamedTuple):
 class Trace:
     """T samples of N vehicles, `step` seconds apart; arrays of shape (T, N), `time` (T,).
 
-    A vehicle's samples count while `active`; later ones are whatever SUMO did with the rest of the batch.
-    `vehicle_length`, `position` along the way, `gap` and `lateral` in m, speeds in m/s, `throttle` and `brake` as commanded,
-    `pedal` is where the brake pedal stands; `obstacle_speed` is the obstacle's along the vehicle's way.
+    A vehicle's samples count while `active`; later samples are meaningless, for SUMO goes on with the rest of the batch.
+    `vehicle_length`, `position` along the path, `gap` and `lateral` in m, speeds in m/s, `throttle` and `brake` as commanded,
+    `pedal` is the brake pedal's position; `obstacle_speed` is the obstacle's speed along the vehicle's path.
     """
 
     step: float
@@ -164,8 +164,8 @@ class Trace:
     brake: FloatArray
     gear: FloatArray
     active: BoolArray
-    obstacle_speed: FloatArray = field(default_factory=lambda: NOTHING)
-    pedal: FloatArray = field(default_factory=lambda: NOTHING)
+    obstacle_speed: FloatArray = field(default_factory=lambda: ZERO)
+    pedal: FloatArray = field(default_factory=lambda: ZERO)
 
     def of(self, vehicles: slice) -> Trace:
         """The trace of some of the vehicles."""
@@ -174,10 +174,10 @@ class Trace:
 
 
 class Contact(NamedTuple):
-    """Where N vehicles were touched first, shape (N,).
+    """Where the first contact on each of N vehicles was, shape (N,).
 
-    `side` is one of `SIDES`, empty without a contact. `place` is that of the obstacle's middle [% of the vehicle's width from the side
-    that its `lateral` is negative on, or of its length from the front], within 0 to 100, NaN without a contact.
+    `side` is one of `SIDES`, empty without a contact. `place` is where the obstacle's middle was [% of the vehicle's width from the side
+    on which `lateral` is negative, or of its length from the front], within 0 to 100, NaN without a contact.
     """
 
     side: npt.NDArray[np.str_]
@@ -187,17 +187,17 @@ class Contact(NamedTuple):
 NO_CONTACT = Contact(np.array("", dtype="U5"), np.array(np.nan))
 """No contact of N vehicles."""
 UNDEFINED: FloatArray = np.array(np.nan)
-"""What is undefined for N vehicles."""
+"""Scalar NaN, broadcast to all N vehicles."""
 for _array in (*NO_CONTACT, UNDEFINED):
     _array.flags.writeable = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationRuns:
-    """N simulations as they went; `outcome` holds values of `Outcome`, `collision_speed` is NaN without one [m/s].
+    """Trajectories and outcomes of N simulations; `outcome` holds values of `Outcome`, `collision_speed` is NaN without a collision [m/s].
 
-    `test_speed_error` is the worst deviation from a test's speed before the system acted, NaN where there is none to hold [m/s];
-    `warning_ttc` the time to collision at which the system first warned its driver, NaN where it never did [s].
+    `test_speed_error` is the largest deviation from the test's speed before the driving system acted, NaN if no speed is prescribed
+    [m/s]; `warning_ttc` the time to collision at which the system first warned its driver, NaN if it never did [s].
     """
 
     trace: Trace
@@ -221,28 +221,28 @@ class SimulationRuns:
 
     @property
     def relative_speed(self) -> FloatArray:
-        """Speed of a collision relative to the obstacle along the vehicle's way [m/s], shape (N,); NaN without one.
+        """Speed of a collision relative to the obstacle along the vehicle's path [m/s], shape (N,); NaN without a collision.
 
-        A gap d that closes within a step from speed v at the relative acceleration a is gone at sqrt(v^2 + 2 a d); the collision is noted
-        at the end of the step. Where no gap closes it is the speed that was noted.
+        A gap d that closes within a time step, from the relative speed v at the relative acceleration a, closes at sqrt(v^2 + 2 a d);
+        `collision_speed` holds only the speed at the end of the step, which counts where no gap closes.
         """
         trace, columns = self.trace, np.arange(len(self.collision_speed))
         last = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
-        theirs = np.broadcast_to(trace.obstacle_speed, trace.speed.shape)
-        (before, after), (gap, gone) = (([values[np.maximum(last - 1, 0), columns], values[last, columns]])
-                                        for values in (trace.speed - theirs, trace.gap))
-        closes = (gap > -TOUCH) & np.isfinite(gap) & (gone <= 0) & (before > 0)
+        obstacle_speed = np.broadcast_to(trace.obstacle_speed, trace.speed.shape)
+        (before, after), (gap, gap_after) = (([values[np.maximum(last - 1, 0), columns], values[last, columns]])
+                                        for values in (trace.speed - obstacle_speed, trace.gap))
+        closes = (gap > -TOUCH) & np.isfinite(gap) & (gap_after <= 0) & (before > 0)
         squared = before * before + 2 * (after - before) / trace.step * np.where(closes, np.maximum(gap, 0.0), 0.0)
         at_contact = np.minimum(np.maximum(np.sqrt(np.maximum(squared, 0.0)), np.minimum(before, after)), np.maximum(before, after))
-        noted = self.collision_speed - theirs[last, columns]
-        return np.asarray(np.where(closes & ~np.isnan(self.collision_speed), at_contact, noted))
+        at_end_of_step = self.collision_speed - obstacle_speed[last, columns]
+        return np.asarray(np.where(closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step))
 
 
 class CellResults(NamedTuple):
-    """What M vehicles did in every cell of a rating, shape (M, cells).
+    """Results of M vehicles in every cell of a rating, shape (M, cells).
 
-    `impact` is the relative speed of the collision [km/h] and `warning` the true time to collision at the warning [s], NaN without one;
-    `valid` is false where the test could not be driven.
+    `impact` is the relative speed of the collision [km/h], NaN without one; `warning` the true time to collision at the warning [s],
+    NaN without one; `valid` is false where the test could not be driven.
     """
 
     impact: FloatArray
@@ -257,11 +257,11 @@ class CellResults(NamedTuple):
 class Evaluations:
     """M evaluated settings: what was simulated, how it ended, metrics and objectives.
 
-    `settings` has shape (M, n) and holds the filtered values in their table units, all else (M,).
+    `settings` has shape (M, n) and holds the filtered values in their table units; all other arrays have shape (M,).
     `metrics` has the columns of `safevar_sumo.metrics.METRICS`; an undefined value is NaN.
     `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count. `reasons` says, by the bytes of a
     setting, why it could not be simulated. `files` are digests, by name, of files that user code
-    read for the first time in a batch; they belong to the batch, not to its rows. `cells` is what a rating asks for.
+    read for the first time in a batch; they belong to the batch, not to its rows. `cells` are a rating's results, None without a rating.
     """
 
     settings: FloatArray
@@ -283,7 +283,7 @@ class Evaluations:
         return self.metrics[SAFETY_DEGREE]
 
     def column(self, name: str) -> FloatArray:
-        """A metric, f_safe, f_diff or f_num_diff by name; shape (M,). A metric that nothing could measure is undefined everywhere."""
+        """A metric, f_safe, f_diff or f_num_diff by name; shape (M,). A metric without values is NaN everywhere."""
         if name in ("f_safe", "f_diff", "f_num_diff"):
             return np.asarray(getattr(self, name))
         return np.asarray(self.metrics.get(name, np.full(len(self), np.nan)))
@@ -299,7 +299,7 @@ class Evaluations:
 
     @property
     def valid(self) -> BoolArray:
-        """Where the simulation ended in a way that can be scored: no simulator's error, no invalid test, and it was feasible at all."""
+        """Where the simulation can be scored: the setting is feasible, the test valid, and the simulator reported no error."""
         return np.asarray(~self.failed & (self.outcome != Outcome.INVALID_TEST) & ~self.infeasible)
 
     @property
@@ -325,14 +325,14 @@ class Evaluations:
 
     @classmethod
     def none(cls, n: int, metrics: Iterable[str]) -> Evaluations:
-        """No evaluation of settings of `n` characteristics."""
+        """Empty evaluations, for settings of `n` characteristics."""
         empty = np.zeros(0)
         return cls(settings=np.zeros((0, n)), outcome=np.zeros(0, dtype="U16"), collision_speed=empty,
                    metrics=dict.fromkeys(metrics, empty), f_diff=empty, f_num_diff=empty)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Evaluations]) -> Evaluations:
-        """Several evaluations one after the other; a metric that is missing in one of them is undefined there."""
+        """Join evaluations in order; a metric that is missing in one of them is undefined there."""
         def joined(name: str) -> np.ndarray:
             return np.concatenate([getattr(part, name) for part in parts])
 

@@ -1,4 +1,4 @@
-"""The data that ships with the code: studies and SUMO networks; and how the program is called."""
+"""Shipped data (studies and SUMO networks), and the command that starts the program."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parent
 RUN = "python -m safevar_sumo"
-"""Begins every command of this package."""
+"""Start of every command line of this package."""
 
 
 def _folder(name: str) -> Path:
-    """In an installed package the folder lies inside it, in a checkout beside it."""
+    """A data folder: inside the installed package, or beside the package in a checkout."""
     inside = PACKAGE / name
     return inside if inside.is_dir() else PACKAGE.parent / name
 

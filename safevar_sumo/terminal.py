@@ -31,7 +31,7 @@ class WholeTable(Table):
             self.add_column(Text(head), justify="right")
 
     def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
-        """A row of texts, or of cells with a style of their own."""
+        """Add a row of texts, or of cells with their own style."""
         super().add_row(*(plain(cell) if isinstance(cell, str) else cell for cell in cells), **options)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -42,14 +42,14 @@ class WholeTable(Table):
         if excess > 0:
             first = self.columns[0]
             cells = [Measurement.get(console, wide, cell) for cell in (first.header, *first.cells)]
-            words, natural = (max(sizes) for sizes in zip(*cells, strict=True))
-            first.width = max(words, natural - excess)
+            longest_word, natural = (max(sizes) for sizes in zip(*cells, strict=True))
+            first.width = max(longest_word, natural - excess)
         yield from super().__rich_console__(console, options)
 
 
 def plain(text: object, style: str = "") -> Text:
-    """Printable text for rich: other characters become question marks, and other spaces plain ones."""
-    return Text("".join(sign if sign.isprintable() else " " if sign.isspace() else "?" for sign in str(text)), style)
+    """Printable text for rich: other white space becomes a space, any other character a question mark."""
+    return Text("".join(letter if letter.isprintable() else " " if letter.isspace() else "?" for letter in str(text)), style)
 
 
 def print_text(console: Console, text: str) -> None:
@@ -58,7 +58,7 @@ def print_text(console: Console, text: str) -> None:
 
 
 def print_meanings(console: Console, members: Iterable[Characteristic]) -> None:
-    """Print the descriptions of characteristics, a line for each that has one."""
+    """Print the descriptions of characteristics, one line each; a characteristic without description is left out."""
     table = Table.grid(padding=(0, 2))
     for member in members:
         if member.words:
@@ -71,8 +71,8 @@ def print_constraints(console: Console, study: Study) -> None:
     """Print the constraints that all settings satisfy, if the study has any."""
     rows = study.vehicle.characteristics
     if study.constraints:
-        listed = "; ".join(f"{one.quantity} {one.legal(rows)}" for one in study.constraints)
-        print_text(console, f"Only settings that satisfy the study's constraints: {listed}.")
+        conditions = "; ".join(f"{one.quantity} {one.legal(rows)}" for one in study.constraints)
+        print_text(console, f"Only settings that satisfy the study's constraints: {conditions}.")
 
 
 def print_names(console: Console, title: str, rows: Iterable[tuple[str, ...]], heads: tuple[str, ...]) -> None:
@@ -85,18 +85,18 @@ def print_names(console: Console, title: str, rows: Iterable[tuple[str, ...]], h
 
 SECONDS_BETWEEN_LINES = 30.0
 StageProgress = Callable[[str, int, int], None]
-"""Called with the stage, how much of it is done, and how much there is."""
+"""Called with the stage, the amount done, and the total amount."""
 
 
 @contextmanager
 def stages(console: Console) -> Iterator[StageProgress]:
-    """A bar on a terminal, a line every half minute elsewhere; yields the function that reports progress."""
+    """Show a bar on a terminal, a line every half minute elsewhere; yields the function that reports progress."""
     columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=20), MofNCompleteColumn(), TimeRemainingColumn())
     last_line = time.monotonic()
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("starting", total=None)
 
-        def done(stage: str, number: int, total: int) -> None:
+        def report(stage: str, number: int, total: int) -> None:
             nonlocal last_line
             if number == 0:
                 bar.reset(task, description=stage, total=total)
@@ -105,12 +105,12 @@ def stages(console: Console) -> Iterator[StageProgress]:
                 last_line = time.monotonic()
                 print_text(console, f"{stage}: {number} of {total}")
 
-        yield done
+        yield report
 
 
 @contextmanager
 def shown(progress: bool | StageProgress) -> Iterator[StageProgress]:
-    """The function that reports progress: a bar's for True, else `progress` itself."""
+    """Yield the function that reports progress: a bar for True, nothing for False, else `progress` itself."""
     if progress is True:
         with stages(Console(stderr=True)) as bar:
             yield bar

@@ -1,4 +1,4 @@
-"""Checks of your own code as pytest classes, for a test file of yours.
+"""Checks of your own code as pytest classes, to use in your test files.
 
 ```python
 from safevar_sumo.testing import AdsChecks
@@ -8,8 +8,8 @@ class TestCareful(AdsChecks):
     subject = "my_ads:Careful"
 ```
 
-Each check is a test of its own. `subject` is `package.module:Name` as a study names it, or the class or record itself; `study` is a
-study to try it in, by default one beside it that names it.
+Each check is a separate test. `subject` is `package.module:Name` as in a study file, or the class or record itself; `study` is the
+study to try it in, by default a study file beside the code that names the subject.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ ALL = tuple(ADVICE)
 
 
 class Checks:
-    """Every check of a subject of whatever kind."""
+    """Every check, for a subject of any kind."""
 
     subject: ClassVar[Any] = None
     study: ClassVar[str | None] = None
     kind: ClassVar[str] = ""
-    """Kind that the subject must be of; any by default."""
+    """Required kind of the subject; any kind by default."""
 
     def __init_subclass__(cls, kind: str = "", **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -40,7 +40,7 @@ class Checks:
 
     @classmethod
     def report(cls) -> Report:
-        """What `check` finds, found once."""
+        """The report of `check`, made once for each subject and study."""
         name = cls.subject if isinstance(cls.subject, str) else f"{cls.subject.__module__}:{cls.subject.__qualname__}"
         key = name, cls.study
         if key not in _REPORTS:
@@ -49,11 +49,11 @@ class Checks:
 
     @pytest.mark.parametrize("name", ALL)
     def test_check(self, name: str) -> None:
-        """No finding of this check."""
+        """Assert that this check has no finding."""
         report = self.report()
         assert self.kind in ("", report.kind), f"{report.subject} is of the kind {report.kind}, not {self.kind}"
-        findings = [one for one in report.findings if one.check == name]
-        assert not findings, "\n".join(f"{one}\n  expected: {one.expected}\n  advice: {one.advice}" for one in findings)
+        findings = [finding for finding in report.findings if finding.check == name]
+        assert not findings, "\n".join(f"{finding}\n  expected: {finding.expected}\n  advice: {finding.advice}" for finding in findings)
 
 
 class AdsChecks(Checks, kind="ads"):

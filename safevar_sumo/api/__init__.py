@@ -1,4 +1,4 @@
-"""The library as others use it, beside the questions of `safevar_sumo.analysis`; the names here are those of `import safevar_sumo`."""
+"""The public library without the questions of `safevar_sumo.analysis`; `import safevar_sumo` re-exports the names."""
 
 from safevar_sumo.analysis.subject import Results, load
 from safevar_sumo.api.research_questions import Figures, Tables, figures, tables

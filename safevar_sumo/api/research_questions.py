@@ -1,4 +1,4 @@
-"""The research questions answered, and their pictures."""
+"""Answers to the research questions as tables, and figures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Tables(dict[str, "pd.DataFrame"]):
-    """Answers by name, each a tidy frame over all results; a notebook shows them in the paper's layout."""
+    """Answers by name, each a tidy frame over all results; notebooks show the answers in the paper's layout."""
 
     def __init__(self, answers: list[Answer]) -> None:
         super().__init__({answer.name: answer.frame for answer in answers})
@@ -24,7 +24,7 @@ class Tables(dict[str, "pd.DataFrame"]):
 
     @property
     def notes(self) -> dict[str, tuple[str, ...]]:
-        """By name, notes on what is missing or left out, and why."""
+        """Notes by name: what is missing or left out, and why."""
         return {answer.name: answer.notes for answer in self.answers}
 
     def _repr_markdown_(self) -> str:
@@ -45,9 +45,9 @@ def tables(*results: Results | str | Path, question: str | None = None) -> Table
     Parameters
     ----------
     results
-        Results, or their directories: one for each case that stands in the tables.
+        Results, or their directories, one for each case in the tables.
     question
-        This question alone, such as "rq1".
+        Answer only this question, such as "rq1".
 
     Returns
     -------
@@ -57,7 +57,7 @@ def tables(*results: Results | str | Path, question: str | None = None) -> Table
     Raises
     ------
     InputError
-        If there is no such question, or no results hold what it asks for.
+        If there is no such question, or no results can answer it.
     """
     from safevar_sumo.analysis.research_questions.answer import answer
 
@@ -75,12 +75,12 @@ def figures(*results: Results | str | Path) -> Figures:
     Returns
     -------
     Figures
-        By name, such as "pareto-fronts"; with several results, with the case's name in front: "rain-pareto-fronts".
+        By name, such as "pareto-fronts"; with several results, the case's name comes first: "rain-pareto-fronts".
 
     Raises
     ------
     InputError
-        If none can be drawn.
+        If no figure can be drawn.
     """
     from safevar_sumo.analysis.research_questions.gallery import draw
 

@@ -1,4 +1,4 @@
-"""A study carried out, on this machine or on a cluster."""
+"""Run a study on this machine or on a cluster."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from safevar_sumo.analysis.subject import Results, load
-from safevar_sumo.api.simulation import assembled
+from safevar_sumo.api.simulation import load_and_assemble
 from safevar_sumo.campaign import Campaign, Observer, RunKey, algorithm_of, all_runs, read_by_algorithms, run_campaign
 from safevar_sumo.errors import InputError, SafevarError, one_of, warn
 from safevar_sumo.progress import CampaignProgress
@@ -26,7 +26,7 @@ from safevar_sumo.workers.identity import identity_of
 from safevar_sumo.workers.local import available_cores, local_pool
 
 ENGINES = {Engine.RECORDED: "recorded", Engine.LIBSUMO: "sumo"}
-"""Names of engines in commands and manifests."""
+"""Names of the engines in commands and manifests."""
 if TYPE_CHECKING:
     from safevar_sumo.analysis.evaluator import Progress
 
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = None, cluster: str | None = None,
         pool: Pool | None = None, progress: bool | Progress | Observer = False, only: Sequence[tuple[str, int]] | None = None,
         batch: int | None = None, engine: str = Engine.RECORDED, retry_failed: bool = False) -> Results:
-    """Search a study; called again with the same study and directory, it goes on where it was stopped.
+    """Search a study; a call with the same study and directory continues where an earlier one was stopped.
 
     Parameters
     ----------
     study
-        A study, or what `load_study` makes one of.
+        A study, or anything that `load_study` accepts.
     out
         Directory of the results, by default `results/NAME`.
     jobs
@@ -47,53 +47,53 @@ def run(study: StudyLike, out: str | Path | None = None, *, jobs: int | None = N
     cluster
         Compute on the workers of the Dask scheduler at this address instead.
     pool
-        Where to simulate, if not in worker processes of its own or on a cluster.
+        Pool that simulates, instead of worker processes of its own or a cluster.
     progress
-        True for a bar on the terminal; a function called with the study's name, how many evaluations are done, and how many there
-        are at the most; or an `Observer`.
+        True for a bar on the terminal; a function called with the study's name, the number of evaluations done, and their maximum
+        number; or an `Observer`.
     only
-        These runs alone, as (algorithm, number from 0); the results are whole once every run is finished.
+        Only these runs, as (algorithm, number from 0); the results are complete once every run is finished.
     batch
-        Settings per batch, at the most, gathered from several runs; never changes a result.
+        Maximum number of settings per batch, gathered from several runs; never changes a result.
     engine
-        "recorded": in a recorded scene where nobody reacts to the vehicle under test, else in SUMO; "sumo": in SUMO always. Never
-        changes a result.
+        "recorded": simulate in a recorded scene if no actor reacts to the vehicle under test, else in SUMO; "sumo": always in SUMO.
+        Never changes a result.
     retry_failed
-        Whether settings that could not be simulated before are tried again.
+        Whether to simulate again the settings that failed before (simulator-error).
 
     Raises
     ------
     InputError
-        If the study cannot be used, or the directory belongs to another one.
+        If the study cannot be used, or the directory belongs to another study.
     SafevarError
         If nothing can be computed, a file cannot be written, or another process works on one of the runs.
     """
-    chosen, system = prepared(study)
+    chosen, system = load_for_search(study)
     keys = all_runs(chosen) if only is None else [RunKey(*key) for key in only]
     directory = Path(out) if out is not None else Path("results") / chosen.name
-    where = nullcontext(pool) if pool is not None else open_pool(chosen, jobs, cluster)
-    with where as opened, _observed(progress, chosen, keys) as observer:
-        carried_out(chosen, system, keys, directory, opened, observer, batch, engine, retry_failed=retry_failed)
+    pool_context = nullcontext(pool) if pool is not None else open_pool(chosen, jobs, cluster)
+    with pool_context as workers, _observer(progress, chosen, keys) as observer:
+        carry_out_runs(chosen, system, keys, directory, workers, observer, batch, engine, retry_failed=retry_failed)
     return load(directory)
 
 
-def prepared(study: StudyLike, source: str = "") -> tuple[Study, System]:
-    """A study that can be searched, and what its simulations are made of; `source` is how errors call it.
+def load_for_search(study: StudyLike, source: str = "") -> tuple[Study, System]:
+    """Load a study that can be searched, and assemble its system; errors name it `source`.
 
     Raises
     ------
     InputError
         If one of its names or parameters cannot be used.
     """
-    chosen, system = assembled(study, source)
+    chosen, system = load_and_assemble(study, source)
     for name in chosen.search.labels:
         algorithm_of(name, chosen)
     return chosen, system
 
 
-def carried_out(study: Study, system: System, keys: list[RunKey], directory: Path, pool: Pool, observer: Observer,
+def carry_out_runs(study: Study, system: System, keys: list[RunKey], directory: Path, pool: Pool, observer: Observer,
                 batch: int | None, engine: str = Engine.RECORDED, *, retry_failed: bool = False) -> Campaign:
-    """Carry out runs of a study in a directory; with all of them finished, its solutions are written. See `run_campaign`.
+    """Carry out runs of a study in a directory; write its solutions once all runs are finished. See `run_campaign`.
 
     Raises
     ------
@@ -102,34 +102,34 @@ def carried_out(study: Study, system: System, keys: list[RunKey], directory: Pat
     """
     sources = {**sources_of(study, pool), **read_by_algorithms(study)}
     results = ResultsDirectory(directory, study, identity_of(study, system, sources), system.measuring.scoring)
-    chosen, reason = engine_for(system, engine)
-    results.manifest["engine"] = {"name": ENGINES[chosen], "reason": reason}
-    campaign = run_campaign(study, keys, results, pool, observer, batch or settings_per_batch(system, chosen), engine=chosen,
+    used, reason = engine_for(system, engine)
+    results.manifest["engine"] = {"name": ENGINES[used], "reason": reason}
+    campaign = run_campaign(study, keys, results, pool, observer, batch or settings_per_batch(system, used), engine=used,
                             retry_failed=retry_failed)
     if campaign.busy:
-        raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: the same again later finishes the study")
+        raise SafevarError(f"another process works on {', '.join(map(str, campaign.busy))}: run the same again later to finish the study")
     if keys == all_runs(study):
         results.finish(campaign.solutions)
     return campaign
 
 
-def engine_for(system: System, asked: str) -> tuple[Engine, str]:
-    """Who moves a system's vehicles, and why; raises InputError for an engine that there is not."""
-    if asked not in ENGINES.values():
-        raise InputError("--engine", repr(asked), one_of(ENGINES.values()))
-    if asked == ENGINES[Engine.LIBSUMO]:
+def engine_for(system: System, name: str) -> tuple[Engine, str]:
+    """The engine that moves a system's vehicles, and why; raises InputError for an unknown engine."""
+    if name not in ENGINES.values():
+        raise InputError("--engine", repr(name), one_of(ENGINES.values()))
+    if name == ENGINES[Engine.LIBSUMO]:
         return Engine.LIBSUMO, "asked for"
     reason = reason_for_sumo(system)
     return (Engine.LIBSUMO, reason) if reason else (Engine.RECORDED, "nobody reacts to the vehicle under test")
 
 
 def open_pool(study: Study, jobs: int | None = None, cluster: str | None = None) -> AbstractContextManager[Pool]:
-    """Where batches of a study are computed: worker processes, or the workers of a cluster."""
+    """Open the pool that computes a study's batches: worker processes, or the workers of a cluster."""
     limit = study.search.time_limit
     return cluster_pool(cluster, limit) if cluster is not None else local_pool(jobs or available_cores(), limit)
 
 
-def _observed(progress: bool | Progress | Observer, study: Study, keys: list[RunKey]) -> AbstractContextManager[Observer]:
+def _observer(progress: bool | Progress | Observer, study: Study, keys: list[RunKey]) -> AbstractContextManager[Observer]:
     """The observer that `progress` stands for."""
     if progress is True:
         return CampaignProgress(Console(stderr=True), study, keys, quiet=False)
@@ -153,7 +153,7 @@ class NullObserver:
 
 
 class CallingObserver(NullObserver):
-    """Calls a function with the study's name, how many evaluations are done, and how many there are at the most."""
+    """Calls a function with the study's name, the number of evaluations done, and their maximum number."""
 
     def __init__(self, progress: Progress, study: Study, keys: list[RunKey]) -> None:
         self._progress, self._name = progress, study.name

@@ -1,4 +1,4 @@
-"""Settings simulated: one with its trace, step by step, beside the original vehicle, or many at once."""
+"""Simulate one setting beside the original vehicle, with a trace step by step, or many settings at once."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from safevar_sumo.workers.evaluation import Pool
 
 
-SEEN = {"speed": "seen speed [m/s]", "gap": "seen gap [m]", "closing_speed": "seen closing speed [m/s]", "lateral": "seen lateral [m]",
-        "lateral_speed": "seen lateral speed [m/s]"}
+SEEN_HEADS = {"speed": "seen speed [m/s]", "gap": "seen gap [m]", "closing_speed": "seen closing speed [m/s]",
+              "lateral": "seen lateral [m]", "lateral_speed": "seen lateral speed [m/s]"}
 
 
 class RecordingAds:
-    """An ADS whose observations of its only vehicle are kept."""
+    """Wraps an ADS and records its observations of its only vehicle."""
 
     def __init__(self, ads: Ads) -> None:
         self._ads = ads
@@ -56,22 +56,23 @@ class RecordingAds:
 def trace_frame(runs: SimulationRuns, recording: RecordingAds) -> pd.DataFrame:
     """One row per step of the only vehicle while its simulation counts.
 
-    Where the obstacle was (`gap` along the vehicle's path, `lateral` from the middle of its lane) and what the ADS saw of
-    it; `ttc` is empty while nothing is closing, as a standing vehicle is not, a gap while there is no obstacle ahead.
+    Columns hold where the obstacle was (`gap` along the vehicle's path, `lateral` from the middle of its lane) and where the ADS saw
+    it. `ttc` is empty while no gap closes or the vehicle stands, `gap` while there is no obstacle ahead.
     """
     import pandas as pd  # takes longer to load than the simulation
 
     trace = runs.trace
-    counting = trace.active[:, 0]
-    closing = np.where(trace.speed > STANDSTILL, time_to_collision(runs), np.inf)
+    active = trace.active[:, 0]
+    ttc = np.where(trace.speed > STANDSTILL, time_to_collision(runs), np.inf)
     columns = {
         "time [s]": trace.time, "position [m]": trace.position[:, 0], "speed [m/s]": trace.speed[:, 0],
         "acceleration [m/s^2]": np.diff(trace.speed[:, 0], prepend=trace.speed[:1, 0]) / trace.step, "gap [m]": trace.gap[:, 0],
-        "ttc [s]": closing[:, 0], "throttle [-]": trace.throttle[:, 0], "brake [-]": trace.brake[:, 0],
+        "ttc [s]": ttc[:, 0], "throttle [-]": trace.throttle[:, 0], "brake [-]": trace.brake[:, 0],
         "gear [-]": trace.gear[:, 0], "lateral [m]": trace.lateral[:, 0], "lateral speed [m/s]": trace.lateral_speed[:, 0]}
-    frame = pd.DataFrame({name: values[counting] for name, values in columns.items()})
-    seen = pd.DataFrame([{"time [s]": round(float(one.time), TIME_DECIMALS),
-                          **{head: float(getattr(one, name)[0]) for name, head in SEEN.items()}} for one in recording.observations])
+    frame = pd.DataFrame({name: values[active] for name, values in columns.items()})
+    seen = pd.DataFrame([{"time [s]": round(float(observation.time), TIME_DECIMALS),
+                          **{head: float(getattr(observation, name)[0]) for name, head in SEEN_HEADS.items()}}
+                         for observation in recording.observations])
     return frame.merge(seen, how="left", on="time [s]").replace([np.inf, -np.inf], np.nan)
 
 
@@ -82,19 +83,19 @@ class Simulation:
     Attributes
     ----------
     study
-        The study that it was simulated in.
+        The study that the setting was simulated in.
     setting
-        What was simulated: every characteristic in its table unit, after the filter.
+        The simulated values: every characteristic in its table unit, after the filter.
     put_back
-        Values asked for that the filter put back to the original, by name.
+        Requested values that the filter put back to the original, by name.
     evaluation
-        Its outcome, metrics and objectives as arrays of one row.
+        Outcome, metrics and objectives as arrays of one row.
     drives
-        The simulation as it went, of one vehicle.
+        The trajectory and outcome, of one vehicle.
     scoring
-        What was measured, and what a search would minimise.
+        The metrics, and the objectives that a search would minimise.
     original
-        The original vehicle in the same study; of the original vehicle, itself.
+        The simulation of the original vehicle in the same study; the original's own is itself.
     """
 
     study: Study
@@ -103,7 +104,7 @@ class Simulation:
     evaluation: Evaluations
     drives: SimulationRuns
     scoring: Scoring
-    _seen: RecordingAds
+    _recording: RecordingAds
     _original: Simulation | None = None
 
     @property
@@ -112,12 +113,12 @@ class Simulation:
 
     @property
     def outcome(self) -> Outcome:
-        """How it ended."""
+        """How the simulation ended."""
         return Outcome(str(self.evaluation.outcome[0]))
 
     @property
     def collision_speed(self) -> float:
-        """Speed at which it collided [m/s]; NaN without a collision."""
+        """Speed of the vehicle at the collision [m/s]; NaN without a collision."""
         return float(self.evaluation.collision_speed[0])
 
     @property
@@ -141,11 +142,11 @@ class Simulation:
     @cached_property
     def trace(self) -> pd.DataFrame:
         """One row per step, units in the columns' names; NaN where a value does not exist."""
-        return trace_frame(self.drives, self._seen)
+        return trace_frame(self.drives, self._recording)
 
     @property
     def verdict(self) -> str:
-        """How it ended, in words."""
+        """How the simulation ended, in words."""
         if self.outcome is Outcome.COLLISION:
             return f"collides at {self.collision_speed:.2f} m/s"
         least = self.metrics[SAFETY_DEGREE]
@@ -167,13 +168,13 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
     Parameters
     ----------
     study
-        A study, or what `load_study` makes one of.
+        A study, or anything that `load_study` accepts.
     changes
-        Values by characteristic, in their table units; all others are the original's.
+        Values by characteristic, in their table units; all other characteristics keep the original's value.
     filtered
         Put changes that are smaller than their thresholds back to the original, as every search does.
     beyond
-        Take values outside the domains, and settings that violate the study's constraints, too.
+        Also accept values outside the domains, and settings that violate the study's constraints.
     gui
         Show the setting in sumo-gui.
 
@@ -184,46 +185,46 @@ def simulate(study: StudyLike, changes: Mapping[str, float] | None = None, *, fi
     SimulationError
         If SUMO fails.
     """
-    chosen, system = assembled(study)
-    return beside_the_original(chosen, system, changed(system, changes, filtered, beyond), filtered=filtered, gui=gui)
+    chosen, system = load_and_assemble(study)
+    return simulate_with_original(chosen, system, changed_setting(system, changes, filtered, beyond), filtered=filtered, gui=gui)
 
 
-def changed(system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool) -> FloatArray:
-    """The setting with these changes, shape (n,), not filtered; raises InputError for one that is illegal or, filtered, infeasible."""
+def changed_setting(system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool) -> FloatArray:
+    """The setting with these changes, shape (n,), not filtered; raises InputError if it is illegal or, once filtered, infeasible."""
     setting = system.characteristics.setting(changes or {}, "changes", beyond=beyond)
     if not beyond:
         system.check_feasible(setting[np.newaxis], "changes", filtered=filtered)
     return setting
 
 
-def beside_the_original(chosen: Study, system: System, asked: FloatArray, *, filtered: bool = True, gui: bool = False) -> Simulation:
-    """Simulate a setting that is asked for, shape (n,), and the original vehicle."""
+def simulate_with_original(study: Study, system: System, requested: FloatArray, *, filtered: bool = True, gui: bool = False) -> Simulation:
+    """Simulate a requested setting, shape (n,), and the original vehicle."""
     characteristics = system.characteristics
-    setting = characteristics.filter(asked) if filtered else asked
-    original = _simulated(chosen, system, characteristics.original, characteristics.original)
+    setting = characteristics.filter(requested) if filtered else requested
+    original = _simulate_one(study, system, characteristics.original, characteristics.original)
     if np.array_equal(setting, characteristics.original) and not gui:
-        return replace(original, put_back=_put_back(system, asked, setting))
-    return replace(_simulated(chosen, system, asked, setting, Engine.GUI if gui else Engine.LIBSUMO), _original=original)
+        return replace(original, put_back=_put_back(system, requested, setting))
+    return replace(_simulate_one(study, system, requested, setting, Engine.GUI if gui else Engine.LIBSUMO), _original=original)
 
 
-def assembled(study: StudyLike, source: str = "") -> tuple[Study, System]:
-    """A study, and what its simulations are made of; errors call it `source`, or as it was given."""
+def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System]:
+    """Load a study and assemble its system; errors name it `source`, by default as the caller named it."""
     chosen = load_study(study)
     return chosen, assemble(chosen, source or (str(study) if isinstance(study, str | Path) else ""))
 
 
-def _simulated(study: Study, system: System, asked: FloatArray, setting: FloatArray, engine: Engine = Engine.LIBSUMO) -> Simulation:
-    seen = RecordingAds(system.ads)
+def _simulate_one(study: Study, system: System, requested: FloatArray, setting: FloatArray, engine: Engine = Engine.LIBSUMO) -> Simulation:
+    recording = RecordingAds(system.ads)
     rows = setting[np.newaxis]
-    drives = drive(replace(at_worst(system, rows), ads=seen), rows, engine)  # in SUMO itself
+    drives = drive(replace(at_worst(system, rows), ads=recording), rows, engine)  # in SUMO itself
     return Simulation(
         study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
-        put_back=_put_back(system, asked, setting), evaluation=score(system, rows, drives), drives=drives,
-        scoring=system.measuring.scoring, _seen=seen)
+        put_back=_put_back(system, requested, setting), evaluation=score(system, rows, drives), drives=drives,
+        scoring=system.measuring.scoring, _recording=recording)
 
 
-def _put_back(system: System, asked: FloatArray, setting: FloatArray) -> dict[str, float]:
-    return {name: float(value) for name, value, used in zip(system.characteristics.names, asked, setting, strict=True) if value != used}
+def _put_back(system: System, requested: FloatArray, setting: FloatArray) -> dict[str, float]:
+    return {name: float(value) for name, value, used in zip(system.characteristics.names, requested, setting, strict=True) if value != used}
 
 
 LEGAL = ("a list of mappings such as [{'mass': 2500}], a pandas.DataFrame with a column for each characteristic that is changed, "
@@ -237,29 +238,29 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
     Parameters
     ----------
     study
-        A study, or what `load_study` makes one of.
+        A study, or anything that `load_study` accepts.
     settings
-        A mapping for each setting with the characteristics that are changed, or a frame with a column for each of them: a value
-        that is missing (no key, None or NaN) is the original's. Or an array of shape (M, n), n characteristics in the study's
-        order, without missing values. In the characteristics' table units.
+        A mapping for each setting with the changed characteristics, or a frame with a column for each of them; a missing value
+        (no key, None or NaN) means the original's. Or an array of shape (M, n), n characteristics in the study's order, without
+        missing values. All in the characteristics' table units.
     filtered
         Put changes that are smaller than their thresholds back to the original, as every search does.
     beyond
-        Take values outside the domains, and settings that violate the study's constraints, too.
+        Also accept values outside the domains, and settings that violate the study's constraints.
     pool
-        Where to simulate, if not in worker processes of its own.
+        Pool that simulates, instead of worker processes of its own.
     jobs
         Worker processes, by default one for each core.
     progress
-        True for a bar on the terminal, or a function called with the stage, how many settings are done, and how many there are.
+        True for a bar on the terminal, or a function called with the stage, the number of settings done, and their total.
 
     Returns
     -------
     pandas.DataFrame
-        One row per setting, in their order and with a frame's index: the characteristics as simulated, f_safe [m or -m/s],
+        One row per setting, in the order of `settings` and with the index of a frame: the characteristics as simulated, f_safe [m or -m/s],
         f_diff [fraction], f_num_diff, the metrics in their units (NaN where undefined), collision_speed [m/s], outcome.
-        A setting that cannot be simulated has the outcome simulator-error, one that leaves a test's speed before the system acts
-        invalid-test: neither is a failure or a success, and neither has metrics.
+        A setting that cannot be simulated has the outcome simulator-error, a setting that leaves a test's speed before the driving
+        system acts invalid-test: both are neither failure nor success, and have no metrics.
 
     Raises
     ------
@@ -268,23 +269,23 @@ def evaluate(study: StudyLike, settings: pd.DataFrame | Sequence[Mapping[str, fl
     SafevarError
         If nothing can be simulated.
     """
-    chosen, system = assembled(study)
+    chosen, system = load_and_assemble(study)
     characteristics = system.characteristics
-    asked, index = _table(settings, characteristics)
-    _check(asked, characteristics, beyond)
+    requested, index = _table(settings, characteristics)
+    _check(requested, characteristics, beyond)
     if not beyond:
-        system.check_feasible(asked, "settings", filtered=filtered)
-    rows = characteristics.filter(asked) if filtered else asked
-    with shown(progress) as tell:
-        evaluations = evaluated(chosen, rows, pool, jobs, tell)
+        system.check_feasible(requested, "settings", filtered=filtered)
+    rows = characteristics.filter(requested) if filtered else requested
+    with shown(progress) as report:
+        evaluations = evaluate_settings(chosen, rows, pool, jobs, report)
     frame = evaluations_frame(characteristics.names, [(("", 0), evaluations)]).drop(columns=["algorithm", "run"])
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
     return frame.set_axis(index)
 
 
-def evaluated(study: Study, rows: FloatArray, pool: Pool | None = None, jobs: int | None = None,
-              progress: Progress | None = None) -> Evaluations:
-    """Simulate settings, shape (M, n), in worker processes, whether they satisfy the study's constraints or not."""
+def evaluate_settings(study: Study, rows: FloatArray, pool: Pool | None = None, jobs: int | None = None,
+                      progress: Progress | None = None) -> Evaluations:
+    """Simulate settings, shape (M, n), in worker processes, including settings that violate the study's constraints."""
     from safevar_sumo.analysis.evaluator import open_evaluator, silent
 
     with open_evaluator(study, pool, jobs, progress or silent) as evaluator:
@@ -303,11 +304,11 @@ def _table(settings: Any, characteristics: CharacteristicSet) -> tuple[FloatArra
             if name not in names:
                 raise unknown("settings", f"column {name!r} is no characteristic", name, names)
         if settings.columns.has_duplicates:
-            raise InputError("settings", "a column is there twice", "each characteristic once")
+            raise InputError("settings", "a column appears twice", "each characteristic once")
         table = pd.DataFrame(dict(zip(names, characteristics.original, strict=True)), index=settings.index)
         for name in settings.columns:
-            given = settings[name].astype(object)
-            table[name] = given.where(given.notna(), table[name])
+            values = settings[name].astype(object)
+            table[name] = values.where(values.notna(), table[name])
         return _numbers(table), settings.index
     if isinstance(settings, Mapping):
         raise InputError("settings", f"is a {type(settings).__name__}", LEGAL)
@@ -324,7 +325,7 @@ def _numbers(settings: Any) -> FloatArray:
         raise InputError("settings", str(error), LEGAL) from None
 
 
-def _check(asked: FloatArray, characteristics: CharacteristicSet, beyond: bool) -> None:
-    legal = np.column_stack([member.is_legal(values, beyond=beyond) for member, values in zip(characteristics, asked.T, strict=True)])
+def _check(requested: FloatArray, characteristics: CharacteristicSet, beyond: bool) -> None:
+    legal = np.column_stack([member.is_legal(values, beyond=beyond) for member, values in zip(characteristics, requested.T, strict=True)])
     for row, column in np.argwhere(~legal)[:1]:
-        characteristics.members[column].check(float(asked[row, column]), f"settings, row {row}", beyond=beyond)
+        characteristics.members[column].check(float(requested[row, column]), f"settings, row {row}", beyond=beyond)

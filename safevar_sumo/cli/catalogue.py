@@ -1,4 +1,4 @@
-"""The command that lists what there is."""
+"""The command list: studies, models, weathers, algorithms, metrics and objectives."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def list_command(as_json: bool) -> None:
 
 def _catalogue(studies: list[Study]) -> dict[str, Any]:
     vehicles: dict[str, list[dict[str, Any]]] = {}
-    for one in studies:
-        vehicles.setdefault(one.vehicle.model, [
+    for study in studies:
+        vehicles.setdefault(study.vehicle.model, [
             {"name": member.name, "unit": member.unit, "original": member.original, "lower": member.lower, "upper": member.upper,
              "threshold": member.threshold, "meaning": member.meaning, "counterpart": member.counterpart}
-            for member in CharacteristicSet.of(one.vehicle.characteristics)])
+            for member in CharacteristicSet.of(study.vehicle.characteristics)])
     return {
-        "studies": [{"name": one.name, "title": one.title, "vehicle": one.vehicle.model, "ads": one.ads.model,
-                     "scenario": one.scenario.model, "weather": _weather_name(one)} for one in studies],
+        "studies": [{"name": study.name, "title": study.title, "vehicle": study.vehicle.model, "ads": study.ads.model,
+                     "scenario": study.scenario.model, "weather": _weather_name(study)} for study in studies],
         "vehicles": [{"name": name, "characteristics": vehicles.get(name, [])} for name in VEHICLES],
         "ads": [_described(name, cls) for name, cls in ADS.items()],
         "scenarios": [_described(name, cls) for name, cls in SCENARIOS.items()],
@@ -50,7 +50,7 @@ def _catalogue(studies: list[Study]) -> dict[str, Any]:
         "objectives": [
             *({"name": name, "description": f"The metric {metric.name}, as unsafe as possible."} for name, metric in OBJECTIVES.items()),
             *({"name": change.name, "description": f"{change.title.capitalize()} [{change.unit}]."} for change in CHANGES.values()),
-            {"name": RATING_POINTS.name, "description": f"Of studies that a protocol rates: {RATING_POINTS.description}"}],
+            {"name": RATING_POINTS.name, "description": f"Only in studies that a protocol rates: {RATING_POINTS.description}"}],
     }
 
 
@@ -58,18 +58,18 @@ def _weather_name(study: Study) -> str:
     return study.weather if isinstance(study.weather, str) else study.weather.name
 
 
-def _described(name: str, what: Callable[..., Any]) -> dict[str, str]:
-    """Its name, and the first sentence of its docstring."""
-    return {"name": name, "description": (what.__doc__ or "").strip().partition("\n")[0]}
+def _described(name: str, model: Callable[..., Any]) -> dict[str, str]:
+    """The name of a model, and the first line of its docstring."""
+    return {"name": name, "description": (model.__doc__ or "").strip().partition("\n")[0]}
 
 
 def _print_catalogue(console: Console, studies: list[Study]) -> None:
     catalogue = _catalogue(studies)
-    studied = [(name, title, ", ".join(parts)) for name, title, *parts in map(dict.values, catalogue["studies"])]
-    print_names(console, "Studies", studied, ("name", "title", "vehicle, ADS, scenario, weather"))
+    study_rows = [(name, title, ", ".join(parts)) for name, title, *parts in map(dict.values, catalogue["studies"])]
+    print_names(console, "Studies", study_rows, ("name", "title", "vehicle, ADS, scenario, weather"))
     members: dict[str, CharacteristicSet] = {}
-    for one in studies:
-        members.setdefault(one.vehicle.model, CharacteristicSet.of(one.vehicle.characteristics))
+    for study in studies:
+        members.setdefault(study.vehicle.model, CharacteristicSet.of(study.vehicle.characteristics))
     for vehicle in catalogue["vehicles"]:
         rows = [(row["name"], row["unit"], *(f"{row[key]:g}" for key in ("original", "lower", "upper", "threshold")))
                 for row in vehicle["characteristics"]]
@@ -82,4 +82,4 @@ def _print_catalogue(console: Console, studies: list[Study]) -> None:
     print_names(console, "Weathers", weathers, ("name", "friction", "sight", "delay, s", "light", "road"))
     for title, key in (("ADSs", "ads"), ("Scenarios", "scenarios"), ("Algorithms", "algorithms"), ("Metrics", "metrics"),
                        ("Objectives, beside all metrics", "objectives")):
-        print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "what"))
+        print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "description"))

@@ -1,4 +1,4 @@
-"""The command that checks an author's own code."""
+"""The command check: checks the user's own code."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from safevar_sumo.terminal import print_text
 
 @commands.command(name="check")
 @click.argument("subject", metavar="SUBJECT")
-@click.option("--study", metavar="STUDY", help="Try it in this study.  [default: a study file beside it that names it, else a shipped one]")
+@click.option("--study", metavar="STUDY", help="Study to try SUBJECT in.  [default: a study beside it that names it, else a shipped study]")
 @json_option
 def check_command(subject: str, study: str | None, as_json: bool) -> int:
     """Check whether your driving system, vehicle, scenario, metric, objective, algorithm or TraCI controller works with this package.
 
-    SUBJECT is package.module:Name, the name of something that is shipped, or a study's name or path, of which everything is checked.
-    The exit code is 0 if it passed, 1 with findings, 2 if it cannot be loaded.
+    SUBJECT is package.module:Name, the name of a shipped model, or the name or path of a study to check everything that it names.
+    The exit code is 0 if SUBJECT passes, 1 with findings, 2 if it cannot be loaded.
     """
     from safevar_sumo.conformance import check
 

@@ -1,4 +1,4 @@
-"""Checks of files that a command writes, changes given with --set, and what the shell completes."""
+"""Checks of output files, values of --set, and shell completion."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ PICTURES = (".png", ".pdf", ".svg")
 
 
 def check_output(path: Path, flag: str, endings: tuple[str, ...]) -> None:
-    """Refuse a file of an unknown kind or one that cannot be written.
+    """Refuse an output file that has an unknown ending or cannot be written.
 
     Raises
     ------
     InputError
-        Naming the flag and what is legal.
+        Names the flag and the legal endings.
     """
     if path.suffix.lower() not in endings:
         raise InputError(flag, str(path), f"a file that ends in {', '.join(endings)}")
@@ -34,26 +34,26 @@ def check_output(path: Path, flag: str, endings: tuple[str, ...]) -> None:
 
 
 def refuse_inputs(path: Path, flag: str, *inputs: str | Path) -> None:
-    """Refuse to write over what a command reads: a file, or a file of a results directory.
+    """Refuse to overwrite an input of the command: a file, or a file of a results directory.
 
     Raises
     ------
     InputError
-        Naming the flag and the file.
+        Names the flag and the file.
     """
     if not path.exists():
         return
-    for one in map(Path, inputs):
-        read = [one, *one.glob("*.*"), *one.glob("runs/*")] if one.is_dir() else [one]
-        if any(place.exists() and path.samefile(place) for place in read if place.suffix not in PICTURES):
-            raise InputError(flag, f"{path} is what the command reads", "another file")
+    for source in map(Path, inputs):
+        files = [source, *source.glob("*.*"), *source.glob("runs/*")] if source.is_dir() else [source]
+        if any(file.exists() and path.samefile(file) for file in files if file.suffix not in PICTURES):
+            raise InputError(flag, f"{path} is an input of the command", "another file")
 
 
 class Within(click.FloatRange):
     """A range of numbers that refuses NaN."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The number, if it is one and within the range."""
+        """Return the number if it is within the range."""
         number = super().convert(value, param, ctx)
         if math.isnan(number):
             self.fail(f"{value} is not in the range {self._describe_range()}.", param, ctx)
@@ -64,17 +64,17 @@ NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 SIGNED = re.compile(r"[+-](?:\d+\.?\d*|\.\d+)")
 SHARE = re.compile(rf"({SIGNED.pattern})%")
 SWEEP = re.compile(rf"({NUMBER})\.\.({NUMBER})(?::(\d{{1,6}}))?")
-SWEPT = 11
-"""Values of a sweep that does not say how many."""
-MOST = 10_000
-"""Settings of all sweeps together."""
+DEFAULT_SWEEP_LENGTH = 11
+"""Number of values of a sweep that gives none."""
+MAX_SETTINGS = 10_000
+"""Maximum number of settings of all sweeps together."""
 ONE_VALUE = "one value for each: NAME=VALUE in the characteristic's unit, or NAME=+10% of the original"
 LEGAL = "NAME=VALUE in the characteristic's unit, NAME=+10% of the original, or NAME=FROM..TO, NAME=FROM..TO:NUMBER"
 
 
 def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, beyond: bool, *, single: bool = False
                  ) -> dict[str, list[float]]:
-    """The values that each named characteristic is to take, one after the other; `single`: one for each, of a command without --beyond.
+    """The values of each named characteristic; `single`: one value each, for a command without --beyond.
 
     Raises
     ------
@@ -98,13 +98,13 @@ def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, b
         for value in values_by_name[name]:
             share = f", or {name}={text}% of the original" if SIGNED.fullmatch(text) else ""
             member.check(value, "--set", beyond=beyond, otherwise=share, switch="" if single else "--beyond")
-    if np.prod([len(values) for values in values_by_name.values()], dtype=float) > MOST:
-        raise InputError("--set", f"{' '.join(changes)}: more than {MOST} settings", "shorter sweeps, FROM..TO:NUMBER")
+    if np.prod([len(values) for values in values_by_name.values()], dtype=float) > MAX_SETTINGS:
+        raise InputError("--set", f"{' '.join(changes)}: more than {MAX_SETTINGS} settings", "shorter sweeps, FROM..TO:NUMBER")
     return values_by_name
 
 
 def settings_of(changes: dict[str, list[float]], base: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
-    """Every combination of the values, over a setting of shape (n,); shape (M, n)."""
+    """`base`, shape (n,), with every combination of the values; shape (M, n)."""
     columns = [characteristics.names.index(name) for name in changes]
     rows = []
     for values in product(*changes.values()):
@@ -118,7 +118,8 @@ def _values(change: str, text: str, original: float, legal: str) -> list[float]:
     if share := SHARE.fullmatch(text):
         return [original + abs(original) * float(share[1]) / 100]
     if sweep := SWEEP.fullmatch(text):
-        return np.linspace(float(sweep[1]), float(sweep[2]), max(1, int(sweep[3] or SWEPT))).tolist()  # type: ignore[no-any-return]
+        number = max(1, int(sweep[3] or DEFAULT_SWEEP_LENGTH))
+        return np.linspace(float(sweep[1]), float(sweep[2]), number).tolist()  # type: ignore[no-any-return]
     try:
         return [float(text)]
     except ValueError:
@@ -132,8 +133,8 @@ def complete_study(ctx: click.Context, param: click.Parameter, incomplete: str) 
 
 
 def complete_changes(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """`NAME=` for each characteristic of the study that is named before, with its domain as help."""
-    study = str(ctx.params.get("study") or next(iter(ctx.args), ""))  # an option without its value yet keeps arguments unparsed
+    """`NAME=` for each characteristic of the study named earlier in the command line, with its domain as help."""
+    study = str(ctx.params.get("study") or next(iter(ctx.args), ""))  # click parses no argument after an option that still lacks its value
     if not study or Path(study).is_dir():
         return []
     try:

@@ -31,7 +31,7 @@ COMMANDS = {
     "opinion": ("questions", "Have another vehicle model confirm or contradict the causes of failures."),
     "tolerance": ("questions", "Find how far each characteristic may go: alone, in pairs, and all together."),
     "risk": ("questions", "Estimate the probability of an unsafe outcome, and which characteristics decide it."),
-    "rules": ("questions", "Find rules that describe where it is unsafe, in physical units."),
+    "rules": ("questions", "Find rules, in physical units, that describe the unsafe settings."),
     "rating": ("rating", "Rate a vehicle and a worn variant of it as Euro NCAP does: points, colours, robustness layers."),
     "tables": ("report", "Answer the research questions as tables."),
     "figures": ("report", "Draw the figures of results."),
@@ -41,30 +41,30 @@ COMMANDS = {
     "replicate": ("reference", "Compare whole studies with published ones: tables, and which conclusions hold."),
     "calibrate": ("reference", "Fit a study's free parameters to reference data."),
 }
-"""Every command in the order of the help, with its module in this folder and its sentence in the help."""
+"""Commands in the order of the help, each with its module in this folder and its sentence in the help."""
 
 
 class OneOfEach(click.Command):
-    """A command that refuses options of which the last alone would count: one that is given twice, two of one choice."""
+    """A command that refuses an option given twice, and two options that exclude each other, instead of using the last."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         if not ctx.resilient_parsing:
             values, _, order = self.make_parser(ctx).parse_args(list(args))
             flags: dict[str, str] = {}
-            for one in order:
-                if not isinstance(one, click.Option) or one.multiple or one.name is None:
+            for option in order:
+                if not isinstance(option, click.Option) or option.multiple or option.name is None:
                     continue
-                flag, other = one.opts[-1], flags.get(one.name)
-                if other not in (None, flag):
-                    raise InputError(flag, f"{other} is given too", "one of them")
-                if other == flag and not one.is_flag:
-                    raise InputError(flag, f"is given twice, the last time as {values[one.name]!r}", "one value")
-                flags[one.name] = flag
+                flag, earlier = option.opts[-1], flags.get(option.name)
+                if earlier not in (None, flag):
+                    raise InputError(flag, f"{earlier} is given too", "one of them")
+                if earlier == flag and not option.is_flag:
+                    raise InputError(flag, f"is given twice, the last time as {values[option.name]!r}", "one value")
+                flags[option.name] = flag
         return super().parse_args(ctx, args)
 
 
-class OnDemand(click.Group):
-    """Loads the module of a command when the command is called: modules of other commands take long to load."""
+class LazyCommands(click.Group):
+    """Loads a command's module only when the command is called, for the other modules take long to load."""
 
     command_class = OneOfEach
 
@@ -73,12 +73,12 @@ class OnDemand(click.Group):
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         if name in COMMANDS:
-            with _interrupted_at_once():
+            with _exit_on_interrupt():
                 importlib.import_module(f"safevar_sumo.cli.{COMMANDS[name][0]}")
         return super().get_command(ctx, name)
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
-        """Name the nearest command if there is none of this name."""
+        """Suggest the nearest command if the name is unknown."""
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
             ctx.fail(f"there is no command {args[0]!r}{did_you_mean(args[0], COMMANDS)}")
         return super().resolve_command(ctx, args)
@@ -89,7 +89,7 @@ class OnDemand(click.Group):
             return super().invoke(ctx)
         except InputError as error:
             command = super().get_command(ctx, str(ctx.invoked_subcommand))
-            flags = {one.name: one.opts[-1] for one in command.params if isinstance(one, click.Option)} if command else {}
+            flags = {option.name: option.opts[-1] for option in command.params if isinstance(option, click.Option)} if command else {}
             error.source = flags.get(str(error.source), error.source)
             raise
 
@@ -98,10 +98,10 @@ class OnDemand(click.Group):
             formatter.write_dl([(name, sentence) for name, (_, sentence) in COMMANDS.items()])
 
 
-@click.group(cls=OnDemand, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=LazyCommands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="safevar_sumo")
 def commands() -> None:
-    """Search the smallest variations of a vehicle that make its automated driving system unsafe, on SUMO.
+    """Search for the smallest variations of a vehicle that make its automated driving system unsafe, on SUMO.
 
     STUDY is the name of a study (see: list) or the path of a study file.
     """
@@ -109,8 +109,8 @@ def commands() -> None:
 
 def main() -> None:
     """Run the program; its exit code is 0, 1 (failed), 2 (bad input) or 130 (interrupted)."""
-    _have_standard_streams()
-    warnings.showwarning = _tell
+    _ensure_standard_streams()
+    warnings.showwarning = _show_warning
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -135,14 +135,14 @@ def main() -> None:
     _leave(code if isinstance(code, int) else 0)
 
 
-def _tell(message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None,
-          line: str | None = None) -> None:
+def _show_warning(message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None,
+                  line: str | None = None) -> None:
     """Show a warning without the place in the code that it comes from."""
     click.echo(f"warning: {message}", err=True)
 
 
 @contextmanager
-def _interrupted_at_once() -> Iterator[None]:
+def _exit_on_interrupt() -> Iterator[None]:
     """End the program on Ctrl-C while modules load: compiled modules would swallow the exception."""
     def leave(*_: object) -> None:
         os.write(2, b"safevar-sumo: interrupted\n")
@@ -157,7 +157,7 @@ def _interrupted_at_once() -> Iterator[None]:
             signal.signal(signal.SIGINT, signal.default_int_handler if before is None else before)
 
 
-def _have_standard_streams() -> None:
+def _ensure_standard_streams() -> None:
     """Open standard streams that the caller has closed, so that no file gets their numbers."""
     while (handle := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(handle, True)
@@ -172,24 +172,24 @@ def _drop_output() -> None:
 
 
 def _fail(message: str, code: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is over: another Ctrl-C changes neither code nor message
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # another Ctrl-C must change neither exit code nor message
     click.echo(f"safevar-sumo: {message}", err=True)
     _leave(code)
 
 
 def _leave(code: int) -> NoReturn:
     """End the program even if user code has left threads running, for which the interpreter would wait."""
-    left = [one.name for one in threading.enumerate()
-            if one is not threading.current_thread() and not one.daemon and one not in _threads_queues]
-    if left:
-        click.echo(f"note: still running and ended now: {', '.join(left)}", err=True)
+    running = [thread.name for thread in threading.enumerate()
+               if thread is not threading.current_thread() and not thread.daemon and thread not in _threads_queues]
+    if running:
+        click.echo(f"note: threads still running, ended now: {', '.join(running)}", err=True)
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
 
 
-def tell_remarks(study: Study, others: Iterable[str] = ()) -> None:
-    """Print what a study names but does not use, on the standard error."""
+def print_remarks(study: Study, others: Iterable[str] = ()) -> None:
+    """Print the remarks on a study, such as a key that has no effect, to standard error."""
     for remark in (*study.origin.remarks, *others):
         click.echo(f"note: {remark}", err=True)

@@ -34,7 +34,7 @@ from safevar_sumo.terminal import stages
 
 
 def question(options: type[Options], metavar: str, *extra: Callable[[Command], Command]) -> Callable[[Command], click.Command]:
-    """A command with the flags of a question's options, those that all questions share, and some of its own."""
+    """Decorator for the command of a question: flags of its options, flags that all questions share, and `extra` decorators."""
     def add(command: Command) -> click.Command:
         decorators: list[Callable[[Command], Command]] = [
             click.argument("place", metavar=metavar), options_of(options), point_option, now_option, jobs_option, json_option, *extra]
@@ -46,7 +46,7 @@ def question(options: type[Options], metavar: str, *extra: Callable[[Command], C
 
 
 def _answer(compute: Callable[..., Any], subject: Any, options: Options, jobs: int | None) -> Any:
-    """The result, computed with a bar on the terminal."""
+    """Compute the result while a bar on the terminal shows the progress."""
     with stages(Console(stderr=True)) as progress:
         return compute(subject, options, jobs=jobs, progress=progress)
 
@@ -59,10 +59,10 @@ def _plot_option(help_text: str) -> Callable[[Command], Command]:
     return click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help=help_text)
 
 
-@question(ExplainOptions, "DIR|STUDY", click.option("--full", is_flag=True, help="Print every explanation in full, not the answer alone."),
-          click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write causes.json, causes.csv and a picture there."))
-def explain(place: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **given: Any) -> None:
-    """Explain failures of results in DIR, or all over the domain of STUDY: which changes did it, how little is enough, why."""
+@question(ExplainOptions, "DIR|STUDY", click.option("--full", is_flag=True, help="Print every explanation in full, not only the answer."),
+          click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write causes.json, causes.csv and a figure there."))
+def explain(place: str, full: bool, point: str | None, jobs: int | None, as_json: bool, out: Path | None, **values: Any) -> None:
+    """Explain failures of results in DIR, or across the domain of STUDY: which changes cause them, how small a change is enough, why."""
     from safevar_sumo.analysis.explain.compute import explain_failures
     from safevar_sumo.analysis.explain.render import necessity_figure, print_explained
     from safevar_sumo.analysis.figures import save
@@ -70,7 +70,7 @@ def explain(place: str, full: bool, point: str | None, jobs: int | None, as_json
     source = results_or_study(place, point)
     if out is not None:
         make_directory(out)
-    result = _answer(explain_failures, source, ExplainOptions(**given), jobs)
+    result = _answer(explain_failures, source, ExplainOptions(**values), jobs)
     if as_json:
         click.echo(_json(result))
     else:
@@ -83,12 +83,12 @@ def explain(place: str, full: bool, point: str | None, jobs: int | None, as_json
 
 
 @question(OpinionOptions, "DIR", click.argument("more", nargs=-1, metavar=""))
-def opinion(place: str, more: tuple[str, ...], point: str | None, jobs: int | None, as_json: bool, **given: Any) -> None:
+def opinion(place: str, more: tuple[str, ...], point: str | None, jobs: int | None, as_json: bool, **values: Any) -> None:
     """Have another vehicle model confirm or contradict the minimal causes of failures of results in DIR."""
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
     from safevar_sumo.analysis.opinion.render import print_opinions
 
-    options = OpinionOptions(**{**given, "solutions": (*given["solutions"], *more)})
+    options = OpinionOptions(**{**values, "solutions": (*values["solutions"], *more)})
     result = _answer(ask_for_opinions, results_or_study(place, point), options, jobs)
     if not as_json:
         print_opinions(Console(), result)
@@ -99,14 +99,14 @@ def opinion(place: str, more: tuple[str, ...], point: str | None, jobs: int | No
 
 
 @question(ToleranceOptions, "STUDY|DIR",
-          _plot_option("Draw the profiles here: png, pdf or svg; with --pairs, the worst pairs in a second file beside it."))
-def tolerance(place: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **given: Any) -> None:
+          _plot_option("Draw the profiles to this file: png, pdf or svg; with --pairs, the worst pairs to a second file beside it."))
+def tolerance(place: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> None:
     """Find how far each characteristic of STUDY may go: alone, in pairs, and all together."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
     from safevar_sumo.analysis.tolerance.render import pairs_figure, print_tolerance, profiles_figure
 
-    options, study = ToleranceOptions(**given), study_at_point(place, point)
+    options, study = ToleranceOptions(**values), study_at_point(place, point)
     second = None if plot is None else plot.with_stem(f"{plot.stem}-pairs")
     for path in (plot, second if options.pairs else None):
         if path is not None:
@@ -122,23 +122,23 @@ def tolerance(place: str, point: str | None, jobs: int | None, as_json: bool, pl
             save(pairs_figure(result), second, "--plot")
 
 
-@question(RiskOptions, "STUDY|DIR", _plot_option("Draw what decides here: png, pdf or svg."))
-def risk(place: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **given: Any) -> None:
-    """Estimate how likely an unsafe outcome is when vehicles vary as STUDY says under [variation], and what decides."""
+@question(RiskOptions, "STUDY|DIR", _plot_option("Draw the sensitivity indices to this file: png, pdf or svg."))
+def risk(place: str, point: str | None, jobs: int | None, as_json: bool, plot: Path | None, **values: Any) -> None:
+    """Estimate how likely an unsafe outcome is if vehicles vary as [variation] of STUDY says, and which characteristics decide it."""
     from safevar_sumo.analysis.figures import save
     from safevar_sumo.analysis.risk.compute import estimate_risk
     from safevar_sumo.analysis.risk.render import print_risk, sensitivity_figure
 
-    options, study = RiskOptions(**given), study_at_point(place, point)
+    options, study = RiskOptions(**values), study_at_point(place, point)
     if plot is not None:
         check_output(plot, "--plot", PICTURES)
         if study.correlations:
             raise InputError("--plot", "sensitivity indices of correlated characteristics are not defined", "a study without correlations")
         if options.is_for_rare:
-            raise InputError("--plot", "a method for rare failures leaves out what decides, which the figure shows", "--method auto")
+            raise InputError("--plot", "a method for rare failures computes no sensitivity indices to draw", "--method auto")
     result = _answer(estimate_risk, study, options, jobs)
     if study.correlations:
-        click.echo("note: characteristics are correlated, for which sensitivity indices are not defined: there are none", err=True)
+        click.echo("note: no sensitivity indices: they are not defined for correlated characteristics", err=True)
     if result.errors:
         click.echo(f"warning: {result.errors} vehicles could not be simulated and are left out", err=True)
     if as_json:
@@ -150,11 +150,11 @@ def risk(place: str, point: str | None, jobs: int | None, as_json: bool, plot: P
 
 
 @question(RulesOptions, "STUDY|DIR")
-def rules(place: str, point: str | None, jobs: int | None, as_json: bool, **given: Any) -> None:
-    """Find rules in physical units that say where STUDY is unsafe, from evenly spread settings, not from a search."""
+def rules(place: str, point: str | None, jobs: int | None, as_json: bool, **values: Any) -> None:
+    """Find rules, in physical units, that describe the unsafe settings of STUDY, from evenly spread settings instead of a search."""
     from safevar_sumo.analysis.rules.compute import find_rules, print_rules
 
-    result = _answer(find_rules, study_at_point(place, point), RulesOptions(**given), jobs)
+    result = _answer(find_rules, study_at_point(place, point), RulesOptions(**values), jobs)
     if not as_json:
         print_rules(Console(), result)
         return

@@ -26,13 +26,13 @@ FILE = click.Path(path_type=Path)
 @click.argument("place", metavar="STUDY|DIR")
 @options_of(RatingOptions)
 @click.option("--matrix", is_flag=True, help="Print every matrix: speed by impact location, with the colours of the cells.")
-@click.option("--plot", type=FILE, metavar="FILE", help="Draw the matrices here: png, pdf or svg.")
-@click.option("--xlsx", type=FILE, metavar="FILE", help="Write the official spreadsheet with the variant's predictions, or the original's, "
-                                                       "here; takes --template, or --preprocessed.")
-@click.option("--template", type=FILE, metavar="FILE", help="What the official calculator's generate-template wrote: ca_template.xlsx.")
-@click.option("--preprocessed", type=FILE, metavar="FILE", help="What the calculator's preprocess wrote: its verification sheets are "
-                                                               "filled with what was simulated, in --xlsx or with --force in this file.")
-@click.option("--force", is_flag=True, help="Overwrite files that exist.")
+@click.option("--plot", type=FILE, metavar="FILE", help="Draw the matrices to this file: png, pdf or svg.")
+@click.option("--xlsx", type=FILE, metavar="FILE", help="Write the official spreadsheet with the predictions of the variant, else of the "
+                                                       "original, to this file; needs --template or --preprocessed.")
+@click.option("--template", type=FILE, metavar="FILE", help="Output of the official calculator's generate-template: ca_template.xlsx.")
+@click.option("--preprocessed", type=FILE, metavar="FILE", help="Output of the calculator's preprocess: its verification sheets are "
+                                                               "filled with simulated results, in --xlsx, or with --force in this file.")
+@click.option("--force", is_flag=True, help="Overwrite existing files.")
 @now_option
 @jobs_option
 @json_option
@@ -68,7 +68,7 @@ def rating(place: str, changes: tuple[str, ...], solution: str | None, matrix: b
 
 
 def _changes(study: Study, changes: tuple[str, ...]) -> dict[str, float]:
-    """Values by characteristic, one for each."""
+    """The value of each changed characteristic."""
     values = read_changes(changes, CharacteristicSet.of(study.vehicle.characteristics), False, single=True)
     return {name: value for name, (value,) in values.items()}
 
@@ -79,14 +79,14 @@ def _refuse_existing(path: Path, flag: str, force: bool) -> None:
 
 
 def _workbook(xlsx: Path | None, template: Path | None, preprocessed: Path | None, force: bool) -> Any:
-    """The spreadsheet to fill, read and checked before anything is simulated; None if none is asked for."""
+    """The spreadsheet to fill, read and checked before any simulation; None without --xlsx and --preprocessed."""
     if template is not None and preprocessed is not None:
         raise InputError("--template", "--preprocessed is given too", "one of them: --preprocessed holds the template's sheets already")
     source = template if template is not None else preprocessed
     if source is None:
         if xlsx is not None:
-            raise InputError("--xlsx", f"{xlsx} takes the official template, which pip install 'euroncap-rating-2026' and "
-                                       "euroncap_rating_2026 crash_avoidance generate-template write",
+            raise InputError("--xlsx", f"{xlsx} needs the official template; to make it: pip install 'euroncap-rating-2026', then "
+                                       "euroncap_rating_2026 crash_avoidance generate-template",
                              "--template FILE, or --preprocessed FILE")
         return None
     if template is not None and xlsx is None:

@@ -1,4 +1,4 @@
-"""Commands that compare studies with published data: validate, calibrate, import, replicate; and what they print."""
+"""Commands that compare studies with published data: validate, calibrate, import, replicate; and the text that they print."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rich.console import Console
 
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.options import PICTURES, check_output, complete_study, refuse_inputs
-from safevar_sumo.cli.program import OneOfEach, commands, tell_remarks
+from safevar_sumo.cli.program import OneOfEach, commands, print_remarks
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.progress import counted
@@ -56,17 +56,17 @@ from safevar_sumo.workers.local import available_cores, local_pool
 @click.argument("study", shell_complete=complete_study)
 @click.argument("reference", type=click.Path(path_type=Path), metavar="REFERENCE.csv")
 @click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
-@click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw here against reference.")
+@click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Plot simulated against reference values.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option("--totals", type=click.Path(path_type=Path), metavar="FILE.toml",
-              help="Keep rank correlations, errors and counts of collisions there too: no row of the data.")
-@click.option("--effects", "with_effects", is_flag=True, help="How strongly each characteristic acts there and here, by linear regression.")
-@click.option("--spread", "with_spread", is_flag=True, help="How many rows the model's own uncertainty and that of repeats cover.")
+              help="Also save rank correlations, errors and counts of collisions there, without any row of the data.")
+@click.option("--effects", "with_effects", is_flag=True, help="Compare the characteristics' linear effects with the reference's.")
+@click.option("--spread", "with_spread", is_flag=True, help="Count the rows within the model's own uncertainty and that of repeats.")
 def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, as_json: bool, totals: Path | None,
              with_effects: bool, with_spread: bool) -> None:
     """Compare STUDY with settings and metrics in the published package's CSV format."""
     chosen = load_study(study)
-    tell_remarks(chosen)
+    print_remarks(chosen)
     system = assemble(chosen, study)
     if plot is not None:
         check_output(plot, "--plot", PICTURES)
@@ -77,7 +77,7 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     with (local_pool(jobs or available_cores(), chosen.search.time_limit) as pool,
           counted(Console(stderr=True), "settings", len(np.unique(settings, axis=0))) as done):
         evaluations = evaluate_all(chosen, settings, pool, done)
-    data, here = _simulated(reference, data, evaluations.take(np.arange(1, len(settings))))
+    data, here = _simulated_rows(reference, data, evaluations.take(np.arange(1, len(settings))))
     if not evaluations.valid[0]:
         raise SimulationError(f"study {study!r} cannot be simulated with the original vehicle")
     result = agreement(data, here, chosen, evaluations.take([0]))
@@ -87,42 +87,42 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
     if totals is not None:
         keep_totals(totals, chosen, reference.name, result)
     effects = effects_of(data, here, system.characteristics) if with_effects else []
-    covered = covered_by_spread(data, chosen) if with_spread else None
+    coverage = covered_by_spread(data, chosen) if with_spread else None
     if as_json:
-        rows = {one.name: {"reference": one.reference, "here": one.here, "agrees": one.agrees} for one in effects}
-        more = {**({"effects": rows} if with_effects else {}), **({"spread": covered.to_dict()} if covered is not None else {})}
-        click.echo(json.dumps({**result.to_dict(), **more}, indent=2, allow_nan=False))
+        rows = {effect.name: {"reference": effect.reference, "here": effect.here, "agrees": effect.agrees} for effect in effects}
+        extra = {**({"effects": rows} if with_effects else {}), **({"spread": coverage.to_dict()} if coverage is not None else {})}
+        click.echo(json.dumps({**result.to_dict(), **extra}, indent=2, allow_nan=False))
     else:
         print_agreement(Console(), chosen, result)
         if with_effects:
             print_effects(Console(), effects)
-        if covered is not None:
-            Console().print(str(covered))
+        if coverage is not None:
+            Console().print(str(coverage))
 
 
 @commands.command(name="calibrate")
 @click.argument("study", shell_complete=complete_study)
 @click.argument("others", nargs=-1, metavar="[STUDY]... [[STUDY=]REFERENCE.csv]...")
-@click.option("--trials", type=click.IntRange(min=1), help="How many sets of parameters are tried.  [default: the first study's]")
+@click.option("--trials", type=click.IntRange(min=1), help="Number of parameter sets to try.  [default: the first study's]")
 @click.option("--seed", type=click.IntRange(min=0, max=2**31), help="Seed of the search.  [default: the first study's]")
-@click.option("--starts", type=click.IntRange(min=0, max=1000), help="Random places to start from, too.  [default: the first study's]")
-@click.option("--from-scratch", is_flag=True, help="Start from random places alone, as if the studies' values were not known.")
+@click.option("--starts", type=click.IntRange(min=0, max=1000), help="Additional random starts.  [default: the first study's]")
+@click.option("--from-scratch", is_flag=True, help="Start only from random points, without the studies' own values.")
 @click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw the loss over every parameter.")
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE.toml",
-              help="Study file to write; of several studies, the directory of their files.  [default: STUDY-calibrated.toml]")
+              help="Study file to write; for several studies, the directory for their files.  [default: STUDY-calibrated.toml]")
 def calibrate_command(study: str, others: tuple[str, ...], trials: int | None, seed: int | None, starts: int | None,
                       from_scratch: bool, jobs: int | None, plot: Path | None, out: Path | None) -> None:
-    """Fit what STUDY declares under [calibration] to the published values and to rows of reference files, as [fit] says.
+    """Fit the parameters that STUDY declares under [calibration] to published values and to rows of reference files, as [fit] says.
 
-    Several studies are fitted together: they share the parameters that they give one value, unless [calibration] says that it is their
-    own. A file belongs to the study that is named before it, STUDY=FILE.csv, or that its name begins with.
+    Several studies are fitted together: they share each parameter to which they give the same value, unless [calibration] marks it as
+    a study's own. A reference file belongs to the study in STUDY=FILE.csv, or else to the study whose name its own name begins with.
     """
-    names = [study, *(one for one in others if _is_study(one))]
-    files = [one for one in others if not _is_study(one)]
-    asked = {name: value for name, value in (("trials", trials), ("seed", seed), ("starts", starts)) if value is not None}
-    given = [load_study(name) for name in names]
-    chosen = [msgspec.structs.replace(one, fit=msgspec.structs.replace(one.fit, **asked)) for one in given]
+    names = [study, *(word for word in others if _is_study(word))]
+    files = [word for word in others if not _is_study(word)]
+    fit_options = {name: value for name, value in (("trials", trials), ("seed", seed), ("starts", starts)) if value is not None}
+    loaded = [load_study(name) for name in names]
+    chosen = [msgspec.structs.replace(one, fit=msgspec.structs.replace(one.fit, **fit_options)) for one in loaded]
     systems = [assemble(one, name) for one, name in zip(chosen, names, strict=True)]
     if len({one.name for one in chosen}) < len(chosen):
         raise InputError("STUDY", f"two studies are called {chosen[0].name!r}", "studies of different names")
@@ -133,35 +133,35 @@ def calibrate_command(study: str, others: tuple[str, ...], trials: int | None, s
     for source in (*map(Path, names), *(path for _, path in owners)):
         for target in targets:
             if target.exists() and source.exists() and target.samefile(source):
-                raise InputError("--out", f"{target} is what the calibration starts from", "another file")
+                raise InputError("--out", f"{target} is an input of the calibration", "another file")
     for target in targets:
         check_writable(target)
     if len({path.name for _, path in owners}) < len(owners):
-        raise InputError("REFERENCE.csv", "two files have one name", "files of different names")
+        raise InputError("REFERENCE.csv", "two files have the same name", "files of different names")
     data = [{path.name: _read(path, system.characteristics) for owner, path in owners if owner == k} for k, system in enumerate(systems)]
-    tried, lowest, best = 0, np.inf, tuple(chosen)
+    done, lowest, best = 0, np.inf, tuple(chosen)
     count = chosen[0].fit.trials
     try:
         with (local_pool(jobs or available_cores(), max(one.search.time_limit for one in chosen)) as pool,
               stages(Console(stderr=True)) as show):
             show("trials", 0, count)
 
-            def one_done(cost: float, so_far: Study | tuple[Study, ...]) -> None:
-                nonlocal tried, lowest, best
-                tried, lowest, best = tried + 1, cost, so_far if isinstance(so_far, tuple) else (so_far,)
-                show(f"trials, lowest cost {cost:.4f}", tried, count)
+            def after_trial(cost: float, so_far: Study | tuple[Study, ...]) -> None:
+                nonlocal done, lowest, best
+                done, lowest, best = done + 1, cost, so_far if isinstance(so_far, tuple) else (so_far,)
+                show(f"trials, lowest cost {cost:.4f}", done, count)
 
             if len(chosen) == 1:
-                calibrations = [calibrate(chosen[0], data[0], pool, one_done, from_scratch=from_scratch)]
+                calibrations = [calibrate(chosen[0], data[0], pool, after_trial, from_scratch=from_scratch)]
             else:
                 subjects = [Subject(one, references) for one, references in zip(chosen, data, strict=True)]
-                calibrations = calibrate_together(subjects, pool, one_done, from_scratch=from_scratch)
+                calibrations = calibrate_together(subjects, pool, after_trial, from_scratch=from_scratch)
     except KeyboardInterrupt:
-        if tried:
-            account = f"Best of {tried} of {count} trials, then interrupted (seed {chosen[0].fit.seed}). Cost {lowest:.4f}."
+        if done:
+            comment = f"Best of {done} of {count} trials, then interrupted (seed {chosen[0].fit.seed}). Cost {lowest:.4f}."
             for one, fitted, target in zip(chosen, best, targets, strict=True):
-                write_study(target, fitted_as(one, fitted), account)
-            click.echo(f"interrupted: the best of {tried} trials is in {', '.join(map(str, targets))}", err=True)
+                write_study(target, fitted_as(one, fitted), comment)
+            click.echo(f"interrupted: the best of {done} trials is in {', '.join(map(str, targets))}", err=True)
         raise
     if plot is not None and calibrations[0].profiles is not None:
         plot_profiles(plot, calibrations[0].profiles, chosen)
@@ -171,38 +171,39 @@ def calibrate_command(study: str, others: tuple[str, ...], trials: int | None, s
         Console().print(f"Study file: {target}", soft_wrap=True)
 
 
-def _is_study(given: str) -> bool:
+def _is_study(word: str) -> bool:
     """Whether a word names a study rather than a reference file."""
-    return given in study_names() or given.endswith(".toml")
+    return word in study_names() or word.endswith(".toml")
 
 
 def _targets(studies: Sequence[Study], out: Path | None) -> list[Path]:
-    """The files that are written, one for each study."""
+    """The study files to write, one for each study."""
     if len(studies) == 1:
         return [out or Path(f"{studies[0].name}-calibrated.toml")]
     if out is not None and not out.is_dir():
-        raise InputError("--out", f"{out} is no directory", "a directory that exists, for the files of several studies")
+        raise InputError("--out", f"{out} is not a directory", "an existing directory, for the files of several studies")
     return [(out or Path()) / f"{study.name}-calibrated.toml" for study in studies]
 
 
-def _owner(given: str, studies: Sequence[Study]) -> tuple[int, Path]:
-    """Number of the study that a reference file belongs to, and its path."""
+def _owner(word: str, studies: Sequence[Study]) -> tuple[int, Path]:
+    """Index of the study that a reference file belongs to, and the file's path."""
     names = [study.name for study in studies]
-    name, _, place = given.partition("=")
-    if place and name in names and not Path(given).exists():
+    name, _, place = word.partition("=")
+    if place and name in names and not Path(word).exists():
         return names.index(name), Path(place)
-    path = Path(given)
+    path = Path(word)
     if len(names) == 1:
         return 0, path
-    fitting = [own for own in names if path.name.startswith(own)]
-    if not fitting:
-        raise InputError("REFERENCE.csv", f"{given} may belong to each of {', '.join(names)}", "STUDY=FILE.csv, or a name that begins so")
-    return names.index(max(fitting, key=len)), path
+    matching = [name for name in names if path.name.startswith(name)]
+    if not matching:
+        legal = "STUDY=FILE.csv, or a file name that begins with the study's name"
+        raise InputError("REFERENCE.csv", f"{word} may belong to any of {', '.join(names)}", legal)
+    return names.index(max(matching, key=len)), path
 
 
 @commands.command(name="import")
 @click.argument("study", shell_complete=complete_study)
-@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory of the results.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory for the results.")
 @click.option("--nsga2", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of NSGA-II.")
 @click.option("--rs", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of random search.")
 @click.option("--safe-fuzzer", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of SafeFuzzer.")
@@ -221,7 +222,7 @@ def import_command(study: str, out: Path, original: str | None, **given: Path | 
     for algorithm, path in files.items():
         solutions[algorithm] = evaluations_of(_read(path, characteristics), characteristics)
     write_imported(out, chosen, solutions, metrics, {algorithm: path.name for algorithm, path in files.items()})
-    click.echo(f"Results: {out}, {', '.join(f'{len(found)} solutions of {name}' for name, found in solutions.items())}")
+    click.echo(f"Results: {out}, {', '.join(f'{len(rows)} solutions of {name}' for name, rows in solutions.items())}")
 
 
 def _read(path: Path, characteristics: CharacteristicSet) -> ReferenceData:
@@ -231,22 +232,22 @@ def _read(path: Path, characteristics: CharacteristicSet) -> ReferenceData:
     return data
 
 
-def _simulated(path: Path, data: ReferenceData, here: Evaluations) -> tuple[ReferenceData, Evaluations]:
+def _simulated_rows(path: Path, data: ReferenceData, here: Evaluations) -> tuple[ReferenceData, Evaluations]:
     """The rows that could be simulated."""
     valid = here.valid
     if not valid.any():
-        raise SimulationError(f"{path}: not one of its {len(valid)} rows could be simulated")
+        raise SimulationError(f"{path}: none of its {len(valid)} rows could be simulated")
     if not valid.all():
         click.echo(f"warning: {path}: {np.count_nonzero(~valid)} rows could not be simulated and are left out", err=True)
     return data.take(valid), here.take(valid)
 
 
 SEVERAL = ("--published", "--reference")
-"""Options that take all words up to the next option."""
+"""Options whose values are all words up to the next option."""
 
 
 class _TakesSeveral(OneOfEach):
-    """`--published A B` as `--published A --published B`."""
+    """Reads `--published A B` as `--published A --published B`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         words: list[str] = []
@@ -265,7 +266,7 @@ class _TakesSeveral(OneOfEach):
 @click.option("--published", "published", multiple=True, required=True, metavar="DIR...", help="Imported results (command import).")
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE.md", help="Write the page to this file.")
 @click.option("--reference", "references", multiple=True, metavar="[STUDY=]FILE.csv...",
-              help="Published rows to look for next to what the searches found; of which study, where several have one vehicle.")
+              help="Published rows to compare with the solutions nearby; name the study if several have the same vehicle.")
 def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Path | None, references: tuple[str, ...]) -> None:
     """Compare the results DIR... with published ones: tables side by side, and whether each conclusion holds."""
     if out is not None:
@@ -275,7 +276,7 @@ def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Pat
         if Path(directory).resolve() in [Path(other).resolve() for other in directories]:
             raise InputError("--published", f"{directory} is given as results too", "results that the command import has written")
     pairs = paired(load_cases(directories), load_cases(published))
-    page = replication(pairs, _near(pairs.here, references))
+    page = replication(pairs, _nearness(pairs.here, references))
     if out is None:
         click.echo(page, nl=False)
     else:
@@ -283,24 +284,24 @@ def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Pat
         click.echo(f"Replication: {out}")
 
 
-def _near(cases: Sequence[Case], references: Sequence[str]) -> list[Nearness]:
-    """Published rows next to the solutions, for the case that each file belongs to."""
+def _nearness(cases: Sequence[Case], references: Sequence[str]) -> list[Nearness]:
+    """Compare solutions with the nearest published rows, for the case that each file belongs to."""
     rows: dict[str, list[ReferenceData]] = {}
-    for given in references:
-        name, _, place = given.rpartition("=")
-        fitting = [case for case in cases if name in ("", case.study.name)]
-        read = _rows_by_case(Path(place), fitting) if fitting else {}
-        if len(read) != 1:
-            relation = "may belong to each of" if read else "belongs to none of"
-            names = ", ".join(read or (case.study.name for case in cases))
-            raise InputError("--reference", f"{given} {relation} {names}", "STUDY=FILE.csv")
-        for case, data in read.items():
+    for reference in references:
+        name, _, place = reference.rpartition("=")
+        candidates = [case for case in cases if name in ("", case.study.name)]
+        rows_by_case = _rows_by_case(Path(place), candidates) if candidates else {}
+        if len(rows_by_case) != 1:
+            relation = "may belong to any of" if rows_by_case else "belongs to none of"
+            names = ", ".join(rows_by_case or (case.study.name for case in cases))
+            raise InputError("--reference", f"{reference} {relation} {names}", "STUDY=FILE.csv")
+        for case, data in rows_by_case.items():
             rows.setdefault(case, []).append(data)
     return [one for case in cases if case.name in rows for one in nearness(case, rows[case.name])]
 
 
 def _rows_by_case(path: Path, cases: Sequence[Case]) -> dict[str, ReferenceData]:
-    """The rows of a file for every case with the vehicle of the file."""
+    """The rows of a file, for every case whose vehicle is the file's."""
     rows: dict[str, ReferenceData] = {}
     for case in cases:
         try:
@@ -312,8 +313,8 @@ def _rows_by_case(path: Path, cases: Sequence[Case]) -> dict[str, ReferenceData]
 
 
 def print_agreement(console: Console, study: Study, result: Agreement) -> None:
-    """Comparison with reference data, metric by metric."""
-    table = WholeTable("", right=("Spearman's rho", "mean abs. error", "in repeats", "bias", "original there", "original here"),
+    """Print the comparison with reference data, metric by metric."""
+    table = WholeTable("", right=("Spearman's rho", "mean abs. error", "error / repeats", "bias", "original, reference", "original, here"),
                        title=f"{study.title}: {result.rows} rows")
     for name in result.spearman:
         head = METRICS[name].heading
@@ -324,21 +325,22 @@ def print_agreement(console: Console, study: Study, result: Agreement) -> None:
     collisions = result.collisions
     console.print(f"Collisions: {collisions['reference']} in the reference, {collisions['here']} here, {collisions['both']} in both: "
                   f"precision {_number(result.precision)}, recall {_number(result.recall)}; their mean speed is "
-                  f"{_number(result.collision_speed['reference'])} m/s there and {_number(result.collision_speed['here'])} m/s here.")
+                  f"{_number(result.collision_speed['reference'])} m/s in the reference, "
+                  f"{_number(result.collision_speed['here'])} m/s here.")
     if result.undecided["within_repeats"] is not None:
-        console.print(f"Of {result.undecided['differ']} settings that collide on one side alone, {result.undecided['within_repeats']} "
-                      "may do either: repeats of them differ by as much.")
+        console.print(f"Of {result.undecided['differ']} settings that collide only in the reference or only here, "
+                      f"{result.undecided['within_repeats']} may do either: their repeats differ by as much.")
     bins = ", ".join(f"{part['lowest']:.2f} to {part['highest']:.2f}: {part['bias']:+.2f}" for part in result.by_predicted)
     console.print(f"Mean error by the safety degree here: {bins}.", markup=False)
 
 
 def print_effects(console: Console, effects: Sequence[Effect]) -> None:
-    """Effects there and here, and whether they agree."""
+    """Print the effects in the reference and here, and whether they agree."""
     title = f"Linear effects on the safety degree over a domain, m (agree: within {EFFECT_SHARE:.0%} or {LEAST_EFFECT:g} m)"
-    table = WholeTable("characteristic", right=("there", "here", "agree"), title=title)
-    for one in effects:
-        agrees = "-" if one.agrees is None else "yes" if one.agrees else "no"
-        table.add_row(one.name, *("-" if value is None else f"{value:+.2f}" for value in (one.reference, one.here)), agrees)
+    table = WholeTable("characteristic", right=("reference", "here", "agree"), title=title)
+    for effect in effects:
+        agrees = "-" if effect.agrees is None else "yes" if effect.agrees else "no"
+        table.add_row(effect.name, *("-" if value is None else f"{value:+.2f}" for value in (effect.reference, effect.here)), agrees)
     console.print(table)
 
 
@@ -347,22 +349,22 @@ def _number(value: float | None) -> str:
 
 
 def print_calibration(console: Console, study: Study, result: Calibration) -> None:
-    """Fitted values, and how well they agree with both halves of the data."""
-    table = WholeTable("parameter", "unit", right=("fitted", "as good from", "to", "lower", "upper"), title=study.title)
+    """Print the fitted values, and how well they agree with the rows used and with the rows held back."""
+    table = WholeTable("parameter", "unit", right=("fitted", "fits as well from", "to", "lower", "upper"), title=study.title)
     for name, value in result.values.items():
         row = result.bounds[name]
         shared = f" (shared with {', '.join(result.together)})" if name in result.shared else ""
         table.add_row(name + shared, row.unit, *(f"{number:.5g}" for number in (value, *result.intervals[name], row.lower, row.upper)))
     console.print(table)
     for name in result.used:
-        both = WholeTable("", right=("Spearman's rho", "mean abs. error", "bias"), title=f"{name}: rows used / held back")
-        halves = (result.used[name], result.held_back[name])
-        for metric in halves[0].spearman:
+        comparison = WholeTable("", right=("Spearman's rho", "mean abs. error", "bias"), title=f"{name}: rows used / held back")
+        agreements = (result.used[name], result.held_back[name])
+        for metric in agreements[0].spearman:
             head = METRICS[metric].heading
-            both.add_row(head, *(
-                " / ".join("-" if number is None else f"{number:.3f}" for number in (getattr(half, what)[metric] for half in halves))
-                for what in ("spearman", "mean_absolute_error", "bias")))
-        console.print(both)
+            comparison.add_row(head, *(
+                " / ".join("-" if number is None else f"{number:.3f}" for number in (getattr(one, quantity)[metric] for one in agreements))
+                for quantity in ("spearman", "mean_absolute_error", "bias")))
+        console.print(comparison)
     for name in on_a_bound(result.values, result.bounds):
-        console.print(f"{name} stands on its bound: a wider one may fit better.", markup=False)
+        console.print(f"{name} lies on its bound: a wider bound may fit better.", markup=False)
     console.print(cost_line(result))

@@ -21,16 +21,16 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.results import make_directory, write_whole
 
 WITHOUT_NOTES = ("csv", "json")
-"""Formats that hold the numbers alone; the notes go to the standard error."""
+"""Formats that hold only numbers; notes go to standard error."""
 
 
 @commands.command()
 @click.argument("directories", nargs=-1, required=True, metavar="DIR...")
-@click.option("--rq", "question", type=click.Choice(QUESTIONS), help="This question alone.")
-@click.option("--format", "kind", type=click.Choice(list(FORMATS)), default="text", show_default=True, help="How they are written.")
+@click.option("--rq", "question", type=click.Choice(QUESTIONS), help="Answer only this question.")
+@click.option("--format", "kind", type=click.Choice(list(FORMATS)), default="text", show_default=True, help="Format of the tables.")
 @click.option("--layout", type=click.Choice(list(LAYOUTS_BY_NAME)), default="full", show_default=True,
-              help="Everything, or RQ1, RQ2 and the combinations as the paper has them.")
-@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write each table to a file of this directory.")
+              help="Everything, or RQ1, RQ2 and the combinations laid out as in the paper.")
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write each table to a file in this directory.")
 def tables(directories: tuple[str, ...], question: str | None, kind: str, layout: str, out: Path | None) -> None:
     """Answer the research questions as tables, from the results directories DIR..., one for each case."""
     if layout != "full" and kind not in FORMATS_WITH_LAYOUT:
@@ -52,14 +52,14 @@ def tables(directories: tuple[str, ...], question: str | None, kind: str, layout
 
 @commands.command()
 @click.argument("directories", nargs=-1, required=True, metavar="DIR...")
-@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory of the pictures.")
-@click.option("--format", "kind", type=click.Choice(PICTURES), default="png", show_default=True, help="Kind of the pictures.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Directory for the pictures.")
+@click.option("--format", "kind", type=click.Choice(PICTURES), default="png", show_default=True, help="Format of the pictures.")
 def figures(directories: tuple[str, ...], out: Path, kind: str) -> None:
     """Draw the figures of the results directories DIR..., one file for each figure and case."""
     cases = load_cases(directories)
     make_directory(out)
-    written, lacking = draw_all(cases, out, kind)
-    _warn([*(remark for case in cases for remark in case.remarks), *lacking])
+    written, missing = draw_all(cases, out, kind)
+    _warn([*(remark for case in cases for remark in case.remarks), *missing])
     for path in written:
         click.echo(str(path))
 
@@ -72,8 +72,8 @@ def _warn(messages: list[str]) -> None:
 @commands.command()
 @click.argument("directories", nargs=-1, required=True, metavar="DIR...")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("report.html"), show_default=True, metavar="FILE.html",
-              help="The page.")
-@click.option("--only", metavar="SECTION,...", help="These sections alone, separated by commas: tested, verdict, causes, ...")
+              help="File to write the page to.")
+@click.option("--only", metavar="SECTION,...", help="Only these sections, separated by commas: tested, verdict, causes, ...")
 @point_option
 @now_option
 @jobs_option
@@ -84,10 +84,10 @@ def report(directories: tuple[str, ...], out: Path, only: str | None, point: str
 
     check_output(out, "--out", (".html", ".htm"))
     sections = [name.strip() for name in only.split(",")] if only is not None else []
-    with stages(Console(stderr=True)) as progress, warnings.catch_warnings(record=True) as otherwise:
+    with stages(Console(stderr=True)) as progress, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         page = make_report(directories, sections, jobs, progress, point=point, as_it_is_now=as_it_is_now())
-    for one in otherwise:
-        click.echo(f"warning: {one.message}", err=True)
+    for warning in caught:
+        click.echo(f"warning: {warning.message}", err=True)
     write_whole(out, page)
     click.echo(f"Report: {out} ({len(page.encode()) / 1e6:.2f} MB)")

@@ -1,4 +1,4 @@
-"""The command that simulates a study once or, in a sweep, many times; and what it prints."""
+"""The command simulate: simulates a study once or, in a sweep, many times, and prints the results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rich.text import Text
 
 from safevar_sumo.analysis.model_spread import ModelSpread, model_spreads, studies_of_sets
 from safevar_sumo.analysis.words import ask
-from safevar_sumo.api.simulation import Simulation, beside_the_original, evaluated
+from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
 from safevar_sumo.cli.options import (
     PICTURES,
     Within,
@@ -45,64 +45,64 @@ FILE = click.Path(path_type=Path)
 @click.argument("study", metavar="STUDY|DIR", shell_complete=complete_study)
 @replay_options
 @click.option("--set", "changes", multiple=True, metavar="NAME=VALUE", shell_complete=complete_changes,
-              help="A characteristic's value in its unit, +10% of the original, or a sweep FROM..TO; may be repeated for others.")
+              help="A characteristic's value in its unit, +10% of the original, or a sweep FROM..TO; repeat --set for others.")
 @click.option("--no-filter", is_flag=True, help="Keep changes that are smaller than the filter's thresholds.")
-@click.option("--beyond", is_flag=True, help="Take values beyond the domains, and settings that violate a constraint, too.")
+@click.option("--beyond", is_flag=True, help="Also accept values beyond the domains, and settings that violate a constraint.")
 @click.option("--trace", type=click.Path(path_type=Path), metavar="FILE.csv", help="Write the simulation step by step.")
-@click.option("--plot", type=FILE, metavar="FILE", help="Draw it beside the original vehicle: png, pdf or svg.")
-@click.option("--animate", type=FILE, metavar="FILE", help="Show both from above, moving: gif, mp4 or html.")
-@click.option("--gui", is_flag=True, help="Show both in sumo-gui, each on its road.")
+@click.option("--plot", type=FILE, metavar="FILE", help="Draw the simulation beside the original vehicle's to this file: png, pdf or svg.")
+@click.option("--animate", type=FILE, metavar="FILE", help="Animate both simulations, seen from above, in this file: gif, mp4 or html.")
+@click.option("--gui", is_flag=True, help="Show both simulations in sumo-gui, each on its own road.")
 @click.option("--slower", type=Within(0.01, 1000), default=1.0, show_default=True, metavar="TIMES",
               help="How many times slower than real time --gui plays.")
 @now_option
-@click.option("--point", metavar="NAME", help="Of a study with a matrix: this point alone.")
-@click.option("--spread", is_flag=True, help="The vehicle model's own uncertainty too: other parameters that fit published data as well.")
+@click.option("--point", metavar="NAME", help="Only this point of the study's matrix.")
+@click.option("--spread", is_flag=True, help="Add the vehicle model's own uncertainty: other parameters that fit published data as well.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def simulate_command(study: str, solution: str | None, choice: str | None, changes: tuple[str, ...], no_filter: bool, beyond: bool,
-                     trace: Path | None, point: str | None, spread: bool, as_json: bool, **shown: Any) -> None:
+                     trace: Path | None, point: str | None, spread: bool, as_json: bool, **replay: Any) -> None:
     """Simulate STUDY once, or a solution of the results directory DIR with the study as recorded there."""
-    target, showing = target_of(study, solution, choice), Shown(**shown)
+    target, replays = target_of(study, solution, choice), Replays(**replay)
     system = assemble(target.study, target.source)
     if point is not None:
         system = named_point(system, point, "--point")
-    swept = read_changes(changes, system.characteristics, beyond)
+    values_by_name = read_changes(changes, system.characteristics, beyond)
     base = system.characteristics.original if target.setting is None else target.setting
-    asked = settings_of(swept, base, system.characteristics)
+    requested = settings_of(values_by_name, base, system.characteristics)
     if not beyond and changes:
-        system.check_feasible(asked, "--set", filtered=not no_filter, switch="--beyond")
-    _check_outputs(study, trace, showing)
-    if any(len(values) > 1 for values in swept.values()):
-        if trace is not None or showing.asked or spread:
+        system.check_feasible(requested, "--set", filtered=not no_filter, switch="--beyond")
+    _check_outputs(study, trace, replays)
+    if any(len(values) > 1 for values in values_by_name.values()):
+        if trace is not None or replays.requested or spread:
             legal = "one value for each with --trace, --plot, --animate, --gui or --spread"
             raise InputError("--set", f"{' '.join(changes)} is a sweep", legal)
-        _sweep(target, system, asked, tuple(swept), not no_filter, as_json)
+        _sweep(target, system, requested, tuple(values_by_name), not no_filter, as_json)
         return
-    of_sets = studies_of_sets(target.study) if spread else []
-    simulation = beside_the_original(target.study, system, asked[0], filtered=not no_filter)
+    parameter_sets = studies_of_sets(target.study) if spread else []
+    simulation = simulate_with_original(target.study, system, requested[0], filtered=not no_filter)
     if target.recorded is not None and not changes:
         _warn_of_differences(target, simulation)
     if trace is not None:
         _write_trace(trace, simulation)
-    if showing.asked:
-        showing.show(target.study, system, simulation.evaluation.settings[0])
+    if replays.requested:
+        replays.show(target.study, system, simulation.evaluation.settings[0])
     rows = np.stack([simulation.evaluation.settings[0], system.characteristics.original])
-    spreads = model_spreads(target.study, rows, point or "") if of_sets else []
-    _tell(target, system, simulation, spreads, as_json)
+    spreads = model_spreads(target.study, rows, point or "") if parameter_sets else []
+    _print_results(target, system, simulation, spreads, as_json)
 
 
-def _check_outputs(study: str, trace: Path | None, showing: Shown) -> None:
+def _check_outputs(study: str, trace: Path | None, replays: Replays) -> None:
     if trace is not None:
         refuse_inputs(trace, "--trace", study)
         check_writable(trace, "--trace")
-    if showing.asked:
-        showing.check(study)
-        if trace is not None and trace.resolve() in showing.files:
+    if replays.requested:
+        replays.check(study)
+        if trace is not None and trace.resolve() in replays.files:
             raise InputError("--trace", f"{trace} is what --plot or --animate writes", "another file")
 
 
-def _sweep(target: Target, system: System, asked: FloatArray, names: tuple[str, ...], filtered: bool, as_json: bool) -> None:
-    settings = system.characteristics.filter(asked) if filtered else asked
-    evaluations = evaluated(target.study, np.concatenate([system.characteristics.original[np.newaxis], settings]))
+def _sweep(target: Target, system: System, requested: FloatArray, names: tuple[str, ...], filtered: bool, as_json: bool) -> None:
+    settings = system.characteristics.filter(requested) if filtered else requested
+    evaluations = evaluate_settings(target.study, np.concatenate([system.characteristics.original[np.newaxis], settings]))
     original, rows = evaluations.take([0]), evaluations.take(np.arange(1, len(evaluations)))
     if as_json:
         records = [{"study": target.study.name, "vcs": dict(zip(system.characteristics.names, rows.settings[row].tolist(), strict=True)),
@@ -110,13 +110,13 @@ def _sweep(target: Target, system: System, asked: FloatArray, names: tuple[str, 
         click.echo(json.dumps(records, indent=2, allow_nan=False))
     else:
         print_sweep(Console(), target.study, names, original, rows)
-    back = int(np.count_nonzero((settings != asked).any(axis=1)))
-    if back:
-        click.echo(f"note: in {back} of {len(asked)} settings the filter put a change back that is too small; --no-filter keeps them",
+    put_back = int(np.count_nonzero((settings != requested).any(axis=1)))
+    if put_back:
+        click.echo(f"note: in {put_back} of {len(requested)} settings the filter undid changes that are too small; --no-filter keeps them",
                    err=True)
 
 
-def _tell(target: Target, system: System, simulation: Simulation, spreads: Sequence[ModelSpread], as_json: bool) -> None:
+def _print_results(target: Target, system: System, simulation: Simulation, spreads: Sequence[ModelSpread], as_json: bool) -> None:
     points = at_every_point(system, simulation.evaluation.settings) if system.matrix and (as_json or system.rater is None) else []
     if as_json:
         replayed = {} if target.handle is None else {"solution": str(target.handle)}
@@ -125,15 +125,15 @@ def _tell(target: Target, system: System, simulation: Simulation, spreads: Seque
         click.echo(json.dumps({**simulation.to_dict(), **replayed, **matrix, **spread}, indent=2, allow_nan=False))
     else:
         print_simulation(Console(), simulation)
-        for what, one in zip(("the simulated vehicle", "the original"), spreads, strict=False):
-            print_text(Console(), f"The vehicle model's own uncertainty, {what}: {one}.")
+        for vehicle, model_spread in zip(("the simulated vehicle", "the original"), spreads, strict=False):
+            print_text(Console(), f"The vehicle model's own uncertainty, {vehicle}: {model_spread}.")
         if system.rater is None:
             print_matrix(Console(), points)
         else:
             print_text(Console(), f"{len(system.matrix)} cells and variations: {ask('rating', target.source)} --matrix")
         if types := tags(system.points):
             print_text(Console(), types)
-    remarks = [remark for one in system.points for remark in remarks_of(one.scenario)]
+    remarks = [remark for point in system.points for remark in remarks_of(point.scenario)]
     for remark in dict.fromkeys([*remarks, *system.remarks, *vehicle_remarks(system)]):
         click.echo(f"note: {remark}", err=True)
     for name, value in simulation.put_back.items():
@@ -142,16 +142,16 @@ def _tell(target: Target, system: System, simulation: Simulation, spreads: Seque
 
 
 def _warn_of_differences(target: Target, simulation: Simulation) -> None:
-    """Warn if a replay differs from the recorded solution."""
+    """Warn where a replay differs from the recorded solution."""
     from safevar_sumo.replay.comparison import differences
 
     assert target.recorded is not None
-    for one in differences(simulation.evaluation, target.recorded):
-        click.echo(f"warning: {target.handle} of {target.source}: {one}; other versions or code than those of the study?", err=True)
+    for difference in differences(simulation.evaluation, target.recorded):
+        click.echo(f"warning: {target.handle} of {target.source}: {difference}; other versions or code than in the study?", err=True)
 
 
 def _write_trace(path: Path, simulation: Simulation) -> None:
-    """One row per simulation step, units in the header."""
+    """Write one row per time step, units in the header."""
     try:
         with path.open("w", encoding="utf-8", newline="") as file:
             simulation.trace.to_csv(file, index=False, lineterminator="\n")
@@ -159,8 +159,8 @@ def _write_trace(path: Path, simulation: Simulation) -> None:
         raise InputError("--trace", f"cannot write {path}: {error.strerror or error}", "a file in a directory that exists") from None
 
 
-class Shown(NamedTuple):
-    """The figure, animation or window that a command was asked for."""
+class Replays(NamedTuple):
+    """The figure, animation and window that a command is to show."""
 
     plot: Path | None
     animate: Path | None
@@ -168,7 +168,7 @@ class Shown(NamedTuple):
     slower: float = 1.0
 
     @property
-    def asked(self) -> bool:
+    def requested(self) -> bool:
         return self.plot is not None or self.animate is not None or self.gui
 
     @property
@@ -177,7 +177,7 @@ class Shown(NamedTuple):
         return [path.resolve() for path in (self.plot, self.animate) if path is not None]
 
     def check(self, study: str) -> None:
-        """Refuse what cannot be written or is read from `study`, before anything is simulated; raises InputError."""
+        """Refuse a file that cannot be written or is an input of `study`, before any simulation; raises InputError."""
         from safevar_sumo.replay.animation import ANIMATIONS, check_animation
 
         if self.slower != 1 and not self.gui:
@@ -208,7 +208,7 @@ class Shown(NamedTuple):
 
 
 def print_simulation(console: Console, simulation: Simulation) -> None:
-    """A setting beside the original vehicle: what was simulated, how it ended, metrics and objectives, a verdict."""
+    """Print a setting beside the original vehicle: its values, outcome, metrics and objectives, and a verdict."""
     _print_setting(console, simulation)
     members = CharacteristicSet.of(simulation.study.vehicle.characteristics)
     print_meanings(console, [member for member in members if simulation.setting[member.name] != member.original])
@@ -220,7 +220,7 @@ def print_simulation(console: Console, simulation: Simulation) -> None:
     console.print(table)
     print_text(console, f"The original vehicle {simulation.original.verdict}.")
     if simulation is not simulation.original and simulation.setting != simulation.original.setting:
-        print_text(console, f"The changed vehicle {simulation.verdict}: {_against(simulation)}.")
+        print_text(console, f"The changed vehicle {simulation.verdict}: {_compared_with_original(simulation)}.")
 
 
 def _print_setting(console: Console, simulation: Simulation) -> None:
@@ -233,17 +233,17 @@ def _print_setting(console: Console, simulation: Simulation) -> None:
     console.print(table)
 
 
-def _against(simulation: Simulation) -> str:
+def _compared_with_original(simulation: Simulation) -> str:
     here, there = simulation.metrics[SAFETY_DEGREE], simulation.original.metrics[SAFETY_DEGREE]
     if np.isnan(here) or np.isnan(there):
-        return "nothing tells whether that is less safe"
+        return "whether that is less safe cannot be decided"
     if here == there:
         return "as safe as the original"
     return f"{'less safe' if here < there else 'safer'} than the original, SD {here:.2f} against {there:.2f}"
 
 
 def print_sweep(console: Console, study: Study, names: Sequence[str], original: Evaluations, variants: Evaluations) -> None:
-    """Many settings, a row each under the original vehicle's, by the values of the named characteristics."""
+    """Print a row for each setting, after the original vehicle's, with its values of the named characteristics."""
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     columns = [characteristics.names.index(name) for name in names]
     units = [characteristics.members[column].unit for column in columns]
@@ -252,24 +252,24 @@ def print_sweep(console: Console, study: Study, names: Sequence[str], original: 
     table.add_column("outcome")
     for name in variants.metrics:
         table.add_column(METRICS[name].heading if name in METRICS else name, justify="right")
-    for which in (original, variants):
-        for row in range(len(which)):
-            metrics = [which.metrics[name][row] for name in variants.metrics]
-            table.add_row(*(f"{which.settings[row, column]:g}" for column in columns), str(which.outcome[row]),
-                          *("-" if np.isnan(value) else f"{value:.3f}" for value in metrics), end_section=which is original)
+    for evaluations in (original, variants):
+        for row in range(len(evaluations)):
+            metrics = [evaluations.metrics[name][row] for name in variants.metrics]
+            table.add_row(*(f"{evaluations.settings[row, column]:g}" for column in columns), str(evaluations.outcome[row]),
+                          *("-" if np.isnan(value) else f"{value:.3f}" for value in metrics), end_section=evaluations is original)
     console.print(table)
-    print_text(console, "First the original vehicle. SD: least distance in m, or minus the collision's speed in m/s.")
+    print_text(console, "First row: the original vehicle. SD: least distance in m, or minus the collision's speed in m/s.")
 
 
 BANDS = ((5.0, "green"), (15.0, "yellow"), (25.0, "dark_orange"), (35.0, "orange4"))
-"""Relative impact speed [km/h] below which a colour holds, red above: the bands of Euro NCAP's tests of AEB between cars."""
-NAMED = 6
-"""How many of the points that fail are named."""
+"""Each colour applies below its relative impact speed [km/h], red above all: the bands of Euro NCAP's car-to-car AEB tests."""
+POINTS_NAMED = 6
+"""Maximum number of failing points that are named."""
 ROW, COLUMN = "speed", "impact_location"
 
 
 def print_matrix(console: Console, results: Sequence[AtPoint], row: int = 0) -> None:
-    """A table for each test and weather, speed by impact location; what else varies has rows of its own."""
+    """Print a table for each test and weather, speed by impact location; other dimensions have rows of their own."""
     records = [point_record(one, row) for one in results]
     tables: dict[tuple[str, str], list[tuple[dict[str, Any], dict[str, Any]]]] = {}
     for one, result in zip(results, records, strict=True):
@@ -279,11 +279,11 @@ def print_matrix(console: Console, results: Sequence[AtPoint], row: int = 0) -> 
         _print_table(console, f"{test}, {weather}", points)
     if records:
         hit = [result["point"] for result in records if result["impact_speed"] is not None]
-        first = "; ".join(hit[:NAMED]) + (f" and {len(hit) - NAMED} more" if len(hit) > NAMED else "")
+        first = "; ".join(hit[:POINTS_NAMED]) + (f" and {len(hit) - POINTS_NAMED} more" if len(hit) > POINTS_NAMED else "")
         summary = f"{len(hit)} of {len(records)} points fail{': ' + first if hit else ''}."
         invalid = sum(result["outcome"] == Outcome.INVALID_TEST for result in records)
         if invalid:
-            summary += f" {invalid} are no valid tests: the vehicle leaves the tolerance of their speed before the ADS acts."
+            summary += f" {invalid} are invalid tests: the vehicle leaves the tolerance of the test's speed before the ADS acts."
         print_text(console, summary)
 
 
@@ -307,8 +307,8 @@ def _cell(result: dict[str, Any]) -> Text:
     if result["outcome"] == Outcome.INVALID_TEST:
         return Text(f"{result['outcome']} ({result['test_speed_error']:+.1f} km/h)", "magenta")
     if result["impact_speed"] is None:
-        touched = f", {result['contact']['side']} side touched" if "contact" in result else ""
-        return Text("avoided" + touched if result["outcome"] in (Outcome.STOPPED, Outcome.PASSED) else result["outcome"], "green")
+        contact = f", {result['contact']['side']} side touched" if "contact" in result else ""
+        return Text("avoided" + contact if result["outcome"] in (Outcome.STOPPED, Outcome.PASSED) else result["outcome"], "green")
     relative = (result["relative_impact_speed"] or 0.0) * KMH_PER_MS
     colour = next((colour for below, colour in BANDS if relative < below), "red")
     return Text(f"{result['impact_speed'] * KMH_PER_MS:.1f} km/h", colour)

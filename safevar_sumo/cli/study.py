@@ -1,4 +1,4 @@
-"""Commands that run a study and show how far it is: study, status; and what they print."""
+"""Commands that run a study and show its progress: study, status; and the text that they print."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from rich.live import Live
 from rich.text import Text
 
 from safevar_sumo.analysis.research_questions.indicators import nondominated
-from safevar_sumo.api.running import ENGINES, carried_out, engine_for, open_pool, prepared
+from safevar_sumo.api.running import ENGINES, carry_out_runs, engine_for, load_for_search, open_pool
 from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
 from safevar_sumo.cli.options import Within, complete_study
-from safevar_sumo.cli.program import commands, tell_remarks
+from safevar_sumo.cli.program import commands, print_remarks
 from safevar_sumo.errors import InputError
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations, FloatArray
@@ -37,39 +37,39 @@ from safevar_sumo.workers.evaluation import Pool
 @click.argument("study", shell_complete=complete_study)
 @click.option("--runs", type=click.IntRange(1, 100_000), help="Runs of each algorithm.")
 @click.option("--evaluations", type=click.IntRange(1, 10_000_000), help="Simulations of each run.")
-@click.option("--algorithms", help="Which algorithms, separated by commas.")
+@click.option("--algorithms", help="Algorithms, separated by commas.")
 @click.option("--seed", type=click.IntRange(min=0, max=2**63 - 1), help="Seed of the whole study.")
 @click.option("--batch", type=click.IntRange(1, 10_000),
-              help="Settings per batch at the most, of several runs; never changes a result.  [default: what is fastest]")
+              help="Maximum settings per batch, gathered from several runs; never changes a result.  [default: the fastest]")
 @click.option("--engine", type=click.Choice(list(ENGINES.values())), default=ENGINES[Engine.RECORDED], show_default=True,
-              help="Who moves the vehicles: numpy in a scene that SUMO has played once, where nobody reacts to them, verified in SUMO; "
-                   "or SUMO always.")
+              help="What moves the vehicles. recorded: numpy in a scene that SUMO has played once, if no actor reacts to them, verified "
+                   "in SUMO; sumo: always SUMO.")
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the results.  [default: results/STUDY]")
 @click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes.  [default: the cores of this machine]")
 @click.option("--cluster", metavar="ADDRESS", help="Compute on the workers of this Dask scheduler instead.")
-@click.option("--only", metavar="ALGORITHM:RUN", help="This run alone, the first run is 0.")
+@click.option("--only", metavar="ALGORITHM:RUN", help="Only this run; runs count from 0.")
 @click.option("--shard", metavar="K/N", help="Every N-th run, from the K-th (1..N): for job arrays that share --out.")
-@click.option("--retry-failed", is_flag=True, help="Simulate again what could not be simulated before (simulator-error).")
-@click.option("--quiet", is_flag=True, help="Print errors and warnings alone.")
+@click.option("--retry-failed", is_flag=True, help="Simulate again the settings that could not be simulated before (simulator-error).")
+@click.option("--quiet", is_flag=True, help="Print only errors and warnings.")
 @click.option("--dry-run", is_flag=True, help="Estimate time and disk space without running anything.")
 def study(study: str, batch: int | None, engine: str, out: Path | None, jobs: int | None, cluster: str | None, only: str | None,
           shard: str | None, retry_failed: bool, quiet: bool, dry_run: bool, **options: Any) -> None:
     """Search STUDY; run the same command again to continue where it stopped."""
-    chosen, system = prepared(_with_options(load_study(study), **options), study)
-    tell_remarks(chosen, [*system.remarks, *vehicle_remarks(system)])
+    chosen, system = load_for_search(_with_options(load_study(study), **options), study)
+    print_remarks(chosen, [*system.remarks, *vehicle_remarks(system)])
     keys = _selected(all_runs(chosen), only, shard)
     directory = out or Path("results") / chosen.name
     with open_pool(chosen, jobs, cluster) as pool:
         if dry_run:
-            driven, reason = engine_for(system, engine)
-            size = batch or settings_per_batch(system, driven)
-            print_forecast(Console(), chosen, len(keys), forecast(chosen, len(keys), pool, size, driven), f"{ENGINES[driven]}: {reason}")
+            used, reason = engine_for(system, engine)
+            size = batch or settings_per_batch(system, used)
+            print_forecast(Console(), chosen, len(keys), forecast(chosen, len(keys), pool, size, used), f"{ENGINES[used]}: {reason}")
             return
         try:
             with CampaignProgress(Console(stderr=True), chosen, keys, quiet) as progress:
-                campaign = carried_out(chosen, system, keys, directory, pool, progress, batch, engine, retry_failed=retry_failed)
+                campaign = carry_out_runs(chosen, system, keys, directory, pool, progress, batch, engine, retry_failed=retry_failed)
         except KeyboardInterrupt:
-            click.echo(f"what is computed is kept in {directory}: the same command goes on from there", err=True)
+            click.echo(f"finished evaluations are kept in {directory}: run the same command again to continue", err=True)
             raise
         if not quiet:
             print_summary(Console(), chosen, campaign, directory, pool)
@@ -87,7 +87,7 @@ def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -
 
 
 def _selected(keys: list[RunKey], only: str | None, shard: str | None) -> list[RunKey]:
-    """The runs that a command asks for."""
+    """The runs that --only and --shard select."""
     if only is not None:
         algorithm, _, run = only.rpartition(":")
         keys = [key for key in keys if key.algorithm == algorithm and str(key.run) == run]
@@ -109,9 +109,9 @@ def _selected(keys: list[RunKey], only: str | None, shard: str | None) -> list[R
 @click.option("--json", "as_json", is_flag=True, help="Print JSON; with --watch, a line at every interval.")
 def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
     """Show the progress of the study in DIR, without disturbing it: runs, front, collisions, time left."""
-    from safevar_sumo.results import status as look
+    from safevar_sumo.results import status as read_status
 
-    progress, begun = look(directory), time.monotonic()
+    progress, start = read_status(directory), time.monotonic()
     first = progress
     for remark in progress.remarks:
         click.echo(remark, err=True)
@@ -119,7 +119,7 @@ def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
         click.echo(json.dumps(progress.record(), indent=None if watch else 2))
         while watch and not progress.finished:
             time.sleep(every)
-            progress = look(directory)
+            progress = read_status(directory)
             click.echo(json.dumps(progress.record()))
         return
     if not watch:
@@ -128,29 +128,29 @@ def status(directory: str, watch: bool, every: float, as_json: bool) -> None:
     with Live(status_view(progress, None), console=Console(), auto_refresh=False) as live:
         while not progress.finished:
             time.sleep(every)
-            progress = look(directory)
-            live.update(status_view(progress, (progress.share - first.share) / (time.monotonic() - begun)), refresh=True)
+            progress = read_status(directory)
+            live.update(status_view(progress, (progress.share - first.share) / (time.monotonic() - start)), refresh=True)
 
 
 SAFETY_NOTE = "SD: least distance in m, or minus the collision's speed in m/s.\nTET, TIT: over solutions without collision."
 
 
 def print_forecast(console: Console, study: Study, runs: int, cost: Forecast, engine: str) -> None:
-    """Estimated time and disk space of a campaign."""
+    """Print the estimated time and disk space of a campaign."""
     print_text(console, study.title)
     table = WholeTable(show_header=False)
     table.add_row("algorithms", ", ".join(study.search.labels))
     table.add_row("runs", str(runs))
     table.add_row("engine", engine)
-    table.add_row("evaluations, at the most", str(cost.evaluations))
+    table.add_row("evaluations, at most", str(cost.evaluations))
     table.add_row("evaluations/s, measured by a short probe", f"{cost.rate:.0f}")
-    table.add_row("time, at the most", f"{cost.seconds / 60:.1f} min")
-    table.add_row("disk, at the most", f"{cost.size / 1e6:.0f} MB")
+    table.add_row("time, at most", f"{cost.seconds / 60:.1f} min")
+    table.add_row("disk, at most", f"{cost.size / 1e6:.0f} MB")
     console.print(table)
 
 
 def print_summary(console: Console, study: Study, campaign: Campaign, directory: Path, pool: Pool) -> None:
-    """The answer; a table of the algorithms' solutions and the original; the most critical setting; RQ1 and RQ2 in brief."""
+    """Print the answer, a table of the algorithms' solutions and the original, the most critical setting, and RQ1 and RQ2 in brief."""
     from safevar_sumo.analysis.explain.summary import lead
     from safevar_sumo.analysis.research_questions.case import case_of
     from safevar_sumo.analysis.research_questions.over_runs import summary_lines  # takes longer to load than all the rest
@@ -162,7 +162,7 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
             print_text(console, line)
     by_vehicle = {"original vehicle": campaign.original}
     for algorithm in study.search.labels:
-        group = [one for key, one in campaign.solutions.items() if key.algorithm == algorithm]
+        group = [solutions_of_run for key, solutions_of_run in campaign.solutions.items() if key.algorithm == algorithm]
         if group:
             by_vehicle[algorithm] = Evaluations.concatenate(group)
     table = WholeTable("", right=by_vehicle, title=study.title)
@@ -175,13 +175,13 @@ def print_summary(console: Console, study: Study, campaign: Campaign, directory:
     console.print(table)
     console.print(SAFETY_NOTE)
     if campaign.failures:
-        console.print(f"{len(campaign.failures)} settings could not be simulated (simulator-error); they are in no result:")
+        console.print(f"{len(campaign.failures)} settings could not be simulated (simulator-error); no result contains them:")
         for line in failure_lines(campaign.failures):
             print_text(console, f"  {line}")
     invalid = sum(campaign.invalid_tests.values())
     if invalid:
         print_text(console, f"{invalid} settings leave the tolerance of a test's speed before the ADS acts (invalid-test): "
-                            "neither failures nor successes, they are in no result.")
+                            "they are neither failures nor successes, and no result contains them.")
     _print_most_critical(console, study, campaign)
     case = case_of(study, record(campaign.original, 0), solutions, solutions_frame(names, []), tuple(campaign.solutions),
                    scoring=campaign.scoring)
@@ -206,28 +206,28 @@ def _print_most_critical(console: Console, study: Study, campaign: Campaign) -> 
         f"{member.name} {member.original:g} -> {value:.6g} {'' if member.unit == '-' else member.unit}".rstrip()
         for member, value in zip(characteristics, worst.settings[0].tolist(), strict=True) if value != member.original]
     console.print(f"Most critical setting: SD {worst.f_safe[0]:.2f} ({worst.outcome[0]}), "
-                  f"the original's {campaign.original.f_safe[0]:.2f} ({campaign.original.outcome[0]}), by")
-    for change in changes or ["no change at all"]:
+                  f"the original's {campaign.original.f_safe[0]:.2f} ({campaign.original.outcome[0]}). Its changes:")
+    for change in changes or ["no change"]:
         console.print(f"  {change}")
 
 
-FRONT = 5
-"""Points of the front that are shown."""
+POINTS_SHOWN = 5
+"""Maximum number of points of the front that are shown."""
 RUNS_SHOWN = 12
-"""Runs under way that are named."""
+"""Maximum number of runs under way that are named."""
 
 
 def status_view(progress: Status, rate: float | None) -> RenderableType:
-    """A study's runs by algorithm and the front so far; `rate` is the share of the work done per second, if it is known."""
+    """A study's runs by algorithm and the front so far; `rate` is the share of all work done per second, None if unknown."""
     table = WholeTable("algorithm", right=("runs", "under\nway", "simulated", "collisions", "simulator\nerrors", "best\nSD"),
                        title=progress.title)
     for algorithm in dict.fromkeys(run.algorithm for run in progress.runs):
         group = [run for run in progress.runs if run.algorithm == algorithm]
-        table.add_row(algorithm, *_cells(group))
-    return Group(table, Text(_under_way(progress)), Text(_left(progress, rate)), _front(progress))
+        table.add_row(algorithm, *_counts(group))
+    return Group(table, Text(_under_way(progress)), Text(_time_left(progress, rate)), _front(progress))
 
 
-def _cells(runs: list[RunStatus]) -> list[str]:
+def _counts(runs: list[RunStatus]) -> list[str]:
     best = [run.best for run in runs if run.best is not None]
     return [f"{sum(run.state == 'finished' for run in runs)}/{len(runs)}", str(sum(run.state == "begun" for run in runs)),
             str(sum(run.simulated for run in runs)), str(sum(run.collisions for run in runs)),
@@ -240,7 +240,7 @@ def _under_way(progress: Status) -> str:
     return f"Under way: {', '.join(begun[:RUNS_SHOWN])}{more}" if begun else ""
 
 
-def _left(progress: Status, rate: float | None) -> str:
+def _time_left(progress: Status, rate: float | None) -> str:
     if progress.finished:
         return "Finished."
     if not rate:
@@ -249,13 +249,13 @@ def _left(progress: Status, rate: float | None) -> str:
 
 
 def _front(progress: Status) -> RenderableType:
-    """The most severe non-dominated points."""
+    """A table of the most severe non-dominated points."""
     if not len(progress.points):
         return Text("Nothing simulated yet.")
     front = nondominated(progress.points)
     front = front[front[:, 0].argsort(kind="stable")]
     table = WholeTable(right=("safety degree [m, -m/s]", "f_diff [fraction]", "changed"),
                        title=f"Front so far: {len(front)} points, the most severe ones")
-    for f_safe, f_diff, number in front[:FRONT].tolist():
+    for f_safe, f_diff, number in front[:POINTS_SHOWN].tolist():
         table.add_row(f"{f_safe:.2f}", f"{f_diff:.3f}", f"{number:.0f}")
     return table

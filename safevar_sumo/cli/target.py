@@ -1,4 +1,4 @@
-"""What is simulated: a study, or what a results directory holds."""
+"""The subject of a command: a study, or a results directory and its solutions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Command = Callable[..., Any]
 
 
 class Target(NamedTuple):
-    """A study, how errors call it, and the solution of its results that is replayed, if any: handle, setting, row."""
+    """A study, its name in errors, and the solution of its results to replay, if any: handle, setting, row."""
 
     study: Study
     source: str
@@ -40,13 +40,13 @@ def replay_options(command: Command) -> Command:
             click.option("--smallest", "choice", flag_value="smallest", help="Replay the unsafe solution with the smallest changes."),
             click.option("--fewest", "choice", flag_value="fewest", help="Replay the unsafe solution with the fewest changes."),
             click.option("--most-severe", "choice", flag_value="most_severe", help="Replay the most severe solution."),
-            click.option("--solution", metavar="ALG:RUN:N", help="Replay the N-th solution of a run, from 0, of a results directory.")):
+            click.option("--solution", metavar="ALG:RUN:N", help="Replay solution N of a run in a results directory; N counts from 0.")):
         command = option(command)
     return command
 
 
 def target_of(place: str, solution: str | None, choice: str | None) -> Target:
-    """Read what a command is given: a study by name or path, or a results directory.
+    """Load the subject of a command: a study by name or path, or a results directory.
 
     Raises
     ------
@@ -55,8 +55,7 @@ def target_of(place: str, solution: str | None, choice: str | None) -> Target:
     """
     if solution is not None and choice is not None:
         raise InputError("--solution", f"{solution!r} and --{choice.replace('_', '-')} both choose a solution", "one of them")
-    asked = solution is not None or choice is not None
-    if not asked:
+    if solution is None and choice is None:
         return Target(study_at_point(place), place)
     if place in study_names() and not Path(place).is_dir():
         raise InputError(place, "is a study and has no solutions", "a directory that the command study has written")
@@ -73,10 +72,10 @@ def target_of(place: str, solution: str | None, choice: str | None) -> Target:
 
 
 jobs_option = click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes.  [default: the cores of this machine]")
-point_option = click.option("--point", metavar="NAME", help="Of a study with a matrix: ask about this point of it alone.")
+point_option = click.option("--point", metavar="NAME", help="Only this point of the study's matrix.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 AS_IT_IS_NOW = "safevar_sumo.as_it_is_now"
-"""Key of that flag in a command's context, for every function that reads a results directory."""
+"""Key of the flag --as-it-is-now in a command's context, for every function that reads a results directory."""
 
 
 def _keep(context: click.Context, _option: click.Parameter, value: bool) -> None:
@@ -85,19 +84,19 @@ def _keep(context: click.Context, _option: click.Parameter, value: bool) -> None
 
 now_option = click.option(
     "--as-it-is-now", is_flag=True, expose_value=False, callback=_keep,
-    help="Simulate with the files and versions that are there now where results were computed with others, and say so.")
+    help="If results were computed with other files or versions, simulate with the present ones, and say so.")
 
 
 def as_it_is_now() -> bool:
-    """Whether the command that runs was given that flag."""
+    """Whether the running command has the flag --as-it-is-now."""
     return bool(click.get_current_context().meta.get(AS_IT_IS_NOW))
 
 
 def options_of(question: type[Options]) -> Callable[[Command], Command]:
-    """The flags of a question's options; the command's keywords make the record, `question(**keywords)`."""
+    """Add the flags of a question's options; `question(**keywords)` makes the record from the command's keywords."""
     def add(command: Command) -> Command:
-        for one in reversed(fields(question)):
-            command = _flag(question.flags()[one.name], one.name, one.default, question.described()[one.name])(command)
+        for field in reversed(fields(question)):
+            command = _flag(question.flags()[field.name], field.name, field.default, question.described()[field.name])(command)
         return command
 
     return add
@@ -109,35 +108,35 @@ def _flag(flag: str, name: str, default: Any, option: Option) -> Callable[[Comma
     if option.form != "one":
         return click.option(flag, name, multiple=option.form == "repeated", metavar=option.metavar, help=option.help,
                             callback=lambda _context, _option, value: _names(value) if option.form == "commas" else value)
-    (low_open, high_open), shows = option.is_open, default is not None
+    (low_open, high_open), show_default = option.is_open, default is not None
     kind: click.ParamType[Any] = click.STRING
     if option.kind is int:
         kind = click.IntRange(option.low, option.high)  # type: ignore[arg-type]
     elif option.kind is float:
         kind = Within(option.low, option.high, min_open=low_open, max_open=high_open)
-    return click.option(flag, name, type=kind, default=default, show_default=shows, metavar=option.metavar, help=option.help)
+    return click.option(flag, name, type=kind, default=default, show_default=show_default, metavar=option.metavar, help=option.help)
 
 
 def _names(text: str | None) -> tuple[str, ...] | None:
-    """Names between commas."""
+    """Names separated by commas."""
     return None if text is None else tuple(name.strip() for name in text.split(","))
 
 
 def results_or_study(place: str, point: str | None = None) -> Study | Case:
-    """The case in a results directory, or a study by name or path; at one point of its matrix if one is named.
+    """The case in a results directory, or a study by name or path; at `point` of its matrix if given.
 
     Raises
     ------
     InputError
-        If it is neither, or has no such point.
+        If `place` is neither, or has no such point.
     """
     from safevar_sumo.analysis.subject import study_or_case
 
-    with warnings.catch_warnings(record=True) as changed:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         source = study_or_case(place, as_it_is_now=as_it_is_now())
-    for one in changed:
-        click.echo(f"warning: {one.message}", err=True)
+    for warning in caught:
+        click.echo(f"warning: {warning.message}", err=True)
     if point is None:
         return source
     if isinstance(source, Study):
@@ -152,6 +151,6 @@ def _at(study: Study, point: str) -> Study:
 
 
 def study_at_point(place: str, point: str | None = None) -> Study:
-    """The study that is named, or the one that a results directory records; raises as `results_or_study`."""
+    """The named study, or the study that a results directory records; raises as `results_or_study`."""
     source = results_or_study(place, point)
     return source if isinstance(source, Study) else source.study

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.analysis.words import ENDS
-from safevar_sumo.api.simulation import assembled, changed
+from safevar_sumo.api.simulation import changed_setting, load_and_assemble
 from safevar_sumo.metrics import METRICS, RATING_POINTS, MetricFacts
 from safevar_sumo.records import STANDSTILL, Evaluations, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.replay.film import Film, film
@@ -150,8 +150,8 @@ def compare(study: StudyLike, changes: Mapping[str, float] | None = None, *, fil
     SimulationError
         If SUMO fails.
     """
-    chosen, system = assembled(study)
-    setting = changed(system, changes, filtered, beyond)
+    chosen, system = load_and_assemble(study)
+    setting = changed_setting(system, changes, filtered, beyond)
     return compare_setting(chosen, system, system.characteristics.filter(setting) if filtered else setting)
 
 

@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from safevar_sumo.errors import unknown
 from safevar_sumo.plugins import Contract, Guard, read_only_copy
-from safevar_sumo.records import EVERYWHERE, NOTHING, BoolArray, Encounter, FloatArray, Trace
+from safevar_sumo.records import EVERYWHERE, ZERO, BoolArray, Encounter, FloatArray, Trace
 from safevar_sumo.study import Weather
 
 VUT = "vut"
@@ -111,7 +111,7 @@ class Scene(NamedTuple):
     lateral: FloatArray
     lateral_speed: FloatArray
     over: BoolArray
-    obstacle_speed: FloatArray = NOTHING
+    obstacle_speed: FloatArray = ZERO
     visible: BoolArray = EVERYWHERE
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.api.running import NullObserver, carried_out
+from safevar_sumo.api.running import NullObserver, carry_out_runs
 from safevar_sumo.campaign import all_runs
 from safevar_sumo.conformance import refuse_defects
 from safevar_sumo.errors import ForeignError, InputError
@@ -84,7 +84,7 @@ def test_a_class_that_remembers_what_only_a_rare_setting_does(mine: Mine, folder
     study = load_study(str(folder / "mine.toml"), search={"algorithms": ["nsga2"], "evaluations": 60, "runs": 1})
     for _ in range(2):  # the same command again does not get by either
         with pytest.raises(ForeignError, match=r"in run nsga2-00 and [\d.]+ alone; again by: python -m safevar_sumo simulate") as caught:
-            carried_out(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), 7)
+            carry_out_runs(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), 7)
         assert "ads.model = 'mine:Mine' a result depends on what else is simulated" in str(caught.value)
     assert not (tmp_path / "out/solutions.csv").exists()
 
@@ -110,7 +110,7 @@ def test_an_algorithm_whose_runs_learn_from_each_other(own: str, shared: bool, m
     study = load_study(str(folder / "mine.toml"))
 
     def searched() -> object:
-        return carried_out(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
+        return carry_out_runs(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
 
     if shared:
         with pytest.raises(ForeignError, match=r"'mine:Mine' settings asked for .* in a second run .*mine.py:9"):
@@ -145,7 +145,7 @@ def test_a_class_that_makes_every_twelfth_vehicle_safer(mine: Mine, folder: Path
     system = mine(SAFER)
     study = load_study(str(folder / "mine.toml"), search={"algorithms": ["rs"], "evaluations": 100, "runs": 2})
     with pytest.raises(ForeignError, match=r"ads.model = 'mine:Mine' (a result depends on what else is simulated|.* in another order)"):
-        carried_out(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
+        carry_out_runs(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
 
 
 CLOCK = """
@@ -167,7 +167,7 @@ def test_an_algorithm_that_draws_from_the_clock(mine: Mine, folder: Path, tmp_pa
     system = mine(CLOCK, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 1\n')
     study = load_study(str(folder / "mine.toml"))
     with pytest.raises(ForeignError, match=r"'mine:Mine' settings asked for .* when the same is done once more .*mine.py:10"):
-        carried_out(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
+        carry_out_runs(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
 
 
 GREEDY = """
@@ -194,7 +194,7 @@ def test_an_algorithm_that_changes_its_problem_or_asks_for_nothing(module: str, 
     system = mine(module, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 10\nruns = 1\n')
     study = load_study(str(folder / "mine.toml"))
     with pytest.raises(ForeignError, match=problem):
-        carried_out(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
+        carry_out_runs(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
 
 
 @pytest.fixture

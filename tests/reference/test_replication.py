@@ -107,7 +107,7 @@ def test_the_page_has_both_sides_and_says_what_is_missing(sides: Path) -> None:
 @pytest.mark.parametrize(("arguments", "problem"), [
     (("one", "--published", "rain"), "none of sun"),
     (("one", "same", "--published", "other"), "two results of the study"),
-    (("one", "rain", "--published", "other", "wet", "--reference", "rs.csv"), "may belong to each of sun, rain"),
+    (("one", "rain", "--published", "other", "wet", "--reference", "rs.csv"), "may belong to any of sun, rain"),
     (("one", "--published", "other", "--reference", "nonsense=rs.csv"), "belongs to none of"),
     (("one", "--published", "other", "--reference", "nowhere.csv"), "cannot be read"),
 ])

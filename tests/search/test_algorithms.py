@@ -20,7 +20,7 @@ from jmetal.problem import DTLZ2
 from jmetal.util.termination_criterion import StoppingByEvaluations
 from scipy.stats import mannwhitneyu
 
-from safevar_sumo.api.running import prepared
+from safevar_sumo.api.running import load_for_search
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.search import ALGORITHMS, MapElites, MoCell, Problem
@@ -319,7 +319,7 @@ def test_a_grid_closes_on_itself() -> None:
 ])
 def test_options_that_cannot_be_used_are_refused(search: dict[str, object], problem: str) -> None:
     with pytest.raises(InputError) as refused:
-        prepared(load_study("smoke", search={"algorithms": ["spea2", "mocell"], **search}))
+        load_for_search(load_study("smoke", search={"algorithms": ["spea2", "mocell"], **search}))
     assert problem in str(refused.value)
 
 
@@ -355,4 +355,4 @@ def test_an_atlas_that_cannot_be_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
     assert MapElites(behaviour="speed").cells(17) == 17 * 21
     monkeypatch.setitem(sys.modules, "ribs", None)
     with pytest.raises(InputError, match="needs pyribs"):
-        prepared(load_study("smoke", search={"algorithms": ["map_elites"]}))
+        load_for_search(load_study("smoke", search={"algorithms": ["map_elites"]}))
