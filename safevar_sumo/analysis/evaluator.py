@@ -23,18 +23,18 @@ from safevar_sumo.workers.interrupts import first_of
 from safevar_sumo.workers.local import available_cores, local_pool
 from safevar_sumo.workers.retrying import RetryingPool
 
-PARTS = 2
-"""Parts of a rating's cells for each worker."""
+PARTS_PER_WORKER = 2
+"""A rating's cells are divided into this many parts for each worker."""
 CONFIDENCE = 0.95
-"""Of the intervals of shares, where no option says otherwise."""
+"""Confidence level of the intervals of shares, unless an option sets another."""
 PROBED = 1024
-"""Settings over the whole domain that decide whether a study has collisions at all."""
+"""Number of settings over the whole domain that decide whether a study has collisions at all."""
 Progress = Callable[[str, int, int], None]
-"""Called with the stage, how many of its settings are done, and how many there are."""
+"""Called with the stage, the number of its settings done so far, and their total."""
 
 
 DRAWS_PER_FEASIBLE = 64
-"""Points of a sequence that are drawn at most for each feasible point."""
+"""Maximum number of points drawn from a sequence for each feasible point."""
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -47,7 +47,7 @@ class Evaluator:
     Attributes
     ----------
     simulated
-        How many settings were evaluated so far.
+        Number of settings evaluated so far.
     """
 
     def __init__(self, study: Study, pool: Pool, progress: Progress = silent) -> None:
@@ -58,9 +58,9 @@ class Evaluator:
 
     def evaluate(self, settings: FloatArray, stage: str, before: int = 0, total: int | None = None, *,
                  anywhere: bool = False) -> Evaluations:
-        """Evaluate settings, shape (M, n); `stage` is their name in the progress, where they follow the first `before` of all `total`.
+        """Evaluate settings, shape (M, n); progress counts them in `stage`, after the first `before` of `total` settings.
 
-        Settings that violate a constraint of the study are not simulated, their outcome is `infeasible`, unless `anywhere` is true.
+        Unless `anywhere` is true, settings that violate a constraint of the study get the outcome `infeasible` without a simulation.
         """
         if self.region and not anywhere:
             feasible = self.region.feasible(settings)
@@ -70,17 +70,17 @@ class Evaluator:
                 return Evaluations.concatenate(parts).take(order)  # back to the order of settings: the feasible rows were evaluated first
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
-        done, different = 0, len(np.unique(settings, axis=0))
-        whole = different if total is None else total
-        self.progress(stage, before, whole)
+        done, distinct = 0, len(np.unique(settings, axis=0))
+        stage_total = distinct if total is None else total
+        self.progress(stage, before, stage_total)
 
         def count(number: int) -> None:
             nonlocal done
             done += number
-            self.progress(stage, before + done, whole)
+            self.progress(stage, before + done, stage_total)
 
         evaluations = evaluate_all(self.study, settings, self._pool, count)
-        self.simulated += different
+        self.simulated += distinct
         return evaluations
 
     def _infeasible(self, settings: FloatArray) -> Evaluations:
@@ -96,16 +96,16 @@ class Evaluator:
             return spread(self.characteristics, number, seed)
         rng, drawn = np.random.default_rng(seed), 0
 
-        def following(some: int) -> FloatArray:
+        def next_points(count: int) -> FloatArray:
             """The next points of the sequence."""
             nonlocal drawn
-            drawn += some
-            return spread(self.characteristics, drawn, seed)[drawn - some:]
+            drawn += count
+            return spread(self.characteristics, drawn, seed)[drawn - count:]
 
-        return self.region.sampled(following, number, rng, filtered=filtered, rejections=DRAWS_PER_FEASIBLE)
+        return self.region.sampled(next_points, number, rng, filtered=filtered, rejections=DRAWS_PER_FEASIBLE)
 
     def cells(self, settings: FloatArray, stage: str) -> CellResults:
-        """Results of settings, shape (M, n), in every cell of a rated study; each worker has a part of the cells, not of the settings.
+        """Results of settings, shape (M, n), in every cell of a rated study; the workers share the cells, not the settings.
 
         Raises
         ------
@@ -115,7 +115,7 @@ class Evaluator:
         rater = rater_of(self.study, self.study.source)
         assert rater is not None
         number = len(rater.protocol.cells)
-        parts = min(PARTS * self._pool.workers, number)
+        parts = min(PARTS_PER_WORKER * self._pool.workers, number)
         inputs, pool = inputs_of(self.study, self._pool), RetryingPool(self._pool, self.study)
         self.progress(stage, 0, number)
         futures = {pool.submit(packed(self.study, inputs, cells=(k, parts)), settings): k for k in range(parts)}
@@ -139,7 +139,7 @@ class Evaluator:
         Raises
         ------
         SimulationError
-            If it cannot be simulated.
+            If the original vehicle cannot be simulated.
         """
         evaluations = self.evaluate(self.characteristics.original[np.newaxis], "original vehicle")
         if not evaluations.valid[0]:
@@ -147,7 +147,7 @@ class Evaluator:
         return evaluations
 
     def criterion(self, stated: str | None, original: Evaluations | None = None) -> Unsafe:
-        """The criterion that an option states, by default the usual one; raises as `Unsafe.parse` and `Unsafe.default_among`."""
+        """The criterion that an option states, else the default one; raises as `Unsafe.parse` and `Unsafe.default_among`."""
         if stated is not None:
             return Unsafe.parse(stated)
         original = self.original() if original is None else original
@@ -157,7 +157,7 @@ class Evaluator:
 
     def with_step(self, step: float) -> Evaluator:
         """An evaluator of the same study with another time step [s]."""
-        metrics = msgspec.structs.replace(self.study.metrics, sampling_interval=None)  # it need not be a multiple of this step
+        metrics = msgspec.structs.replace(self.study.metrics, sampling_interval=None)  # the study's may be no multiple of this step
         return self.for_study(msgspec.structs.replace(self.study, step_length=step, metrics=metrics))
 
     def for_study(self, study: Study) -> Evaluator:
@@ -178,8 +178,8 @@ def open_evaluator(study: Study, pool: Pool | None = None, jobs: int | None = No
         yield Evaluator(study, pool, progress)
         return
     assemble(study, study.source)
-    with local_pool(jobs or available_cores(), study.search.time_limit) as own:
-        yield Evaluator(study, own, progress)
+    with local_pool(jobs or available_cores(), study.search.time_limit) as local:
+        yield Evaluator(study, local, progress)
 
 
 def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:

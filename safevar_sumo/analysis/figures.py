@@ -39,7 +39,7 @@ def new_figure(title: str, rows: int, columns: int, size: tuple[float, float], *
 
 
 def panels(title: str, number: int, across: int, panel: tuple[float, float], least_width: float, above: float) -> tuple[Figure, list[Axes]]:
-    """A figure with `number` panels, at most `across` side by side, of a size [inches], and the panels' axes."""
+    """A figure with `number` panels of the size `panel` [inches], at most `across` side by side, and the panels' axes."""
     columns = min(across, number)
     rows = -(-number // columns)
     figure, axes = new_figure(title, rows, columns, (max(panel[0] * columns, least_width), above + panel[1] * rows))
@@ -54,7 +54,7 @@ def save(figure: Figure, path: Path, source: str = "out") -> None:
     Raises
     ------
     InputError
-        If it cannot be written.
+        If the file cannot be written.
     """
     import matplotlib
 
@@ -67,10 +67,10 @@ def save(figure: Figure, path: Path, source: str = "out") -> None:
 
 
 def literal(name: str) -> str:
-    """A name in which matplotlib sees no formula."""
+    """A name, escaped so that matplotlib sees no formula in it."""
     return name.replace("$", r"\$")
 
 
 def as_formula(unit: str) -> str:
-    """A unit with its powers raised."""
+    """A unit with its powers as superscripts."""
     return re.sub(r"\^(-?\d+)", r"$^{\1}$", literal(unit))

@@ -1,4 +1,4 @@
-"""The vehicle model's own uncertainty: what its parameter sets that fit the published data as well make of one setting."""
+"""The vehicle model's own uncertainty: predictions for one setting by all parameter sets that fit the published data equally well."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from safevar_sumo.vehicles import CharacteristicSet
 BAND = 0.9
 """Share of the predictions that lie in a band."""
 DEVIATIONS = 1.645
-"""Standard deviations on each side of a normal distribution's mean that hold that share."""
-AS_GIVEN = 1e-5
-"""Relative difference below which a study has the value of its spread's first set, which is rounded."""
+"""Half the width [standard deviations] of the interval around a normal distribution's mean that holds that share."""
+ROUNDING = 1e-5
+"""Relative tolerance within which a study's value equals the (rounded) value in the first set of its spread."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelSpread:
-    """What the parameter sets of a study's table [spread] make of one setting.
+    """Predictions for one setting by the parameter sets of a study's table [spread].
 
     Attributes
     ----------
     sets
-        How many sets there are.
+        Number of parameter sets.
     lower, upper
-        The band that 90 % of their safety degrees and of repeats of one simulation lie in, wider by the model's error where the study
-        tells it [m, or -m/s]; None where none has one.
+        Ends of the band that holds 90 % of their safety degrees and of repeats of one simulation, widened by the model's error where
+        the study states it [m, or -m/s]; None if no set has a safety degree.
     collisions
-        With how many of the sets the setting collides.
+        Number of sets with which the setting collides.
     """
 
     sets: int
@@ -52,20 +52,21 @@ class ModelSpread:
     def __str__(self) -> str:
         """One sentence."""
         if self.lower is None or self.upper is None:
-            return f"no safety degree with any of {self.sets} parameter sets that fit the published data as well"
+            return f"no safety degree with any of {self.sets} parameter sets that fit the published data equally well"
         hits = "none of them" if not self.collisions else f"{self.collisions} of them"
         return (f"safety degree {self.lower:.2f} to {self.upper:.2f} ({BAND:.0%} band of {self.sets} parameter sets that fit the published "
-                f"data as well, of repeats and of the model's error); a collision with {hits}")
+                f"data equally well, of repeats and of the model's error); a collision with {hits}")
 
 
 def model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[ModelSpread]:
-    """The model's own uncertainty for each of some settings, shape (M, n), as they are, without the filter; in a matrix at one point of it,
-    or where each comes off worst.
+    """The model's own uncertainty for each setting, shape (M, n); the filter is not applied.
+
+    In a matrix the settings are simulated at `point`; without one, each setting at its worst point.
 
     Raises
     ------
     InputError
-        If the study has no spread, or one of parameters that it does not have.
+        If the study has no spread, or the spread names a parameter that the study lacks.
     """
     evaluations = evaluations_of_sets(study, settings, point)
     lower, upper = band_of(study, evaluations)
@@ -75,19 +76,19 @@ def model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[M
 
 
 def band_of(study: Study, evaluations: Sequence[Evaluations]) -> tuple[FloatArray, FloatArray]:
-    """Ends of the band of what the parameter sets make of settings, repeats and the model's error with it; each of shape (M,)."""
+    """Ends of the band of the sets' predictions for settings, including repeats and the model's error; each of shape (M,)."""
     error = study.model_error.get(SAFETY_DEGREE, 0.0) * distance(study, evaluations[0].settings)
     return band(np.stack([one.f_safe for one in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0), error)
 
 
 def distance(study: Study, settings: FloatArray) -> FloatArray:
-    """How far settings are from the original vehicle, each characteristic in widths of its domain (Euclidean); shape (M,)."""
+    """Euclidean distance of settings from the original vehicle, each characteristic in widths of its domain; shape (M,)."""
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     return np.asarray(np.linalg.norm((settings - characteristics.original) / (characteristics.upper - characteristics.lower), axis=1))
 
 
 def band(safety_degrees: FloatArray, repeatability: float, error: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
-    """Ends of the band of predictions, shape (sets, M), and of repeats of one simulation, `error` wider on each side; of shape (M,)."""
+    """Ends, shape (M,), of the band of predictions, shape (sets, M), and repeats of one simulation; `error` is added on each side."""
     lower, upper = np.full(safety_degrees.shape[1], np.nan), np.full(safety_degrees.shape[1], np.nan)
     defined = np.isfinite(safety_degrees).any(axis=0)
     lower[defined], upper[defined] = np.nanquantile(safety_degrees[:, defined], [(1 - BAND) / 2, (1 + BAND) / 2], axis=0)
@@ -95,21 +96,21 @@ def band(safety_degrees: FloatArray, repeatability: float, error: FloatArray | f
 
 
 def evaluations_of_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
-    """Some settings, shape (M, n), with each of the parameter sets, the study's own first; in this process."""
+    """Evaluate settings, shape (M, n), in this process with each parameter set, the study's own first."""
     systems = [assemble(one) for one in studies_of_sets(study)]
     return [evaluate(named_point(one, point, "point") if point else one, settings) for one in systems]
 
 
 def studies_of_sets(study: Study) -> list[Study]:
-    """The study with each of the parameter sets. A parameter to which the study gives another value than the first set keeps it.
+    """The study with each of the parameter sets. If the study's value of a parameter differs from the first set's, it stays as it is.
 
     Raises
     ------
     InputError
-        If there are no sets, or a parameter of theirs is none of the study's.
+        If there are no sets, or the study lacks one of their parameters.
     """
     if not study.spread:
         raise InputError(study.source, "has no table [spread]", "a study that `calibrate` has fitted, such as sun or rain")
-    sets = {key: values for key, values in study.spread.items() if np.isclose(value_of(study, key), values[0], rtol=AS_GIVEN, atol=0)}
+    sets = {key: values for key, values in study.spread.items() if np.isclose(value_of(study, key), values[0], rtol=ROUNDING, atol=0)}
     count = len(next(iter(study.spread.values())))
     return [study, *(with_values(study, {key: values[k] for key, values in sets.items()}) for k in range(1, count))]

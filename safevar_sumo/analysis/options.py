@@ -24,8 +24,8 @@ class Option(NamedTuple):
     """One option as a flag: help, legal range, name and form of its flag.
 
     `kind` is the type of one value; `form` is "one" value, "commas" between several, or "repeated" flags. The ends `low` and
-    `high` belong to the range unless it is `is_open`. `python` describes the argument of the Python function where that takes
-    something else than the flag.
+    `high` belong to the range unless it is `is_open`. `python` describes the argument of the Python function where it differs
+    from the flag.
     """
 
     help: str
@@ -40,12 +40,12 @@ class Option(NamedTuple):
 
     @property
     def argument(self) -> str:
-        """What the documentation of the Python function says of the option."""
+        """The option's description in the documentation of the Python function."""
         text = self.python or re.sub(r"\s+\[default: (.*)\]$", r" By default \1.", self.help)
         return fill(re.sub(r"--([a-z]+)", r"`\1`", text), 110, break_on_hyphens=False)
 
     def refusal(self, value: float) -> str:
-        """What is expected, if a number is outside the range (as NaN is); empty if it is inside."""
+        """The expected range, if a number is outside it (as NaN is); empty if the number is inside."""
         above = self.low is None or (value > self.low if self.is_open[0] else value >= self.low)
         below = self.high is None or (value < self.high if self.is_open[1] else value <= self.high)
         if above and below:
@@ -60,7 +60,7 @@ def option(default: Any, text: str, **how: Any) -> Any:
 
 
 def unsafe_option() -> Any:
-    usual = "a collision if anything that is looked at collides, else half of the original's safety degree"
+    usual = "a collision if any evaluated setting collides, else half of the original's safety degree"
     return option(None, f"What is unsafe: a collision, or a safety degree below X.  [default: {usual}]", metavar="collision|below=X",
                   python="What is unsafe: `\"collision\"`, or a number X for a safety degree below X [m, or minus a collision's speed in "
                          f"m/s], or an `Unsafe`. By default {usual}.")
@@ -77,7 +77,7 @@ class Options:
     """
 
     question: ClassVar[str]
-    """The command that asks it."""
+    """The command that asks the question."""
 
     def __post_init__(self) -> None:
         for name, described in self.described().items():
@@ -101,7 +101,7 @@ class Options:
         return {name: option.flag or f"--{name.replace('_', '-')}" for name, option in cls.described().items()}
 
     def command_line(self, place: str, point: str = "") -> str:
-        """The command that asks the same of a study or results directory: what differs from the defaults is a flag."""
+        """The command that asks the same of a study or results directory; options that differ from their defaults become flags."""
         parts = [RUN, self.question, quote(place)]
         for item in fields(self):
             value, flag, described = getattr(self, item.name), self.flags()[item.name], item.metadata["option"]
@@ -119,25 +119,25 @@ class Options:
 
 
 EVERY_QUESTION = """pool
-    Where to simulate, if not in worker processes of its own.
+    Pool to simulate on; by default worker processes of its own.
 jobs
     Worker processes, by default one for each core.
 progress
-    True for a bar on the terminal, or a function called with the stage, how much of it is done, and how much there is.
+    True for a bar on the terminal, or a function called with the stage, the number of its settings done, and their total.
 as_it_is_now
-    Simulate with what is there now if results were computed with something else, and warn; by default that is refused.
+    If inputs have changed since results were computed, simulate with the present ones and warn; by default an error is raised.
 
 Raises
 ------
 InputError
-    If something that is asked for is not there or cannot be used, or has changed since the results were computed.
+    If an argument is wrong, or inputs have changed since the results were computed.
 SimulationError
     If the original vehicle cannot be simulated."""
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def documented(options: type[Options]) -> Callable[[Function], Function]:
-    """Complete the docstring of a question's function, which ends with its first argument: its options, and what all questions take."""
+    """Append the options, and the arguments common to all questions, to a function's docstring, which ends with its first argument."""
     def complete(function: Function) -> Function:
         arguments = [f"{name}\n{indent(described.argument, '    ')}" for name, described in options.described().items()]
         function.__doc__ = "\n".join([cleandoc(function.__doc__ or ""), *arguments, EVERY_QUESTION])

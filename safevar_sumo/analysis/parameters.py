@@ -34,18 +34,18 @@ def with_values(study: Study, values: Mapping[str, float]) -> Study:
 
 
 def value_of(study: Study, name: str) -> float:
-    """What a parameter is in the study."""
+    """The value of a parameter in the study."""
     table, key = _place(study, _raw(study), name)
     return float(table[key])
 
 
 def _raw(study: Study) -> Any:
-    """The study as tables; a weather that is given by its name as the table behind it."""
+    """The study as tables; the name of a weather is replaced by the weather's table."""
     return msgspec.to_builtins(msgspec.structs.replace(study, weather=weather_of(study.weather, study.source)))
 
 
 def _place(study: Study, raw: Any, name: str) -> tuple[Any, Any]:
-    """The table or list that a parameter stands in, and its key or index there."""
+    """The table or list that holds a parameter, and its key or index there."""
     refused = InputError(study.source, f"calibration.{name!r} is no parameter of the study",
                          f"a number that is given under {', '.join(prefix.rstrip('.') for prefix in FITTED)}")
     if not name.startswith(FITTED):
@@ -64,5 +64,5 @@ def _place(study: Study, raw: Any, name: str) -> tuple[Any, Any]:
 
 
 def _key(table: Any, name: str) -> int | str:
-    """A list's places are told in one way only: two names of one parameter would be fitted against each other."""
+    """The key, or the index of a list; an index has only one spelling, else two names of one parameter could be fitted at once."""
     return int(name) if isinstance(table, list) and name == str(int(name)) else name

@@ -1,7 +1,7 @@
 """Preventability of collisions (ISO 34502, UN R157): would a reference driver have avoided them in the same vehicle?
 
-A collision that a competent driver avoids is the driving system's failure. One that not even full braking at the first
-possible moment avoids is the vehicle's.
+If a competent driver avoids a collision, the driving system failed. If not even full braking at the first possible moment
+avoids it, the vehicle is the cause.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from safevar_sumo.sumo.matrix import at_every_point, simulate, study_at, worst_p
 from safevar_sumo.sumo.system import System, assemble
 
 LIMIT = 20_000
-"""Approximate limit of simulations for a study's preventability; of more collisions a random sample is simulated."""
+"""Approximate limit of simulations for a study's preventability; beyond it only a random sample of the collisions is simulated."""
 
-TOGETHER = 20
-"""Settings that are simulated at all points of a matrix in one call: enough to fill its batches."""
+SETTINGS_PER_CALL = 20
+"""Number of settings simulated at all points of a matrix in one call: enough to fill its batches."""
 
 
 class PreventableBy(StrEnum):
@@ -47,7 +47,7 @@ class Preventability:
     numbers
         Number of simulated collisions of each class; the classes are disjoint.
     collisions
-        How many different collisions there are.
+        Number of distinct collisions, whether simulated or not.
     """
 
     numbers: Mapping[PreventableBy, int]
@@ -55,7 +55,7 @@ class Preventability:
 
     @property
     def looked_at(self) -> int:
-        """How many collisions were simulated with the reference drivers."""
+        """Number of collisions simulated with the reference drivers."""
         return sum(self.numbers.values())
 
     def share(self, by: PreventableBy) -> float | None:
@@ -65,8 +65,8 @@ class Preventability:
     def interval(self, by: PreventableBy) -> tuple[float, float] | None:
         """95 % interval of the share among all of the study's collisions; None if none were looked at.
 
-        Where all are looked at the share has no sampling error: the interval is the share itself. For a sample it is
-        Clopper and Pearson's, without the correction for a finite population, so it rather is too wide.
+        If all collisions are looked at, the share has no sampling error and the interval is the share itself. For a sample it is
+        Clopper and Pearson's, which is too wide rather than too narrow, as it lacks the correction for a finite population.
         """
         share = self.share(by)
         if share is None or self.looked_at == self.collisions:
@@ -89,19 +89,19 @@ class Preventability:
 
 
 def preventability(evaluator: Evaluator, settings: FloatArray, limit: int = LIMIT) -> Preventability:
-    """Who avoids the collisions of these settings, shape (M, n); equal ones count once.
+    """Classify the collisions of settings, shape (M, n), by the driver that avoids them; equal settings count once.
 
-    If that takes more than about `limit` simulations, a random sample is looked at, drawn with the study's seed.
+    If that takes more than about `limit` simulations, only a random sample is looked at, drawn with the study's seed.
     A setting that cannot be simulated with a reference driver counts as not looked at.
     """
     unique = np.unique(settings, axis=0)
-    most = max(limit // (len(PreventableBy) - 1 + len(assemble(evaluator.study).matrix)), 1)
-    rows = np.random.default_rng(evaluator.study.search.seed).permutation(len(unique))[:most]
+    sample_size = max(limit // (len(PreventableBy) - 1 + len(assemble(evaluator.study).matrix)), 1)
+    rows = np.random.default_rng(evaluator.study.search.seed).permutation(len(unique))[:sample_size]
     return Preventability(numbers=Counter(by for by in preventable_by(evaluator, unique[rows]) if by is not None), collisions=len(unique))
 
 
 def preventable_by(evaluator: Evaluator, settings: FloatArray) -> list[PreventableBy | None]:
-    """Who avoids each collision, settings of shape (M, n); in a matrix at the point where the setting comes off worst.
+    """The class of each collision, for settings of shape (M, n); in a matrix, each setting collides again at its worst point.
 
     None where a setting cannot be simulated.
     """
@@ -111,31 +111,31 @@ def preventable_by(evaluator: Evaluator, settings: FloatArray) -> list[Preventab
     for k in np.unique(worst).tolist():
         rows = np.flatnonzero(worst == k)
         point = system.points[k]
-        here = evaluator.for_study(study_at(evaluator.study, point.name, point.name) if system.matrix else evaluator.study)
-        for row, by in zip(rows.tolist(), _at_one_point(here, system.at(point), settings[rows]), strict=True):
+        at_point = evaluator.for_study(study_at(evaluator.study, point.name, point.name) if system.matrix else evaluator.study)
+        for row, by in zip(rows.tolist(), _at_one_point(at_point, system.at(point), settings[rows]), strict=True):
             classes[row] = by
     return classes
 
 
 def _worst_points(evaluator: Evaluator, system: System, settings: FloatArray) -> npt.NDArray[np.intp]:
-    """For every setting the number of the point where it comes off worst."""
+    """Index of the worst point of every setting."""
     worst = np.zeros(len(settings), dtype=np.intp)
     if system.matrix:
-        for start in range(0, len(settings), TOGETHER):
+        for start in range(0, len(settings), SETTINGS_PER_CALL):
             evaluator.progress("worst points of the collisions", start, len(settings))
-            worst[start:start + TOGETHER] = worst_points(at_every_point(system, settings[start:start + TOGETHER]))
+            worst[start:start + SETTINGS_PER_CALL] = worst_points(at_every_point(system, settings[start:start + SETTINGS_PER_CALL]))
     return worst
 
 
 def _at_one_point(evaluator: Evaluator, system: System, settings: FloatArray) -> list[PreventableBy | None]:
-    """Full braking is only tried where the competent driver collides: the classes are disjoint."""
+    """Classes at one point; full braking is tried only where the competent driver collides, so the classes are disjoint."""
     parameters = approach(system)
     drivers = {name: evaluator.for_study(_driven_by(evaluator.study, name, parameters)) for name in ("competent_driver", "full_braking")}
     competent = drivers["competent_driver"].evaluate(settings, "a competent driver in the same vehicle")
-    left = np.flatnonzero(competent.collided)
-    braking = drivers["full_braking"].evaluate(settings[left], "full braking in the same vehicle")
+    remaining = np.flatnonzero(competent.collided)
+    braking = drivers["full_braking"].evaluate(settings[remaining], "full braking in the same vehicle")
     classes: list[PreventableBy | None] = [PreventableBy.COMPETENT_DRIVER if valid else None for valid in competent.valid]
-    for row, collided, valid in zip(left.tolist(), braking.collided, braking.valid, strict=True):
+    for row, collided, valid in zip(remaining.tolist(), braking.collided, braking.valid, strict=True):
         classes[row] = None if not valid else PreventableBy.NOBODY if collided else PreventableBy.FULL_BRAKING
     return classes
 
@@ -143,8 +143,8 @@ def _at_one_point(evaluator: Evaluator, system: System, settings: FloatArray) ->
 def approach(system: System) -> dict[str, Any]:
     """How a reference driver approaches from rest: as the driving system does with the original vehicle.
 
-    It replays the throttle until the driving system first brakes or reaches its peak speed, and holds that speed. So both are
-    at the same place when the danger begins. Where the run begins at speed, that speed is held.
+    The driver replays the throttle until the driving system first brakes or reaches its peak speed, and holds that speed, so that
+    both are at the same place when the danger begins. A run that begins at speed keeps that speed.
     """
     trace = simulate(system, system.characteristics.original[np.newaxis]).trace
     speed, braked = trace.speed[:, 0], trace.brake[:, 0] > 0

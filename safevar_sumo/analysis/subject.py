@@ -1,4 +1,4 @@
-"""What a question is asked of: a study, or the results of one, read back."""
+"""Subjects of questions: a study, or results read back from their directory."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
     from safevar_sumo.analysis.research_questions.case import Case
 
-MOST = 3
-"""Changes that are named in one line."""
+MOST_NAMED = 3
+"""Maximum number of changes that an error names."""
 
 
 @dataclass(frozen=True)
 class Results:
-    """What a results directory holds, finished or not.
+    """Contents of a results directory; its runs may be unfinished.
 
     Attributes
     ----------
@@ -46,21 +46,21 @@ class Results:
 
     @cached_property
     def original(self) -> Mapping[str, Any]:
-        """The original vehicle's outcome, metrics and objectives as plain values; what is undefined is None."""
+        """The original vehicle's outcome, metrics and objectives as plain values, None where undefined."""
         return dict(read_manifest(self.directory)["original"])
 
     @property
     def solutions(self) -> pd.DataFrame:
         """One row per solution of every finished run.
 
-        Columns: algorithm, run (not of imported ones), the characteristics in their table units, f_safe [m or -m/s],
+        Columns: algorithm, run (absent from imported results), the characteristics in their table units, f_safe [m or -m/s],
         f_diff [fraction], f_num_diff, the metrics in their units (NaN where undefined), outcome.
         """
         return self.case.solutions
 
     @property
     def evaluations(self) -> pd.DataFrame:
-        """One row per simulated setting of every run, in the order in which the run asked; columns as of `solutions`."""
+        """One row per simulated setting of every run, in the order of the run's requests; same columns as `solutions`."""
         return self.case.evaluations
 
     @property
@@ -73,7 +73,7 @@ class Results:
 
 
 def load(directory: str | Path) -> Results:
-    """Read a results directory as `run` or a command has left it, finished or not.
+    """Read a results directory; its runs may be unfinished.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def load(directory: str | Path) -> Results:
     Raises
     ------
     InputError
-        If it is none, or a file in it is damaged.
+        If the directory holds no results, or a file in it is damaged.
     """
     from safevar_sumo.analysis.research_questions.case import load_cases
 
@@ -91,25 +91,25 @@ def load(directory: str | Path) -> Results:
 
 
 def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False) -> Study | Case:
-    """The study, or the case of results or of their directory, that a question is about.
+    """The subject of a question: a study, or the case of results (given as such or by their directory).
 
     Warns
     -----
     UserWarning
-        With `as_it_is_now` of what has changed since the results were computed.
+        With `as_it_is_now`: names each input that has changed since the results were computed.
 
     Raises
     ------
     InputError
-        If it is neither, or something that the results were computed with has changed since.
+        If `source` is neither, or an input of the results has changed since they were computed.
     """
     if isinstance(source, str | Path) and str(source) not in study_names():
-        if os.path.isdir(source):  # takes any text, which methods of a path do not
+        if os.path.isdir(source):  # accepts any text, unlike the methods of a path
             source = load(source)
         elif not os.path.exists(source):
-            legal = f"a directory that the command study has written, {one_of(study_names())}, or the path of a study file (TOML)"
+            expected = f"a directory that the command study has written, {one_of(study_names())}, or the path of a study file (TOML)"
             problem = f"is no results directory, no study and no file{did_you_mean(source, study_names())}"
-            raise InputError(source, problem, legal)
+            raise InputError(source, problem, expected)
     if isinstance(source, Results):
         for change in changes_since(source.directory, source.case, as_it_is_now=as_it_is_now):
             warn(f"{source.directory}: {change}")
@@ -118,18 +118,18 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False) ->
 
 
 def study_of(source: StudyLike | Results, *, as_it_is_now: bool = False) -> Study:
-    """The study itself, or the one of the results; raises as `study_or_case`."""
+    """The study itself, or the study of the results; raises as `study_or_case`."""
     subject = study_or_case(source, as_it_is_now=as_it_is_now)
     return subject if isinstance(subject, Study) else subject.study
 
 
 def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) -> list[str]:
-    """Differences between what is simulated now and what results were computed with; none of imported results, which record nothing.
+    """Changes of a simulation's inputs since results were computed; empty for imported results, which record no inputs.
 
     Raises
     ------
     InputError
-        If it differs in anything and `as_it_is_now` does not allow that; names the files.
+        If anything has changed and `as_it_is_now` is false; names the files.
     """
     from safevar_sumo.campaign import read_by_algorithms
     from safevar_sumo.sumo.system import assemble
@@ -146,21 +146,21 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     manifest, sources = comparable_inputs(manifest, sources, read_later(directory), study.origin.places)
     changed = differences_now(manifest, manifest_of(study, identity_of(study, system, sources)))
     if changed and not as_it_is_now:
-        more = f" (and {len(changed) - MOST} more)" if len(changed) > MOST else ""
-        raise InputError(directory / MANIFEST, f"{'; '.join(changed[:MOST])}{more}: what is simulated now is not what these results hold",
-                         "what was there then; or --as-it-is-now (as_it_is_now=True), which simulates with what is there now and says so")
+        more = f" (and {len(changed) - MOST_NAMED} more)" if len(changed) > MOST_NAMED else ""
+        raise InputError(directory / MANIFEST, f"{'; '.join(changed[:MOST_NAMED])}{more}: new simulations would not match these results",
+                         "the inputs of that time; or --as-it-is-now (as_it_is_now=True), which simulates with the present ones and warns")
     return [f"{difference}; simulated as it is now" for difference in changed]
 
 
 T = TypeVar("T")
 
 
-def answered(compute: Callable[..., T], subject: Study | Case, options: type[Options], given: Mapping[str, Any]) -> T:
-    """The result of a question's computation; `given` holds the arguments of the question's function by name."""
+def answer_question(compute: Callable[..., T], subject: Study | Case, options: type[Options], arguments: Mapping[str, Any]) -> T:
+    """The result of a question's computation; `arguments` are those of the question's function by name."""
     from safevar_sumo.metrics import Unsafe
 
-    asked = {name: given[name] for name in options.described()}
-    if asked.get("unsafe") is not None:
-        asked["unsafe"] = str(Unsafe.parse(asked["unsafe"]))
-    with shown(given["progress"]) as show:
-        return compute(subject, options(**asked), pool=given["pool"], jobs=given["jobs"], progress=show)
+    values = {name: arguments[name] for name in options.described()}
+    if values.get("unsafe") is not None:
+        values["unsafe"] = str(Unsafe.parse(values["unsafe"]))
+    with shown(arguments["progress"]) as show:
+        return compute(subject, options(**values), pool=arguments["pool"], jobs=arguments["jobs"], progress=show)

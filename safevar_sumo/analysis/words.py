@@ -18,7 +18,7 @@ ENDS = {
 
 
 def changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
-    """All changes of some values, in the study's order, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
+    """The changed ones of some values, in the study's order, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
     changed = [(member, values[member.name]) for member in characteristics if values.get(member.name, member.original) != member.original]
     return ", ".join(f"{member.name} {member.original:g} -> {member.text(value)}{member.suffix} "
                      f"({(value - member.original) / abs(member.original):+.1%})" for member, value in changed) or "no change at all"
@@ -46,10 +46,10 @@ def joined(parts: Iterable[str]) -> str:
 
 
 def number_of(count: int, what: str) -> str:
-    """`1 change`, `2 changes`."""
+    """A number with its noun: `1 change`, `2 changes`."""
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def decimal(value: float | None) -> str:
-    """Two decimals, never `-0.00`; `-` for what is undefined."""
+    """Two decimals, never `-0.00`; `-` if undefined."""
     return "-" if value is None or math.isnan(value) else f"{round(value, 2) + 0.0:.2f}"

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, course, sentence
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, sentence, summary_of
 from safevar_sumo.analysis.explain.causes import RESOLUTION, End, affordable, boundaries, involved, minimal_causes, necessary
 from safevar_sumo.analysis.explain.compute import explain_failures
 from safevar_sumo.analysis.explain.necessity import distinct_causes, necessity, robustness, smallest_robust
@@ -223,7 +223,7 @@ def drive_of(*vehicles: tuple[float, float, float, float]) -> SimulationRuns:
 
 def compared(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> BrakingComparison:
     drives = drive_of(one, other)
-    return compare_braking(*(course(drives, column, 1.0) for column in (0, 1)))
+    return compare_braking(*(summary_of(drives, column, 1.0) for column in (0, 1)))
 
 
 SAME = (10.0, 15.0, 0.2, 6.0)
@@ -251,7 +251,7 @@ def test_a_creeping_deceleration_is_no_late_pedal() -> None:
     drives.trace.speed[:, 1] = np.maximum(slower, 0.0)
     drives.trace.position[1:, 1] = np.cumsum((drives.trace.speed[1:, 1] + drives.trace.speed[:-1, 1]) / 2) * STEP
     drives.trace.gap[:, 1] = OBSTACLE - drives.trace.position[:, 1]
-    comparison = compare_braking(*(course(drives, column, 1.0) for column in (0, 1)))
+    comparison = compare_braking(*(summary_of(drives, column, 1.0) for column in (0, 1)))
     assert comparison.parts["delay"] == 0
     assert comparison.parts["deceleration"] == pytest.approx(comparison.lost)
     assert "later" not in sentence(comparison)

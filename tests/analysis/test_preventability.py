@@ -12,7 +12,7 @@ import scipy
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.braking_comparison import sentence
-from safevar_sumo.analysis.explain.compute import Where, points_in_words, where
+from safevar_sumo.analysis.explain.compute import PointComparison, compare_at_points, points_in_words
 from safevar_sumo.analysis.explain.summary import lead
 from safevar_sumo.analysis.preventability import PreventableBy, approach, preventability, preventable_by
 from safevar_sumo.metrics import Unsafe
@@ -105,18 +105,19 @@ def weak(system: System) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def failure(system: System, weak: np.ndarray) -> Where:
-    (one,), step = where(system, system.characteristics.original[np.newaxis], weak, Unsafe())
+def failure(system: System, weak: np.ndarray) -> PointComparison:
+    (one,), step = compare_at_points(system, system.characteristics.original[np.newaxis], weak, Unsafe())
     assert step == 0.05
     return one
 
 
-def test_it_fails_where_it_collides_when_simulated_there_alone(system: System, weak: np.ndarray, failure: Where) -> None:
+def test_it_fails_where_it_collides_when_simulated_there_alone(system: System, weak: np.ndarray, failure: PointComparison) -> None:
     alone = [point.name for point in system.points if evaluate(system.at(point), weak).collided[0]]
     assert list(failure.points) == alone == ["CPLA, speed 40, clear", "CPLA, speed 40, night", "CPFA, speed 30, clear"]
 
 
-def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(system: System, weak: np.ndarray, failure: Where) -> None:
+def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(system: System, weak: np.ndarray,
+                                                                            failure: PointComparison) -> None:
     assert failure.because.changed.safety_degree == evaluate(system, weak).f_safe[0]
     at = next(point for point in system.points if point.name == failure.because.place)
     original = evaluate(system.at(at), system.characteristics.original[np.newaxis])
@@ -131,7 +132,7 @@ def test_points_in_words() -> None:
 
 
 @pytest.mark.slow
-def test_the_summary_of_a_matrix_asks_why_at_the_worst_point_alone(system: System, weak: np.ndarray, failure: Where) -> None:
+def test_the_summary_of_a_matrix_asks_why_at_the_worst_point_alone(system: System, weak: np.ndarray, failure: PointComparison) -> None:
     study = load_study("euro_ncap_pedestrian", matrix={"tests": TESTS})
     solutions = solutions_frame(system.characteristics.names, [(("nsga2", 0), evaluate(system, weak))])
     original = evaluate(system, system.characteristics.original[np.newaxis])

@@ -99,7 +99,7 @@ def test_a_warning_of_what_has_changed_names_the_callers_line(question: str, sli
     shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("runs"))
     manifest = json.loads((slippery / "manifest.json").read_text())
     write_manifest(tmp_path / "copy", {**manifest, "results": 0})
-    monkeypatch.setattr(f"safevar_sumo.analysis.{question}.answered", lambda *_: None)
+    monkeypatch.setattr(f"safevar_sumo.analysis.{question}.answer_question", lambda *_: None)
     with pytest.warns(UserWarning, match="simulated as it is now") as caught:
         getattr(sv, question)(tmp_path / "copy", as_it_is_now=True)
     assert {one.filename for one in caught} == {__file__}

@@ -26,13 +26,12 @@ from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.tolerance.render import print_tolerance, profiles_figure
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of
+from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.report.input import _at_point as at_point
 from safevar_sumo.report.rated import picture
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo import rater
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers.evaluation import evaluate_batch
 

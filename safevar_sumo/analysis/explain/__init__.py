@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, documented, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answered, study_or_case
+from safevar_sumo.analysis.subject import Results, answer_question, study_or_case
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
@@ -31,9 +31,9 @@ class ExplainOptions(Options):
         python='Handles of solutions, such as "nsga2:3:0". By default the robust failure with the fewest changes, those with the fewest '
                "and the smallest changes, the most severe one, and one of each distinct minimal cause, the most frequent first.")
     unsafe: str | None = unsafe_option()
-    top: int = option(8, "How many failures are explained in full.", kind=int, low=1, high=1000)
-    limit: int = option(40_000, "Simulations, about, for the minimal causes of all failures; of more failures a random sample is looked "
-                                 "into.", kind=int, low=1, metavar="N")
+    top: int = option(8, "Maximum number of failures explained in full.", kind=int, low=1, high=1000)
+    limit: int = option(40_000, "Approximate number of simulations for the minimal causes of all failures; if all failures would take "
+                                 "more, a random sample is analysed.", kind=int, low=1, metavar="N")
 
 
 @documented(ExplainOptions)
@@ -45,8 +45,8 @@ def explain(source: StudyLike | Results, *, solutions: Sequence[str] = ExplainOp
     Parameters
     ----------
     source
-        Results or their directory, whose solutions are explained; or a study, of which failures all over the domain are.
+        Results or their directory, to explain their solutions; or a study, to explain failures all over its domain.
     """
     from safevar_sumo.analysis.explain.compute import explain_failures
 
-    return answered(explain_failures, study_or_case(source, as_it_is_now=as_it_is_now), ExplainOptions, locals())
+    return answer_question(explain_failures, study_or_case(source, as_it_is_now=as_it_is_now), ExplainOptions, locals())

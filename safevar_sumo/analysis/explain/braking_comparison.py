@@ -34,7 +34,7 @@ class Braking(NamedTuple):
     time, gap, speed
         Time, gap and speed when the brake was first commanded [s, m, m/s].
     delay
-        From the command until its brake pedal has followed it [s].
+        Time from the command until the brake pedal has followed it [s].
     mean_speed_lost, speed_lost
         Speed at the command less the mean speed during the delay, and less the speed at its end [m/s].
     deceleration
@@ -60,7 +60,7 @@ class Braking(NamedTuple):
         return self.gap - self.needed
 
 
-class Course(NamedTuple):
+class RunSummary(NamedTuple):
     """Summary of one run: its outcome, its braking (None without any), and the least gap.
 
     `safety_degree` is in m, or -m/s; NaN if undefined. `closest` is the gap where the obstacle is nearest [m], NaN on a collision.
@@ -80,8 +80,8 @@ class BrakingComparison(NamedTuple):
     `slowing` are the distances that the two save by slowing down while the pedal moves [m].
     """
 
-    original: Course
-    changed: Course
+    original: RunSummary
+    changed: RunSummary
     parts: dict[str, float]
     place: str = ""
     slowing: tuple[float, float] = (0.0, 0.0)
@@ -92,21 +92,21 @@ class BrakingComparison(NamedTuple):
         return sum(self.parts.values())
 
 
-def course(runs: SimulationRuns, column: int, safety_degree: float) -> Course:
+def summary_of(runs: SimulationRuns, column: int, safety_degree: float) -> RunSummary:
     """Summary of one of N runs."""
     trace, encounter = runs.trace, runs.encounter
     active = np.flatnonzero(trace.active[:, column])
     counted = trace.active[:, column] & encounter.in_conflict[:, column]
     impact_speed, collided = float(runs.collision_speed[column]), bool(np.isfinite(runs.collision_speed[column]))
     if not active.size:
-        return Course(str(runs.outcome[column]), safety_degree, None, np.nan, impact_speed)
+        return RunSummary(str(runs.outcome[column]), safety_degree, None, np.nan, impact_speed)
     last, closest = int(active[-1]), np.nan
     if counted.any() and not collided:
         last = int(np.argmin(np.where(counted, encounter.separation[:, column], np.inf)))
         closest = float(trace.gap[last, column])
     braked = (trace.brake[:last + 1, column] > 0) & (trace.speed[:last + 1, column] > STANDSTILL) & trace.active[:last + 1, column]
     braking = _braking(runs, column, int(np.argmax(braked)), last) if braked.any() else None
-    return Course(str(runs.outcome[column]), safety_degree, braking, closest, impact_speed)
+    return RunSummary(str(runs.outcome[column]), safety_degree, braking, closest, impact_speed)
 
 
 def _braking(runs: SimulationRuns, column: int, first: int, last: int) -> Braking | None:
@@ -125,7 +125,7 @@ def _braking(runs: SimulationRuns, column: int, first: int, last: int) -> Brakin
         speed_lost=initial - float(speed[pressed]), deceleration=energy / distance)
 
 
-def compare_braking(original: Course, changed: Course, place: str = "") -> BrakingComparison:
+def compare_braking(original: RunSummary, changed: RunSummary, place: str = "") -> BrakingComparison:
     """Compare a changed vehicle's run with the original's at the same place."""
     one, other = original.braking, _braking_or_the_originals(changed, original)
     if one is None or other is None:
@@ -136,7 +136,7 @@ def compare_braking(original: Course, changed: Course, place: str = "") -> Braki
     return BrakingComparison(original, changed, {**parts, "remainder": remainders[0] - remainders[1]}, place, slowing)
 
 
-def _braking_or_the_originals(changed: Course, original: Course) -> Braking | None:
+def _braking_or_the_originals(changed: RunSummary, original: RunSummary) -> Braking | None:
     """The braking of a changed vehicle; one that collides without braking is given the original's braking, at its own speed."""
     if changed.braking is not None or original.braking is None or not np.isfinite(changed.collision_speed):
         return changed.braking
@@ -158,7 +158,7 @@ def _parts(one: Braking, other: Braking) -> tuple[dict[str, float], tuple[float,
         "deceleration": (1 / other.deceleration - 1 / one.deceleration) * (speeds[0]**2 + speeds[1]**2) / 4}, (saved[0], saved[1])
 
 
-WORTH_A_WORD = 0.005
+LEAST_MENTIONED = 0.005
 """Smallest part of a distance that a sentence mentions [m]: half a centimetre."""
 PARTS = {
     "place": ("it begins to brake nearer", "it begins to brake farther away"), "speed": ("it is faster", "it is slower"),
@@ -168,16 +168,16 @@ PARTS = {
 """Words for a part that costs distance, and for the same part where it gains distance."""
 
 
-def ending(course: Course) -> str:
+def ending(run: RunSummary) -> str:
     """How a run ended, in words."""
-    if course.outcome == Outcome.COLLISION:
-        return f"hits at {course.collision_speed:.2f} m/s"
-    end = ENDS.get(Outcome(course.outcome), course.outcome)
-    return end if course.safety_degree != course.safety_degree else f"{end}, safety degree {course.safety_degree:.2f} m"
+    if run.outcome == Outcome.COLLISION:
+        return f"hits at {run.collision_speed:.2f} m/s"
+    end = ENDS.get(Outcome(run.outcome), run.outcome)
+    return end if run.safety_degree != run.safety_degree else f"{end}, safety degree {run.safety_degree:.2f} m"
 
 
 def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
-    """Why the changed vehicle is less safe than the original, in one sentence or two; `full` says what the distance lost is."""
+    """Why the changed vehicle is less safe than the original, in one sentence or two; `full` explains the distance lost."""
     at = f"At {comparison.place}: the" if comparison.place else "The"
     ends = f"{at} original {ending(comparison.original)}; this one {ending(comparison.changed)}."
     one, other = comparison.original.braking, comparison.changed.braking
@@ -190,7 +190,7 @@ def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
     parts, is_lost = comparison.parts, comparison.lost >= 0
     pieces = [f"{abs(parts[name]):.2f} m {costs if parts[name] > 0 else gains}because {PARTS[name][parts[name] < 0]}"
               f"{_numbers(comparison, name)}"
-              for name in sorted(PARTS, key=lambda name: -parts[name]) if abs(parts[name]) >= WORTH_A_WORD]
+              for name in sorted(PARTS, key=lambda name: -parts[name]) if abs(parts[name]) >= LEAST_MENTIONED]
     if abs(parts["remainder"]) > REMAINDER:
         pieces.append(f"{parts['remainder']:+.2f} m that this does not explain")
     if not pieces:

@@ -1,7 +1,7 @@
 """Minimal causes: the smallest subsets of a setting's changes that are unsafe by themselves.
 
-Outcomes need not be monotone: one change may undo the effect of another. So nothing is inferred: subsets are simulated size by
-size, all of a size, until some are unsafe. Those are minimal, as no smaller subset is unsafe.
+Outcomes need not be monotone: one change may undo the effect of another. So all subsets of a size are simulated, size by size,
+until some are unsafe. These are minimal, as no smaller subset is unsafe.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import FloatArray
 
 CHUNK = 20_000
-"""Subsets that are held in memory at the same time."""
+"""Maximum number of subsets in memory at the same time."""
 
 
 class MinimalCause(NamedTuple):
@@ -53,21 +53,21 @@ def minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -
         subsets = [_Subset(setting, columns) for setting, group in enumerate(changed) if not causes[setting]
                    for columns in combinations(group, size)]
         for start in range(0, len(subsets), CHUNK):
-            part = subsets[start:start + CHUNK]
-            tried = np.tile(original, (len(part), 1))
-            for row, (setting, columns) in enumerate(part):
-                tried[row, list(columns)] = settings[setting, list(columns)]
-            evaluations = evaluator.evaluate(tried, f"subsets of {size} changes")
+            chunk = subsets[start:start + CHUNK]
+            partial = np.tile(original, (len(chunk), 1))
+            for row, (setting, columns) in enumerate(chunk):
+                partial[row, list(columns)] = settings[setting, list(columns)]
+            evaluations = evaluator.evaluate(partial, f"subsets of {size} changes")
             for row in np.flatnonzero(unsafe.of(evaluations)).tolist():
-                causes[part[row].setting].append(
-                    MinimalCause(part[row].columns, tried[row], str(evaluations.outcome[row]), finite_or_none(evaluations.f_safe[row])))
+                causes[chunk[row].setting].append(
+                    MinimalCause(chunk[row].columns, partial[row], str(evaluations.outcome[row]), finite_or_none(evaluations.f_safe[row])))
     return causes
 
 
 def expected_cost(changes: int) -> int:
-    """Estimate of the number of subsets of a number of changes that are simulated until the smallest unsafe ones appear.
+    """Estimated number of subsets of the changes that are simulated until the smallest unsafe subsets appear.
 
-    It assumes causes of half of the changes, about the size of those of the shipped studies.
+    Causes are assumed to have half of the changes, about as in the shipped studies.
     """
     return sum(comb(changes, size) for size in range((changes + 1) // 2 + 1))
 
@@ -93,7 +93,7 @@ def involved(causes: Sequence[MinimalCause]) -> frozenset[int]:
 
 
 GRID = 32
-"""Places simulated on a line at first: an unsafe island as wide as their distance is not skipped."""
+"""Number of points first simulated on a line, which finds every unsafe island as wide as their distance."""
 FINER = 8
 """Number of parts into which the interval with the boundary is divided, `ROUNDS` times."""
 ROUNDS = 3
@@ -112,8 +112,8 @@ class End(StrEnum):
 class Boundary(NamedTuple):
     """The smallest unsafe share of a cause's changes, and the setting there, shape (n,).
 
-    `alone` are, by column, the values that the changes can be taken back to one at a time, the others as they are. `end` is the
-    state just below the share; if that is the filter's threshold, `at_threshold` is the column whose change it puts back.
+    `alone` has, by column, the value to which this change can be reduced while the others stay as they are. `end` is the state
+    just below the share; if that is the filter's threshold, `at_threshold` is the column whose change the filter undoes.
     """
 
     fraction: float
@@ -173,15 +173,15 @@ class Line(NamedTuple):
         return np.where(part >= 1, self.end, self.start + part * (self.end - self.start))
 
 
-def first_unsafe(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, what: str = "boundaries") -> FloatArray:
+def first_unsafe(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, stage: str = "boundaries") -> FloatArray:
     """The first unsafe share of every line, whose end is unsafe; exact to `RESOLUTION` of the line above `lowest`."""
-    return edges(evaluator, lines, unsafe, what)[0]
+    return edges(evaluator, lines, unsafe, stage)[0]
 
 
-def edges(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, what: str = "boundaries") -> tuple[FloatArray, list[End]]:
+def edges(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, stage: str = "boundaries") -> tuple[FloatArray, list[End]]:
     """The first unsafe share of every line as `first_unsafe`, and the state just below it.
 
-    A place that cannot be simulated is neither safe nor unsafe: the search passes it and reports `NOT_SIMULATED` if it ends there.
+    A point that cannot be simulated is neither safe nor unsafe: the search passes it, and reports `NOT_SIMULATED` if it ends there.
     """
     lowest = np.array([line.lowest for line in lines])
     low, high, simulated = lowest, np.ones(len(lines)), np.ones(len(lines), dtype=bool)
@@ -189,7 +189,7 @@ def edges(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, what: str = "
         shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(1, parts + 1) / parts
         shares[:, -1] = high
         inner = np.concatenate([line.at(group[:-1]) for line, group in zip(lines, shares, strict=True)]) if lines else np.zeros((0, 0))
-        evaluations = evaluator.evaluate(inner, what)
+        evaluations = evaluator.evaluate(inner, stage)
         is_unsafe, valid = (np.ones(shares.shape, dtype=bool) for _ in range(2))
         is_unsafe[:, :-1] = unsafe.of(evaluations).reshape(len(lines), parts - 1)
         valid[:, :-1] = evaluations.valid.reshape(len(lines), parts - 1)

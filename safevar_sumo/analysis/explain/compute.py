@@ -9,7 +9,7 @@ import numpy as np
 
 from safevar_sumo.analysis.evaluator import Evaluator, Progress, finite_or_none, open_evaluator, silent
 from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, course
+from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, summary_of
 from safevar_sumo.analysis.explain.causes import MinimalCause, affordable, boundaries, minimal_causes, necessary
 from safevar_sumo.analysis.explain.necessity import STEP_FACTORS, distinct_causes, key_of, necessity, robustness, smallest_robust
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
@@ -29,8 +29,8 @@ Causes = Mapping[int, list[MinimalCause]]
 Reasons = tuple[str, ...]
 
 
-LOOKED_AT, RATED_LOOKED_AT = 4096, 64
-"""Settings over the whole domain that are searched for failures of a study without results."""
+SEARCHED, SEARCHED_IF_RATED = 4096, 64
+"""Number of settings over the whole domain that are searched for failures of a study without results."""
 
 
 class Failures(NamedTuple):
@@ -39,9 +39,9 @@ class Failures(NamedTuple):
     Attributes
     ----------
     evaluations
-        Of filtered settings; solutions of several runs that are the same setting are there once.
+        Evaluations of filtered settings; equal solutions of several runs are evaluated once.
     handles
-        Their handles as solutions; None for settings that are not.
+        The settings' handles as solutions; None for a setting that is no solution.
     unsafe
         The criterion.
     rows
@@ -74,7 +74,7 @@ def failures_of(source: Study | Case, evaluator: Evaluator, original: Evaluation
     if isinstance(source, Study):
         if named:
             raise InputError("solution", f"{source.name!r} is a study and has no solutions", "a results directory")
-        number = RATED_LOOKED_AT if is_rated(source) else LOOKED_AT
+        number = SEARCHED_IF_RATED if is_rated(source) else SEARCHED
         settings = evaluator.characteristics.filter(evaluator.spread(number, source.search.seed, filtered=True))
         solution_handles: list[SolutionId | None] = [None] * len(settings)
         recorded = None
@@ -82,11 +82,11 @@ def failures_of(source: Study | Case, evaluator: Evaluator, original: Evaluation
     else:
         solutions = source.solutions
         all_handles, all_settings = handles(solutions), solutions[list(evaluator.characteristics.names)].to_numpy(dtype=float)
-        asked = list(dict.fromkeys(position_of(solutions, handle) for handle in named))
-        kept = [*asked, *(row for row in _each_once(all_settings) if row not in set(asked))]
-        settings, solution_handles = all_settings[kept], [all_handles[row] for row in kept]
-        recorded = solutions["outcome"].to_numpy(dtype=str)[kept]
-        rows = list(range(len(asked))) if named else None
+        named_rows = list(dict.fromkeys(position_of(solutions, handle) for handle in named))
+        distinct = [*named_rows, *(row for row in _distinct_rows(all_settings) if row not in set(named_rows))]
+        settings, solution_handles = all_settings[distinct], [all_handles[row] for row in distinct]
+        recorded = solutions["outcome"].to_numpy(dtype=str)[distinct]
+        rows = list(range(len(named_rows))) if named else None
     evaluations = evaluator.evaluate(settings, "settings to explain")
     criterion = unsafe or Unsafe.default_among(evaluations, original)
     if rows is None:
@@ -95,57 +95,57 @@ def failures_of(source: Study | Case, evaluator: Evaluator, original: Evaluation
     return Failures(evaluations, solution_handles, criterion, rows, otherwise)
 
 
-def _each_once(settings: np.ndarray) -> list[int]:
+def _distinct_rows(settings: np.ndarray) -> list[int]:
     """The first row of every distinct setting, in their order."""
     return sorted(np.unique(settings, axis=0, return_index=True)[1].tolist())
 
 
 NAMED = 6
-"""How many of the points that fail are named in a sentence."""
+"""Maximum number of failing points that a sentence names."""
 
 
-class Where(NamedTuple):
+class PointComparison(NamedTuple):
     """A failure at the points of a study.
 
     Attributes
     ----------
     because
-        Original and failure side by side at the point at which the failure comes off worst.
+        Original and failure side by side at the failure's worst point.
     points
-        Names of the points of a matrix at which it is unsafe, in the study's order.
+        Names of the points of a matrix at which the failure is unsafe, in the study's order.
     """
 
     because: BrakingComparison
     points: tuple[str, ...]
 
 
-def where(system: System, original: FloatArray, settings: FloatArray, unsafe: Unsafe) -> tuple[list[Where], float]:
-    """Settings, shape (M, n), beside the original, shape (1, n); and the time step that they were simulated with [s]."""
+def compare_at_points(system: System, original: FloatArray, settings: FloatArray, unsafe: Unsafe) -> tuple[list[PointComparison], float]:
+    """Compare settings, shape (M, n), with the original, shape (1, n); also returns the time step of the simulations [s]."""
     at_points = at_every_point(system, np.concatenate([original, settings]))
     names, worst = points_of(system, at_points, unsafe)[1:], worst_points(at_points)[1:]
-    places = []
+    comparisons = []
     for row, (failing, at) in enumerate(zip(names, worst.tolist(), strict=True), 1):
         one = at_points[at]
-        first, other = (course(one.drives, column, float(one.evaluations.f_safe[column])) for column in (0, row))
-        places.append(Where(compare_braking(first, other, one.point.name), failing))
-    return places, at_points[0].drives.trace.step
+        first, other = (summary_of(one.drives, column, float(one.evaluations.f_safe[column])) for column in (0, row))
+        comparisons.append(PointComparison(compare_braking(first, other, one.point.name), failing))
+    return comparisons, at_points[0].drives.trace.step
 
 
-def turned(evaluator: Evaluator, original: FloatArray, settings: FloatArray) -> tuple[list[Where], float]:
-    """As `where`, of a rated study: the cells with another colour than the original's, and both vehicles in the cell that turns most."""
+def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: FloatArray) -> tuple[list[PointComparison], float]:
+    """As `compare_at_points`, for a rated study: the cells with a worse colour than the original's, compared in the worst of them."""
     system = assemble(evaluator.study)
     assert system.rater is not None
     colours = system.rater.points(evaluator.cells(np.concatenate([original, settings]), "cells that turn")).colours.astype(int)
-    places, step = list[Where](), 0.0
+    comparisons, step = list[PointComparison](), 0.0
     for row in range(1, len(colours)):
         worse = colours[row] - colours[0]
         point = system.matrix[int(np.argmax(worse))]
         (at_point,) = at_every_point(system.at(point), np.concatenate([original, settings[row - 1:row]]))
-        first, other = (course(at_point.drives, column, float(at_point.evaluations.f_safe[column])) for column in (0, 1))
+        first, other = (summary_of(at_point.drives, column, float(at_point.evaluations.f_safe[column])) for column in (0, 1))
         names = tuple(system.matrix[k].name for k in np.flatnonzero(worse).tolist())
-        places.append(Where(compare_braking(first, other, point.name), names))
+        comparisons.append(PointComparison(compare_braking(first, other, point.name), names))
         step = at_point.drives.trace.step
-    return places, step
+    return comparisons, step
 
 
 def points_of(system: System, at_points: list[AtPoint], unsafe: Unsafe) -> list[tuple[str, ...]]:
@@ -157,7 +157,7 @@ def points_of(system: System, at_points: list[AtPoint], unsafe: Unsafe) -> list[
 
 
 def points_in_words(points: tuple[str, ...], number: int, most: int = NAMED) -> str:
-    """Such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25, night; CPLA, speed 60, clear.`"""
+    """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25, night; CPLA, speed 60, clear.`"""
     first, more = "; ".join(points[:most]), len(points) - most
     others = f" and {more} more" if more > 0 else ""
     return f"Fails at {len(points)} of {number} points{': ' + first if points else ''}{others}."
@@ -171,9 +171,9 @@ class Chosen(NamedTuple):
     sample
         The rows that were analysed: all failures, or a random sample of them.
     causes
-        The minimal causes of these and of the chosen ones, by row.
+        The minimal causes of the sample and of the chosen failures, by row.
     reasons
-        The chosen rows, and why each was chosen.
+        The reasons for the choice of each chosen row.
     """
 
     original: Evaluations
@@ -193,7 +193,7 @@ def chosen_failures(source: Study | Case, options: ExplainOptions, evaluator: Ev
     settings, rows = failures.evaluations.settings, failures.rows
     sample = rows if named else [rows[i] for i in affordable(settings[rows], evaluator, limit)]
     robust = None if named or is_rated(evaluator.study) else _robust(failures, evaluator, original, limit)
-    reasons = dict.fromkeys(rows[:len(named)], ("asked for",)) if named else _that_matter(failures, robust)
+    reasons = dict.fromkeys(rows[:len(named)], ("asked for",)) if named else _choices(failures, robust)
     explained = sorted({*sample, *reasons})
     causes = dict(zip(explained, minimal_causes(evaluator, settings[explained], failures.unsafe), strict=True))
     if not named:
@@ -230,16 +230,16 @@ def _avoidable(study: Study, evaluations: Evaluations) -> BoolArray:
 
 
 def _robust(failures: Failures, evaluator: Evaluator, original: Evaluations, limit: int) -> int | None:
-    """The smallest robust failure, if there is one among those that may be tried; none where the original vehicle is unsafe itself."""
+    """The smallest robust failure that the limit allows to find; None without one, or if the original vehicle itself is unsafe."""
     if not failures.rows or failures.unsafe.of(original)[0]:
         return None
-    _, step = where(assemble(evaluator.study), original.settings, original.settings[:0], failures.unsafe)
+    _, step = compare_at_points(assemble(evaluator.study), original.settings, original.settings[:0], failures.unsafe)
     row = smallest_robust(evaluator, failures.evaluations.take(failures.rows), step, failures.unsafe, limit)
     return None if row is None else failures.rows[row]
 
 
-def _that_matter(failures: Failures, robust: int | None) -> dict[int, Reasons]:
-    """The reasons to explain a failure, by its row: smallest robust one, fewest changes, most severe, smallest changes."""
+def _choices(failures: Failures, robust: int | None) -> dict[int, Reasons]:
+    """Reasons to explain a failure, by its row: smallest robust one, fewest changes, most severe, smallest changes."""
     reasons: dict[int, Reasons] = {} if robust is None else {robust: (ROBUST,)}
     for choice in ("fewest", "most_severe", "smallest"):
         if failures.rows:
@@ -250,7 +250,7 @@ def _that_matter(failures: Failures, robust: int | None) -> dict[int, Reasons]:
 
 def _with_one_of_each_cause(failures: Failures, evaluator: Evaluator, sample: Causes, reasons: Mapping[int, Reasons], causes: Causes,
                             top: int) -> dict[int, Reasons]:
-    """Add one failure of each distinct minimal cause that is not there yet, the simplest that has it, up to `top` in all."""
+    """Add, up to `top` failures in all, the simplest failure of each distinct minimal cause that no chosen failure has yet."""
     chosen = dict(list(reasons.items())[:top])
     keys = {row: {key_of(evaluator.characteristics, cause) for cause in group} for row, group in causes.items()}
     for key in distinct_causes(evaluator.characteristics, list(sample.values()))["cause"]:
@@ -269,16 +269,16 @@ def _explained(failures: Failures, evaluator: Evaluator, original: Evaluations, 
     if not reasons:
         return ()
     rows = list(reasons)
-    here, names = failures.evaluations.take(rows), evaluator.characteristics.names
+    chosen, names = failures.evaluations.take(rows), evaluator.characteristics.names
     if is_rated(evaluator.study):
-        beside, step = turned(evaluator, original.settings, here.settings)
-        robust = robustness(evaluator, here.settings, step, failures.unsafe, STEP_FACTORS[:1])
+        comparisons, step = compare_at_cells(evaluator, original.settings, chosen.settings)
+        robust = robustness(evaluator, chosen.settings, step, failures.unsafe, STEP_FACTORS[:1])
     else:
-        beside, step = where(assemble(evaluator.study), original.settings, here.settings, failures.unsafe)
-        robust = robustness(evaluator, here.settings, step, failures.unsafe)
+        comparisons, step = compare_at_points(assemble(evaluator.study), original.settings, chosen.settings, failures.unsafe)
+        robust = robustness(evaluator, chosen.settings, step, failures.unsafe)
     shrunk = iter(boundaries(evaluator, [cause for row in rows for cause in causes[row]], failures.unsafe))
-    collided = np.flatnonzero(_avoidable(evaluator.study, here))
-    avoided = dict(zip(collided.tolist(), preventable_by(evaluator, here.settings[collided]), strict=True))
+    collided = np.flatnonzero(_avoidable(evaluator.study, chosen))
+    avoided = dict(zip(collided.tolist(), preventable_by(evaluator, chosen.settings[collided]), strict=True))
     explanations = []
     for i, row in enumerate(rows):
         group = []
@@ -290,11 +290,11 @@ def _explained(failures: Failures, evaluator: Evaluator, original: Evaluations, 
                 alone={names[column]: value for column, value in boundary.alone.items()}, outcome=cause.outcome,
                 safety_degree=cause.safety_degree, end=boundary.end,
                 at_threshold=None if boundary.at_threshold is None else names[boundary.at_threshold]))
-        changed = evaluator.characteristics.changed(here.settings[i])
+        changed = evaluator.characteristics.changed(chosen.settings[i])
         explanations.append(Explanation(
-            handle=failures.handles[row], reasons=reasons[row], setting=dict(zip(names, here.settings[i].tolist(), strict=True)),
-            outcome=str(here.outcome[i]), safety_degree=finite_or_none(here.f_safe[i]),
+            handle=failures.handles[row], reasons=reasons[row], setting=dict(zip(names, chosen.settings[i].tolist(), strict=True)),
+            outcome=str(chosen.outcome[i]), safety_degree=finite_or_none(chosen.f_safe[i]),
             changed=tuple(name for name, is_changed in zip(names, changed, strict=True) if is_changed),
             necessary=tuple(names[column] for column in sorted(necessary(causes[row]))), causes=tuple(group), robustness=robust[i],
-            because=beside[i].because, preventable=str(avoided.get(i) or ""), points=beside[i].points))
+            because=comparisons[i].because, preventable=str(avoided.get(i) or ""), points=comparisons[i].points))
     return tuple(explanations)

@@ -84,7 +84,7 @@ STEP_FACTORS = (1.0, 0.5, 2.0)
 BORDERLINE = 0.8
 """Share of unsafe neighbours below which a failure is called borderline."""
 FAILURES_PER_BATCH = 8
-"""Number of failures that are tried at a time, the smallest first."""
+"""Number of failures simulated at a time, the smallest first."""
 
 
 class Robustness(NamedTuple):
@@ -126,13 +126,13 @@ def robustness(evaluator: Evaluator, settings: FloatArray, step: float, unsafe: 
 
 
 def smallest_robust(evaluator: Evaluator, failures: Evaluations, step: float, unsafe: Unsafe, limit: int) -> int | None:
-    """The row of the smallest failure that is not borderline: of the fewest changes, then the smallest largest change.
+    """The row of the smallest failure that is not borderline: fewest changes first, then the smallest largest change.
 
     Failures are tried in that order until one is robust or about `limit` simulations are spent; None if no failure was robust by then.
     """
     order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])
-    most = max(FAILURES_PER_BATCH, limit // (NEIGHBOURS * len(STEP_FACTORS)))
-    for first in range(0, min(len(order), most), FAILURES_PER_BATCH):
+    affordable = max(FAILURES_PER_BATCH, limit // (NEIGHBOURS * len(STEP_FACTORS)))
+    for first in range(0, min(len(order), affordable), FAILURES_PER_BATCH):
         rows = order[first:first + FAILURES_PER_BATCH]
         for row, result in zip(rows.tolist(), robustness(evaluator, failures.settings[rows], step, unsafe), strict=True):
             if not result.borderline:

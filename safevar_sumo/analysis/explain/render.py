@@ -1,4 +1,4 @@
-"""Failures explained, for a reader: the shortest answer first."""
+"""The result of `explain` as text, the shortest answer first, and as a figure."""
 
 from __future__ import annotations
 
@@ -25,39 +25,39 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CAUSES_SHOWN = 3
-"""Minimal causes of a failure, and distinct ones of all failures, that a table has room for."""
+"""Maximum number of minimal causes printed for a failure."""
 DISTINCT_SHOWN = 10
 NECESSARY_SHOWN = 4
-Again = Callable[[Mapping[str, float]], str]
-"""The command that simulates these changes."""
+CommandFor = Callable[[Mapping[str, float]], str]
+"""Returns the command that simulates changes."""
 
 
 def print_explained(console: Console, place: str, result: Explained, point: str = "", *, full: bool = False) -> None:
-    """The answer in about ten lines; `full` explains every chosen failure. `place` and `point` stand in the printed commands."""
+    """Print the answer in about ten lines; `full` explains every chosen failure. `place` and `point` appear in the printed commands."""
     members = CharacteristicSet.of(result.study.vehicle.characteristics)
     print_text(console, result.study.title)
     print_text(console, f"Unsafe: {result.unsafe}. {number_of(result.failures, 'failure')} among {result.looked_at} different settings.")
     print_constraints(console, result.study)
     if result.otherwise:
-        print_text(console, f"note: {number_of(result.otherwise, 'setting')} not as the results say; another version or code?")
+        print_text(console, f"note: {number_of(result.otherwise, 'setting')} with another outcome than recorded; another version or code?")
     if not result.explanations:
         print_text(console, f"Nothing unsafe found. How far each characteristic may go: {ask('tolerance', place, point)}")
         return
-    again: Again = partial(command, place, point=point)
-    _print_answer(console, again, result, members)
+    command_for: CommandFor = partial(command, place, point=point)
+    _print_answer(console, command_for, result, members)
     if not full:
         print_text(console, f"{number_of(len(result.explanations), 'failure')} explained in full: {ask('explain', place, point)} --full")
         return
     print_text(console, _sawtooth(result))
     for failure in result.explanations:
-        _print_one(console, again, failure, members, result)
+        _print_one(console, command_for, failure, members, result)
     if result.preventability.looked_at:
         print_text(console, str(result.preventability))
     _print_common(console, result)
 
 
-def _print_answer(console: Console, again: Again, result: Explained, members: CharacteristicSet) -> None:
-    """The paragraph; why the first failure fails and how little is enough; the most frequent changes and causes."""
+def _print_answer(console: Console, command_for: CommandFor, result: Explained, members: CharacteristicSet) -> None:
+    """Print a paragraph, why the first failure fails and how little is enough, and the most frequent changes and causes."""
     first = result.explanations[0]
     by_reason = {reason: failure for failure in result.explanations for reason in failure.reasons}
     smallest, robust = by_reason.get(REASONS["fewest"], first), by_reason.get(ROBUST)
@@ -67,7 +67,7 @@ def _print_answer(console: Console, again: Again, result: Explained, members: Ch
     for cause in [cause for cause in first.causes if cause.changes][:1]:
         limits = [f"{_named(member)} {member.original:g} -> {member.text(cause.boundary[member.name])}{member.suffix}"
                   for member in members if member.name in cause.boundary]
-        print_text(console, f"How little is enough: {', '.join(limits)}. {again(cause.boundary)}")
+        print_text(console, f"How little is enough: {', '.join(limits)}. {command_for(cause.boundary)}")
     if result.analysed and len(result.distinct):
         print_text(console, f"Necessary most often ({_looked_at(result)}): {_most_necessary(result, members)}.")
         common = result.distinct.iloc[0]
@@ -76,11 +76,11 @@ def _print_answer(console: Console, again: Again, result: Explained, members: Ch
 
 
 def _finding(failure: Explanation | None) -> Finding | None:
-    """The record of a failure that the paragraph takes; None for a setting that is not unsafe."""
+    """The record of a failure for the paragraph; None for a setting that is not unsafe."""
     if failure is None or not failure.causes:
         return None
     changes = {name: failure.setting[name] for name in failure.changed}
-    return Finding(str(failure.handle or "a setting of its own"), changes, failure.outcome, failure.safety_degree, failure.robustness,
+    return Finding(str(failure.handle or "a sampled setting"), changes, failure.outcome, failure.safety_degree, failure.robustness,
                    len(failure.causes[0].changes))
 
 
@@ -112,15 +112,15 @@ def _sawtooth(result: Explained) -> str:
             "a value mean nothing.")
 
 
-def _print_one(console: Console, again: Again, failure: Explanation, members: CharacteristicSet, result: Explained) -> None:
-    title = f"{', '.join(LABELS.get(reason, reason) for reason in failure.reasons)}: {failure.handle or 'a setting of its own'}"
+def _print_one(console: Console, command_for: CommandFor, failure: Explanation, members: CharacteristicSet, result: Explained) -> None:
+    title = f"{', '.join(LABELS.get(reason, reason) for reason in failure.reasons)}: {failure.handle or 'a sampled setting'}"
     console.rule(escape(title), align="left")
     ends = f"{failure.outcome}, SD {decimal(failure.safety_degree)} with {number_of(len(failure.changed), 'change')}"
     print_text(console, f"{ends}: {changes(members, failure.setting)}")
     if not failure.causes:
         print_text(console, "It is not unsafe.")
     for cause in failure.causes[:CAUSES_SHOWN]:
-        _print_cause(console, again, cause, members)
+        _print_cause(console, command_for, cause, members)
     if len(failure.causes) > CAUSES_SHOWN:
         print_text(console, f"... and {len(failure.causes) - CAUSES_SHOWN} more of the same number of changes (--json has all).")
     if len(failure.causes) > 1:
@@ -141,7 +141,7 @@ def _print_one(console: Console, again: Again, failure: Explanation, members: Ch
         print_text(console, f"Unsafe neighbours within the filter's thresholds: {shares}; {word} ({failure.robustness.share:.0%}).")
 
 
-def _print_cause(console: Console, again: Again, cause: Cause, members: CharacteristicSet) -> None:
+def _print_cause(console: Console, command_for: CommandFor, cause: Cause, members: CharacteristicSet) -> None:
     if not cause.changes:
         print_text(console, "No change is needed: the original vehicle itself is unsafe.")
         return
@@ -153,11 +153,11 @@ def _print_cause(console: Console, again: Again, cause: Cause, members: Characte
             table.add_row(member.name, member.unit, f"{member.original:g}", *(member.text(value) for value in values))
     console.print(table)
     print_meanings(console, [member for member in members if member.name in cause.changes])
-    print_text(console, f"{cause.limit} {again(cause.changes)}")
+    print_text(console, f"{cause.limit} {command_for(cause.changes)}")
 
 
 def _side_by_side(comparison: BrakingComparison) -> WholeTable:
-    """Original and changed vehicle, and the part of the lost distance that each line explains."""
+    """Table of the original and the changed vehicle, with the part of the distance lost that each line explains."""
     table = WholeTable("", "unit", right=("original", "changed", "explains, m"))
     parts = comparison.parts
     brakings = comparison.original.braking, comparison.changed.braking
@@ -196,9 +196,9 @@ def _looked_at(result: Explained) -> str:
 
 
 def necessity_figure(result: Explained) -> Figure:
-    """How often each characteristic is necessary, beside how often it is changed (RQ3.2 asked again)."""
+    """How often each characteristic is necessary, beside how often it is changed (as RQ3.2 counts)."""
     frame = result.necessity.iloc[::-1]
-    figure, ((axis,),) = new_figure(f"{result.study.name}: changed is not needed", 1, 1, (6.4, 1.4 + 0.3 * max(len(frame), 4)))
+    figure, ((axis,),) = new_figure(f"{result.study.name}: changed vs. necessary", 1, 1, (6.4, 1.4 + 0.3 * max(len(frame), 4)))
     names = [literal(name) for name in frame["characteristic"]]
     for column, label, colour, height in (
             ("changed", "changed", CHANGED, 0.8), ("involved", "in some minimal cause", INVOLVED, 0.5),

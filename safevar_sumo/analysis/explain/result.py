@@ -19,7 +19,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 ROBUST = "smallest robust"
 REASONS = {"fewest": "fewest changes", "smallest": "smallest changes", "most_severe": "most severe"}
-"""Why a failure was chosen, as JSON has it."""
+"""Reasons for the choice of a failure, as in JSON."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,11 +33,11 @@ class Cause:
     boundary
         The same, shrunk by a common factor as far as they stay unsafe: at `fraction` of the changes.
     alone
-        How far each value alone can be taken back, the others as in `changes`.
+        The value to which each change can be reduced while the others stay as in `changes`.
     outcome, safety_degree
         Result of `changes` alone [m, or -m/s].
     end, at_threshold
-        State just below `fraction`; if that is the filter's threshold, the characteristic whose change it puts back.
+        State just below `fraction`; if that is the filter's threshold, the characteristic whose change the filter undoes.
     """
 
     changes: dict[str, float]
@@ -60,10 +60,10 @@ class Cause:
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation:
-    """One failure explained; `handle` is None for a setting that is no solution, `reasons` are those it was chosen for.
+    """One failure explained; `handle` is None if the setting is no solution, `reasons` are the reasons for its choice.
 
-    `safety_degree` is in m, or -m/s; `changed` and `necessary` are names; `causes` are all minimal ones; `preventable` is
-    the class of `PreventableBy` of a collision; `points` are those of a matrix at which it is unsafe.
+    `safety_degree` is in m, or -m/s; `changed` and `necessary` are names; `causes` are all minimal causes; `preventable` is
+    a collision's class of `PreventableBy`; `points` are the points of a matrix at which the setting is unsafe.
     """
 
     handle: SolutionId | None
@@ -103,7 +103,7 @@ class Explained:
     necessity, distinct
         Frames over all analysed failures, of `safevar_sumo.analysis.explain.necessity`.
     looked_at, failures, analysed
-        Numbers of settings evaluated, of unsafe ones among them, and of those over which the two frames are.
+        Numbers of evaluated settings, of unsafe ones among them, and of unsafe ones that the two frames cover.
     otherwise
         Number of solutions whose outcome differs from the results.
     preventability

@@ -10,7 +10,7 @@ import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Evaluator, finite_or_none
 from safevar_sumo.analysis.explain.causes import MinimalCause, minimal_causes
-from safevar_sumo.analysis.explain.compute import points_in_words, points_of, where
+from safevar_sumo.analysis.explain.compute import compare_at_points, points_in_words, points_of
 from safevar_sumo.analysis.explain.necessity import Robustness, robustness, smallest_robust
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, preventability
@@ -27,16 +27,16 @@ from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
-LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smallest largest change"}
+LABELS = {ROBUST: "robust with the fewest changes", REASONS["smallest"]: "smallest largest change", "a cause of its own": "distinct cause"}
 """Titles that name the quantity; for other reasons the reason is the title."""
 LIMIT = 4000
-"""Approximate limit of simulations for the robust failure at the end of a study; that of `explain` is higher."""
+"""Approximate limit of simulations for the robust failure at the end of a study; `explain` has a higher one."""
 
 
 def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Pool, place: str) -> list[str]:
-    """Summarise a study's solutions in lines: first a paragraph for a manager, last the command to go on with.
+    """Summarise a study's solutions in lines: first a paragraph for a manager, last the command for the next step.
 
-    What is unsafe is `Unsafe.default`.
+    The criterion is `Unsafe.default`.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
     original
         The original vehicle's evaluation.
     pool
-        Simulates subsets of their changes.
+        Simulates subsets of the solutions' changes.
     place
         The directory of the results.
     """
@@ -77,30 +77,30 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
 
 def _paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Series[bool], original: Evaluations, unsafe: Unsafe,
                point: str) -> str:
-    """The unsafe solutions in one paragraph; with `point` those that are unsafe at that point of a matrix."""
+    """The unsafe solutions in one paragraph; with `point`, the solutions that are unsafe at that point of a matrix."""
     names, all_handles = evaluator.characteristics.names, handles(solutions)
-    kept = np.flatnonzero(is_unsafe.to_numpy() & ~solutions.duplicated(list(names)).to_numpy())
+    candidates = np.flatnonzero(is_unsafe.to_numpy() & ~solutions.duplicated(list(names)).to_numpy())
     if point:
         evaluator = evaluator.for_study(study_at(evaluator.study, point, point))
         original = evaluator.original()
     system = assemble(evaluator.study)
-    evaluations = evaluator.evaluate(solutions.iloc[kept][list(names)].to_numpy(dtype=float), "unsafe solutions")
+    evaluations = evaluator.evaluate(solutions.iloc[candidates][list(names)].to_numpy(dtype=float), "unsafe solutions")
     preventable = preventability(evaluator, evaluations.settings[evaluations.collided])
     failing = np.flatnonzero(unsafe.of(evaluations))
     failures = evaluations.take(failing)
     if not len(failures):
         return in_short(system, original, None, None, preventable)
-    step = where(system, original.settings, original.settings[:0], unsafe)[1]
+    step = compare_at_points(system, original.settings, original.settings[:0], unsafe)[1]
     robust = smallest_robust(evaluator, failures, step, unsafe, LIMIT // len(system.points))
     fewest = int(np.lexsort([getattr(failures, name) for name in reversed(CHOICES["fewest"])])[0])
     rows = [fewest] if robust is None else [fewest, robust]
-    findings, here = [], failures.take(rows)
-    causes, shares = minimal_causes(evaluator, here.settings, unsafe), robustness(evaluator, here.settings, step, unsafe)
+    findings, chosen = [], failures.take(rows)
+    causes, shares = minimal_causes(evaluator, chosen.settings, unsafe), robustness(evaluator, chosen.settings, step, unsafe)
     for i, row in enumerate(rows):
-        changed = np.flatnonzero(evaluator.characteristics.changed(here.settings[i]))
-        changes = {names[column]: float(here.settings[i, column]) for column in changed}
-        name, degree = str(all_handles[kept[failing[row]]]), finite_or_none(here.f_safe[i])
-        findings.append(Finding(name, changes, str(here.outcome[i]), degree, shares[i], len(causes[i][0].columns)))
+        changed = np.flatnonzero(evaluator.characteristics.changed(chosen.settings[i]))
+        changes = {names[column]: float(chosen.settings[i, column]) for column in changed}
+        name, degree = str(all_handles[candidates[failing[row]]]), finite_or_none(chosen.f_safe[i])
+        findings.append(Finding(name, changes, str(chosen.outcome[i]), degree, shares[i], len(causes[i][0].columns)))
     return in_short(system, original, findings[0], findings[1] if len(findings) > 1 else None, preventable)
 
 
@@ -117,7 +117,7 @@ def _places(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple[list[st
 def _in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
     """The first of a setting's minimal causes, and how many others there are."""
     if not causes:
-        return "Simulated again it is not unsafe."
+        return "Simulated again, it is not unsafe."
     values = {evaluator.characteristics.names[column]: float(causes[0].setting[column]) for column in causes[0].columns}
     more = len(causes) - 1
     others = f" ({number_of(more, 'alternative set')} of the same size; see explain)" if more else ""
@@ -126,9 +126,9 @@ def _in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
 
 NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 NAMED = 4
-"""Most changes that are listed, the largest first."""
+"""Maximum number of changes that are listed, the largest first."""
 CONDITIONS = {"clear": "In clear weather", "wet": "On a wet road", "fog": "In fog", "night": "At night"}
-"""Weathers in words; others are named."""
+"""Weathers in words; any other weather is named."""
 
 
 class Finding(NamedTuple):
@@ -137,15 +137,15 @@ class Finding(NamedTuple):
     Attributes
     ----------
     name
-        Such as a solution's handle.
+        A name, such as a solution's handle.
     changes
-        All of its changes, values by name in their units.
+        All of the failure's changes, values by name in their units.
     outcome, safety_degree
         Result of the changes [m, or -m/s].
     robustness
-        Of the failure.
+        Robustness of the failure.
     needed
-        Number of changes that are enough: the size of its minimal causes.
+        Number of changes that are enough: the size of the failure's minimal causes.
     """
 
     name: str
@@ -157,18 +157,18 @@ class Finding(NamedTuple):
 
 
 def in_short(system: System, original: Evaluations, smallest: Finding | None, robust: Finding | None, preventable: Preventability) -> str:
-    """The paragraph.
+    """The paragraph about a study's failures.
 
     Parameters
     ----------
     system
-        Of the study; of a study with a matrix at the point, or all points, that the evaluations are of.
+        The study's system; with a matrix, at the point or the points of the evaluations.
     original
         The original vehicle's evaluation.
     smallest
         The failure with the fewest changes; None if nothing is unsafe.
     robust
-        The robust failure with the fewest changes; None if none of those tried is robust.
+        The robust failure with the fewest changes; None if no tried failure is robust.
     preventable
         Shares of the collisions that reference drivers avoid.
     """

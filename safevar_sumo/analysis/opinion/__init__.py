@@ -1,4 +1,4 @@
-"""What does another vehicle model say of the failures: is each minimal cause one there too?
+"""Does another vehicle model confirm the failures: is each minimal cause unsafe with it too?
 
 The options and the function of the library are defined here, so that a command's help can be shown without loading the computation.
 """
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, documented, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answered, study_or_case
+from safevar_sumo.analysis.subject import Results, answer_question, study_or_case
 
 if TYPE_CHECKING:
     from safevar_sumo.analysis.evaluator import Progress
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class OpinionOptions(Options):
-    """Which failures are driven again with the second vehicle model."""
+    """Failures that are driven again with the second vehicle model."""
 
     question: ClassVar[str] = "opinion"
     solutions: tuple[str, ...] = option(
-        (), "Ask about the N-th solution of a run, from 0; may be repeated, or name several between commas.  [default: the failures that a "
-            "report explains]", metavar="ALG:RUN:N", form="repeated",
+        (), "Drive the N-th solution of a run, from 0; may be repeated, or list several, separated by commas.  [default: the failures that "
+            "a report explains]", metavar="ALG:RUN:N", form="repeated",
         python='Handles of solutions, such as "nsga2:3:0". By default the failures that a report explains.')
     unsafe: str | None = unsafe_option()
 
@@ -49,4 +49,4 @@ def opinion(source: str | Path | Results, *, solutions: Sequence[str] = OpinionO
     """
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
 
-    return answered(ask_for_opinions, study_or_case(source, as_it_is_now=as_it_is_now), OpinionOptions, locals())
+    return answer_question(ask_for_opinions, study_or_case(source, as_it_is_now=as_it_is_now), OpinionOptions, locals())

@@ -27,16 +27,16 @@ from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers.evaluation import Pool
 
 LIMIT = 12_000
-"""Simulations, about, for the minimal causes: what a report takes."""
+"""Approximate number of simulations for the minimal causes, as for a report."""
 BELOW = np.array([RESOLUTION, 2 * RESOLUTION, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0])
-"""Shares of a cause's changes, below its boundary, at which its nearest safe neighbour is looked for."""
+"""Relative reductions of a cause's boundary at which its nearest safe neighbour is searched."""
 
 LADDER = np.arange(1, 10) / 10
-"""Shares of a cause's changes at which it is looked for where it begins to be unsafe with the second model."""
+"""Shares of a cause's changes at which the second model is tried, to find where it begins to be unsafe."""
 
 
 class Cause(NamedTuple):
-    """A minimal cause that the second model is asked about: its values, and its boundary as a share of its changes."""
+    """A minimal cause for the second model to judge: its values, and its boundary as a share of its changes."""
 
     solution: str | None
     changes: Mapping[str, float]
@@ -44,16 +44,16 @@ class Cause(NamedTuple):
 
 
 class Neighbour(NamedTuple):
-    """The nearest setting below a cause that is safe with our model, shape (n,), and which share of the changes it has."""
+    """The nearest setting below a cause that is safe with our model, shape (n,), and its share of the changes."""
 
     setting: FloatArray
     share: float
 
 
 def second_system(study: Study) -> tuple[System, System, Declared]:
-    """A study's system, the same with the second vehicle model, and how that represents the vehicle.
+    """A study's system, the same system with the second vehicle model, and that model's representation of the vehicle.
 
-    The driving system is the same, with what it knows of our original vehicle.
+    The driving system is the same, including its knowledge of our original vehicle.
 
     Raises
     ------
@@ -68,19 +68,19 @@ def second_system(study: Study) -> tuple[System, System, Declared]:
 
 def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Pool | None = None, jobs: int | None = None,
                      progress: Progress = silent) -> Opinions:
-    """Look for the minimal causes of the failures that a report explains, or of solutions that are named, and ask the second model.
+    """Find the minimal causes of the failures that a report explains, or of named solutions, and let the second model judge them.
 
     Raises
     ------
     InputError
-        As `second_system` and `chosen_failures`, and for a study, which has no failures yet.
+        As `second_system` and `chosen_failures`, and if `source` is a study, which has no failures yet.
     """
     if isinstance(source, Study):
         raise InputError("opinion", f"{source.name!r} is a study and has no solutions", "a directory that the command study has written")
     second_system(source.study)
-    asked = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=LIMIT)
+    explain_options = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=LIMIT)
     with open_evaluator(source.study, pool, jobs, progress) as evaluator:
-        chosen = chosen_failures(source, asked, evaluator)
+        chosen = chosen_failures(source, explain_options, evaluator)
         minimal = [(str(chosen.failures.handles[row]), cause) for row in chosen.reasons for cause in chosen.causes[row]]
         limits = boundaries(evaluator, [cause for _, cause in minimal], chosen.failures.unsafe)
     names = evaluator.characteristics.names
@@ -91,7 +91,7 @@ def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Poo
 
 
 def opinions_of(study: Study, causes: Sequence[Cause], unsafe: Unsafe, progress: Progress = silent) -> Opinions:
-    """What the second model says of minimal causes; raises as `second_system`."""
+    """The second model's opinions on minimal causes; raises as `second_system`."""
     system, second, declared = second_system(study)
     members = system.characteristics
     settings = np.stack([members.original, *(members.setting(cause.changes, "cause", beyond=True) for cause in causes)])
@@ -99,33 +99,34 @@ def opinions_of(study: Study, causes: Sequence[Cause], unsafe: Unsafe, progress:
     progress(stage, 0, number)
     here = evaluate(system, settings)
     neighbours = _neighbours(system, causes, settings[1:], unsafe)
-    less = members.original + LADDER[:, np.newaxis, np.newaxis] * (settings[1:] - members.original)
+    scaled = members.original + LADDER[:, np.newaxis, np.newaxis] * (settings[1:] - members.original)
     beside = np.stack([one.setting for one in neighbours]) if neighbours else settings[1:]
-    there = evaluate(second, np.concatenate([settings, beside, less.reshape(-1, len(members))]))
+    there = evaluate(second, np.concatenate([settings, beside, scaled.reshape(-1, len(members))]))
     progress(stage, number, number)
-    ends_here, ends_there = ([_end(found, row) for row in range(number)] for found in (here, there))
+    ends_here, ends_there = ([_end(evaluations, row) for row in range(number)] for evaluations in (here, there))
     fails_here, fails_there = unsafe.of(here), unsafe.of(there)
     original = _Original(ends_here[0], ends_there[0], bool(fails_here[0]), bool(fails_there[0] or not there.valid[0]))
     fails_beside = fails_there[number:number + len(causes)]
-    fails_less = fails_there[number + len(causes):].reshape(len(LADDER), len(causes))
+    fails_scaled = fails_there[number + len(causes):].reshape(len(LADDER), len(causes))
     opinions = []
     for k, (cause, neighbour) in enumerate(zip(causes, neighbours, strict=True)):
-        words = (f"Its nearest safe neighbour, {neighbour.share:.1%} of the changes, is {'unsafe' if fails_beside[k] else 'safe'} there: "
-                 f"{_first(fails_less[:, k])} of the changes are enough there, {cause.fraction:.1%} here.")
+        words = (f"The nearest setting that is safe with our model, {neighbour.share:.1%} of the changes, is "
+                 f"{'unsafe' if fails_beside[k] else 'safe'} with the second: with it {_first_unsafe_step(fails_scaled[:, k])} of the "
+                 f"changes are enough, with ours {cause.fraction:.1%}.")
         fails = bool(fails_there[k + 1]) if there.valid[k + 1] else None
         opinions.append(_opinion(cause, declared, original, ends_here[k + 1], ends_there[k + 1], fails, words))
     return Opinions(study=study, unsafe=unsafe, opinions=tuple(opinions), original_here=ends_here[0], original_there=ends_there[0])
 
 
-def _first(fails: BoolArray) -> str:
-    """From where on it is unsafe: the steps of the ladder that this lies between."""
+def _first_unsafe_step(fails: BoolArray) -> str:
+    """The step of the ladder within which a cause begins to be unsafe."""
     safe = np.flatnonzero(~fails)
     below = LADDER[safe[-1]] if len(safe) else 0.0
     return f"{below:.0%} to {below + LADDER[0]:.0%}"
 
 
 class _Original(NamedTuple):
-    """How the original vehicle ends with both models, and whether it is unsafe."""
+    """How the original vehicle's run ends with both models, and whether it is unsafe."""
 
     here: End
     there: End
@@ -134,7 +135,7 @@ class _Original(NamedTuple):
 
 
 def _opinion(cause: Cause, declared: Declared, original: _Original, here: End, there: End, fails: bool | None, neighbour: str) -> Opinion:
-    """`fails` is whether the cause is unsafe there; None where it could not be simulated."""
+    """The opinion on a cause; `fails` states whether it is unsafe with the second model, None if it could not be simulated."""
     def says(verdict: Verdict, because: str, there: End = there) -> Opinion:
         return Opinion(solution=cause.solution, changes=dict(cause.changes), here=here, there=there, opinion=verdict, because=because)
 
@@ -143,27 +144,27 @@ def _opinion(cause: Cause, declared: Declared, original: _Original, here: End, t
     if original.fails_here:
         return says(Verdict.OUTSIDE, "the original vehicle itself is unsafe: no change causes anything")
     if original.fails_there:
-        return says(Verdict.OUTSIDE, f"the original vehicle itself is not safe there: {original.there}")
+        return says(Verdict.OUTSIDE, f"the original vehicle itself is not safe with the second model: {original.there}")
     if fails is None:
-        return says(Verdict.OUTSIDE, f"it could not be simulated there: {there}")
+        return says(Verdict.OUTSIDE, f"it could not be simulated with the second model: {there}")
     if fails:
-        return says(Verdict.CONFIRMED, f"unsafe there too: {there}; the original vehicle is safe there: {original.there}. {neighbour}")
-    return says(Verdict.CONTRADICTED, f"safe there: {there}; the original vehicle: {original.there}")
+        return says(Verdict.CONFIRMED, f"also unsafe with the second: {there}; its original vehicle is safe: {original.there}. {neighbour}")
+    return says(Verdict.CONTRADICTED, f"safe with the second: {there}; its original vehicle: {original.there}")
 
 
 def _neighbours(system: System, causes: Sequence[Cause], settings: FloatArray, unsafe: Unsafe) -> list[Neighbour]:
-    """For each cause, with its setting, the first setting below its boundary that is safe with our model; at last the original."""
+    """For each cause, the first setting below its boundary that is safe with our model; the original if no other is."""
     if not causes:
         return []
     original = system.characteristics.original
     shares = np.array([cause.fraction * (1 - BELOW) for cause in causes])
-    tried = original + shares[..., np.newaxis] * (settings - original)[:, np.newaxis]
-    found = evaluate(system, tried.reshape(-1, len(original)))
-    safe = (found.valid & ~unsafe.of(found)).reshape(shares.shape)
+    candidates = original + shares[..., np.newaxis] * (settings - original)[:, np.newaxis]
+    evaluations = evaluate(system, candidates.reshape(-1, len(original)))
+    safe = (evaluations.valid & ~unsafe.of(evaluations)).reshape(shares.shape)
     safe[:, -1] = True
     first = np.argmax(safe, axis=1)
-    return [Neighbour(tried[k, at], float(shares[k, at])) for k, at in enumerate(first.tolist())]
+    return [Neighbour(candidates[k, at], float(shares[k, at])) for k, at in enumerate(first.tolist())]
 
 
-def _end(found: Evaluations, row: int) -> End:
-    return End(str(found.outcome[row]), finite_or_none(found.f_safe[row]))
+def _end(evaluations: Evaluations, row: int) -> End:
+    return End(str(evaluations.outcome[row]), finite_or_none(evaluations.f_safe[row]))

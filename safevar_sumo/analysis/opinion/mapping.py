@@ -39,8 +39,8 @@ class Row(NamedTuple):
 class Represented(NamedTuple):
     """Vehicles as parameters of the second model.
 
-    `brake_delay` [s], `brake_rise`, `brake_fall` [1/s] and `brake_lag` [s] are the brake's way from command to torque: a dead time, rates,
-    a first-order lag. Resistances beside those of the original vehicle: `drag` [N s/m], `air_drag` [N s^2/m^2] and `wheel_damping` of all
+    `brake_delay` [s], `brake_rise`, `brake_fall` [1/s] and `brake_lag` [s] lead from the brake's command to its torque: a dead time, rates,
+    a first-order lag. Resistances in addition to the original vehicle's: `drag` [N s/m], `air_drag` [N s^2/m^2] and `wheel_damping` of all
     wheels [N m s]. `drive` is the engine's torque over that of the original vehicle.
     """
 
@@ -60,10 +60,10 @@ Surface = tuple[Any, Slope, bool | BoolArray]
 
 
 def _represented(plant: Plant, **others: Any) -> Represented:
-    usual: dict[str, Any] = {"brake_delay": 0.0, "brake_rise": np.inf, "brake_fall": np.inf, "brake_lag": 0.0, "drag": 0.0, "air_drag": 0.0,
-                             "wheel_damping": 0.0, "drive": 1.0}
+    defaults: dict[str, Any] = {"brake_delay": 0.0, "brake_rise": np.inf, "brake_fall": np.inf, "brake_lag": 0.0, "drag": 0.0,
+                                "air_drag": 0.0, "wheel_damping": 0.0, "drive": 1.0}
     ones = np.ones_like(plant.mass)
-    return Represented(plant, **{name: np.asarray(value, dtype=float) * ones for name, value in {**usual, **others}.items()})
+    return Represented(plant, **{name: np.asarray(value, dtype=float) * ones for name, value in {**defaults, **others}.items()})
 
 
 def _worn(vehicle: WornVehicle, c: Characteristics, original: Mapping[str, float], surface: Surface) -> Represented:
@@ -78,7 +78,7 @@ def _worn(vehicle: WornVehicle, c: Characteristics, original: Mapping[str, float
 
 
 def _torque(force: FloatArray, mass: float) -> FloatArray:
-    """The torque at all wheels that brakes a vehicle of this mass as hard as a force on it does: it stops the wheels beside the body."""
+    """The torque at all wheels that brakes a vehicle of this mass like a force on its body; it has to stop the wheels as well."""
     p = commonroad()
     return np.asarray(force * p.R_w * (1 + WHEELS * p.I_y_w / (mass * p.R_w**2)))
 
@@ -122,11 +122,11 @@ class Table(NamedTuple):
     Attributes
     ----------
     study
-        A shipped study with the vehicle; parameters that your own vehicle does not have are taken from there.
+        A shipped study with the vehicle; it supplies parameters that your own vehicle lacks.
     rows
         The characteristics that the second model represents.
     outside
-        Characteristics that it cannot represent, each with the reason.
+        Characteristics that the second model cannot represent, each with the reason.
     represent
         The equations of the rows.
     """
@@ -186,7 +186,7 @@ TABLES: Mapping[str, Table] = {
 
 
 class Declared(NamedTuple):
-    """How a study's vehicle is represented: by the table of a shipped vehicle, which it is or is made from, with its own parameters."""
+    """Representation of a study's vehicle: the table of the shipped vehicle that it is or derives from, with its own parameters."""
 
     name: str
     vehicle: Any
@@ -200,7 +200,7 @@ class Declared(NamedTuple):
 
 
 def declared_of(study: Study, vehicle: Any) -> Declared:
-    """The table for a study's vehicle: a shipped vehicle, a class made from one, or your own with all characteristics of one.
+    """The table for a study's vehicle: a shipped vehicle, a class derived from one, or your own with all characteristics of one.
 
     Raises
     ------
@@ -216,6 +216,6 @@ def declared_of(study: Study, vehicle: Any) -> Declared:
         parameters = {one.name: getattr(own, one.name, study.vehicle.parameters.get(one.name, shipped.get(one.name, one.default)))
                       for one in msgspec.structs.fields(kind)}
         return Declared(name, kind(**parameters), table, tuple(key for key, unit in units.items() if kind.UNITS.get(key) != unit))
-    known = f"one of {', '.join(TABLES)}, a class made from one, or one with the same characteristics in the same units"
+    known = f"one of {', '.join(TABLES)}, a class derived from one, or one with the same characteristics in the same units"
     problem = f"vehicle.model = {study.vehicle.model!r} with {', '.join(units)} is no vehicle that the second model can represent"
     raise InputError(study.source, problem, known)

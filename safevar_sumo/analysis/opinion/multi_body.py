@@ -20,16 +20,16 @@ WHEELS = 4
 STEP = 1e-3
 """Longest step of the integration [s]: a sixth of a radian of the fastest motion, an axle between its springs and its tyres (75 rad/s)."""
 LEAST_SPEED = 0.1
-"""Speed that a slip is relative to at the least [m/s]: half of `v_s` in the package's `vehicle_dynamics_std`."""
+"""Slip is relative to the speed, but at least to this one [m/s]: half of `v_s` in the package's `vehicle_dynamics_std`."""
 SLIP, LEAST_CONTROLLED = 0.1, 2.0
-"""Slip above which the anti-lock controller takes brake pressure away [-], and the speed from which on it acts [m/s].
+"""Slip above which the anti-lock controller releases brake pressure [-], and the speed above which it acts [m/s].
 
-Real ones work between 0.1 and 0.2 from about 7 km/h on (Bosch, Automotive Handbook, "Antilock braking system").
+Real controllers work between 0.1 and 0.2 from about 7 km/h on (Bosch, Automotive Handbook, "Antilock braking system").
 """
 RELEASE, BUILD_UP = 25.0, 8.0
-"""Rates at which it takes pressure away and lets it rise again [1/s], as shares of full pressure: faster down than up, as valves are.
+"""Rates at which the controller releases and restores pressure [1/s], as shares of full pressure; valves release faster than they restore.
 
-Chosen; they use at least 0.78 of the friction from 0.2 to 1 (tests), of which UN Regulation 13-H, annex 6, asks for 0.75.
+Chosen; they use at least 0.78 of a friction from 0.2 to 1 (tests), where UN Regulation 13-H, annex 6, requires 0.75.
 """
 
 
@@ -62,9 +62,9 @@ def _tyre() -> Any:
 class Plant(NamedTuple):
     """Constants of N vehicles, SI, after the package's m, m_s, m_uf, m_ur, a, b, h_s, I_y_s, K_sf, K_sdf, K_zt, R_w, I_y_w.
 
-    Of shape (N,); what the axles have each, front before rear, of shape (2, N): `arms`, a and -b; `static`, shares of the sprung mass;
-    `springs` and `dampers` of each wheel; `brake_shares`, T_sb and the rest, and `drive_shares`, T_se and the rest. `unsprung` is an axle's
-    mass, `friction` Pacejka's p_dx1, `brake_torque` that of all wheels at full pedal; `back` and `down` are the slope's.
+    Shape (N,), or (2, N) for values per axle, front before rear: `arms`, a and -b; `static`, shares of the sprung mass; `springs` and
+    `dampers` of each wheel; `brake_shares`, T_sb and 1 - T_sb; `drive_shares`, T_se and 1 - T_se. `unsprung` is an axle's mass,
+    `friction` Pacejka's p_dx1, `brake_torque` the torque of all wheels at full pedal; `back` and `down` are the slope's.
     """
 
     mass: FloatArray
@@ -89,11 +89,11 @@ class Plant(NamedTuple):
 
 def plant_of(mass: FloatArray, empty: float, slope: Slope, *, brake_front: float, drive_front: float, centre: FloatArray | None = None,
              wheelbase: float | None = None, height: float | None = None, **others: Any) -> Plant:
-    """A vehicle of another mass than the package's.
+    """A vehicle with another mass than the package's.
 
     Unsprung masses, springs, dampers, tyres and inertia grow with the `empty` vehicle's mass, so that all frequencies stay the package's;
-    what is loaded rests on the springs. `centre` is the whole vehicle's behind the front axle [m], `height` above the road; what is None
-    is the package's.
+    a load rests on the springs. `centre` is the whole vehicle's centre of mass behind the front axle [m], `height` that above the road
+    [m]; the package's values replace None.
     """
     p = commonroad()
     ones, scale = np.ones_like(mass), empty / p.m
@@ -108,7 +108,7 @@ def plant_of(mass: FloatArray, empty: float, slope: Slope, *, brake_front: float
         dampers=scale * np.stack([p.K_sdf * ones, p.K_sdr * ones]), tyre_spring=scale * p.K_zt * ones,
         brake_shares=np.stack([brake_front * ones, (1 - brake_front) * ones]),
         drive_shares=np.stack([drive_front * ones, (1 - drive_front) * ones]), back=slope.back * ones, down=slope.down * ones, **values)
-    return plant._replace(height=plant.height + at_speed(plant, ones).heave)  # the body's own is counted from unloaded tyres
+    return plant._replace(height=plant.height + at_speed(plant, ones).heave)  # the body's heights count from unloaded tyres
 
 
 class Body(NamedTuple):
@@ -130,17 +130,17 @@ class Body(NamedTuple):
 
 
 def at_speed(plant: Plant, speed: FloatArray) -> Body:
-    """On its springs as it stands, with the wheels rolling."""
-    nothing, both = np.zeros_like(plant.mass), np.zeros_like(plant.arms)
+    """The body in static balance on its springs, with rolling wheels."""
+    zeros, axle_zeros = np.zeros_like(plant.mass), np.zeros_like(plant.arms)
     heights = (plant.sprung * plant.static + plant.unsprung) * plant.down / (2 * plant.tyre_spring)
-    # The springs carry their loads unbent where the body is as high as its axles, there where these are.
+    # The springs carry the static load without deflection if, above each axle, the body is as high as the axle.
     heave, pitch = (heights * plant.static).sum(axis=0), (heights[1] - heights[0]) / (plant.arms[0] - plant.arms[1])
-    return Body(speed, pitch, nothing, heave, nothing, heights, both, both + speed / plant.radius, both + 1)
+    return Body(speed, pitch, zeros, heave, zeros, heights, axle_zeros, axle_zeros + speed / plant.radius, axle_zeros + 1)
 
 
 class Forces(NamedTuple):
-    """Of one tyre of each axle, shape (2, N): the force along the road [N], how it grows with the wheel's speed [N s/rad], and the slip
-    [-], positive where it brakes.
+    """One tyre of each axle, shape (2, N): the force along the road [N], its derivative by the wheel's speed [N s/rad], and the slip [-],
+    positive when braking.
     """
 
     force: FloatArray
@@ -149,7 +149,7 @@ class Forces(NamedTuple):
 
 
 def tyre_forces(plant: Plant, body: Body) -> Forces:
-    """Pacejka's formula for pure longitudinal slip, as the package's `formula_longitudinal` has it, and its derivative."""
+    """Pacejka's formula for pure longitudinal slip, as in the package's `formula_longitudinal`, and its derivative."""
     tyre, relative_to = _tyre(), np.maximum(body.speed, LEAST_SPEED)
     load = np.maximum(body.heights * plant.tyre_spring, 1.0)
     slip = (body.speed - plant.radius * body.wheels) / relative_to
@@ -162,7 +162,7 @@ def tyre_forces(plant: Plant, body: Body) -> Forces:
 
 
 class Rates(NamedTuple):
-    """How fast the rates in a body and its wheels' speeds change, SI; shapes as there."""
+    """Time derivatives of a body's speed, rates and wheel speeds, SI; shapes as in `Body`."""
 
     speed: FloatArray
     pitch_rate: FloatArray
@@ -189,7 +189,7 @@ def rates(plant: Plant, body: Body, torques: FloatArray, forces: Forces) -> Rate
 def advance(plant: Plant, body: Body, pedal: FloatArray, driving: FloatArray, step: float) -> Body:
     """A step of the integration under a brake pedal and a torque of engine and drags on all wheels [N m].
 
-    Wheels, which are stiff, go implicitly, linearised; the others rate first, height after.
+    Wheel speeds, which are stiff, are integrated implicitly (linearised); all others explicitly, rates before heights.
     """
     p, forces = plant, tyre_forces(plant, body)
     allowed = _anti_lock(body, forces.slip, pedal, step)
@@ -198,7 +198,7 @@ def advance(plant: Plant, body: Body, pedal: FloatArray, driving: FloatArray, st
     wheels = np.maximum(body.wheels + step * change.wheels / (1 + step * stiff * p.radius / p.wheel_inertia), 0.0)
     gained = stiff * (wheels - body.wheels)
     speed = np.maximum(body.speed + step * (change.speed + 2 * (gained[0] + gained[1]) / p.mass), 0.0)
-    stands = (body.speed <= 0) & (driving <= 0) & (p.back >= 0)  # tyres of Pacejka's push a little where they do not slip at all
+    stands = (body.speed <= 0) & (driving <= 0) & (p.back >= 0)  # Pacejka's tyres push a little even without any slip
     pitch_rate, heave_rate = body.pitch_rate + step * change.pitch_rate, body.heave_rate + step * change.heave_rate
     height_rates = body.height_rates + step * change.height_rates
     return Body(

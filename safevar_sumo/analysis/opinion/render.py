@@ -1,4 +1,4 @@
-"""What the second vehicle model says, as text on the terminal."""
+"""The second vehicle model's opinions, as text on the terminal."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ STYLES = {Verdict.CONFIRMED: "green", Verdict.CONTRADICTED: "red", Verdict.OUTSI
 
 
 def print_opinions(console: Console, result: Opinions) -> None:
-    """How many causes are confirmed, then every cause with the reason."""
+    """Print how many causes are confirmed, then every cause with the reason."""
     members = CharacteristicSet.of(result.study.vehicle.characteristics)
     print_text(console, result.study.title)
     print_text(console, f"Unsafe: {result.unsafe}. {MODEL}: {verdict(result)}")
-    print_text(console, f"The original vehicle here: {result.original_here}; there: {result.original_there}.")
+    print_text(console, f"The original vehicle with our model: {result.original_here}; with the second: {result.original_there}.")
     for handle in result.without_cause:
         print_text(console, f"note: {handle} is not unsafe: it has no cause")
     for one in result.opinions:
         line = plain(f"{one.solution}: " if one.solution else "").append(str(one.opinion), STYLES[one.opinion])
         console.print(line.append(plain(f": {changes(members, one.changes)}")), soft_wrap=True, highlight=False)
-        print_text(console, f"  here {one.here}; {one.because}")
+        print_text(console, f"  with our model {one.here}; {one.because}")
 
 
 def verdict(result: Opinions) -> str:
-    """How many causes have which opinion, in a sentence."""
+    """A sentence on the number of causes with each verdict."""
     if not result.opinions:
-        return "there is no cause to ask about."
+        return "there is no cause to judge."
     parts = [f"{result.count(one)} {one}" for one in Verdict if result.count(one)]
     return f"of {number_of(len(result.opinions), 'minimal cause')} {joined(parts)}."

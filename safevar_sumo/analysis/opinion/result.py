@@ -15,7 +15,7 @@ from safevar_sumo.study import SAFETY_DEGREE, Study
 
 
 class Verdict(StrEnum):
-    """What the second model says of a cause."""
+    """The second model's verdict on a cause."""
 
     CONFIRMED = "confirmed"
     CONTRADICTED = "contradicted"
@@ -23,7 +23,7 @@ class Verdict(StrEnum):
 
 
 class End(NamedTuple):
-    """How a run ends: outcome and safety degree [m, or -m/s]; None where it was not driven, or has none."""
+    """How a run ends: outcome and safety degree [m, or -m/s]; None if it was not driven, or has no safety degree."""
 
     outcome: str | None = None
     safety_degree: float | None = None
@@ -41,18 +41,18 @@ class End(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Opinion:
-    """What the second model says of one minimal cause.
+    """The second model's opinion on one minimal cause.
 
     Attributes
     ----------
     solution
-        The handle of the failure that has it; None where a cause was given without one.
+        The handle of the failure with this cause; None for a cause without a failure.
     changes
         The cause: values by name, in their units.
     here, there
-        How they end with our model and with the second one.
+        How the run with these changes ends with our model and with the second one.
     opinion, because
-        The verdict, and what it rests on in a sentence or two.
+        The verdict, and its reason in a sentence or two.
     """
 
     solution: str | None
@@ -77,9 +77,9 @@ class Opinions:
     opinions
         One for each minimal cause of each failure.
     original_here, original_there
-        How the original vehicle ends with both models.
+        How the original vehicle's run ends with both models.
     without_cause
-        Solutions that were asked about and are not unsafe: they have no cause.
+        Requested solutions that are not unsafe and so have no cause.
     """
 
     study: Study
@@ -90,7 +90,7 @@ class Opinions:
     without_cause: tuple[str, ...] = ()
 
     def count(self, verdict: Verdict) -> int:
-        """How many causes have this verdict."""
+        """Number of causes with this verdict."""
         return sum(one.opinion == verdict for one in self.opinions)
 
     def to_dict(self) -> list[dict[str, Any]]:

@@ -1,7 +1,7 @@
-"""The second vehicle model where our vehicles are: it takes a driving system's commands and gives speeds, in the same simulation.
+"""The second vehicle model in place of ours: in the same simulation it takes a driving system's commands and returns speeds.
 
-Its sensors are the study's own; the engine's torque is that of our original vehicle, which runs along: with the same pedal, at the same
-speed. Brakes, tyres, axles and body are the second model's.
+Its sensors are the study's own; its engine torque is that of our original vehicle, which is simulated beside it with the same pedal at
+the same speed. Brakes, tyres, axles and body are the second model's.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from safevar_sumo.vehicles.base import Characteristics
 from safevar_sumo.vehicles.sensors import delayed, history, remembered
 
 CREEPS = 0.01
-"""Speed above which the wheels of the original vehicle turn as fast as it goes [m/s]."""
+"""Speed above which the original vehicle's wheel speed is scaled with its speed [m/s]."""
 
 
 class _Prepared(NamedTuple):
-    """Constants of a run: the study's vehicle, for its sensors; the original one, for its engine; and what is represented.
+    """Constants of a run: the study's vehicle, for its sensors; the original one, for its engine; and the second model's parameters.
 
     `engine_mass` is the mass that the original's engine moves, turning wheels included [kg], `engine_radius` that of its wheels [m].
     """
@@ -39,7 +39,7 @@ class _Prepared(NamedTuple):
 
 
 class SecondState(NamedTuple):
-    """State of N vehicles: m/s, pedals as the actuators have them, and the states of all that takes part."""
+    """State of N vehicles: speed [m/s], actuated pedals, gear, and the states of the vehicles behind it."""
 
     speed: FloatArray
     throttle: FloatArray
@@ -59,7 +59,7 @@ class SecondVehicle:
     own
         The study's vehicle.
     declared
-        How it is represented.
+        The vehicle's representation in the second model.
     study
         The study.
     """
@@ -68,19 +68,19 @@ class SecondVehicle:
         self._own, self._declared = own, declared
         self.UNITS = own.UNITS
         shipped = load_study(declared.table.study).vehicle.characteristics
-        given = {**shipped, **{name: row for name, row in study.vehicle.characteristics.items() if name not in declared.foreign}}
-        self._original = {one.name: one.original for one in CharacteristicSet.of({name: given[name] for name in declared.vehicle.UNITS})}
+        rows = {**shipped, **{name: row for name, row in study.vehicle.characteristics.items() if name not in declared.foreign}}
+        self._original = {one.name: one.original for one in CharacteristicSet.of({name: rows[name] for name in declared.vehicle.UNITS})}
 
     def prepare(self, characteristics: Characteristics, road_friction: Any, step: float, slope: Slope = LEVEL,
                 wet: bool | BoolArray = False) -> _Prepared:
         ones = np.ones_like(next(iter(characteristics.values())))
         original = {name: value * ones for name, value in self._original.items()}
         surface = (road_friction, slope, wet)
-        rest = () if slope is LEVEL and not np.any(wet) else (slope, wet) if np.any(wet) else (slope,)
+        optional = () if slope is LEVEL and not np.any(wet) else (slope, wet) if np.any(wet) else (slope,)
         twin, represent = self._declared.vehicle, self._declared.table.represent
         engine = represent(twin, original, self._original, surface).plant
         return _Prepared(
-            own=self._own.prepare(characteristics, road_friction, step, *rest),
+            own=self._own.prepare(characteristics, road_friction, step, *optional),
             original=twin.prepare(original, road_friction, step, slope, wet),
             represented=represent(twin, {**original, **{name: characteristics[name] for name in original if name in characteristics}},
                                   self._original, surface),
@@ -90,11 +90,11 @@ class SecondVehicle:
         return self._own.sumo_type(prepared.own)
 
     def at_rest(self, prepared: _Prepared) -> SecondState:
-        nothing = np.zeros_like(prepared.engine_mass)
-        return self._state(prepared, nothing, self._own.at_rest(prepared.own), self._declared.vehicle.at_rest(prepared.original))
+        standstill = np.zeros_like(prepared.engine_mass)
+        return self._state(prepared, standstill, self._own.at_rest(prepared.own), self._declared.vehicle.at_rest(prepared.original))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> SecondState:
-        """With the pedals that hold the original vehicle's speed."""
+        """The state with the pedals that hold the original vehicle's speed."""
         return self._state(prepared, speed, self._own.at_speed(prepared.own, speed),
                            self._declared.vehicle.at_speed(prepared.original, speed))
 
@@ -108,7 +108,7 @@ class SecondVehicle:
         return None if sensors is None else sensors(prepared.own)
 
     def sense(self, prepared: _Prepared, state: SecondState, seen: Observation) -> tuple[Observation, SecondState]:
-        """Through the study's own sensors."""
+        """Sense through the study's own sensors."""
         sensed, own = self._own.sense(prepared.own, state.own, seen)
         return sensed, state._replace(own=own)
 
@@ -120,12 +120,12 @@ class SecondVehicle:
         p, r = prepared, prepared.represented
         original, driving = self._engine(p, state, command.throttle)
         commands = remembered(state.brake_commands, command.brake)
-        asked, body, brake = delayed(commands, r.brake_delay, p.step), state.body, state.brake
+        demand, body, brake = delayed(commands, r.brake_delay, p.step), state.body, state.brake
         steps = math.ceil(p.step / STEP)
         step = p.step / steps
         follows = step / (step + r.brake_lag)
         for _ in range(steps):
-            brake = brake + np.minimum(np.maximum((asked - brake) * follows, -r.brake_fall * step), r.brake_rise * step)
+            brake = brake + np.minimum(np.maximum((demand - brake) * follows, -r.brake_fall * step), r.brake_rise * step)
             body = advance(r.plant, body, brake, driving, step)
         return SecondState(body.speed, original.throttle, brake, original.gear, state.own, original, body, commands)
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, documented, option
-from safevar_sumo.analysis.subject import Results, answered, study_or_case
+from safevar_sumo.analysis.subject import Results, answer_question, study_or_case
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class RatingOptions(Options):
-    """Which variant is rated beside the original vehicle: characteristics that are changed, or a solution of results."""
+    """The variant that is rated beside the original vehicle: changed characteristics, or a solution of results."""
 
     question: ClassVar[str] = "rating"
     changes: Mapping[str, float] | None = option(
@@ -36,13 +36,13 @@ class RatingOptions(Options):
 def rating(study: StudyLike | Results, changes: Mapping[str, float] | None = RatingOptions.changes, *,
            solution: str | None = RatingOptions.solution, pool: Pool | None = None, jobs: int | None = None,
            progress: bool | Progress = False, as_it_is_now: bool = False) -> Rating:
-    """Rate a vehicle as Euro NCAP does in 2026, and one variant of it beside it: crash avoidance, frontal collisions.
+    """Rate the crash avoidance (frontal collisions) of a vehicle and of one variant as Euro NCAP does in 2026.
 
     Parameters
     ----------
     study
-        A study, or results or their directory, whose vehicle and driving system are rated; its weather is that of the tests by day.
+        A study, or results or their directory, whose vehicle and driving system are rated; the tests by day have the study's weather.
     """
     from safevar_sumo.analysis.rating.compute import rate_variant
 
-    return answered(rate_variant, study_or_case(study, as_it_is_now=as_it_is_now), RatingOptions, locals())
+    return answer_question(rate_variant, study_or_case(study, as_it_is_now=as_it_is_now), RatingOptions, locals())

@@ -24,14 +24,14 @@ from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
 DECIMALS = 9
-"""Of points and speeds in JSON, beyond which there is nothing but rounding."""
+"""Decimals of points and speeds in JSON; further ones would hold only rounding errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RatedTest:
-    """A test of one vehicle, in one light where it is tested by day and by night; points of (standard, extended, robustness).
+    """A test of one vehicle, in one light if there are tests by day and by night; points of (standard, extended, robustness).
 
-    `layers` says which robustness layers hold: None for one that is neither simulated nor claimed; by day for both lights.
+    `layers` states whether each robustness layer holds, None if it is neither simulated nor claimed; by day for both lights.
     """
 
     block: Block
@@ -45,7 +45,7 @@ class RatedTest:
 
 @dataclass(frozen=True, kw_only=True)
 class Rated:
-    """One vehicle: its setting, and what it did and earned; `fails` if a required cell is not green, so that it earns nothing."""
+    """One vehicle: its setting, its results and its points; it `fails`, and earns nothing, if a required cell is not green."""
 
     name: str
     setting: Mapping[str, float]
@@ -76,25 +76,25 @@ class Rated:
                 for one in self.protocol.layers_of(block.test)}
 
     def colour(self, number: int) -> str | None:
-        """Of the cell of that number; None where the test could not be driven."""
+        """Colour of the cell with this number; None if the test could not be driven."""
         colour = int(self.scored.colours[0, number])
         return None if colour < 0 else COLOURS[colour]
 
     def passes(self, number: int) -> bool:
-        """Whether a cell of a robustness layer meets what the layer asks."""
-        here, nominal = self.scored.colours[0, [number, self.nominal(number)]].tolist()
-        return bool(here >= 0 and (here < RED if self.protocol.cells[number].criterion == NOT_RED else here <= nominal))
+        """Whether a cell of a robustness layer meets the layer's criterion."""
+        colour, nominal = self.scored.colours[0, [number, self.nominal(number)]].tolist()
+        return bool(colour >= 0 and (colour < RED if self.protocol.cells[number].criterion == NOT_RED else colour <= nominal))
 
     def nominal(self, number: int) -> int:
-        """The cell of a matrix that a cell of a layer varies."""
+        """Number of the matrix cell that a layer's cell varies."""
         cell = self.protocol.cells[number]
         return self.protocol.matrix_of[cell.block.name, cell.row, cell.column]
 
     def cell(self, number: int) -> dict[str, Any]:
-        """A cell as `rating --json` has it."""
-        one, impact = self.protocol.cells[number], finite_or_none(self.cells.impact[0, number])
+        """A cell as `rating --json` prints it."""
+        cell, impact = self.protocol.cells[number], finite_or_none(self.cells.impact[0, number])
         warning = finite_or_none(self.cells.warning[0, number])
-        return {"range": one.range, "vut_speed": one.vut, "target_speed": one.target, "impact_location": one.location,
+        return {"range": cell.range, "vut_speed": cell.vut, "target_speed": cell.target, "impact_location": cell.location,
                 "colour": self.colour(number), "relative_impact_speed": None if impact is None else round(impact, DECIMALS),
                 "warning_ttc": None if warning is None else round(warning, DECIMALS)}
 
@@ -111,7 +111,7 @@ class Rated:
 
 
 def possible(protocol: Protocol) -> float:
-    """All points of the tests that are simulated."""
+    """Maximum points of all simulated tests."""
     return round(sum(sum(block.points) for block in protocol.blocks), DECIMALS)
 
 
@@ -134,7 +134,7 @@ class Rating:
 
     @property
     def lost(self) -> float:
-        """Points that the variant has less than the original; less than 0 if it has more."""
+        """Points that the variant earns less than the original; negative if it earns more."""
         return 0.0 if self.variant is None else round(self.original.points - self.variant.points, DECIMALS)
 
     @property
@@ -177,7 +177,7 @@ class Rating:
 
 def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | None = None, jobs: int | None = None,
                  progress: Progress = silent) -> Rating:
-    """Rate the original vehicle and the variant of it that the options describe, if any; raises as `rate`.
+    """Rate the original vehicle and the variant that the options describe, if any; raises as `rate`.
 
     Raises
     ------
@@ -192,7 +192,7 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
         row = subject.solutions.iloc[position_of(subject.solutions, SolutionId.parse(options.solution))]
         values, name = {one: float(row[one]) for one in characteristics.names}, options.solution
     if options.changes:
-        characteristics.setting(options.changes, "changes", switch="")  # refuses what is none
+        characteristics.setting(options.changes, "changes", switch="")  # refuses unknown names
         values, name = {**values, **options.changes}, f"{name} changed" if values else name
     variants = {name: characteristics.setting(values, "changes")} if values else {}
     return rate(study, variants, pool=pool, jobs=jobs, progress=progress)
@@ -200,7 +200,7 @@ def rate_variant(subject: Study | Case, options: RatingOptions, *, pool: Pool | 
 
 def rate(study: Study, settings: Mapping[str, FloatArray], *, pool: Pool | None = None, jobs: int | None = None,
          progress: Progress = silent) -> Rating:
-    """Rate the original vehicle of a study and variants of it, settings of shape (n,) by name, as they are, without the filter.
+    """Rate the original vehicle of a study and its variants, settings of shape (n,) by name; the filter is not applied.
 
     Raises
     ------
@@ -214,7 +214,7 @@ def rate(study: Study, settings: Mapping[str, FloatArray], *, pool: Pool | None 
 
 
 def rate_on(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
-    """The same on an evaluator of the rated study."""
+    """As `rate`, with an evaluator of the rated study."""
     rater = rater_of(evaluator.study, evaluator.study.source)
     assert rater is not None
     names = CharacteristicSet.of(evaluator.study.vehicle.characteristics).names
@@ -227,23 +227,23 @@ def rate_on(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
 
 
 def remarks(rating: Rating) -> list[str]:
-    """What a user should know of a rating."""
+    """Remarks that a user should read with a rating."""
     weather = weather_of(rating.study.weather, f"study {rating.study.name!r}")
-    found = []
+    lines = []
     if weather.wet or weather.road_friction != 1:
-        found.append(f"Euro NCAP tests on a dry road; this is rated in the weather {weather.name!r}, by night {by_night(weather).name!r}.")
+        lines.append(f"Euro NCAP tests on a dry road; this is rated in the weather {weather.name!r}, by night {by_night(weather).name!r}.")
     for one in rating.variants:
         if one.fails:
-            found.append(f"{one.name}: nothing is earned, as CCRs at 10 and 20 km/h is not green in all of the standard range.")
+            lines.append(f"{one.name}: nothing is earned, as CCRs at 10 and 20 km/h is not green in all of the standard range.")
         required = [number for number, cell in enumerate(one.protocol.cells) if cell.block.test == "CPNA" and cell.vut == 10
                     and cell.location == 75 and not cell.is_varied]
         if not one.fails and any(one.colour(number) != "green" for number in required):
-            found.append(f"{one.name}: CPNA at 10 km/h and 75 % is not green, which Euro NCAP requires; its calculator "
+            lines.append(f"{one.name}: CPNA at 10 km/h and 75 % is not green, which Euro NCAP requires; its calculator "
                          f"{one.protocol.calculator} does not check it, and neither do these points.")
         invalid = int(np.count_nonzero(~one.cells.valid))
         if invalid:
-            found.append(f"{one.name}: {invalid} cells are no valid tests and earn nothing: the vehicle cannot hold their speed.")
+            lines.append(f"{one.name}: {invalid} cells are no valid tests and earn nothing: the vehicle cannot hold their speed.")
     if all(np.isnan(one.cells.warning).all() for one in rating.variants):
-        found.append("The driving system never warns: rows with FCW are red.")
-    return found
+        lines.append("The driving system never warns: rows with FCW are red.")
+    return lines
 

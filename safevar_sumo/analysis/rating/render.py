@@ -23,7 +23,7 @@ LETTERS = {colour: colour[0].upper() for colour in COLOURS}
 ON_TERMINAL = {"green": "black on green", "yellow": "black on bright_yellow", "orange": "black on dark_orange",
                "brown": "white on dark_red", "red": "white on red"}
 DARK = ("green", "brown", "red")
-"""Colours that are written on in white."""
+"""Colours on which text is white."""
 LIGHTS = {"day": " by day", "night": " by night", None: ""}
 COLUMNS_OF_PAIRS = 4
 
@@ -39,11 +39,11 @@ def print_rating(console: Console, result: Rating) -> None:
 
 def verdict(result: Rating) -> str:
     """The rating in a sentence: what a variant loses and where, or what the original vehicle earns."""
-    whole, variant = possible(result.protocol), result.variant
+    maximum, variant = possible(result.protocol), result.variant
     if variant is None:
-        return f"The original vehicle earns {result.original.points:.2f} of the {whole:g} points of the tests that are simulated."
+        return f"The original vehicle earns {result.original.points:.2f} of the {maximum:g} points of the tests that are simulated."
     changed = _changed(result, variant)
-    of = f"of the {result.original.points:.2f} points that the original earns (of {whole:g} that are simulated)"
+    of = f"of the {result.original.points:.2f} points that the original earns (of {maximum:g} that are simulated)"
     if not result.lost:
         return f"With {changed} the vehicle keeps all {of}."
     if result.lost < 0:
@@ -64,7 +64,7 @@ def lost_by_test(result: Rating) -> list[tuple[RatedTest, float]]:
 
 
 def turned_in_words(result: Rating) -> list[tuple[str, str]]:
-    """Tests in which cells of the matrices have another colour than the original's, and at which speeds."""
+    """Tests with matrix cells in another colour than the original's, each with a text on colours and speeds."""
     tests: dict[str, dict[tuple[str, str], list[str]]] = {}
     for cell, before, after in result.turned():
         if not cell.is_varied:
@@ -75,7 +75,7 @@ def turned_in_words(result: Rating) -> list[tuple[str, str]]:
 
 
 def not_simulated(result: Rating) -> str:
-    """What the points leave open."""
+    """Sentences on the tests and robustness layers that the points do not cover."""
     tests = result.protocol.not_simulated
     named = ", ".join(f"{test} {points:g}" for test, points in tests.items())
     text = f"Not simulated, neither passed nor failed: {named}; {sum(tests.values()):g} points."
@@ -115,7 +115,7 @@ def _sum(points: Sequence[float]) -> str:
 
 
 def _layers(result: Rating) -> WholeTable:
-    """The layers that are simulated or claimed; those of a variant where they are others than the original's."""
+    """The layers that are simulated or claimed; a variant has a row only where it differs from the original."""
     table = WholeTable("test", "vehicle", "robustness layers that hold", "that do not", "that are claimed", title="Robustness layers")
     for tests in zip(*(one.tests for one in result.variants), strict=True):
         claimed = result.original.claims.get(tests[0].block.test, ())
@@ -162,8 +162,8 @@ def _cell_text(one: Rated, number: int, *, with_value: bool) -> str:
     value = record["warning_ttc"] if cell.judged == "warning" else record["relative_impact_speed"]
     letter = "?" if colour is None else LETTERS[colour]
     letter = letter.lower() if cell.range == "extended" else letter
-    is_told = with_value and value is not None and (colour != "green" or cell.judged == "warning")
-    return f"{letter}{value:.1f}" if is_told and value < 10 else f"{letter}{value:.0f}" if is_told else letter
+    shows_value = with_value and value is not None and (colour != "green" or cell.judged == "warning")
+    return f"{letter}{value:.1f}" if shows_value and value < 10 else f"{letter}{value:.0f}" if shows_value else letter
 
 
 def matrices_figure(result: Rating) -> Figure:

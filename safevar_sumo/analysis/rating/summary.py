@@ -1,4 +1,4 @@
-"""What a search found in a rated study, in words; nothing is simulated for it."""
+"""Summary of a search's solutions for a rated study, without new simulations."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TITLES = {"fewest": "Fewest changes that cost a point", "smallest": "Smallest la
 
 
 def rated_lead(study: Study, solutions: pd.DataFrame, original: Evaluations, place: str) -> list[str]:
-    """Summarise the solutions of a rated study in lines, the last of which has the commands to go on with.
+    """Summarise the solutions of a rated study in lines; the last line has the commands for the next steps.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """The official spreadsheet: predictions, claimed layers and input parameters in its template, measurements in a preprocessed one.
 
-Nothing is assumed of a spreadsheet: every cell that is written to is found where the protocol's data has it, with its headings, or the
+Before anything is written, every target cell is checked: its headings must stand where the protocol's data expects them, or the
 spreadsheet is refused.
 """
 
@@ -28,37 +28,37 @@ MADE_BY = "that pip install 'euroncap-rating-2026=={}' and euroncap_rating_2026 
 
 
 class _Book:
-    """A spreadsheet that is read and checked at once, and filled and saved later."""
+    """A spreadsheet that is read and checked on construction, and filled and saved later."""
 
     made_by = "generate-template"
 
     def __init__(self, source: Path, output: Path) -> None:
         self.source, self.output, self.protocol = source, output, protocol_of(EURO_NCAP_2026)
         if not source.is_file():
-            raise InputError(source, "is a directory" if source.is_dir() else "there is no such file", self._legal)
+            raise InputError(source, "is a directory" if source.is_dir() else "there is no such file", self._expected_file)
         try:
             self._book = openpyxl.load_workbook(source)
         except (OSError, InvalidFileException, zipfile.BadZipFile, KeyError, ValueError) as error:
-            raise InputError(source, f"is no spreadsheet that can be read: {error}", self._legal) from None
+            raise InputError(source, f"is no spreadsheet that can be read: {error}", self._expected_file) from None
         self._check_version()
 
     @property
-    def _legal(self) -> str:
+    def _expected_file(self) -> str:
         return f"the file {MADE_BY.format(self.protocol.calculator, self.made_by)}"
 
     def _sheet(self, name: str) -> Any:
         if name not in self._book.sheetnames:
-            raise InputError(self.source, f"has no sheet {name!r}", self._legal)
+            raise InputError(self.source, f"has no sheet {name!r}", self._expected_file)
         return self._book[name]
 
     def _expect(self, sheet: str, cell: str, expected: object, found: object) -> None:
         if str(found).strip() != str(expected):
-            raise InputError(self.source, f"sheet {sheet!r}, cell {cell}: {found!r} in place of {str(expected)!r}", self._legal)
+            raise InputError(self.source, f"sheet {sheet!r}, cell {cell}: {found!r} in place of {str(expected)!r}", self._expected_file)
 
     def _check_version(self) -> None:
         version = str(self._sheet(VERSION)["B1"].value)
         if version.split(".")[:2] != self.protocol.calculator.split(".")[:2]:
-            raise InputError(self.source, f"sheet {VERSION!r}, cell B1: version {version!r}", self._legal)
+            raise InputError(self.source, f"sheet {VERSION!r}, cell B1: version {version!r}", self._expected_file)
 
     def _save(self) -> None:
         try:
@@ -82,7 +82,7 @@ class Template(_Book):
         scenarios = {test for test, _, _ in self._parameters()}
         for test in self.protocol.tests:
             if test not in scenarios:
-                raise InputError(self.source, f"sheet {PARAMETERS!r} has no scenario {test!r}", self._legal)
+                raise InputError(self.source, f"sheet {PARAMETERS!r} has no scenario {test!r}", self._expected_file)
 
     def _check_block(self, block: Block) -> None:
         sheet, (top, left) = self._sheet(block.sheet), coordinate_to_tuple(block.first)
@@ -108,7 +108,7 @@ class Template(_Book):
                 yield test, str(sheet.cell(row, 6).value).strip(), sheet.cell(row, 7)
 
     def fill(self, rated: Rated) -> None:
-        """Fill in a vehicle's colours, which rows are warned of, which layers hold or are claimed, and which tests are predicted."""
+        """Fill in a vehicle's colours, the function of each row, the layers that hold or are claimed, and the predicted tests."""
         for number, cell in enumerate(self.protocol.cells):
             if not cell.is_varied:
                 top, left = coordinate_to_tuple(cell.block.first)
@@ -123,13 +123,13 @@ class Template(_Book):
         for layer in self.protocol.layers:
             self._sheet(layer.sheet)[layer.cell].value = "YES" if holds[layer.test, layer.layer] else "NO"
         for test, parameter, cell in self._parameters():
-            if "Heading correction" not in parameter:  # of lane departure, which takes no N/A
+            if "Heading correction" not in parameter:  # a parameter of lane departure, which accepts no N/A
                 cell.value = PREDICTED if test in self.protocol.tests else NOT_ASSESSED
         self._save()
 
 
 class Preprocessed(_Book):
-    """What the calculator has preprocessed: it has drawn cells, whose measurements are filled in."""
+    """The file that the calculator has preprocessed: it has drawn cells at random, whose measurements are filled in."""
 
     made_by = "preprocess"
 
@@ -139,7 +139,7 @@ class Preprocessed(_Book):
         self._rows = [drawn for sheet in self._sheets for drawn in self._drawn(sheet)]
 
     def _drawn(self, name: str) -> list[tuple[Any, dict[str, int], int, int]]:
-        """Sheet, columns by their heads, row, and number of the cell, of everything that was drawn."""
+        """Sheet, columns by heading, row, and cell number of every drawn cell."""
         sheet, drawn = self._sheet(name), []
         columns: dict[str, int] = {}
         for row in range(1, sheet.max_row + 1):
@@ -148,26 +148,26 @@ class Preprocessed(_Book):
                 columns = {value: k + 1 for k, value in enumerate(values) if value}
                 for head in HEADS:
                     if head not in columns:
-                        raise InputError(self.source, f"sheet {name!r}, row {row}: there is no column {head!r}", self._legal)
+                        raise InputError(self.source, f"sheet {name!r}, row {row}: there is no column {head!r}", self._expected_file)
                 continue
             point = values[columns["Test point"] - 1] if columns else ""
             if not point:
                 continue
             scenario = values[columns["Scenario"] - 1]
             if scenario not in {block.name for block in self.protocol.blocks}:
-                continue  # of a test that is not simulated
+                continue  # the test is not simulated
             place = point.strip("()").split(",")
             number = self.protocol.matrix_of.get((scenario, int(place[0]), int(place[1]))) if all(
                 part.strip().isdigit() for part in place) and len(place) == 2 else None
             if number is None:
-                raise InputError(self.source, f"sheet {name!r}, row {row}: {scenario} has no test point {point!r}", self._legal)
+                raise InputError(self.source, f"sheet {name!r}, row {row}: {scenario} has no test point {point!r}", self._expected_file)
             drawn.append((sheet, columns, row, number))
-        if not columns and sheet["A2"].value != "General requirements":  # of a vehicle that is red everywhere nothing is drawn
-            raise InputError(self.source, f"sheet {name!r} has no column 'Test point'", self._legal)
+        if not columns and sheet["A2"].value != "General requirements":  # no cell is drawn for a vehicle that is red everywhere
+            raise InputError(self.source, f"sheet {name!r} has no column 'Test point'", self._expected_file)
         return drawn
 
     def fill(self, rated: Rated) -> None:
-        """Fill in what was simulated in every cell that was drawn, and whether the robustness layer that was drawn with it held there."""
+        """Fill in the simulated value of every drawn cell, and whether the robustness layer drawn with it holds there."""
         varied = {(cell.block.name, cell.row, cell.column, cell.range, cell.condition): number
                   for number, cell in enumerate(self.protocol.cells) if cell.is_varied}
         for sheet, columns, row, number in self._rows:
@@ -183,7 +183,7 @@ class Preprocessed(_Book):
 
 
 def _measured(rated: Rated, number: int) -> float:
-    """Relative speed of the impact [km/h], 0 if there is none; of a row that is warned of, the time to collision then [s]."""
+    """Relative speed of the impact [km/h], 0 without an impact; in a row with FCW, the time to collision at the warning [s]."""
     is_warning = rated.protocol.cells[number].judged == "warning"
     value = float((rated.cells.warning if is_warning else rated.cells.impact)[0, number])
     return 0.0 if math.isnan(value) else float(half_up(max(value, 0.0), DECIMALS))  # type: ignore[arg-type]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, documented, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answered, study_of
+from safevar_sumo.analysis.subject import Results, answer_question, study_of
 from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.study import StudyLike
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from safevar_sumo.workers.evaluation import Pool
 
 METHODS = ("auto", "monte_carlo", "subset_simulation", "cross_entropy")
-"""How a probability may be estimated."""
+"""Methods that estimate a probability."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +39,7 @@ class RiskOptions(Options):
                                  "subset_simulation if OpenTURNS is installed, the probability is below 0.01 and --samples vehicles "
                                  "would have fewer than 100 failures.",
                          metavar="METHOD", kind=str)
-    rare: bool = option(False, "For rare failures, 1e-3 to 1e-8: as auto, but it needs OpenTURNS and leaves out what decides.", kind=bool)
+    rare: bool = option(False, "For rare failures, 1e-3 to 1e-8: as auto, but requires OpenTURNS and computes no sensitivities.", kind=bool)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -50,7 +50,7 @@ class RiskOptions(Options):
 
     @property
     def is_for_rare(self) -> bool:
-        """Whether a method for rare failures is asked for, not merely allowed."""
+        """Whether a method for rare failures is required, not merely allowed."""
         return self.rare or self.method in ("subset_simulation", "cross_entropy")
 
 
@@ -64,8 +64,8 @@ def risk(study: StudyLike | Results, *, samples: int = RiskOptions.samples, conf
     Parameters
     ----------
     study
-        A study, or results or their directory, whose study is asked about.
+        A study, or results or their directory, which stand for their study.
     """
     from safevar_sumo.analysis.risk.compute import estimate_risk
 
-    return answered(estimate_risk, study_of(study, as_it_is_now=as_it_is_now), RiskOptions, locals())
+    return answer_question(estimate_risk, study_of(study, as_it_is_now=as_it_is_now), RiskOptions, locals())

@@ -143,7 +143,7 @@ class Risk:
     Attributes
     ----------
     samples, failures
-        Vehicles that were drawn, and how many of them were unsafe; those that could not be simulated are `errors`.
+        Number of vehicles that were simulated, and of unsafe ones among them; `errors` counts those that could not be simulated.
     method
         "monte_carlo", "subset_simulation" or "cross_entropy".
     simulations
@@ -153,7 +153,7 @@ class Risk:
     design_point
         Values of the most probable failure by characteristic, if a method for rare failures was used.
     remark
-        What the estimate may have missed, or why its method was chosen; may be empty.
+        Failures that the estimate may have missed, or the reason for its method; may be empty.
     sensitivity, sensitivity_of_unsafe
         The two frames of `sensitivities`; None if characteristics are correlated or bound by constraints: then Sobol indices are
         not defined.
@@ -181,7 +181,7 @@ class Risk:
         return not self.study.variation
 
     def of_fleet(self, vehicles: int) -> float:
-        """Probability that at least one of so many vehicles is unsafe, if they vary independently of each other."""
+        """Probability that at least one of `vehicles` vehicles is unsafe, if they vary independently of each other."""
         return fleet_probability(self.probability, vehicles)
 
     def to_dict(self) -> dict[str, Any]:
@@ -235,8 +235,8 @@ def estimate_risk(study: Study, options: RiskOptions, *, pool: Pool | None = Non
             estimate, method = counts, _method(options)
         else:
             estimate, method = counts.estimate(options.confidence), "monte_carlo"
-        left_out = model.correlated or bool(evaluator.region) or options.is_for_rare
-        degree_indices, unsafe_indices = (None, None) if left_out else sensitivities(evaluator, model, unsafe, options.confidence)
+        no_indices = model.correlated or bool(evaluator.region) or options.is_for_rare
+        degree_indices, unsafe_indices = (None, None) if no_indices else sensitivities(evaluator, model, unsafe, options.confidence)
     point = None if estimate.design_point is None else model.of_normal(estimate.design_point[np.newaxis])[0]
     return Risk(
         study=study, unsafe=unsafe, samples=estimate.simulations - estimate.errors, failures=estimate.failures, errors=estimate.errors,
@@ -269,39 +269,39 @@ def _method(options: RiskOptions) -> str:
 
 def _draw_vehicles(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, options: RiskOptions,
                    response: Response) -> Estimate | _Counts:
-    """Draw vehicles by plain Monte Carlo; if few of the first are unsafe, switch to a method for rare failures."""
+    """Draw vehicles by plain Monte Carlo; if few of the first `PILOT` are unsafe, switch to a method for rare failures."""
     counts, rng = _Counts(), np.random.default_rng(evaluator.study.search.seed)
     is_pilot = _may_be_rare(options) and not evaluator.region
     if options.is_for_rare and evaluator.region:
-        counts.remark = "the study has constraints, within which only plain Monte Carlo draws"
+        counts.remark = "the study has constraints, which only plain Monte Carlo supports"
     if options.is_for_rare:
         openturns()  # raises at once if it is missing
-    most = max(options.samples, PILOT) if options.is_for_rare else options.samples
-    while counts.count + counts.errors < most:
+    requested = max(options.samples, PILOT) if options.is_for_rare else options.samples
+    while counts.count + counts.errors < requested:
         chunk = PILOT if is_pilot else CHUNK if options.width is not None else LARGEST_CHUNK
         drawn = counts.count + counts.errors
-        number = min(chunk, most - drawn)
+        number = min(chunk, requested - drawn)
         probabilities = rng.random((number, len(evaluator.characteristics))) if is_pilot else None
         settings = _feasible_vehicles(evaluator, model, number, rng) if probabilities is None else model.settings(probabilities)
-        evaluations = evaluator.evaluate(settings, "vehicles as they vary", drawn, most)
+        evaluations = evaluator.evaluate(settings, "vehicles as they vary", drawn, requested)
         valid = int(np.count_nonzero(evaluations.valid))
         counts.count, counts.errors = counts.count + valid, counts.errors + number - valid
         counts.failures += int(np.count_nonzero(unsafe.of(evaluations)))
         if probabilities is not None:
             is_pilot = False
             values = response.take(scipy.stats.norm.ppf(probabilities), evaluations)
-            is_frequent = not options.is_for_rare and counts.failures * (most / number) >= ENOUGH
+            is_frequent = not options.is_for_rare and counts.failures * (requested / number) >= ENOUGH
             if valid and counts.failures < RARE_BELOW * valid and not is_frequent:
                 estimate = _rare(response, values, options, counts, evaluator.study.search.seed)
                 if estimate is not None:
                     return estimate
             elif options.is_for_rare:
-                counts.remark = f"more than {RARE_BELOW:g} of {valid} vehicles are unsafe: plain Monte Carlo"
+                counts.remark = f"more than {RARE_BELOW:g} of {valid} vehicles are unsafe: plain Monte Carlo is used"
         low, high = clopper_pearson(counts.failures, counts.count, options.confidence) if counts.count else (0.0, 1.0)
         if options.width is not None and high - low <= options.width:
             break
     if not counts.count:
-        raise SimulationError(f"study {evaluator.study.name!r}: not one of {counts.errors} vehicles could be simulated")
+        raise SimulationError(f"study {evaluator.study.name!r}: none of {counts.errors} vehicles could be simulated")
     return counts
 
 
@@ -310,10 +310,10 @@ def _may_be_rare(options: RiskOptions) -> bool:
 
 
 def _rare(response: Response, values: FloatArray, options: RiskOptions, counts: _Counts, seed: int) -> Estimate | None:
-    """The estimate by a method for rare failures; None where plain Monte Carlo goes on, with the reason as a remark."""
+    """The estimate by a method for rare failures; None if plain Monte Carlo has to go on, for the reason in the remark."""
     if is_plateau(values):
-        counts.remark = ("the response is a plateau: most vehicles nearest to failing have the same safety degree, which leads no method "
-                        "for rare failures to them; plain Monte Carlo")
+        counts.remark = ("the response is a plateau: most vehicles nearest to failing have the same safety degree, so that methods for "
+                        "rare failures cannot approach failures; plain Monte Carlo is used")
         return None
     if not options.is_for_rare and find_spec("openturns") is None:
         counts.remark = ("fewer than 0.01 of the first vehicles are unsafe; pip install 'safevar_sumo[rare]' for a method that needs fewer "
@@ -322,7 +322,7 @@ def _rare(response: Response, values: FloatArray, options: RiskOptions, counts: 
     try:
         return estimate_rare(response, _method(options), options.confidence, seed)
     except PlateauError:
-        counts.remark = "the response is a plateau on the way to failures: no method for rare failures gets across; plain Monte Carlo"
+        counts.remark = "the response is a plateau before failures, which no method for rare failures crosses; plain Monte Carlo is used"
         return None
 
 
@@ -338,7 +338,7 @@ def _feasible_vehicles(evaluator: Evaluator, model: VariationModel, number: int,
 BASE = 512
 """Number of base points of Saltelli's design, which has n + 2 settings for each."""
 LEAST_FOR_INDICES = 100
-"""Sobol indices of being unsafe need at least so many unsafe and so many safe settings in the design."""
+"""Minimum number of unsafe, and of safe, settings in the design for Sobol indices of being unsafe."""
 RESAMPLES = 200
 """Number of bootstrap samples for the intervals."""
 
@@ -367,7 +367,7 @@ def sensitivities(evaluator: Evaluator, model: VariationModel, unsafe: Unsafe, c
 
 
 def _indices(problem: dict[str, Any], output: FloatArray, confidence: float, seed: int) -> pd.DataFrame:
-    """Sobol indices of an output over the design; base points at which the output is undefined for a setting are left out."""
+    """Sobol indices of an output over the design; omits base points at which the output is undefined for any setting."""
     from SALib.analyze import sobol
 
     blocks = output.reshape(BASE, -1)

@@ -23,44 +23,44 @@ from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 RARE_BELOW = 1e-2
 """Probability above which plain Monte Carlo is as good."""
 PILOT = 1000
-"""Vehicles drawn plainly, from which the method is chosen."""
+"""Number of vehicles first drawn by plain Monte Carlo, whose outcomes decide the method."""
 ENOUGH = 100
-"""Failures among the vehicles that are asked for, at the rate of the first, from which on plain Monte Carlo shows them as well."""
+"""Plain Monte Carlo is kept if, at the pilot's rate, all requested vehicles would have at least this many failures."""
 SHARE = 0.1
-"""p0: share of a level's vehicles that are nearest to failing, from which the next level starts."""
+"""p0: share of a level's vehicles, those nearest to failing, from which the next level starts."""
 LEVEL = 1000
-"""N: vehicles of a level. A block is p0 N of them, so that none continues from one in its own block."""
+"""N: number of vehicles of a level. A block has p0 N vehicles, so that no vehicle continues from one in its own block."""
 REPEATS, REPEATS_OF_RARER = 4, 8
-"""Independent repeats, down to some 1e-4 and below."""
+"""Number of independent repeats for probabilities down to `RARER`, and below it."""
 RARER = 3e-4
 INFLATION = 1.3
-"""OpenTURNS takes the levels of a subset simulation for independent of each other; the coefficients of variation over 240 repeats of linear
-limit states of 1e-3 to 1e-6 in 5 to 12 dimensions are 1.1 to 1.3 times what it says."""
+"""Factor on OpenTURNS' coefficient of variation, which takes the levels of a subset simulation for independent of each other: over 240
+repeats of linear limit states of 1e-3 to 1e-6 in 5 to 12 dimensions the observed coefficients are 1.1 to 1.3 times as large."""
 PRIOR = 3
-"""Degrees of freedom of the interval beside the number of repeats, for what OpenTURNS' own estimates tell."""
+"""Degrees of freedom of the interval in addition to the number of repeats, for the information in OpenTURNS' own estimates."""
 SMALLEST = 1e-10
 """Probability at which a subset simulation gives up."""
 WIDTH = 2.0
 """Width of the uniform proposals of its Markov chains."""
 SAFE = 1e6
-"""Response where the safety degree is undefined or nothing could be simulated: as far from failing as can be."""
+"""Response where the safety degree is undefined or the simulation failed: as far from failing as possible."""
 EDGE = 1e-9
-"""Response of a failure at the limit itself."""
+"""Smallest absolute value of a response, so that its sign always shows whether the vehicle is unsafe."""
 TIED = 0.5
-"""Share of the vehicles nearest to failing that respond alike, from which on the response is a plateau."""
+"""The response is a plateau if at least this share of the vehicles nearest to failing have the same one."""
 SEGMENT = 9
-"""Places between two failures that are looked at."""
+"""Number of points evaluated between two failures."""
 COMPARED = 14
-"""Failures that are compared with each other."""
+"""Maximum number of failures that are compared pairwise."""
 AROUND = 100
-"""Settings around the design point in each round of its search."""
+"""Number of settings around the design point in each round of its search."""
 ROUNDS = 4
 Model = Callable[[FloatArray], FloatArray]
 """From points in standard normal space to settings."""
 
 
 class PlateauError(Exception):
-    """The response does not tell what is nearer to failing."""
+    """The response does not show which vehicles are nearer to failing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +78,7 @@ class Estimate:
 
 
 class Response:
-    """The response g(u), below 0 where it is unsafe; remembers failures and how near to failing whatever is asked was."""
+    """The response g(u), below 0 where a vehicle is unsafe; counts simulations and remembers failures."""
 
     def __init__(self, evaluator: Evaluator, settings_of: Model, unsafe: Unsafe) -> None:
         self._evaluator, self._settings_of, self._unsafe = evaluator, settings_of, unsafe
@@ -91,24 +91,24 @@ class Response:
 
     @property
     def failures(self) -> FloatArray:
-        """Different points that are unsafe, shape (k, n)."""
+        """Distinct unsafe points, shape (k, n)."""
         return np.unique(np.concatenate([np.zeros((0, self.dimensions)), *self._points]), axis=0)
 
     def __call__(self, points: Any) -> FloatArray:
         """The response at points, shape (N, n)."""
-        where = np.asarray(points, dtype=float).reshape(-1, self.dimensions)
-        evaluations = self._evaluator.evaluate(self._settings_of(where), self.stage, self.simulations, max(self.expected, self.simulations))
-        return self.take(where, evaluations)
+        array = np.asarray(points, dtype=float).reshape(-1, self.dimensions)
+        evaluations = self._evaluator.evaluate(self._settings_of(array), self.stage, self.simulations, max(self.expected, self.simulations))
+        return self.take(array, evaluations)
 
-    def take(self, where: FloatArray, evaluations: Evaluations) -> FloatArray:
-        """The response of evaluations, which are counted and remembered."""
+    def take(self, points: FloatArray, evaluations: Evaluations) -> FloatArray:
+        """The response of points with known evaluations, which are counted and remembered."""
         unsafe = self._unsafe.of(evaluations)
         margin = self._unsafe.margin(evaluations)
         margin = np.where(evaluations.valid & ~np.isnan(margin), margin, SAFE)
-        self.simulations += len(where)
+        self.simulations += len(points)
         self.errors += int(np.count_nonzero(~evaluations.valid))
         self.failed += int(np.count_nonzero(unsafe))
-        self._points.append(where[unsafe])
+        self._points.append(points[unsafe])
         return np.where(unsafe, np.minimum(margin, -EDGE), np.maximum(margin, EDGE))
 
 
@@ -129,7 +129,7 @@ def openturns() -> Any:
 
 
 def is_plateau(values: FloatArray) -> bool:
-    """Whether the values nearest to failing, the share p0 of them, are mostly one value."""
+    """Whether the share p0 of the values, those nearest to failing, is mostly one value."""
     nearest = np.sort(values[values > 0])[:max(int(SHARE * len(values)), 2)]
     if not len(nearest):
         return False
@@ -147,13 +147,13 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
     Raises
     ------
     PlateauError
-        If the response does not tell what is nearer to failing.
+        If the response does not show which vehicles are nearer to failing.
     """
     run = _subset if method == "subset_simulation" else _cross_entropy
     probabilities, variations, thresholds = [], [], list[float]()
     repeats, number = REPEATS, 0
     response.expected = response.simulations + 4 * REPEATS * LEVEL
-    with _own_random_numbers():
+    with _generator_restored():
         while number < repeats:
             response.stage = f"rare failures, repeat {number + 1} of {repeats}"
             probability, variation, thresholds = run(response, (seed + 7919 * number) % 2**31)
@@ -167,14 +167,14 @@ def estimate_rare(response: Response, method: str, confidence: float, seed: int)
     if mean <= 0:
         return Estimate(probability=0.0, variation=math.nan, interval=(0.0, SMALLEST), failures=response.failed, errors=response.errors,
                         simulations=response.simulations, design_point=None,
-                        remark="no failure was found: either there is none, or no response leads to where they are")
+                        remark="no failure was found: either there is none, or the response does not lead to it")
     spread = float(np.std(probabilities, ddof=1)) / mean / math.sqrt(repeats)
     variation = max(spread, INFLATION * math.sqrt(float(np.mean(np.square(variations))) / repeats))
     quantile = float(scipy.stats.t.ppf((1 + confidence) / 2, repeats + PRIOR))
-    reach = math.exp(quantile * math.sqrt(math.log1p(variation**2)))
+    factor = math.exp(quantile * math.sqrt(math.log1p(variation**2)))
     rng = np.random.default_rng(seed)
-    remark = _islands(response, thresholds, rng)
-    return Estimate(probability=mean, variation=variation, interval=(mean / reach, min(mean * reach, 1.0)), failures=response.failed,
+    remark = _remark_on_islands(response, thresholds, rng)
+    return Estimate(probability=mean, variation=variation, interval=(mean / factor, min(mean * factor, 1.0)), failures=response.failed,
                     errors=response.errors, design_point=_design_point(response, rng), remark=remark, simulations=response.simulations)
 
 
@@ -184,8 +184,8 @@ def _event(ot: Any, response: Callable[[Any], FloatArray], dimensions: int) -> A
 
 
 @contextmanager
-def _own_random_numbers() -> Iterator[None]:
-    """OpenTURNS has one generator for the whole process: it is left as it was."""
+def _generator_restored() -> Iterator[None]:
+    """Restores the state of OpenTURNS' random generator, of which there is one for the whole process."""
     generator = openturns().RandomGenerator
     state = generator.GetState()
     try:
@@ -203,12 +203,12 @@ def _subset(response: Response, seed: int) -> tuple[float, float, list[float]]:
     algorithm.setMaximumCoefficientOfVariation(-1.0)
     algorithm.setMinimumProbability(SMALLEST)
 
-    def does_not_go_on() -> bool:
+    def is_stuck() -> bool:
         thresholds = list(algorithm.getThresholdPerStep())
         stuck[0] = len(thresholds) > 1 and thresholds[-1] > 0 and thresholds[-1] == thresholds[-2]
         return stuck[0]
 
-    algorithm.setStopCallback(does_not_go_on)
+    algorithm.setStopCallback(is_stuck)
     ot.RandomGenerator.SetSeed(seed)
     try:
         algorithm.run()
@@ -239,8 +239,8 @@ def _cross_entropy(response: Response, seed: int) -> tuple[float, float, list[fl
     return probability, float(result.getCoefficientOfVariation()) if probability > 0 else 0.0, []
 
 
-def _islands(response: Response, thresholds: list[float], rng: np.random.Generator) -> str:
-    """Remark on failures between which it is safe: groups of which a path within a group stays near to failing."""
+def _remark_on_islands(response: Response, thresholds: list[float], rng: np.random.Generator) -> str:
+    """Remark on islands of failures with safe settings between them; straight paths within an island stay near to failing."""
     failures = response.failures
     if len(failures) < 2:
         return ""
@@ -257,12 +257,12 @@ def _islands(response: Response, thresholds: list[float], rng: np.random.Generat
     number, _ = scipy.sparse.csgraph.connected_components(joined)
     if number < 2:
         return ""
-    return (f"failures lie on {number} islands between which it is safe: there may be others, which this method has missed; "
+    return (f"failures lie on {number} islands with safe settings between them, and this method may have missed others; "
             "--method monte_carlo misses none, with many samples")
 
 
 def _apart(points: FloatArray) -> FloatArray:
-    """Points that are far from each other: each is the farthest from those before it."""
+    """Points far from each other: each is the farthest from all chosen before it."""
     chosen = [int(np.argmin(np.linalg.norm(points, axis=1)))]
     distance = np.linalg.norm(points - points[chosen[0]], axis=1)
     while len(chosen) < min(COMPARED, len(points)):
@@ -272,7 +272,7 @@ def _apart(points: FloatArray) -> FloatArray:
 
 
 def _design_point(response: Response, rng: np.random.Generator) -> FloatArray | None:
-    """The failure nearest to the origin: the nearest that was seen, drawn towards the origin and looked around in ever smaller steps."""
+    """The failure nearest to the origin: searched from the nearest known one, towards the origin and around it in ever smaller steps."""
     if not len(response.failures):
         return None
     best, response.stage = _nearest(response.failures), "most probable failure"

@@ -39,7 +39,7 @@ def print_risk(console: Console, result: Risk) -> None:
         print_text(console, f"Of {FLEET:,} vehicles that vary independently at least one is unsafe with probability "
                             f"{result.of_fleet(FLEET):.2g}.")
     if result.of_domain:
-        print_text(console, "warning: no probability in the field: the study has no [variation] table that says how real vehicles vary.")
+        print_text(console, "warning: this is no probability in the field: the study has no [variation] table for how real vehicles vary.")
     print_text(console, _how_vehicles_vary(result.study))
     print_constraints(console, result.study)
     if result.sensitivity is None or result.sensitivity_of_unsafe is None:
@@ -97,7 +97,7 @@ def sensitivity_figure(result: Risk) -> Figure:
         axis.set_xlabel("share of the variance [-]")
         axis.set_xlim(0, 1)
         if rows["total"].isna().all():
-            axis.text(0.5, 0.5, "too few settings are unsafe,\nor safe, to tell", transform=axis.transAxes, ha="center", fontsize=FONT)
+            axis.text(0.5, 0.5, "too few settings are unsafe,\nor safe, for indices", transform=axis.transAxes, ha="center", fontsize=FONT)
         axis.grid(visible=False, axis="y")
     axes[1].set_yticklabels([])
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False, fontsize=FONT)

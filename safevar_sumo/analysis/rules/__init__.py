@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, documented, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answered, study_of
+from safevar_sumo.analysis.subject import Results, answer_question, study_of
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ class RulesOptions(Options):
     """Options of the search for rules."""
 
     question: ClassVar[str] = "rules"
-    samples: int = option(16_384, "Settings over the whole domain: half of them make the rules, the other half judges them.",
+    samples: int = option(16_384, "Number of settings over the whole domain; one half yields the rules, the other half tests them.",
                            kind=int, low=2, high=10_000_000, metavar="N")
     unsafe: str | None = unsafe_option()
 
@@ -37,8 +37,8 @@ def rules(study: StudyLike | Results, *, samples: int = RulesOptions.samples, un
     Parameters
     ----------
     study
-        A study, or results or their directory, whose study is asked about.
+        A study, or results or their directory, which stand for their study.
     """
     from safevar_sumo.analysis.rules.compute import find_rules
 
-    return answered(find_rules, study_of(study, as_it_is_now=as_it_is_now), RulesOptions, locals())
+    return answer_question(find_rules, study_of(study, as_it_is_now=as_it_is_now), RulesOptions, locals())

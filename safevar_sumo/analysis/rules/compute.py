@@ -1,4 +1,4 @@
-"""Finds rules in physical units that say where a study is unsafe, from an unbiased design, judged on another one.
+"""Finds rules in physical units that say where a study is unsafe, from an unbiased design, and validates them on a second one.
 
 A classification tree (CART, by scikit-learn) cuts the domain into boxes. The tree is pruned to the smallest whose score in
 cross-validation is within a standard error of the best. Its boxes with more unsafe settings than safe ones become rules. A rule
@@ -27,13 +27,13 @@ from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool
 
 LEAST_FOR_RULES = 10
-"""Unsafe, and safe, settings that rules need at least."""
+"""Minimum number of unsafe, and of safe, settings for rules."""
 FOLDS, DEEPEST, PRUNINGS = 5, 6, 24
-"""Folds of the cross-validation; most conditions of a box; number of prunings that are compared."""
+"""Number of folds of the cross-validation; maximum depth of the tree; maximum number of prunings compared."""
 LEAST_ADDED = 0.01
 """Share of the unsafe settings that a rule must cover in addition to the rules before it."""
 DIGITS = 3
-"""Digits of a width to which limits are rounded."""
+"""Limits are rounded to this many digits of the domain's width."""
 Limits = dict[int, tuple[float | None, float | None]]
 """By column: at least, at most; None where open."""
 
@@ -138,7 +138,7 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
                   "(run `rules --samples N` for more)")
     else:
         boxes = _boxes(training.settings, is_unsafe, members)
-    rules = [_judged(limits, validation.settings, is_unsafe_validation, members) for limits in boxes]
+    rules = [_validated(limits, validation.settings, is_unsafe_validation, members) for limits in boxes]
     return Rules(study=study, unsafe=unsafe, rules=sorted(rules, key=lambda rule: -rule.unsafe_inside), remark=remark,
                  samples=len(training) + len(validation), unsafe_share=float(np.mean(np.concatenate([is_unsafe, is_unsafe_validation]))))
 
@@ -150,11 +150,11 @@ def _design(evaluator: Evaluator, number: int, seed: int) -> Evaluations:
 
 
 def _boxes(settings: FloatArray, unsafe: BoolArray, members: CharacteristicSet) -> list[Limits]:
-    """The boxes that become rules, each once."""
+    """The distinct boxes that become rules."""
     tree = _pruned_tree((settings - members.lower) / (members.upper - members.lower), unsafe)
     leaves = [(_rounded(limits, members), density) for limits, density in _leaves(tree, members)]
     chosen = [limits for limits, density in leaves if density > 0.5] or [max(leaves, key=lambda leaf: leaf[1])[0]]
-    simple = [_without_idle_conditions(limits, settings, unsafe) for limits in chosen]
+    simple = [_without_useless_conditions(limits, settings, unsafe) for limits in chosen]
     return _covering_more(simple, settings, unsafe)
 
 
@@ -176,20 +176,20 @@ def _pruned_tree(shares: FloatArray, unsafe: BoolArray) -> Any:
 
 
 def _leaves(tree: Any, members: CharacteristicSet) -> list[tuple[Limits, float]]:
-    """The boxes of a tree, and the density of the unsafe in each."""
-    inner, boxes = tree.tree_, []
-    places: list[tuple[int, Limits]] = [(0, {})]
-    while places:
-        node, limits = places.pop()
-        if inner.children_left[node] < 0:
-            counts = inner.value[node][0]
+    """The boxes of a tree, each with its share of unsafe settings."""
+    nodes, boxes = tree.tree_, []
+    stack: list[tuple[int, Limits]] = [(0, {})]
+    while stack:
+        node, limits = stack.pop()
+        if nodes.children_left[node] < 0:
+            counts = nodes.value[node][0]
             boxes.append((limits, float(counts[-1] / counts.sum())))
             continue
-        column = int(inner.feature[node])
-        cut = float(members.lower[column] + inner.threshold[node] * (members.upper - members.lower)[column])
+        column = int(nodes.feature[node])
+        cut = float(members.lower[column] + nodes.threshold[node] * (members.upper - members.lower)[column])
         low, high = limits.get(column, (None, None))
-        places.append((int(inner.children_left[node]), {**limits, column: (low, cut)}))
-        places.append((int(inner.children_right[node]), {**limits, column: (cut, high)}))
+        stack.append((int(nodes.children_left[node]), {**limits, column: (low, cut)}))
+        stack.append((int(nodes.children_right[node]), {**limits, column: (cut, high)}))
     return boxes
 
 
@@ -202,10 +202,10 @@ def _rounded(limits: Limits, members: CharacteristicSet) -> Limits:
     return {column: (rounded(limits[column][0], widths[column]), rounded(limits[column][1], widths[column])) for column in sorted(limits)}
 
 
-def _without_idle_conditions(limits: Limits, settings: FloatArray, unsafe: BoolArray) -> Limits:
+def _without_useless_conditions(limits: Limits, settings: FloatArray, unsafe: BoolArray) -> Limits:
     """Drop conditions as long as the lower bound of the density does not fall."""
-    def least_density(some: Limits) -> float:
-        inside = within(some, settings)
+    def least_density(box: Limits) -> float:
+        inside = within(box, settings)
         count = int(np.count_nonzero(inside))
         return clopper_pearson(int(np.count_nonzero(unsafe & inside)), count)[0] if count else 0.0
 
@@ -219,26 +219,26 @@ def _without_idle_conditions(limits: Limits, settings: FloatArray, unsafe: BoolA
 
 
 def _covering_more(boxes: list[Limits], settings: FloatArray, unsafe: BoolArray) -> list[Limits]:
-    """Boxes, those that cover most first, without those that cover few unsafe settings in addition; at least one."""
+    """Boxes in order of coverage, without those that add few unsafe settings to the boxes before them; at least one."""
     kept: list[Limits] = []
-    left = unsafe.copy()
+    uncovered = unsafe.copy()
     for limits in sorted(boxes, key=lambda box: -np.count_nonzero(unsafe & within(box, settings))):
         inside = within(limits, settings)
-        if not kept or np.count_nonzero(left & inside) >= LEAST_ADDED * np.count_nonzero(unsafe):
+        if not kept or np.count_nonzero(uncovered & inside) >= LEAST_ADDED * np.count_nonzero(unsafe):
             kept.append(limits)
-            left &= ~inside
+            uncovered &= ~inside
     return kept
 
 
 def within(limits: Limits, settings: FloatArray) -> BoolArray:
-    """Which settings lie within limits; shape (M,)."""
+    """Whether settings lie within limits; shape (M,)."""
     inside = np.ones(len(settings), dtype=bool)
     for column, (low, high) in limits.items():
         inside &= (settings[:, column] >= (-np.inf if low is None else low)) & (settings[:, column] <= (np.inf if high is None else high))
     return inside
 
 
-def _judged(limits: Limits, settings: FloatArray, unsafe: BoolArray, members: CharacteristicSet) -> Rule:
+def _validated(limits: Limits, settings: FloatArray, unsafe: BoolArray, members: CharacteristicSet) -> Rule:
     """A rule with its numbers on the validation settings."""
     inside = within(limits, settings)
     return Rule({members.names[column]: ends for column, ends in limits.items()}, int(np.count_nonzero(inside)),
@@ -259,7 +259,7 @@ def print_rules(console: Console, result: Rules) -> None:
         print_text(console, f"- {rule_in_words(rule, members, result.unsafe)}")
     if result.rules:
         print_meanings(console, [member for member in members if any(member.name in rule.limits for rule in result.rules)])
-        print_text(console, f"Judged on settings that did not make the rules; in brackets {result.rules[0].confidence:.0%} intervals.")
+        print_text(console, f"Tested on settings that did not form the rules; in brackets {result.rules[0].confidence:.0%} intervals.")
 
 
 def rule_in_words(rule: Rule, characteristics: CharacteristicSet, unsafe: Unsafe) -> str:

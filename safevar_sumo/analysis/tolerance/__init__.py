@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from safevar_sumo.analysis.options import Options, documented, option, unsafe_option
-from safevar_sumo.analysis.subject import Results, answered, study_of
+from safevar_sumo.analysis.subject import Results, answer_question, study_of
 from safevar_sumo.study import StudyLike
 
 if TYPE_CHECKING:
@@ -27,9 +27,9 @@ class ToleranceOptions(Options):
     question: ClassVar[str] = "tolerance"
     unsafe: str | None = unsafe_option()
     characteristics: tuple[str, ...] | None = option(
-        None, "These characteristics alone, separated by commas.  [default: all]", metavar="A,B", form="commas",
-        python="Which ones vary: alone, in pairs, and together in the joint box; the others are the original's. By default all.")
-    pairs: bool = option(False, "Look at every pair too.", kind=bool)
+        None, "Only these characteristics, separated by commas.  [default: all]", metavar="A,B", form="commas",
+        python="Characteristics that vary alone, in pairs, and together in the joint box; the others are the original's. By default all.")
+    pairs: bool = option(False, "Evaluate every pair too.", kind=bool)
 
 
 @documented(ToleranceOptions)
@@ -41,8 +41,8 @@ def tolerance(study: StudyLike | Results, *, unsafe: Criterion | None = None, ch
     Parameters
     ----------
     study
-        A study, or results or their directory, whose study is asked about.
+        A study, or results or their directory, which stand for their study.
     """
     from safevar_sumo.analysis.tolerance.compute import find_tolerances
 
-    return answered(find_tolerances, study_of(study, as_it_is_now=as_it_is_now), ToleranceOptions, locals())
+    return answer_question(find_tolerances, study_of(study, as_it_is_now=as_it_is_now), ToleranceOptions, locals())

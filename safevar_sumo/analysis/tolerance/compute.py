@@ -24,11 +24,11 @@ from safevar_sumo.vehicles import Characteristic
 from safevar_sumo.workers.evaluation import Pool
 
 VALUES, RATED_VALUES = 201, 33
-"""Values over the domain, and in a rated study, where each of them is a whole matrix; the original comes on top."""
+"""Number of values over the domain; fewer in a rated study, where each takes a whole matrix. The original value is added."""
 FINER, ROUNDS, RATED_ROUNDS = 8, 4, 1
-"""Into how many parts the place of a change is divided, and how often: to a 4096th of the distance of two values."""
+"""Number of parts into which an interval with a change of state is divided, and how often: to a 4096th of the distance of two values."""
 ALMOST_ONE, SAME_POINTS = 1 - 1e-6, 1e-9
-"""A loss that counts as one point, and one that is rounding."""
+"""A loss above the first counts as one point; a loss up to the second is rounding."""
 SAFE, UNSAFE, NOT_SIMULATED, INFEASIBLE = range(4)
 Interval = tuple[float, float]
 
@@ -41,7 +41,7 @@ class OneAtATimeScan:
     ----------
     profile
         Columns `value` [unit], `safety_degree` [m, or -m/s], `outcome`, `unsafe`, `valid`, in the order of the values; closer
-        together where the state changes. What is not valid could not be simulated: it is neither safe nor unsafe.
+        together where the state changes. A value that is not valid could not be simulated: it is neither safe nor unsafe.
     """
 
     characteristic: Characteristic
@@ -87,20 +87,20 @@ class OneAtATimeScan:
 
     @property
     def points(self) -> list[tuple[float, float]] | None:
-        """Values and the points that they keep, in their order; None of a study that is not rated."""
+        """Values in their order, each with the points that it keeps; None if the study is not rated."""
         if RATING_POINTS.name not in self.profile:
             return None
         return list(zip(self.profile["value"].tolist(), self.profile[RATING_POINTS.name].tolist(), strict=True))
 
     def first_loss(self, points: float = 0.0) -> float | None:
-        """The value nearest to the original with which more than so many points are lost; None if there is none."""
+        """The value nearest to the original that loses more than `points` points; None if there is none."""
         pairs, original = self.points or [], self.characteristic.original
         full = next((kept for value, kept in pairs if value == original), math.nan)
         losing = [value for value, kept in pairs if full - kept > points + SAME_POINTS]
         return min(losing, key=lambda value: abs(value - original), default=None)
 
     def to_dict(self) -> dict[str, Any]:
-        """The entry of `alone` in `tolerance --json`; of a rated study with points, and where the first of them are lost."""
+        """The entry of `alone` in `tolerance --json`; for a rated study with the points, and the values that first lose some."""
         rated = {} if self.points is None else {
             "points": [list(pair) for pair in self.points], "any_lost": self.first_loss(), "first_point_lost": self.first_loss(ALMOST_ONE)}
         return {**rated,
@@ -121,10 +121,10 @@ def scan(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[O
     values = [np.union1d(np.linspace(members[column].lower, members[column].upper, number), members[column].original) for column in columns]
     profiles = _evaluated(evaluator, columns, values, unsafe)
     for _ in range(rounds):
-        between = [_between_states(profile) for profile in profiles]
-        if not any(map(len, between)):
+        inner = [_between_states(profile) for profile in profiles]
+        if not any(map(len, inner)):
             break
-        finer = _evaluated(evaluator, columns, between, unsafe)
+        finer = _evaluated(evaluator, columns, inner, unsafe)
         profiles = [pd.concat([profile, more], ignore_index=True).sort_values("value", ignore_index=True)
                     for profile, more in zip(profiles, finer, strict=True)]
     return [OneAtATimeScan(characteristic=members[column], profile=profile) for column, profile in zip(columns, profiles, strict=True)]
@@ -170,7 +170,7 @@ class Tolerance:
 
     @property
     def verdict(self) -> str:
-        """What is unsafe by itself, in one sentence."""
+        """One sentence on the characteristics and pairs that are unsafe by themselves."""
         single = [scan.characteristic.name for scan in self.alone if scan.unsafe]
         unsafe_pairs = [" with ".join(member.name for member in pair.characteristics) for pair in self.pairs or []
                         if pair.nearest is not None]
@@ -209,7 +209,7 @@ class Tolerance:
 
 def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | None = None, jobs: int | None = None,
                     progress: Progress = silent) -> Tolerance:
-    """Find how far the characteristics of a study may go. Nothing is filtered: this is about the vehicle, not about a search.
+    """Find how far the characteristics of a study may go. The filter is not applied: this is about the vehicle, not about a search.
 
     Raises
     ------
@@ -222,9 +222,9 @@ def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | Non
         unsafe = evaluator.criterion(options.unsafe, original)
         alone = scan(evaluator, columns, unsafe)
         pairs = planes(evaluator, columns, unsafe) if options.pairs else None
-        is_safe = not unsafe.of(original)[0]
-        boxed = is_safe and not is_rated(study)  # thousands of whole matrices
-        box = safe_box(evaluator, columns, unsafe, _unsafe_settings(evaluator, alone, pairs or [])) if boxed else no_box(evaluator, columns)
+        has_box = not unsafe.of(original)[0] and not is_rated(study)  # in a rated study it would take thousands of whole matrices
+        box = (safe_box(evaluator, columns, unsafe, _unsafe_settings(evaluator, alone, pairs or [])) if has_box
+               else no_box(evaluator, columns))
     return Tolerance(study=study, unsafe=unsafe, original=original, alone=alone, pairs=pairs, joint=box)
 
 

@@ -19,10 +19,10 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import Characteristic
 
 SIDE = 21
-"""Values of each of the two, evenly spaced over its domain, ends included."""
+"""Number of values of each of the two characteristics, evenly spaced over its domain, ends included."""
 PARTS, ROUNDS, SQUARES = 4, 4, 12
-"""Into how many parts a side of a square is divided on the way to the nearest unsafe setting, how often (to a 5120th of the domain), and
-how many squares of a plane at a time."""
+"""Search for the nearest unsafe setting: parts into which a square's side is divided, number of such divisions (down to a 5120th of the
+domain), and maximum number of squares of a plane in each."""
 
 _WEIGHT = np.outer(*[np.where(np.isin(np.arange(SIDE), (0, SIDE - 1)), 0.5, 1.0)] * 2)
 
@@ -34,13 +34,13 @@ class Pair:
     Attributes
     ----------
     values
-        Of either, shape (2, SIDE), in its unit.
+        Values of both characteristics, shape (2, SIDE), each in its unit.
     safety_degree, unsafe, valid
-        On the grid, shape (SIDE, SIDE): the first characteristic down, the second across [m, or -m/s]. What is not valid could not be
-        simulated, or is `infeasible`, and is neither safe nor unsafe.
+        On the grid, shape (SIDE, SIDE): the first characteristic down, the second across [m, or -m/s]. A setting that is not valid could
+        not be simulated, or is `infeasible`, and is neither safe nor unsafe.
     nearest
         The two values of the unsafe setting that is nearest to the original, in widths of the domains, to a 5120th of each; None if the
-        grid has none. What is unsafe between safe values of the grid alone is not seen.
+        grid has none. Unsafe settings that lie only between safe values of the grid are not found.
     """
 
     characteristics: tuple[Characteristic, Characteristic]
@@ -70,7 +70,7 @@ class Pair:
 
 
 def planes(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list[Pair]:
-    """Every pair of some characteristics; where one is unsafe, with its nearest unsafe setting."""
+    """The plane of every pair of characteristics, with its nearest unsafe setting if it has one."""
     members, original = evaluator.characteristics.members, evaluator.characteristics.original
     chosen = list(combinations(columns, 2))
     axes = {column: np.linspace(members[column].lower, members[column].upper, SIDE) for column in columns}
@@ -89,20 +89,20 @@ def planes(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe) -> list
 
 def _nearest(evaluator: Evaluator, chosen: Sequence[tuple[int, int]], is_unsafe: BoolArray,
              unsafe: Unsafe) -> dict[int, tuple[float, float]]:
-    """Of every plane that has one, the unsafe setting nearest to the original, in widths of the domains.
+    """The unsafe setting nearest to the original, in widths of the domains, of every plane that has one.
 
-    A branch and bound search: squares with an unsafe corner are divided into smaller ones, as long as a place in them is nearer than
-    the nearest unsafe setting so far; of each plane the `SQUARES` nearest ones at a time.
+    A branch and bound search: squares with an unsafe corner are divided into smaller ones, as long as a point in them is nearer than
+    the nearest unsafe setting so far; each round divides the `SQUARES` nearest squares of each plane.
     """
     members = evaluator.characteristics
-    which = np.array(chosen, dtype=int).reshape(-1, 2)
-    original, width = members.original[which], (members.upper - members.lower)[which]
-    lower, size = members.lower[which], width / (SIDE - 1)
+    columns = np.array(chosen, dtype=int).reshape(-1, 2)
+    original, width = members.original[columns], (members.upper - members.lower)[columns]
+    lower, size = members.lower[columns], width / (SIDE - 1)
     best, place = np.full(len(chosen), np.inf), np.zeros((len(chosen), 2))
 
     def improve(plane: npt.NDArray[np.intp], values: FloatArray) -> None:
         distances = np.sqrt(np.sum(((values - original[plane]) / width[plane]) ** 2, axis=1))
-        for row in np.lexsort((distances, plane)):  # of each plane the nearest first
+        for row in np.lexsort((distances, plane)):  # the nearest of each plane first
             if distances[row] < best[plane[row]]:
                 best[plane[row]], place[plane[row]] = distances[row], values[row]
 
@@ -124,7 +124,7 @@ def _nearest(evaluator: Evaluator, chosen: Sequence[tuple[int, int]], is_unsafe:
         plane = np.repeat(square_of, len(steps))
         values = np.minimum(np.repeat(corner, len(steps), axis=0) + np.tile(steps, (len(kept), 1)) * size[plane], (lower + width)[plane])
         settings = np.tile(members.original, (len(values), 1))
-        np.put_along_axis(settings, which[plane], values, axis=1)
+        np.put_along_axis(settings, columns[plane], values, axis=1)
         hits = unsafe.of(evaluator.evaluate(settings, "nearest unsafe settings"))
         improve(plane[hits], values[hits])
         square, i, j = np.nonzero(_with_unsafe_corner(hits.reshape(len(kept), PARTS + 1, PARTS + 1)))
@@ -140,11 +140,11 @@ def _with_unsafe_corner(grids: BoolArray) -> BoolArray:
 UNSAFE_AT_MOST = 0.003
 """Share of a box that may be unsafe, with 95 % confidence, if every sampled setting is safe."""
 PROBE, SEARCHED = 256, 1024
-"""Sobol points, and as many corners, that look for unsafe settings: in every box that is tried, and in one in which the first find none."""
+"""Number of Sobol points, and of corners, that search a box for unsafe settings: at first, and again if the first search finds none."""
 FOLLOWED = 16
-"""Unsafe settings, the nearest, that are followed back towards the original."""
+"""Number of unsafe settings, the nearest ones, that are followed back towards the original."""
 STEP_BACK = 0.999
-"""Share at which the box ends before the nearest unsafe setting."""
+"""The box ends at this share of the way to the nearest unsafe setting."""
 SMALLEST = 1e-6
 """Smallest factor of a box; below it there is no safe box."""
 
@@ -153,8 +153,8 @@ class SafeBox(NamedTuple):
     """Within `factor` times the domain around the original, no setting of a random sample is unsafe.
 
     With `confidence`, at most `unsafe_at_most` of all settings in the box are unsafe or cannot be simulated: `failed` of the `samples`
-    settings could not be, and count as unsafe in that bound. `attempts` boxes were tested. Only `characteristics` vary, the others
-    are the original's. Where no box is safe, `factor` is 0 and the bound 1.
+    settings could not be simulated, and count as unsafe in that bound. `attempts` boxes were tested. Only `characteristics` vary, the
+    others are the original's. If no box is safe, `factor` is 0 and the bound 1.
     """
 
     factor: float
@@ -171,7 +171,7 @@ class SafeBox(NamedTuple):
 
 
 def no_box(evaluator: Evaluator, columns: Sequence[int], attempts: int = 0) -> SafeBox:
-    """The result where the original vehicle itself is unsafe, or settings however near to it."""
+    """The result if the original vehicle itself is unsafe, or settings arbitrarily near to it are."""
     return SafeBox(0.0, CONFIDENCE, 0, 0, attempts, 1.0, tuple(evaluator.characteristics.names[column] for column in columns))
 
 
@@ -190,14 +190,14 @@ def safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, beyon
     A box is searched with Sobol points and with as many corners, where all changes add up. Unsafe points are followed back towards the
     original, and the box shrinks to end before them, until it has none. These points chose the box: they prove nothing about it.
 
-    The box is then tested with settings drawn independently and uniformly in it, by a random generator of their own. If one is unsafe,
+    The box is then tested with settings drawn independently and uniformly in it, by a separate random generator. If one is unsafe,
     the box shrinks and is searched and tested again. Test k, k = 1, 2, ..., may be wrong with probability alpha_k = alpha / 2^k, alpha
     = 1 - `confidence`: if test k accepts, the bound is Clopper and Pearson's upper one at confidence 1 - alpha_k for the share of the
     box that is unsafe or cannot be simulated. Box k depends on earlier samples alone, so given box k the bound fails with probability
     alpha_k at the most; all tests together fail with probability sum alpha_k <= alpha, whichever of them accepts. Later tests draw more
     settings, so that the bound stays `UNSAFE_AT_MOST` if all of them can be simulated.
     """
-    factor = min(1.0, STEP_BACK * float(np.min(_reach(evaluator, beyond), initial=np.inf)))
+    factor = min(1.0, STEP_BACK * float(np.min(_factor_reaching(evaluator, beyond), initial=np.inf)))
     attempt = 0
     for search in range(10**6):
         if factor < SMALLEST:
@@ -219,27 +219,27 @@ def safe_box(evaluator: Evaluator, columns: Sequence[int], unsafe: Unsafe, beyon
                 share = float(scipy.stats.beta.ppf(1 - error, failed + 1, samples - failed)) if failed < samples else 1.0
                 return SafeBox(factor, CONFIDENCE, samples, failed, attempt, share,
                                tuple(evaluator.characteristics.names[column] for column in columns))
-        near = hits[np.argsort(_reach(evaluator, hits), kind="stable")[:FOLLOWED]]
+        near = hits[np.argsort(_factor_reaching(evaluator, hits), kind="stable")[:FOLLOWED]]
         lines = [Line(evaluator.characteristics.original, end, 0.0) for end in near]
         shares = first_unsafe(evaluator, lines, unsafe, "nearest unsafe settings")
         edge = np.stack([line.at(np.array([share]))[0] for line, share in zip(lines, shares, strict=True)])
-        factor = min(factor, float(np.min(_reach(evaluator, edge)))) * STEP_BACK
+        factor = min(factor, float(np.min(_factor_reaching(evaluator, edge)))) * STEP_BACK
     return no_box(evaluator, columns, attempt)
 
 
 def _in_box(evaluator: Evaluator, columns: Sequence[int], factor: float, points: FloatArray) -> FloatArray:
     """Settings in a box around the original, from points of the unit cube; shape (K, n)."""
-    members, which = evaluator.characteristics, list(columns)
+    members, indices = evaluator.characteristics, list(columns)
     lower = members.original - factor * (members.original - members.lower)
     upper = members.original + factor * (members.upper - members.original)
     settings = np.tile(members.original, (len(points), 1))
-    settings[:, which] = lower[which] + points * (upper - lower)[which]
+    settings[:, indices] = lower[indices] + points * (upper - lower)[indices]
     return settings
 
 
 def _drawn_in_box(evaluator: Evaluator, columns: Sequence[int], factor: float, number: int, rng: np.random.Generator) -> FloatArray:
     """Feasible settings drawn uniformly in a box; fewer than `number` where hardly any is feasible."""
-    return evaluator.region.sampled(lambda some: _in_box(evaluator, columns, factor, rng.random((some, len(columns)))), number)
+    return evaluator.region.sampled(lambda count: _in_box(evaluator, columns, factor, rng.random((count, len(columns)))), number)
 
 
 def _unsafe_of(evaluator: Evaluator, factor: float, settings: FloatArray, unsafe: Unsafe) -> tuple[FloatArray, int]:
@@ -248,9 +248,9 @@ def _unsafe_of(evaluator: Evaluator, factor: float, settings: FloatArray, unsafe
     return settings[unsafe.of(evaluations)], int(np.count_nonzero(~evaluations.valid & ~evaluations.infeasible))
 
 
-def _reach(evaluator: Evaluator, settings: FloatArray) -> FloatArray:
+def _factor_reaching(evaluator: Evaluator, settings: FloatArray) -> FloatArray:
     """Factor of the box that has a setting on its surface, shape (K,)."""
     members = evaluator.characteristics
     change = settings - members.original
-    room = np.where(change < 0, members.original - members.lower, members.upper - members.original)
-    return np.asarray(np.max(np.divide(np.abs(change), room, out=np.zeros_like(change), where=room > 0), axis=1, initial=0.0))
+    largest = np.where(change < 0, members.original - members.lower, members.upper - members.original)
+    return np.asarray(np.max(np.divide(np.abs(change), largest, out=np.zeros_like(change), where=largest > 0), axis=1, initial=0.0))

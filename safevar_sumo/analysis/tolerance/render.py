@@ -27,14 +27,14 @@ PAIRS_SHOWN = 12
 
 
 def print_tolerance(console: Console, result: Tolerance) -> None:
-    """The verdict, each characteristic alone, the worst pairs, and all together."""
+    """Print the verdict, each characteristic alone, the worst pairs, and all together."""
     print_text(console, result.study.title)
     original = result.original
     print_text(console, f"Unsafe: {result.unsafe}. The original vehicle: {original.outcome[0]}, SD {decimal(original.f_safe[0])}.")
     print_text(console, result.verdict)
     print_constraints(console, result.study)
     console.print(_alone(result))
-    print_text(console, "* the end of the domain: nothing beyond was looked at.")
+    print_text(console, "* the end of the domain: values beyond it were not simulated.")
     print_meanings(console, [scan.characteristic for scan in result.alone])
     if result.pairs:
         _print_pairs(console, result)
@@ -46,7 +46,7 @@ def print_tolerance(console: Console, result: Tolerance) -> None:
 
 
 def first_losses(scan: OneAtATimeScan) -> str:
-    """Where a characteristic alone costs points, in a sentence."""
+    """A sentence on the values at which a characteristic alone costs points."""
     member, anything, point = scan.characteristic, scan.first_loss(), scan.first_loss(ALMOST_ONE)
     if anything is None:
         return f"{member.name}: costs no points anywhere in its domain."
@@ -58,14 +58,14 @@ def first_losses(scan: OneAtATimeScan) -> str:
 def _together(result: Tolerance) -> str:
     box = result.joint
     subset = len(box.characteristics) < len(result.study.vehicle.characteristics)
-    who = f"{', '.join(box.characteristics)} together, the others as in the original" if subset else "All together"
+    subject = f"{', '.join(box.characteristics)} together, the others as in the original" if subset else "All together"
     if not box.factor:
-        return f"{who}: no box around the original is safe."
+        return f"{subject}: no box around the original is safe."
     failed = f"; {box.failed} of them could not be simulated and count as unsafe in what follows" if box.failed else ""
     box_settings = "all settings in the box that satisfy the constraints" if result.study.constraints else "all settings in the box"
     bad = "are unsafe or cannot be simulated" if box.failed else "are unsafe"
-    return (f"{who}: each may go {box.factor:.1%} of the way from its original value to either end of its domain. None of {box.samples} "
-            f"settings drawn at random in this box is unsafe{failed}. With {box.confidence:.0%} confidence at most "
+    return (f"{subject}: each may go {box.factor:.1%} of the way from its original value to either end of its domain. None of "
+            f"{box.samples} settings drawn at random in this box is unsafe{failed}. With {box.confidence:.0%} confidence at most "
             f"{box.unsafe_at_most:.2%} of {box_settings} {bad}.")
 
 
@@ -113,7 +113,7 @@ def _print_pairs(console: Console, result: Tolerance) -> None:
 
 
 def profiles_figure(result: Tolerance) -> Figure:
-    """The safety degree over the domain of each characteristic alone; the original marked, what is unsafe shaded."""
+    """The safety degree over the domain of each characteristic alone; the original is marked, unsafe intervals are shaded."""
     title, column = f"{result.study.name}: one characteristic at a time (unsafe: {result.unsafe})", _column(result)
     figure, axes = panels(title, len(result.alone), 4, (2.3, 1.75), least_width=4.6, above=1.0)
     degrees = np.concatenate([scan.profile[column].dropna() for scan in result.alone])
@@ -121,7 +121,7 @@ def profiles_figure(result: Tolerance) -> Figure:
     for axis, scan in zip(axes, result.alone, strict=True):
         _profile(axis, scan, column)
         if degrees.size:
-            axis.set_ylim(degrees.min() - margin, degrees.max() + margin)  # the same for all: a steep one is one that matters
+            axis.set_ylim(degrees.min() - margin, degrees.max() + margin)  # the same for all, so that steep profiles stand out
     figure.supylabel(DEGREE if column == SAFETY_DEGREE else RATING_POINTS.title, fontsize=FONT)
     notes = {"dot: the original vehicle": True, "hatched: unsafe": any(scan.unsafe for scan in result.alone),
                "below the dashed line: collisions": column == SAFETY_DEGREE and bool(degrees.size) and degrees.min() <= 0}
@@ -130,7 +130,7 @@ def profiles_figure(result: Tolerance) -> Figure:
 
 
 def _column(result: Tolerance) -> str:
-    """What profiles are of."""
+    """The column that the profiles show."""
     return RATING_POINTS.name if is_rated(result.study) else SAFETY_DEGREE
 
 
@@ -150,15 +150,15 @@ def _profile(axis: Axes, scan: OneAtATimeScan, column: str) -> None:
 
 
 def pairs_figure(result: Tolerance, most: int = 6) -> Figure:
-    """The planes of the worst pairs: those with the largest unsafe share, or the least safety degree where nothing is unsafe.
+    """The planes of the worst pairs: with the largest unsafe share, or the lowest safety degree where nothing is unsafe.
 
     Raises
     ------
     InputError
-        If pairs were not looked at.
+        If the result has no pairs.
     """
     if not result.pairs:
-        raise InputError("pairs", "there is no pair to draw", "at least two characteristics, looked at in pairs")
+        raise InputError("pairs", "there is no pair to draw", "at least two characteristics, evaluated in pairs")
     worst = sorted(result.pairs, key=lambda pair: (-pair.unsafe_share, np.nanmin(pair.safety_degree)))[:most]
     degrees = np.concatenate([pair.safety_degree.ravel() for pair in worst])
     title = f"{result.study.name}: the worst pairs (unsafe: {result.unsafe})"
