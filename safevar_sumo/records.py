@@ -18,6 +18,9 @@ IntArray = npt.NDArray[np.int_]
 
 STANDSTILL = 1e-3
 """Below this speed a vehicle counts as standing [m/s] (method section 4)."""
+CRUISING, REGULATING = 0.9, 0.05
+"""What regulates speed and does not brake for anybody [-]: shares of a vehicle's highest speed, at which it still cruises, and of its
+largest brake command, below which one only holds that speed."""
 KMH_PER_MS = 3.6
 """km/h per m/s."""
 GRAVITY = 9.81
@@ -218,6 +221,39 @@ class SimulationRuns:
             outcome=self.outcome[vehicles], collision_speed=self.collision_speed[vehicles],
             contact=Contact._make(map(some, self.contact)), test_speed_error=some(self.test_speed_error),
             warning_ttc=some(self.warning_ttc))
+
+    def nearest(self, column: int) -> int | None:
+        """The sample at which one vehicle's obstacle is nearest, on a collision that of the impact; None if it is never in conflict."""
+        active = self.trace.active[:, column]
+        if np.isfinite(self.collision_speed[column]):
+            return int(np.flatnonzero(active)[-1])
+        counted = active & self.encounter.in_conflict[:, column]
+        return int(np.argmin(np.where(counted, self.encounter.separation[:, column], np.inf))) if counted.any() else None
+
+    def brake_onset(self, column: int) -> int | None:
+        """The sample at which one vehicle begins to brake for the obstacle, up to where that is nearest; None if it does not.
+
+        A braking lasts from where a brake command begins to rise, to `REGULATING` times the largest one or more, until speed is regulated
+        again, by the throttle or by a smaller command. The one that counts is under way when the vehicle cruises for the last time, at
+        `CRUISING` of its highest speed or more, or is the first one after that: whatever braked before, such as a cruise control that had
+        overshot, has not slowed the vehicle down. Where none follows, a vehicle that collides has not braked for the obstacle, and the
+        last braking counts of one that does not.
+        """
+        trace, nearest = self.trace, self.nearest(column)
+        active = trace.active[:None if nearest is None else nearest + 1, column]
+        speed = np.where(active, trace.speed[:len(active), column], 0.0)
+        brake = np.where(speed > STANDSTILL, trace.brake[:len(active), column], 0.0)
+        braked = (brake > 0) & (brake >= REGULATING * brake.max())
+        brakes, cruises = np.flatnonzero(braked), np.flatnonzero(speed >= CRUISING * speed.max())[-1]
+        after = brakes[brakes >= cruises]
+        if not brakes.size or (not after.size and np.isfinite(self.collision_speed[column])):
+            return None
+        one = after[0] if after.size else brakes[-1]
+        driven = np.flatnonzero(((trace.throttle[:one, column] > 0) | (brake[:one] > 0)) & ~braked[:one])
+        first = int(brakes[brakes >= (driven[-1] if driven.size else 0)][0])
+        while first > 0 and brake[first - 1] > (brake[first - 2] if first > 1 else 0):
+            first -= 1
+        return first
 
     @property
     def relative_speed(self) -> FloatArray:

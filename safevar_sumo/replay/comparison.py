@@ -12,7 +12,7 @@ import numpy as np
 from safevar_sumo.analysis.words import ENDS
 from safevar_sumo.api.simulation import changed_setting, load_and_assemble
 from safevar_sumo.metrics import METRICS, RATING_POINTS, MetricFacts
-from safevar_sumo.records import STANDSTILL, Evaluations, FloatArray, Outcome, SimulationRuns
+from safevar_sumo.records import Evaluations, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.replay.film import Film, film
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.study import Study, StudyLike
@@ -29,7 +29,7 @@ APART = 0.1
 class Moments(NamedTuple):
     """Numbers of a run's samples; None where there is no such moment.
 
-    `brake`: the first brake command while the vehicle moves; `nearest`: the obstacle is nearest (the impact, on a collision); `end`: the
+    `brake`: it begins to brake for the obstacle; `nearest`: the obstacle is nearest (the impact, on a collision); `end`: the
     run's last sample.
     """
 
@@ -40,16 +40,7 @@ class Moments(NamedTuple):
 
 def moments(drives: SimulationRuns, row: int) -> Moments:
     """The moments of one of N runs."""
-    trace = drives.trace
-    active = trace.active[:, row]
-    end = int(np.flatnonzero(active)[-1])
-    moving = np.logical_or.accumulate(trace.speed[:, row] > STANDSTILL)
-    braking = np.flatnonzero(active & moving & (trace.brake[:, row] > 0))
-    brake = int(braking[0]) if braking.size else None
-    if not np.isnan(drives.collision_speed[row]):
-        return Moments(brake, end, end)
-    near = np.where(active & drives.encounter.in_conflict[:, row], drives.encounter.separation[:, row], np.inf)
-    return Moments(brake, int(np.argmin(near)) if np.isfinite(near).any() else None, end)
+    return Moments(drives.brake_onset(row), drives.nearest(row), int(np.flatnonzero(drives.trace.active[:, row])[-1]))
 
 
 def divergence(drives: SimulationRuns, one: int = 0, other: int = 1) -> int | None:

@@ -213,9 +213,9 @@ def drive_of(*vehicles: tuple[float, float, float, float]) -> SimulationRuns:
     hit = place >= OBSTACLE
     collision_speed = np.where(hit.any(axis=0), speed[np.argmax(hit, axis=0), np.arange(len(vehicles))], np.nan)
     active = np.cumsum(hit, axis=0) <= 1
-    nothing = np.zeros_like(speed)
+    nothing, throttle = np.zeros_like(speed), np.zeros_like(speed)
     trace = Trace(step=STEP, vehicle_length=5.0, time=time, position=place, speed=speed, gap=OBSTACLE - place, lateral=nothing,
-                  lateral_speed=nothing, throttle=nothing, brake=brake, gear=nothing, active=active, pedal=pedal)
+                  lateral_speed=nothing, throttle=throttle, brake=brake, gear=nothing, active=active, pedal=pedal)
     outcome = np.where(np.isnan(collision_speed), Outcome.STOPPED.value, Outcome.COLLISION.value)
     return SimulationRuns(trace=trace, encounter=Encounter(trace.gap, trace.gap, speed, trace.gap > 0), outcome=outcome,
                   collision_speed=collision_speed)
@@ -240,6 +240,28 @@ def test_one_difference_is_one_part(other: tuple[float, float, float, float], pa
     comparison = compared(SAME, other)
     assert comparison.parts[part] == pytest.approx(lost, abs=0.05)
     assert all(abs(value) < 0.05 for name, value in comparison.parts.items() if name != part)
+
+
+def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> None:
+    """Two overshoot; the throttle ends that, or a brake that fades until the hazard. The last one does nothing else before it collides."""
+    drives = drive_of(SAME, SAME, SAME, (10.0, -5.0, 0.2, 6.0))
+    drives.trace.brake[50:150, 1:3] = 0.5
+    drives.trace.throttle[150:200, 1] = 0.1
+    drives.trace.brake[150:250, 2:] = 0.01
+    plain, overshot, settling, unbraked = (summary_of(drives, column, 1.0).braking for column in range(4))
+    assert overshot == settling == plain
+    assert plain is not None
+    assert plain.time == pytest.approx(0.5)
+    assert unbraked is None
+
+
+def test_pulses_are_one_braking() -> None:
+    """The brake is let go for a tenth of a second at 95 % of the speed, and at a quarter of it."""
+    drives = drive_of(SAME, SAME)
+    for share in (0.95, 0.25):
+        at = int(np.argmax(drives.trace.speed[:, 1] < share * 10))
+        drives.trace.brake[at:at + 50, 1] = 0.0
+    assert summary_of(drives, 1, 1.0).braking == summary_of(drives, 0, 1.0).braking is not None
 
 
 def test_a_creeping_deceleration_is_no_late_pedal() -> None:

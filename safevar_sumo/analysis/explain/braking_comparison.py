@@ -18,10 +18,12 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.analysis.words import ENDS, joined
-from safevar_sumo.records import STANDSTILL, Outcome, SimulationRuns
+from safevar_sumo.records import Outcome, SimulationRuns
 
 FULL = 0.9
 """Share of the command at which the brake pedal counts as having followed it [-]: 0.9 where full braking is commanded."""
+COASTING = 0.1
+"""Deceleration of a vehicle that rolls without a brake [m/s^2]: a rolling resistance of 1 % of its weight."""
 REMAINDER = 0.05
 """Largest unexplained part of the distance lost that a sentence leaves out [m]."""
 
@@ -32,7 +34,7 @@ class Braking(NamedTuple):
     Attributes
     ----------
     time, gap, speed
-        Time, gap and speed when the brake was first commanded [s, m, m/s].
+        Time, gap and speed when the brake was commanded (`SimulationRuns.brake_onset`) [s, m, m/s].
     delay
         Time from the command until the brake pedal has followed it [s].
     mean_speed_lost, speed_lost
@@ -94,29 +96,23 @@ class BrakingComparison(NamedTuple):
 
 def summary_of(runs: SimulationRuns, column: int, safety_degree: float) -> RunSummary:
     """Summary of one of N runs."""
-    trace, encounter = runs.trace, runs.encounter
-    active = np.flatnonzero(trace.active[:, column])
-    counted = trace.active[:, column] & encounter.in_conflict[:, column]
-    impact_speed, collided = float(runs.collision_speed[column]), bool(np.isfinite(runs.collision_speed[column]))
-    if not active.size:
-        return RunSummary(str(runs.outcome[column]), safety_degree, None, np.nan, impact_speed)
-    last, closest = int(active[-1]), np.nan
-    if counted.any() and not collided:
-        last = int(np.argmin(np.where(counted, encounter.separation[:, column], np.inf)))
-        closest = float(trace.gap[last, column])
-    braked = (trace.brake[:last + 1, column] > 0) & (trace.speed[:last + 1, column] > STANDSTILL) & trace.active[:last + 1, column]
-    braking = _braking(runs, column, int(np.argmax(braked)), last) if braked.any() else None
+    impact_speed, nearest, onset = float(runs.collision_speed[column]), runs.nearest(column), runs.brake_onset(column)
+    closest, braking = np.nan, None
+    if nearest is not None and np.isnan(impact_speed):
+        closest = float(runs.trace.gap[nearest, column])
+    if onset is not None:
+        braking = _braking(runs, column, onset, int(np.flatnonzero(runs.trace.active[:, column])[-1]) if nearest is None else nearest)
     return RunSummary(str(runs.outcome[column]), safety_degree, braking, closest, impact_speed)
 
 
 def _braking(runs: SimulationRuns, column: int, first: int, last: int) -> Braking | None:
-    """The braking from sample `first` to `last`; None for a vehicle that does not slow down after the pedal was `pressed`."""
+    """The braking from sample `first` to `last`; None for a vehicle that only coasts after the pedal was `pressed`."""
     trace = runs.trace
     speed, place = trace.speed[:last + 1, column], trace.position[:last + 1, column]
     followed = trace.pedal[first:last + 1, column] >= FULL * trace.brake[first:last + 1, column]
     pressed = first + int(np.argmax(followed))
     distance, energy = float(place[last] - place[pressed]), float(speed[pressed]**2 - speed[last]**2) / 2
-    if not followed.any() or distance <= 0 or energy <= 0:
+    if not followed.any() or distance <= 0 or energy <= COASTING * distance:
         return None
     initial, delay = float(speed[first]), (pressed - first) * trace.step
     return Braking(
@@ -197,7 +193,7 @@ def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
         return f"{ends} They brake alike."
     lost = f"{abs(comparison.lost):.2f} m"
     lead = f"Of the {lost} {'lost' if is_lost else 'gained'}" if not full else (
-        f"Its margin, the gap at the first brake command less the distance needed to stop, is {lost} {'smaller' if is_lost else 'larger'}")
+        f"Its margin, the gap at the brake command less the distance needed to stop, is {lost} {'smaller' if is_lost else 'larger'}")
     return f"{ends} {lead}{unbraked}: {joined(pieces)}."
 
 
