@@ -19,9 +19,9 @@ FURTHER = {metric.name: metric for metric in (
     RMS_ACCELERATION,
     BRAKE_HARSHNESS,
 )}
-"""Metrics of the studies that name them."""
+"""Metrics that only studies which name them have."""
 OBJECTIVES = {F_SAFE.name: SAFETY_DEGREE_METRIC, "f_comfort": MAX_JERK}
-"""Metrics by the names that objectives have for them."""
+"""Metrics by the names of their objectives."""
 SAFEVAR = Scoring(metrics=tuple(metric.facts for metric in METRICS.values()), objectives=(F_SAFE, F_DIFF, F_NUM_DIFF))
 """Metrics and objectives of the published study (method sections 3 and 4)."""
 

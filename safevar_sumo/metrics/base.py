@@ -24,7 +24,7 @@ def sampling_stride(step: float, interval: float | None) -> int:
     Raises
     ------
     InputError
-        If that is no whole number.
+        If that number is not whole.
     """
     if interval is None:
         return 1
@@ -45,7 +45,7 @@ Function = Callable[[SimulationRuns, MetricsTable], FloatArray]
 
 
 class MetricFacts(Struct, frozen=True, kw_only=True):
-    """Facts on a metric for tables and figures.
+    """Facts about a metric for tables and figures.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ def foreign_metric(metric: Any, guard: Guard) -> Metric:
     Raises
     ------
     InputError
-        If it is no record of a metric.
+        If it is not a valid record of a metric.
     """
     legal = "a safevar_sumo.metrics.Metric(name=..., title=..., unit=..., more_is_unsafe=..., function=...)"
     if not isinstance(metric, Metric):
@@ -136,7 +136,7 @@ class Objective(Struct, frozen=True, kw_only=True):
 
     @property
     def sign(self) -> float:
-        """Factor on its values that makes less better."""
+        """Factor on its values with which smaller is better."""
         return -1.0 if self.maximised else 1.0
 
 

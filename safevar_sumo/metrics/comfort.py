@@ -1,4 +1,4 @@
-"""Comfort of those on board, along the vehicle's way: jerk, weighted acceleration, harsh braking. Only studies that name them have them."""
+"""Longitudinal comfort of the occupants: jerk, weighted acceleration, harsh braking. Only studies that name the metrics have them."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from safevar_sumo.records import BoolArray, FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 
 JERK_TIME = 1.0
-"""Time over which jerk is averaged [s], as ISO 15622 (adaptive cruise control) has it, which allows 2.5 m/s^3 above 20 m/s."""
+"""Time over which jerk is averaged [s], as in ISO 15622 (adaptive cruise control), which allows 2.5 m/s^3 above 20 m/s."""
 BRAKING_TIME = 0.5
-"""Time over which a deceleration is averaged [s]: the half second that UN R79 averages accelerations over."""
+"""Time over which a deceleration is averaged [s]: half a second, as for accelerations in UN R79."""
 HIGH_PASS, TRANSITION, TRANSITION_QUALITY = 0.4, 2.0, 0.63
 """W_d of ISO 2631-1, annex A: f_1 and f_3 = f_4 [Hz], Q_4 [-]; the high pass is Butterworth's."""
 
 
 class _Biquad(NamedTuple):
-    """A filter of second order, from the latest sample to the oldest; the first coefficient of the output is 1."""
+    """A second-order filter; coefficients from the latest sample to the oldest, the first one of the output being 1."""
 
     of_input: tuple[float, float, float]
     of_output: tuple[float, float]
 
     @classmethod
     def bilinear(cls, numerator: tuple[float, float, float], denominator: tuple[float, float, float], step: float) -> _Biquad:
-        """From polynomials in s, the highest power first, by Tustin's rule."""
+        """The filter with a transfer function in s, highest power first, by Tustin's rule."""
         k = 2 / step
 
         def in_z(polynomial: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -34,8 +34,8 @@ class _Biquad(NamedTuple):
             return a * k * k + b * k + c, 2 * (c - a * k * k), a * k * k - b * k + c
 
         first, *rest = in_z(denominator)
-        given = in_z(numerator)
-        return cls((given[0] / first, given[1] / first, given[2] / first), (rest[0] / first, rest[1] / first))
+        inputs = in_z(numerator)
+        return cls((inputs[0] / first, inputs[1] / first, inputs[2] / first), (rest[0] / first, rest[1] / first))
 
     def apply(self, samples: FloatArray) -> FloatArray:
         """Filter samples along the first axis, from rest; one operation after the other, so that results do not depend on N."""
@@ -49,29 +49,29 @@ class _Biquad(NamedTuple):
 
 
 def weighted(acceleration: FloatArray, step: float) -> FloatArray:
-    """Acceleration as W_d of ISO 2631-1 weighs it along the vehicle [m/s^2], shape (T, N).
+    """Acceleration along the vehicle, weighted with W_d of ISO 2631-1 [m/s^2], shape (T, N).
 
-    Without the low pass at 100 Hz: the samples of a simulation have nothing above half of their rate.
+    The low pass at 100 Hz is left out: samples of a simulation hold no frequencies above half their rate.
     """
     high, transition = 2 * np.pi * HIGH_PASS, 2 * np.pi * TRANSITION
-    passes = _Biquad.bilinear((1.0, 0.0, 0.0), (1.0, float(np.sqrt(2.0)) * high, high * high), step)
-    weighs = _Biquad.bilinear((0.0, transition, transition * transition),
+    high_pass = _Biquad.bilinear((1.0, 0.0, 0.0), (1.0, float(np.sqrt(2.0)) * high, high * high), step)
+    weighting = _Biquad.bilinear((0.0, transition, transition * transition),
                               (1.0, transition / TRANSITION_QUALITY, transition * transition), step)
-    return weighs.apply(passes.apply(acceleration))
+    return weighting.apply(high_pass.apply(acceleration))
 
 
 def max_jerk(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Largest magnitude of the jerk over a second [m/s^3]; shape (N,), NaN on a collision."""
-    gained, counts = _accelerations(runs)
-    steps = _steps(JERK_TIME, runs.trace.step, len(gained) - 1)
-    jerk = np.abs(gained[steps:] - gained[:-steps]) / (steps * runs.trace.step)
+    accelerations, counts = _accelerations(runs)
+    steps = _steps(JERK_TIME, runs.trace.step, len(accelerations) - 1)
+    jerk = np.abs(accelerations[steps:] - accelerations[:-steps]) / (steps * runs.trace.step)
     return _without_collision(runs, np.max(np.where(counts[steps:], jerk, 0.0), axis=0, initial=0.0))
 
 
 def rms_acceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Root mean square of the weighted acceleration over the run [m/s^2]; shape (N,), NaN on a collision."""
-    gained, counts = _accelerations(runs)
-    squares = np.where(counts, weighted(np.where(counts, gained, 0.0), runs.trace.step), 0.0) ** 2
+    accelerations, counts = _accelerations(runs)
+    squares = np.where(counts, weighted(np.where(counts, accelerations, 0.0), runs.trace.step), 0.0) ** 2
     return _without_collision(runs, np.sqrt(total(squares) / np.maximum(np.count_nonzero(counts, axis=0), 1)))
 
 
@@ -79,12 +79,12 @@ def brake_harshness(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArra
     """Largest deceleration over half a second [m/s^2]; shape (N,), NaN on a collision."""
     speed, active = runs.trace.speed, runs.trace.active
     steps = _steps(BRAKING_TIME, runs.trace.step, len(speed) - 1)
-    lost = (speed[:-steps] - speed[steps:]) / (steps * runs.trace.step)
-    return _without_collision(runs, np.max(np.where(active[steps:], lost, 0.0), axis=0, initial=0.0))
+    decelerations = (speed[:-steps] - speed[steps:]) / (steps * runs.trace.step)
+    return _without_collision(runs, np.max(np.where(active[steps:], decelerations, 0.0), axis=0, initial=0.0))
 
 
 def _accelerations(runs: SimulationRuns) -> tuple[FloatArray, BoolArray]:
-    """Gain of speed per time between two samples [m/s^2], shape (T - 1, N), and where both count."""
+    """Acceleration between two samples [m/s^2], shape (T - 1, N), and where both samples count."""
     return np.diff(runs.trace.speed, axis=0) / runs.trace.step, runs.trace.active[1:]
 
 

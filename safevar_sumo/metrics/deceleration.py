@@ -18,10 +18,10 @@ def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> Floa
     interval = stride * runs.trace.step
     speed, active = runs.trace.speed[::stride], runs.trace.active[::stride]
     braking = active & (runs.trace.brake[::stride] > 0) & (np.abs(speed) > STANDSTILL)
-    lost = (speed[:-1] - speed[1:]) / interval
+    decelerations = (speed[:-1] - speed[1:]) / interval
     counts = braking[1:]
     number = np.count_nonzero(counts, axis=0)
-    summed = total(np.where(counts, lost, 0.0))
+    summed = total(np.where(counts, decelerations, 0.0))
     return np.asarray(np.divide(summed, number, out=np.full_like(summed, np.nan), where=number > 0))
 
 

@@ -1,4 +1,4 @@
-"""Points of a Euro NCAP rating, which belong to a vehicle and not to one of its simulations."""
+"""Points of a Euro NCAP rating: a metric of a vehicle, not of one of its simulations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from safevar_sumo.study import MetricsTable
 
 
 def _of_one_cell(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """Undefined: the rater of a matrix computes it from all cells."""
+    """Undefined for a single cell: the rater of a matrix computes the points from all cells."""
     return np.full(len(runs.outcome), np.nan)
 
 

@@ -1,4 +1,4 @@
-"""Time to collision and what is derived from it: TET and TIT (method section 4; Minderhoud and Bovy 2001)."""
+"""Time to collision and the metrics derived from it: TET and TIT (method section 4; Minderhoud and Bovy 2001)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from safevar_sumo.study import MetricsTable
 def time_to_collision(runs: SimulationRuns) -> FloatArray:
     """TTC(t) = L_s / v_L, distance projected over closing speed [s]; shape (T, N).
 
-    Infinite while not closing, out of the encounter, and after the vehicle first stood still again.
+    Infinite while the distance does not shrink, outside the encounter, and once the vehicle has stopped after moving.
     """
     moved = np.logical_or.accumulate(runs.trace.speed > STANDSTILL, axis=0)
     stood = np.logical_or.accumulate(moved & (runs.trace.speed <= STANDSTILL), axis=0)

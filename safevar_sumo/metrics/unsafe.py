@@ -1,4 +1,4 @@
-"""What counts as unsafe: a collision, a safety degree below a limit, or points of a rating that are lost."""
+"""Criteria for unsafe: a collision, a safety degree below a limit, or lost points of a rating."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 EXPECTED = "collision, points=X with X points of a rating, or below=X with a safety degree X [m, or minus a collision's speed in m/s]"
 COLLISION = str(Outcome.COLLISION)
 HALF, DIGITS = 0.5, 6
-"""Share of the original's safety degree below which a vehicle is unsafe where nothing collides, and significant digits of that limit."""
+"""If nothing collides, a vehicle is unsafe below this share of the original's safety degree; significant digits of that limit."""
 LOSS, DECIMALS = 1.0, 6
-"""Loss of points that is unsafe in a rated study, and decimals of points."""
+"""Loss of points from which on a vehicle is unsafe in a rated study, and decimals of points."""
 
 
 @dataclass(frozen=True)
 class Unsafe:
-    """A collision; or, with `below`, a safety degree below that limit [m, or -m/s]; or, with `points`, no more points of a rating."""
+    """A criterion: a collision; with `below`, a safety degree below it [m, or -m/s]; with `points`, at most so many points of a rating."""
 
     below: float | None = None
     points: float | None = None
@@ -50,7 +50,7 @@ class Unsafe:
         return np.asarray(self._holds(evaluations.outcome, evaluations.column))
 
     def rows(self, solutions: pd.DataFrame) -> pd.Series[bool]:
-        """Which rows are unsafe of a frame of solutions, as `safevar_sumo.results.load` gives it."""
+        """Which rows of a data frame of solutions are unsafe, as returned by `safevar_sumo.results.load`."""
         return self._holds(solutions["outcome"], solutions.__getitem__)  # type: ignore[no-any-return]
 
     def _holds(self, outcome: Any, column: Callable[[str], Any]) -> Any:
@@ -59,7 +59,7 @@ class Unsafe:
         return outcome == COLLISION if self.below is None else column(F_SAFE.name) < self.below
 
     def margin(self, evaluations: Evaluations) -> FloatArray:
-        """By how much evaluations are above the limit, in its unit, shape (M,); a collision's limit is a safety degree of 0."""
+        """Margin of evaluations above the limit, in its unit, shape (M,); for collisions the limit is a safety degree of 0."""
         if self.points is not None:
             return evaluations.column(RATING_POINTS.name) - self.points
         return evaluations.f_safe - (self.below or 0.0)
@@ -71,7 +71,7 @@ class Unsafe:
         Raises
         ------
         InputError
-            If it is neither.
+            If it is not a valid criterion.
         """
         if isinstance(criterion, Unsafe):
             return criterion
@@ -88,17 +88,17 @@ class Unsafe:
 
     @classmethod
     def default(cls, original: Mapping[str, Any], outcomes: Any) -> Unsafe:
-        """What is unsafe where nobody states a criterion.
+        """The criterion if none is stated.
 
-        In a rated study a vehicle is unsafe that has lost the first of the original's points. Otherwise a collision is, if any vehicle
-        collides or the original has no safety degree to halve; else a safety degree below half of the original's.
+        In a rated study a vehicle is unsafe that has lost at least one of the original's points. Otherwise a collision is unsafe if any
+        vehicle collides or the original has no safety degree to halve; else a safety degree below half of the original's.
 
         Parameters
         ----------
         original
             The original vehicle's metrics by name; an undefined one is NaN or None.
         outcomes
-            How the other vehicles end, as an array or a column of `Outcome`.
+            Outcomes of the other vehicles, as an array or a column of `Outcome`.
         """
         points, degree = original.get(RATING_POINTS.name), original.get(SAFETY_DEGREE) or 0.0
         if points is not None:
@@ -114,7 +114,7 @@ class Unsafe:
         Raises
         ------
         InputError
-            If by that nothing can be unsafe.
+            If nothing can be unsafe by that criterion.
         """
         outcomes = np.concatenate([original.outcome, evaluations.outcome])
         unsafe = cls.default({name: float(values[0]) for name, values in original.metrics.items()}, outcomes)
@@ -126,4 +126,4 @@ class Unsafe:
 
 
 Criterion = Unsafe | float | str
-"""What an argument `unsafe` takes: `Unsafe`, a number X for a safety degree below X, "collision" or "below=X"."""
+"""Values of an argument `unsafe`: `Unsafe`, a number X for a safety degree below X, "collision" or "below=X"."""

@@ -1,4 +1,4 @@
-"""Somebody ahead in the vehicle's lane: what car-to-car tests and those along the lane share."""
+"""A target ahead in the vehicle's lane: the common part of the car-to-car tests and of the tests along the lane."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from safevar_sumo.scenarios.target import Course, Target, TargetTest, Times, at
 
 ROAD = "road_0"
 START = 50.0
-"""Place of the vehicle's front bumper on the lane at the start [m]."""
+"""Position of the vehicle's front bumper on the lane at the start [m]."""
 BEYOND = 0.5
-"""How far the front of a target that stands askew is on the lane beyond the junction [m]: nobody departs on a junction itself."""
+"""Position of a rotated target's front on the lane beyond the junction [m]: SUMO inserts no vehicle on the junction itself."""
 
 
-class Ahead(NamedTuple):
-    """A target at a gap [m] before a vehicle, with a speed over time [m/s at s].
+class TargetAhead(NamedTuple):
+    """A target `gap` metres ahead of the vehicle under test, with a speed over time [m/s at s].
 
-    The middle of its rear is at an offset to the right [m]; there it may stand askew, its front in a direction.
+    The middle of its rear is `offset` metres to the right of the lane's middle. A standing target may be rotated around that point.
     """
 
     target: str
@@ -53,49 +53,49 @@ class Ahead(NamedTuple):
     direction: Direction = AHEAD
 
     def lanes(self, roads: Roads) -> Actors:
-        """The lane across in the direction of a target that stands askew: its rear on the junction, its front on the lane beyond."""
-        if not self._askew:
+        """The crossing lane turned into the direction of a rotated target: its rear is on the junction, its front on the lane beyond."""
+        if not self._is_rotated:
             return {}
-        frame, (forth, left), length = Frame.of(roads.lane(APPROACH)), self.direction, self._body.length
+        frame, (along, left), length = Frame.of(roads.lane(APPROACH)), self.direction, self._body.length
         rear = frame.place_of(roads.lane(INSIDE).start)[0], -self.offset
-        entry, exit_ = ((rear[0] + way * forth, rear[1] + way * left) for way in (-length, length - BEYOND))
+        entry, exit_ = ((rear[0] + distance * along, rear[1] + distance * left) for distance in (-length, length - BEYOND))
         return lanes_across(frame, entry, exit_, self.direction)
 
     def actors(self, speed: float, roads: Roads) -> Actors:
-        """The vehicle at `speed` [m/s], and the target in front of it."""
+        """The vehicle at `speed` [m/s], and the target ahead of it."""
         if self.gap <= 0:
             raise InputError("scenario.parameters", f"the target begins {-self.gap:.2f} m inside the vehicle", "a target ahead")
-        place, target = self._placed(roads) if self._askew else self._in_line()
+        start, target = self._at_junction(roads) if self._is_rotated else self._in_lane()
         return {
             "vType[@id='vut']": {"length": repr(self.vut.length), "width": repr(self.vut.width)},
-            "vehicle[@id='vut']": {"departPos": repr(place), "departSpeed": repr(speed)},
+            "vehicle[@id='vut']": {"departPos": repr(start), "departSpeed": repr(speed)},
             **target,
         }
 
-    def _in_line(self) -> tuple[float, Actors]:
-        """Where the vehicle starts on the straight road [m], and the target there."""
+    def _in_lane(self) -> tuple[float, Actors]:
+        """The vehicle's start on the straight road [m], and a target in line with the lane."""
         kind = TYPES.get(self.target, self.target)
         renamed = {f"vType[@id='{kind}']": target_type(self.target)} if kind != self.target else {}
         return START, {**renamed, "vehicle[@id='target']": {
             "type": self.target, "departPos": repr(START + self.gap + self._body.length), "departPosLat": repr(-self.offset),
             "departSpeed": repr(self.speed(0.0))}}
 
-    def _placed(self, roads: Roads) -> tuple[float, Actors]:
-        """Where the vehicle starts before the junction [m], and the target there."""
+    def _at_junction(self, roads: Roads) -> tuple[float, Actors]:
+        """The vehicle's start before the junction [m], and a rotated target on it."""
         along, _ = Frame.of(roads.lane(APPROACH)).place_of(roads.lane(ACROSS_ON).start)
-        place = along + BEYOND * self.direction.along - self._depth - self.gap
-        if place - self.vut.length < 0:
-            raise InputError("scenario.parameters", f"a gap of {self.gap:.0f} m begins before the road does")
+        start = along + BEYOND * self.direction.along - self._depth - self.gap
+        if start - self.vut.length < 0:
+            raise InputError("scenario.parameters", f"a gap of {self.gap:.0f} m is longer than the road")
         parked = {f"vehicle[@id='parked_{size}']": None for size in ("small", "large")}
-        return place, {**parked, "vType[@id='target']": target_type(self.target), "vehicle[@id='target']": {
+        return start, {**parked, "vType[@id='target']": target_type(self.target), "vehicle[@id='target']": {
             "type": self.target, "route": "beyond", "departPos": repr(BEYOND), "departPosLat": "0", "departSpeed": "0"}}
 
     def meeting(self, world: World) -> _Meeting:
-        """The meeting of vehicles with it."""
-        return _Meeting(Frame.of(world.lane(APPROACH if self._askew else ROAD)), Course(follows=True), self, self._depth)
+        """The target's motion in a run."""
+        return _Meeting(Frame.of(world.lane(APPROACH if self._is_rotated else ROAD)), Course(follows=True), self, self._depth)
 
     @property
-    def _askew(self) -> bool:
+    def _is_rotated(self) -> bool:
         return self.direction != AHEAD
 
     @property
@@ -104,28 +104,28 @@ class Ahead(NamedTuple):
 
     @property
     def _depth(self) -> float:
-        """From the middle of its front back along the lane to what the vehicle reaches first [m]."""
-        if not self._askew:
+        """Distance along the lane from the middle of the target's front back to the point that the vehicle reaches first [m]."""
+        if not self._is_rotated:
             return self._body.length
-        (forth, left), half = self.direction, self._body.width / 2
-        front = self._body.length * forth, self._body.length * left - self.offset
+        (along, left), half = self.direction, self._body.width / 2
+        front = self._body.length * along, self._body.length * left - self.offset
         rear = 0.0, -self.offset
-        corners = [(x - sign * left * half, y + sign * forth * half) for x, y in (rear, front) for sign in (1, -1)]
-        return front[0] - _nearest([corners[0], corners[1], corners[3], corners[2]], self.vut.width / 2)
+        corners = [(x - sign * left * half, y + sign * along * half) for x, y in (rear, front) for sign in (1, -1)]
+        return front[0] - _first_contact([corners[0], corners[1], corners[3], corners[2]], self.vut.width / 2)
 
 
 class _Meeting(NamedTuple):
-    """A vehicle behind the target, which it reaches so far behind the target's front [m]; see `Meeting`."""
+    """The vehicle behind a target whose first point of contact is `depth` metres behind its front; see `Meeting`."""
 
     frame: Frame
     course: Course
-    ahead: Ahead
+    ahead: TargetAhead
     depth: float
 
     def begin(self, world: World) -> float:
-        pace = self.ahead.speed(0.0)
-        world.drive(TARGET, pace)
-        return pace
+        speed = self.ahead.speed(0.0)
+        world.drive(TARGET, speed)
+        return speed
 
     def positions(self, world: World) -> FloatArray:
         return world.vehicle_positions(TARGET)
@@ -134,38 +134,41 @@ class _Meeting(NamedTuple):
         along = self.frame.along(positions)
         return Target(along - self.depth, np.full_like(along, self.ahead.offset), speed=at(times, self.ahead.speed))
 
-    def pace(self, sample: int, step: float) -> float:
+    def next_speed(self, sample: int, step: float) -> float:
         return self.ahead.speed((sample + 1) * step)
 
-    def go(self, world: World, pace: float) -> None:
-        world.drive(TARGET, pace)
+    def set_speed(self, world: World, speed: float) -> None:
+        world.drive(TARGET, speed)
 
 
 TYPES = {"cyclist": "adult", "motorcyclist": "car"}
-"""The traffic's types whose place those take that it does not have."""
+"""Vehicle types of the traffic file that targets without a type of their own replace."""
 
 
-def _nearest(corners: list[Coordinates], half: float) -> float:
-    """The least place along a lane of a body between both sides of a vehicle, `half` from the middle; of all of it, if it is beside [m]."""
-    places = [x for x, y in corners if abs(y) <= half]
+def _first_contact(corners: list[Coordinates], half_width: float) -> float:
+    """Where a vehicle of a half width would first touch a body, as a position along the lane [m].
+
+    A body beside the vehicle's way counts with its rearmost corner.
+    """
+    positions = [x for x, y in corners if abs(y) <= half_width]
     for (x, y), (to_x, to_y) in pairwise([*corners, corners[0]]):
-        places += [x + (to_x - x) * (side - y) / (to_y - y) for side in (-half, half) if (y - side) * (to_y - side) < 0]
-    return min(places or [x for x, _ in corners])
+        positions += [x + (to_x - x) * (side - y) / (to_y - y) for side in (-half_width, half_width) if (y - side) * (to_y - side) < 0]
+    return min(positions or [x for x, _ in corners])
 
 
-class BehindSomebody(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of a scenario with somebody ahead.
+class TargetAheadTest(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of a scenario with a target ahead in the lane.
 
     Parameters
     ----------
     speed
-        The vehicle's at the start [km/h].
+        Speed of the vehicle under test at the start [km/h].
     impact_location
-        Where on the vehicle's front the middle of the target's rear would be hit, from its left corner [% of the width].
+        Point of the vehicle's front that would hit the middle of the target's rear, from the left corner [% of the width].
     vut_length, vut_width
-        The vehicle under test [m].
+        Size of the vehicle under test [m].
     grade
-        By how much the road rises over the way, negative where it falls [%].
+        Rise of the road over its length, negative downhill [%].
     """
 
     speed: Annotated[float, Meta(gt=0, le=250)]
@@ -175,7 +178,7 @@ class BehindSomebody(TargetTest, frozen=True, kw_only=True, forbid_unknown_field
     grade: Grade = 0.0
 
     def lanes(self, roads: Roads) -> Actors:
-        """The lane across of a target that stands askew."""
+        """Changes to the lanes for a rotated target."""
         return self._ahead.lanes(roads)
 
     def actors(self, roads: Roads) -> Actors:
@@ -186,7 +189,7 @@ class BehindSomebody(TargetTest, frozen=True, kw_only=True, forbid_unknown_field
         return self._ahead.meeting(world)
 
     def encounter(self, trace: Trace) -> Encounter:
-        """Distances from bumper to body; TTC is that gap over the difference of speeds."""
+        """Distances from bumper to body; TTC is that distance over the difference of speeds."""
         return Encounter(separation=trace.gap, distance=trace.gap, closing_speed=trace.speed - trace.obstacle_speed,
                          in_conflict=trace.gap > 0)
 
@@ -195,11 +198,11 @@ class BehindSomebody(TargetTest, frozen=True, kw_only=True, forbid_unknown_field
         """Speed that the vehicle holds until it brakes [m/s]."""
         return self.speed * KMH
 
-    def _ahead_of(self, target: str, gap: float, speed: Callable[[float], float], direction: Direction = AHEAD) -> Ahead:
+    def _ahead_of(self, target: str, gap: float, speed: Callable[[float], float], direction: Direction = AHEAD) -> TargetAhead:
         """A target at the impact location."""
         vut = Body(self.vut_length, self.vut_width)
-        return Ahead(target, vut, gap, lateral_of(self.impact_location, self.vut_width), speed, direction)
+        return TargetAhead(target, vut, gap, lateral_of(self.impact_location, self.vut_width), speed, direction)
 
     @property
-    def _ahead(self) -> Ahead:
+    def _ahead(self) -> TargetAhead:
         raise NotImplementedError

@@ -1,4 +1,4 @@
-"""Euro NCAP's targets that move along the lane: a pedestrian who walks, CPLA, and a cyclist who rides, CBLA."""
+"""Euro NCAP's tests with a target that moves along the lane: a pedestrian (CPLA) or a cyclist (CBLA)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from msgspec import Meta
 
-from safevar_sumo.scenarios.ahead import Ahead, BehindSomebody
+from safevar_sumo.scenarios.ahead import TargetAhead, TargetAheadTest
 from safevar_sumo.scenarios.base import PreCrash
 from safevar_sumo.scenarios.euro_ncap import KMH, Range, Walk
 
@@ -14,7 +14,7 @@ LOCATIONS = (50.0, 10.0, 25.0, 75.0, 90.0)
 
 
 class _Test(NamedTuple):
-    """A row of the protocol's table: km/h, m, and the range of the tests."""
+    """A row of the protocol's table: speeds in km/h, distances in m, and the range of the tests."""
 
     target: str
     target_speed: float
@@ -29,29 +29,29 @@ TESTS = {
 }
 
 
-class Along(BehindSomebody, frozen=True, kw_only=True):
-    """Somebody moves ahead in the vehicle's lane, away from it, and does not look round.
+class Along(TargetAheadTest, frozen=True, kw_only=True):
+    """A pedestrian or cyclist moves ahead in the vehicle's lane in its direction, and does not react to it.
 
     Parameters
     ----------
     test
-        Row of the protocol that gives what is not given here: CPLA or CBLA.
+        Row of the protocol, CPLA or CBLA: the source of parameters that are not set here.
     speed
-        The vehicle's at the start [km/h].
+        Speed of the vehicle under test at the start [km/h].
     impact_location
-        Where on the vehicle's front the target would be hit, from its left corner [% of the width].
+        Point of the vehicle's front that would hit the target, from the left corner [% of the width].
     target, target_speed, acceleration_distance
-        `adult`, `child` or `cyclist`; its speed, and the way within which it reaches that from the start on [km/h, m].
+        `adult`, `child` or `cyclist`; its speed, and the distance from the start within which it reaches that speed [km/h, m].
     time_to_impact, time_after
-        Time from the start to the impact if nobody brakes, and on from there to the end of the run [s].
+        Time from the start to the impact if nobody brakes, and from there to the end of the run [s].
     vut_length, vut_width
-        The vehicle under test [m].
+        Size of the vehicle under test [m].
     grade
-        By how much the road rises over the way, negative where it falls [%].
+        Rise of the road over its length, negative downhill [%].
 
     Notes
     -----
-    The cyclist rides 15 km/h, in the protocol's rows that are judged by the warning 20 km/h, from the start on.
+    From the start on the cyclist rides 15 km/h; the protocol's rows that are judged by the warning have 20 km/h.
     """
 
     test: Literal["CPLA", "CBLA"] = "CPLA"
@@ -65,7 +65,7 @@ class Along(BehindSomebody, frozen=True, kw_only=True):
 
     @property
     def pre_crash(self) -> PreCrash:
-        """NHTSA's type."""
+        """NHTSA's pre-crash type."""
         return TESTS[self.test].pre_crash
 
     @property
@@ -78,12 +78,12 @@ class Along(BehindSomebody, frozen=True, kw_only=True):
         return TESTS[self.test].range.remarks(self.test, self.speed, self.impact_location, self.grade)
 
     @property
-    def _ahead(self) -> Ahead:
-        walk = Walk(0.0, self._of("target_speed") * KMH, self._of("acceleration_distance"))
+    def _ahead(self) -> TargetAhead:
+        walk = Walk(0.0, self._parameter("target_speed") * KMH, self._parameter("acceleration_distance"))
         gap = self.speed * KMH * self.time_to_impact - walk.travelled(self.time_to_impact)
-        return self._ahead_of(self._of("target"), gap, walk.pace)
+        return self._ahead_of(self._parameter("target"), gap, walk.speed_at)
 
-    def _of(self, name: str) -> Any:
-        """A parameter, or what the protocol has for it."""
-        given = getattr(self, name)
-        return getattr(TESTS[self.test], name) if given is None else given
+    def _parameter(self, name: str) -> Any:
+        """A parameter of the study, by default the protocol's."""
+        value = getattr(self, name)
+        return getattr(TESTS[self.test], name) if value is None else value

@@ -1,4 +1,4 @@
-"""The contract of a scenario: who meets the vehicle under test, and the geometry of the encounter; checks of scenarios from outside."""
+"""The contract of a scenario: the actors, the geometry of the encounter, and checks of scenarios from outside."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ STEEPEST = 30.0
 """Steepest road [%]."""
 Grade = Annotated[float, Meta(ge=-STEEPEST, le=STEEPEST)]
 BEND = 0.05
-"""Largest deviation of a straight lane's middle line from the straight [m]."""
+"""Largest deviation of a lane's centre line from a straight line for which the lane counts as straight [m]."""
 Coordinates = tuple[float, float]
 Actors = Mapping[str, Mapping[str, str] | None]
-"""Changes to a network's traffic or lanes: attributes to set, or None to leave it out, by the XPath of an element below the file's root."""
+"""Changes to a network's traffic or lanes, by the XPath of an element below the file's root: attributes to set, or None to remove it."""
 
 
 class Lane(NamedTuple):
@@ -38,27 +38,27 @@ class Lane(NamedTuple):
 
 
 class BentLane(Lane):
-    """A lane that is not straight: its id, and how far its middle line strays from the straight between its ends [m]."""
+    """A lane that is not straight: its id, and the largest distance of its centre line from the straight line between its ends [m]."""
 
     name: str
     bend: float
 
 
 def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
-    """The lane whose middle line goes through these points [m]."""
+    """The lane whose centre line goes through these points [m]."""
     (x, y), (to_x, to_y) = points[0], points[-1]
     length = math.hypot(to_x - x, to_y - y)
-    strays = [abs((to_x - x) * (at_y - y) - (to_y - y) * (at_x - x)) / length if length else math.hypot(at_x - x, at_y - y)
+    deviations = [abs((to_x - x) * (at_y - y) - (to_y - y) * (at_x - x)) / length if length else math.hypot(at_x - x, at_y - y)
               for at_x, at_y in points]
-    if max(strays) <= BEND:
+    if max(deviations) <= BEND:
         return Lane(points[0], points[-1])
     bent = BentLane(points[0], points[-1])
-    bent.name, bent.bend = name, max(strays)
+    bent.name, bent.bend = name, max(deviations)
     return bent
 
 
 class Roads(Protocol):
-    """A network without anybody on it."""
+    """A network without traffic."""
 
     def lane(self, lane: str) -> Lane:
         """A lane by its id."""
@@ -80,7 +80,7 @@ class World(Protocol):
         """Length of a vehicle [m]."""
 
     def lane_start(self, lane: str) -> tuple[float, float]:
-        """First point of a lane's middle line, the same in all copies [m]."""
+        """First point of a lane's centre line, the same in all copies [m]."""
 
     def lane(self, lane: str) -> Lane:
         """A lane by its id, the same in all copies."""
@@ -92,13 +92,13 @@ class World(Protocol):
         """Width of a person [m]."""
 
     def walk(self, person: str, speed: float) -> None:
-        """Let a person walk on at a speed [m/s], in all copies."""
+        """Make a person continue at a walking speed [m/s], in all copies."""
 
     def drive(self, vehicle: str, speed: float) -> None:
-        """Let a vehicle reach a speed [m/s] within the coming step, in all copies."""
+        """Make a vehicle reach a speed [m/s] within the coming step, in all copies."""
 
     def turn_back(self, person: str) -> None:
-        """Let a person turn round and walk back to its first edge at the same speed."""
+        """Make a person turn round and walk back to its first edge at the same speed."""
 
 
 class Scene(NamedTuple):
@@ -120,10 +120,10 @@ class Scenario(Protocol):
 
     `network` is a folder of `sumo_nets/`, or the path of a folder with the same files; `duration` is the length of a run [s].
 
-    Optional: `reactive_actors = False` says that no actor reacts to the vehicle under test, so that SUMO can play the scene once for all
-    vehicles; `grade`, the rise of the road [%] (SUMO's plane is then that road, and gravity acts in the vehicles); `pre_crash`, its type
-    in NHTSA's typology; `lanes(roads) -> Actors` and `actors(roads) -> Actors`, changes to the network as it is built and to its traffic on
-    the changed one; `remarks() -> list[str]` on its parameters for the
+    Optional: `reactive_actors = False` declares that no actor reacts to the vehicle under test, so that SUMO can play the scene once for
+    all vehicles; `grade`, the rise of the road [%] (SUMO's plane is then that road, and gravity acts in the vehicles); `pre_crash`, its
+    type in NHTSA's typology; `lanes(roads) -> Actors`, changes to the built network, and `actors(roads) -> Actors`, changes to the traffic
+    on it; `remarks() -> list[str]` on its parameters for the
     user; `test_speed` [m/s]: a robot holds the vehicle at that speed until the ADS brakes, a run that leaves the tolerance before that
     is an invalid test, and only contacts at the vehicle's front are collisions.
     """
@@ -189,7 +189,7 @@ def pre_crash_of(scenario: Any) -> str:
 
 
 def tags(points: Iterable[Point]) -> str:
-    """Pre-crash types and light of some points, in a sentence; nothing where the scenarios have no type."""
+    """Pre-crash types and light of some points as a sentence; empty if the scenarios have no type."""
     points = tuple(points)
     types = dict.fromkeys(filter(None, (pre_crash_of(point.scenario) for point in points)))
     light = " and ".join(dict.fromkeys(f"by {point.weather.light}" for point in points))
@@ -222,7 +222,7 @@ class GuardedScenario:
         self.grade, self.pre_crash = float(grade), str(getattr(scenario, "pre_crash", ""))
 
     def actors(self, roads: Roads) -> Actors:
-        """Its changes to the network's traffic; none without such a method."""
+        """Its changes to the network's traffic; none if it has no such method."""
         return self._changes("actors", "the traffic file", roads)
 
     def _changes(self, method: str, file: str, roads: Roads) -> Actors:
@@ -233,7 +233,7 @@ class GuardedScenario:
                 for path, change in changes.items()}
 
     def lanes(self, roads: Roads) -> Actors:
-        """Its changes to the network's lanes; none without such a method: a parameter may have that name."""
+        """Its changes to the network's lanes; none if it has no such method (a parameter may have that name)."""
         return {} if not callable(getattr(self._scenario, "lanes", None)) else self._changes("lanes", "the network", roads)
 
     def remarks(self) -> list[str]:
@@ -271,7 +271,7 @@ class GuardedScenario:
 
 
 class _ReadOnlyWorld:
-    """The methods of the contract `World` alone, with read-only results."""
+    """A world with only the methods of the contract `World`, which return read-only results."""
 
     def __init__(self, world: World) -> None:
         self._world = world

@@ -1,4 +1,4 @@
-"""Euro NCAP's rear ends: a car ahead that stands, is slower or brakes, CCRs, CCRm and CCRb, and a motorcyclist, CMRs and CMRb."""
+"""Euro NCAP's rear-end tests: a car ahead stands (CCRs), is slower (CCRm) or brakes (CCRb); likewise a motorcyclist (CMRs, CMRb)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from msgspec import Meta
 from msgspec.structs import force_setattr
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.scenarios.ahead import Ahead, BehindSomebody
+from safevar_sumo.scenarios.ahead import TargetAhead, TargetAheadTest
 from safevar_sumo.scenarios.base import PreCrash
 from safevar_sumo.scenarios.euro_ncap import AHEAD, JUNCTION, KMH, Heading, Range
 
@@ -19,11 +19,11 @@ NETWORK = "car_to_car"
 CRAWL = 2.0
 """Speed down to which the braking target brakes [km/h]."""
 STEADY_UP_TO = 80.0
-"""Speed up to which the slower target goes 20 km/h; above that 10 km/h faster for each 10 km/h."""
+"""Speed of the vehicle up to which the slower target drives 20 km/h [km/h]; above it both speeds rise alike."""
 
 
 class _Test(NamedTuple):
-    """A row of the protocol's table: who is ahead, the range of the tests, time headway at the start [s]."""
+    """A row of the protocol's table: the target, the range of the tests, time headway at the start [s]."""
 
     target: str
     range: Range
@@ -40,36 +40,36 @@ TESTS = {
 }
 
 
-class CarToCar(BehindSomebody, frozen=True, kw_only=True):
+class CarToCar(TargetAheadTest, frozen=True, kw_only=True):
     """A car or a motorcyclist ahead in the lane stands, drives more slowly, or brakes.
 
     Parameters
     ----------
     test
-        CCRs, CCRm or CCRb, CMRs or CMRb: gives the target, its speed and the headway where they are not given here.
+        CCRs, CCRm, CCRb, CMRs or CMRb: determines the target, and its speed and headway unless they are set here.
     speed, target_speed
-        The vehicle's and the target's at the start [km/h].
+        Speeds of the vehicle under test and of the target at the start [km/h].
     impact_location
-        Where on the vehicle's front the middle of the target's rear would hit it, from its left corner [% of the width].
+        Point of the vehicle's front that would hit the middle of the target's rear, from the left corner [% of the width].
     headway
         Gap at the start over the vehicle's speed [s].
     brakes_at, target_deceleration
-        When the target of CCRb and CMRb begins to brake, down to 2 km/h [s, m/s^2].
+        Time at which the target of CCRb and CMRb begins to brake, and its deceleration, down to 2 km/h [s, m/s^2].
     heading
-        Turn of a target that stands, around the middle of its rear, counterclockwise seen from above [degrees].
+        Rotation of a standing target around the middle of its rear, counterclockwise seen from above [degrees].
     time_after
-        Time from the impact if nobody brakes to the end of the run [s].
+        Time from the impact, if nobody brakes, to the end of the run [s].
     vut_length, vut_width
-        The vehicle under test [m].
+        Size of the vehicle under test [m].
     grade
-        By how much the road rises over the way, negative where it falls [%].
+        Rise of the road over its length, negative downhill [%].
     network
-        By default `car_to_car`, and `junction` where the target stands askew.
+        By default `car_to_car`, or `junction` for a rotated target.
 
     Notes
     -----
-    The conditions of Euro NCAP's calculator (euroncap-rating-2026 5.4.9) for robustness layers: "-2 m/s^2" is an acceleration, so a
-    `target_deceleration` of 6; "+0.5s time headway" a `headway` of 1.5 s; a rotation around the impact point a `heading`.
+    Robustness layers in the words of Euro NCAP's calculator (euroncap-rating-2026 5.4.9): "-2 m/s^2" is an acceleration, hence a
+    `target_deceleration` of 6; "+0.5s time headway" is a `headway` of 1.5 s; a rotation around the impact point is a `heading`.
     """
 
     test: Literal["CCRs", "CCRm", "CCRb", "CMRs", "CMRb"] = "CCRs"
@@ -88,7 +88,7 @@ class CarToCar(BehindSomebody, frozen=True, kw_only=True):
 
     @property
     def pre_crash(self) -> PreCrash:
-        """NHTSA's type."""
+        """NHTSA's pre-crash type."""
         return TESTS[self.test].pre_crash
 
     @property
@@ -101,9 +101,9 @@ class CarToCar(BehindSomebody, frozen=True, kw_only=True):
         return TESTS[self.test].range.remarks(self.test, self.speed, self.impact_location, self.grade)
 
     @property
-    def _ahead(self) -> Ahead:
+    def _ahead(self) -> TargetAhead:
         if self.heading and self._speed_at(0.0):
-            raise InputError("scenario.parameters", f"heading = {self.heading:g} with a target that moves", "a heading of one that stands")
+            raise InputError("scenario.parameters", f"heading = {self.heading:g} with a moving target", "a heading for a standing target")
         return self._ahead_of(TESTS[self.test].target, self._gap, self._speed_at, AHEAD.turned(self.heading))
 
     @property
@@ -116,7 +116,7 @@ class CarToCar(BehindSomebody, frozen=True, kw_only=True):
 
     @property
     def _target_speed(self) -> float:
-        """At the start [m/s]."""
+        """Speed of the target at the start [m/s]."""
         slower = 20.0 + max(self.speed - STEADY_UP_TO, 0.0)
         usual = {PreCrash.LEAD_STOPPED: 0.0, PreCrash.LEAD_SLOWER: slower}.get(TESTS[self.test].pre_crash, self.speed)
         return (usual if self.target_speed is None else self.target_speed) * KMH
@@ -128,17 +128,17 @@ class CarToCar(BehindSomebody, frozen=True, kw_only=True):
         return max(first - self.target_deceleration * max(time - self.brakes_at, 0.0), min(first, CRAWL * KMH))
 
     def _time_to_impact(self) -> float:
-        """If nobody brakes: the gap is closed at a constant speed, or as the target brakes, t^2 b / 2 and then steadily."""
-        faster, gap = self.speed * KMH - self._target_speed, self._gap
+        """If nobody brakes: the gap closes at a constant speed or, with a braking target, by t^2 b / 2 and then at a constant speed."""
+        closing_speed, gap = self.speed * KMH - self._target_speed, self._gap
         if not self._brakes:
-            if faster <= 0:
+            if closing_speed <= 0:
                 raise InputError("scenario.parameters", f"speed = {self.speed:g} km/h never reaches the target", "a slower target")
-            return gap / faster
-        left = gap - faster * self.brakes_at
-        if left <= 0:
-            return gap / faster
-        b, slowed = self.target_deceleration, self._target_speed - self._speed_at(1e9)
-        way = (faster + slowed / 2) * slowed / b
-        if left > way:
-            return self.brakes_at + slowed / b + (left - way) / (faster + slowed)
-        return self.brakes_at + (math.sqrt(faster * faster + 2 * b * left) - faster) / b
+            return gap / closing_speed
+        gap_left = gap - closing_speed * self.brakes_at
+        if gap_left <= 0:
+            return gap / closing_speed
+        b, speed_lost = self.target_deceleration, self._target_speed - self._speed_at(1e9)
+        distance = (closing_speed + speed_lost / 2) * speed_lost / b
+        if gap_left > distance:
+            return self.brakes_at + speed_lost / b + (gap_left - distance) / (closing_speed + speed_lost)
+        return self.brakes_at + (math.sqrt(closing_speed * closing_speed + 2 * b * gap_left) - closing_speed) / b

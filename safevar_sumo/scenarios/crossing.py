@@ -1,4 +1,4 @@
-"""Euro NCAP's targets that cross the way: pedestrians, cyclists, and a car or a motorcyclist at a junction."""
+"""Euro NCAP's tests with a crossing target: pedestrians, cyclists, and a car or a motorcyclist at a junction."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ from safevar_sumo.scenarios.target import PARKED_GAP, Course, Target, TargetTest
 
 KERB = "kerb_0"
 PARKED_LENGTH = {"parked_small": 4.25, "parked_large": 4.5}
-"""The middle of what the protocol allows, 4.1 to 4.4 and 4.3 to 4.7 m."""
+"""Lengths of the parked cars [m]: the middle of the protocol's ranges, 4.1 to 4.4 and 4.3 to 4.7 m."""
 PARKED_WIDTH = 1.8
 TIME_TO_IMPACT = 6.0
 """Time from the start to the impact, unless the target needs longer [s]."""
 ROUNDED_TO = 0.5
-"""A longer time is a multiple of this [s]."""
+"""A longer time to impact is rounded up to a multiple of this [s]."""
 Metres = Annotated[float, Meta(ge=0, le=100)]
 LOCATIONS = (50.0, 25.0, 75.0, 10.0, 90.0)
 
 
 class _Test(NamedTuple):
-    """A row of the protocol's table: km/h, m, m, and the range of the tests; who has no `lateral_start` is as fast from the start on."""
+    """A row of the protocol's table: km/h, m, m, range of the tests; without a `lateral_start` the target starts at its speed."""
 
     side: str
     target: str
@@ -73,14 +73,14 @@ PRE_CRASH = {"adult": PreCrash.PEDESTRIAN, "child": PreCrash.PEDESTRIAN, "cyclis
 
 
 class _Meeting(NamedTuple):
-    """A vehicle before a target's path at a place along the lane [m]: its walk, how it moves, what it takes up; see `Meeting`."""
+    """A vehicle and a target that crosses its lane at `path` [m]; `extent` is the target's size in the lane's frame; see `Meeting`."""
 
     frame: Frame
     course: Course
     path: float
     walk: Walk
     mover: OnFoot | OnWheels
-    reach: Body
+    extent: Body
     direction: Direction
     vut_width: float
 
@@ -94,63 +94,64 @@ class _Meeting(NamedTuple):
         along, left = self.mover.middle(self.frame, positions)
         lateral = left if self.direction.left > 0 else -left
         ahead = np.zeros_like(left) if along is None else along - self.path
-        forth = self.direction.along
-        return Target(self.path - self.reach.length / 2 + ahead, lateral, gone=lateral > (self.vut_width + self.reach.width) / 2,
-                      speed=at(times, lambda time: forth * self.walk.pace(time)) if forth else 0.0, ahead=ahead)
+        speed_share = self.direction.along
+        return Target(self.path - self.extent.length / 2 + ahead, lateral, has_left=lateral > (self.vut_width + self.extent.width) / 2,
+                      speed=at(times, lambda time: speed_share * self.walk.speed_at(time)) if speed_share else 0.0, ahead=ahead)
 
-    def pace(self, sample: int, step: float) -> float:
-        return self.mover.pace(self.walk, sample, step)
+    def next_speed(self, sample: int, step: float) -> float:
+        return self.mover.next_speed(self.walk, sample, step)
 
-    def go(self, world: World, pace: float) -> None:
-        self.mover.go(world, pace)
+    def set_speed(self, world: World, speed: float) -> None:
+        self.mover.set_speed(world, speed)
 
 
 class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Somebody crosses before a vehicle that is on its way, timed to be hit where it is meant to be if nobody brakes.
+    """A target crosses the lane ahead of the moving vehicle, timed so that it is hit at the impact location if nobody brakes.
 
     Parameters
     ----------
     test
-        Row of the protocol that gives what is not given here: CPFA, CPNA, CPNCO (pedestrians), CBFA, CBNA, CBNAO (cyclists), CCCscp or
-        CMCscp (a car or a motorcyclist at a junction).
+        Row of the protocol, the source of parameters that are not set here: CPFA, CPNA, CPNCO (pedestrians), CBFA, CBNA, CBNAO
+        (cyclists), CCCscp or CMCscp (a car or a motorcyclist at a junction).
     speed
-        The vehicle's at the start [km/h].
+        Speed of the vehicle under test at the start [km/h].
     impact_location
-        Where on the vehicle's front the target's middle would be hit, from the side that it comes from [% of the width]; below 0 or
-        above 100 it passes behind or before the vehicle's corner.
+        Point of the vehicle's front that would hit the target's middle, from the side where the target starts [% of the width]; below 0
+        or above 100 the target's middle passes behind or ahead of the vehicle's corner.
     target, target_speed
         `adult`, `child`, `cyclist`, `motorcyclist` or `car`; its speed once it moves [km/h].
     side
-        That it comes from: `near` or `far`.
+        Side where the target starts: `near` or `far`.
     lateral_start, acceleration_distance
-        From the middle of the lane to where it stands at first, and the way within which it reaches its speed [m]. Cyclists, motorcyclists
-        and cars are as fast from the start on, unless this says where they stand.
+        Distance of the standing target from the middle of the lane, and distance within which it reaches its speed [m]. Without a
+        `lateral_start` cyclists, motorcyclists and cars start at their speed.
     start_share
-        Share of its usual distance to the impact at which it starts [-].
+        Share of the usual distance to the impact at which the target starts [-].
     heading
-        Turn of its way around the point of the impact, counterclockwise seen from above [degrees].
+        Rotation of the target's path around the point of impact, counterclockwise seen from above [degrees].
     hidden
-        Whether two parked cars stand between it and the vehicle.
+        Whether two parked cars stand between target and vehicle.
     sensor_setback
-        How far behind the front bumper, in its middle, the sensors look from [m].
+        Distance of the sensors behind the middle of the front bumper [m].
     time_to_impact, time_after
-        Time from the start to the impact, by default 6 s or as long as the target needs, and on from there to the end of the run [s].
+        Time from the start to the impact, by default 6 s or as long as the target needs, and from there to the end of the run [s].
     vut_length, vut_width
-        The vehicle under test [m].
+        Size of the vehicle under test [m].
     grade
-        By how much the road rises over the way, negative where it falls [%].
+        Rise of the road over its length, negative downhill [%].
     network
-        By default `crossing` for a pedestrian who crosses at right angles from the usual start, `junction` for everybody else.
+        By default `crossing` for a pedestrian who crosses at right angles from the usual start, `junction` for all other targets.
 
     Notes
     -----
-    `lateral` is that of the target's middle, `gap` that of the corner or side of its body that is nearest along the way.
+    `lateral` refers to the target's middle, `gap` to the corner or side of its body that is nearest along the lane.
 
-    Where the protocol leaves a choice this is Euro NCAP's calculator's (euroncap-rating-2026 5.4.9): conditions of its robustness
-    layers by `target_speed`, `start_share` and `heading`. What it leaves open is chosen: whatever a layer changes, the target still
-    arrives at the impact location; a faster one starts from where the usual one stands, or is as far away as its speed takes it. With a
-    smaller `start_share` one who stands sets off later, and the run of one who does not begins when it is there. At a junction the
-    middle of the target meets the middle of the front, and it comes from the near side, of which the calculator says one at random.
+    Where the protocol leaves a choice, this class follows Euro NCAP's calculator (euroncap-rating-2026 5.4.9); `target_speed`,
+    `start_share` and `heading` express its robustness layers. Assumptions where the calculator leaves a choice too: with every layer
+    the target still arrives at the impact location; a faster target starts from the usual position or, if it starts at speed, from
+    correspondingly farther away. With a smaller `start_share` a standing target sets off later, and a moving target's run begins when
+    the target is there. At a junction the middle of the target meets the middle of the front, and the target comes from the near side,
+    where the calculator chooses a side at random.
     """
 
     test: Literal["CPFA", "CPNA", "CPNCO", "CBNA", "CBFA", "CBNAO", "CCCscp", "CMCscp"] = "CPFA"
@@ -178,8 +179,8 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     @property
     def pre_crash(self) -> PreCrash:
-        """NHTSA's type."""
-        return PRE_CRASH[self._of("target")]
+        """NHTSA's pre-crash type."""
+        return PRE_CRASH[self._parameter("target")]
 
     @property
     def test_speed(self) -> float:
@@ -189,36 +190,36 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
     @property
     def duration(self) -> float:
         """Length of a run [s]."""
-        return self._time + self.time_after
+        return self._impact_time + self.time_after
 
     def remarks(self) -> list[str]:
         """Remarks on parameters outside the protocol."""
         return TESTS[self.test].range.remarks(self.test, self.speed, self.impact_location, self.grade)
 
     def lanes(self, roads: Roads) -> Actors:
-        """The direction of the lane across."""
+        """Changes to the crossing lane: its direction."""
         return self._mover.lanes(Frame.of(roads.lane(APPROACH)), roads)
 
     def actors(self, roads: Roads) -> Actors:
-        """The vehicle before the target's path, the target beside it, and the parked cars or none."""
+        """The vehicle ahead of the target's path, the target beside the lane, and the parked cars, if any."""
         frame, mover, walk = Frame.of(roads.lane(APPROACH)), self._mover, self._walk
-        path = mover.path(frame, roads, self._sideways)
-        front = path - self._reach.length / 2 - self.speed * KMH * self._time
+        path = mover.path(frame, roads, self._impact_left)
+        front = path - self._extent.length / 2 - self.speed * KMH * self._impact_time
         if front - self.vut_length < 0:
-            raise InputError("scenario.parameters", f"{self.speed:g} km/h for {self._time:g} s begin before the road does")
+            raise InputError("scenario.parameters", f"{self.speed:g} km/h for {self._impact_time:g} s is longer than the road")
         changes = {
             "vType[@id='vut']": {"length": repr(self.vut_length), "width": repr(self.vut_width)},
             "vehicle[@id='vut']": {"departPos": repr(front), "departSpeed": repr(self.speed * KMH)},
-            **mover.actors(frame, roads, self._sideways, self._way, walk),
+            **mover.actors(frame, roads, self._impact_left, self._distance, walk),
         }
         return {**changes, **self._parked(frame, path, roads)}
 
     def _parked(self, frame: Frame, path: float, roads: Roads) -> Actors:
-        """The parked cars beside the way, or none."""
-        if not self._of("hidden"):
+        """The parked cars beside the lane, if any."""
+        if not self._parameter("hidden"):
             return {f"vehicle[@id='{car}']": None for car in PARKED_LENGTH}
         start, left = frame.place_of(roads.lane(KERB).start)
-        changes, end, across = dict[str, dict[str, str]](), path - PARKED_GAP - start, self._kerb_side - PARKED_WIDTH / 2 - left
+        changes, end, across = dict[str, dict[str, str]](), path - PARKED_GAP - start, self._parked_side - PARKED_WIDTH / 2 - left
         for car, length in PARKED_LENGTH.items():
             changes[f"vehicle[@id='{car}']"] = {"departPos": repr(end), "departPosLat": repr(across)}
             changes[f"vehicle[@id='{car}']/stop"] = {"endPos": repr(end)}
@@ -226,97 +227,98 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         return changes
 
     def _meeting(self, world: World) -> _Meeting:
-        frame, mover, reach = Frame.of(world.lane(APPROACH)), self._mover, self._reach
-        course = Course(past=-reach.length - self.vut_length)
-        if self._of("hidden"):
-            course = course._replace(hidden=True, to_middle=reach.length / 2, setback=self.sensor_setback, kerb=-self._kerb_side)
-        return _Meeting(frame, course, mover.path(frame, world, self._sideways), self._walk, mover, reach, self._direction, self.vut_width)
+        frame, mover, extent = Frame.of(world.lane(APPROACH)), self._mover, self._extent
+        course = Course(past=-extent.length - self.vut_length)
+        if self._parameter("hidden"):
+            course = course._replace(hidden=True, to_middle=extent.length / 2, setback=self.sensor_setback, kerb=-self._parked_side)
+        path = mover.path(frame, world, self._impact_left)
+        return _Meeting(frame, course, path, self._walk, mover, extent, self._direction, self.vut_width)
 
     def encounter(self, trace: Trace) -> Encounter:
-        """Between the vehicle's front and the target's body, along the way and across it; TTC by how fast that shrinks."""
-        ahead, across = np.maximum(trace.gap, 0.0), gap_beside(trace.lateral, (self.vut_width + self._reach.width) / 2)
+        """Distance between the vehicle's front and the target's body, along and across the lane; TTC from its rate of change."""
+        ahead, across = np.maximum(trace.gap, 0.0), gap_beside(trace.lateral, (self.vut_width + self._extent.width) / 2)
         distance = np.sqrt(ahead * ahead + across * across)
-        nearing = (trace.speed - trace.obstacle_speed) * ahead - np.sign(trace.lateral) * trace.lateral_speed * across
-        return Encounter(separation=distance, distance=distance, closing_speed=nearing / np.maximum(distance, 1e-9),
-                         in_conflict=trace.gap > -self._reach.length - self.vut_length)
+        approach = (trace.speed - trace.obstacle_speed) * ahead - np.sign(trace.lateral) * trace.lateral_speed * across
+        return Encounter(separation=distance, distance=distance, closing_speed=approach / np.maximum(distance, 1e-9),
+                         in_conflict=trace.gap > -self._extent.length - self.vut_length)
 
     @property
     def _on_foot(self) -> bool:
-        """Whether it is a pedestrian who crosses at right angles from where footpaths are, a person to SUMO."""
-        return self._of("target") in ("adult", "child") and self.heading == 0 and self.start_share == 1
+        """Whether the target is a person in SUMO: a pedestrian who crosses at right angles, starting on a footpath."""
+        return self._parameter("target") in ("adult", "child") and self.heading == 0 and self.start_share == 1
 
     @property
     def _mover(self) -> OnFoot | OnWheels:
-        target = self._of("target")
+        target = self._parameter("target")
         if self._on_foot:
-            return OnFoot(target, self._sign, -self._of("lateral_start"))
+            return OnFoot(target, self._sign, -self._parameter("lateral_start"))
         return OnWheels(target, self._direction)
 
     @property
     def _direction(self) -> Direction:
-        return (FROM_RIGHT if self._of("side") == "near" else FROM_LEFT).turned(self.heading)
+        return (FROM_RIGHT if self._parameter("side") == "near" else FROM_LEFT).turned(self.heading)
 
     @property
-    def _reach(self) -> Body:
-        """What its body takes up along the way and across it [m]."""
-        return self._direction.reach(BODIES[self._of("target")])
+    def _extent(self) -> Body:
+        """Size of the target's body along the lane and across it [m]."""
+        return self._direction.extent(BODIES[self._parameter("target")])
 
     @property
     def _sign(self) -> float:
-        """Of a `lateral` in metres to the left of the lane."""
-        return 1.0 if self._of("side") == "near" else -1.0
+        """Sign of `lateral` for positions to the left of the lane."""
+        return 1.0 if self._parameter("side") == "near" else -1.0
 
     @property
-    def _location(self) -> float:
+    def _impact_lateral(self) -> float:
         """The `lateral` of the impact location [m]."""
         return lateral_of(self.impact_location, self.vut_width)
 
     @property
-    def _sideways(self) -> float:
-        """How far to the left of the lane's middle the impact is [m]."""
-        return self._sign * self._location
+    def _impact_left(self) -> float:
+        """Distance of the impact to the left of the lane's middle [m]."""
+        return self._sign * self._impact_lateral
 
     @property
-    def _kerb_side(self) -> float:
-        """Where the sides of parked cars are that face the lane, to its left [m]."""
+    def _parked_side(self) -> float:
+        """Position of the parked cars' sides that face the lane, to the left of its middle [m]."""
         return -self.vut_width / 2 - PARKED_GAP
 
     @property
-    def _way(self) -> float:
-        """From where it starts to the impact [m]."""
+    def _distance(self) -> float:
+        """Distance from the target's start to the impact [m]."""
         if self._starts_at_speed:
-            return self._target_speed * self._time
-        return (self._of("lateral_start") + self._location) * self.start_share  # type: ignore[no-any-return]
+            return self._target_speed * self._impact_time
+        return (self._parameter("lateral_start") + self._impact_lateral) * self.start_share  # type: ignore[no-any-return]
 
     @property
-    def _time(self) -> float:
-        """From the start to the impact [s]."""
+    def _impact_time(self) -> float:
+        """Time from the start to the impact [s]."""
         if self._starts_at_speed:
             return float(self.time_to_impact or TIME_TO_IMPACT) * self.start_share
         if self.time_to_impact is not None:
             return self.time_to_impact
-        needed = (self._way + self._of("acceleration_distance")) / self._target_speed
+        needed = (self._distance + self._parameter("acceleration_distance")) / self._target_speed
         return float(max(TIME_TO_IMPACT, math.ceil(needed / ROUNDED_TO) * ROUNDED_TO))
 
     @property
     def _walk(self) -> Walk:
         if self._starts_at_speed:
             if self.acceleration_distance is not None:
-                raise InputError("scenario.parameters", "acceleration_distance: the target does not stand first", "lateral_start too")
+                raise InputError("scenario.parameters", "acceleration_distance: the target starts at its speed", "lateral_start too")
             return Walk(0.0, self._target_speed, 0.0)
-        return Walk.reaching(self._way, self._time, self._target_speed, self._of("acceleration_distance"))
+        return Walk.reaching(self._distance, self._impact_time, self._target_speed, self._parameter("acceleration_distance"))
 
     @property
     def _starts_at_speed(self) -> bool:
-        """Whether it does not stand first."""
-        return self._of("lateral_start") is None
+        """Whether the target moves at its speed from the start on."""
+        return self._parameter("lateral_start") is None
 
     @property
     def _target_speed(self) -> float:
-        """Once it moves [m/s]."""
-        return self._of("target_speed") * KMH  # type: ignore[no-any-return]
+        """Speed of the moving target [m/s]."""
+        return self._parameter("target_speed") * KMH  # type: ignore[no-any-return]
 
-    def _of(self, name: str) -> Any:
-        """A parameter, or what the protocol has for it."""
-        given = getattr(self, name)
-        return getattr(TESTS[self.test], name) if given is None else given
+    def _parameter(self, name: str) -> Any:
+        """A parameter of the study, by default the protocol's."""
+        value = getattr(self, name)
+        return getattr(TESTS[self.test], name) if value is None else value

@@ -1,4 +1,4 @@
-"""Parts of all scenarios of Euro NCAP's frontal crash avoidance tests: targets, ranges and directions (protocol CA-FC, v1.2, July 2026).
+"""Common parts of scenarios of Euro NCAP's frontal crash avoidance tests: targets, ranges, directions (protocol CA-FC, v1.2, July 2026).
 
 Speeds are in km/h and impact locations in per cent of the vehicle's width, as in the protocol.
 """
@@ -23,13 +23,13 @@ VUT_LENGTH, VUT_WIDTH = 4.9016, 2.1284
 
 
 ImpactLocation = Annotated[float, Meta(ge=-50, le=150)]
-"""Place on or beside the vehicle's front [% of its width]."""
+"""Point on or beside the vehicle's front [% of its width]."""
 Heading = Annotated[float, Meta(ge=-30, le=30)]
-"""Turn of a target's way, counterclockwise seen from above [degrees]."""
+"""Rotation of a target's path, counterclockwise seen from above [degrees]."""
 
 
 class Body(NamedTuple):
-    """A target: length in the direction that it moves, width across [m]."""
+    """Size of a target: length in its direction of motion, width across [m]."""
 
     length: float
     width: float
@@ -37,9 +37,9 @@ class Body(NamedTuple):
 
 BODIES = {"adult": Body(0.6, 0.5), "child": Body(0.711, 0.298), "cyclist": Body(1.9, 0.5), "motorcyclist": Body(2.1, 0.8),
           "car": Body(4.023, 1.712)}
-"""Bounding boxes of Euro NCAP's targets; those on two wheels with their riders."""
+"""Bounding boxes of Euro NCAP's targets, including riders."""
 SHAPES = {"adult": "pedestrian", "child": "pedestrian", "cyclist": "bicycle", "motorcyclist": "motorcycle", "car": "evehicle"}
-"""Shapes that sumo-gui draws for them; SUMO cuts no corners off these."""
+"""Shapes that sumo-gui draws for the targets; SUMO does not cut off the corners of these shapes."""
 
 
 FASTEST_TARGET = "70"
@@ -47,17 +47,17 @@ FASTEST_TARGET = "70"
 
 
 class Direction(NamedTuple):
-    """Where a target is headed: a unit vector along the vehicle's lane and to its left."""
+    """Direction of a target as a unit vector, along the vehicle's lane and to its left."""
 
     along: float
     left: float
 
     def turned(self, heading: float) -> Direction:
-        """The direction after a turn [degrees, counterclockwise]; rounded, as the last bits of sine and cosine are the machine's own."""
+        """The direction after a turn [degrees, counterclockwise]; rounded, as the last bits of sine and cosine depend on the machine."""
         cosine, sine = (round(part(math.radians(heading)), 12) for part in (math.cos, math.sin))
         return Direction(self.along * cosine - self.left * sine, self.left * cosine + self.along * sine)
 
-    def reach(self, body: Body) -> Body:
+    def extent(self, body: Body) -> Body:
         """Extent of a body along the lane and across it [m]."""
         along, left = abs(self.along), abs(self.left)
         return Body(body.length * along + body.width * left, body.length * left + body.width * along)
@@ -67,22 +67,22 @@ AHEAD, FROM_RIGHT, FROM_LEFT = Direction(1.0, 0.0), Direction(0.0, 1.0), Directi
 TARGET = "target"
 """Id of the target in every network where it is a vehicle."""
 JUNCTION = "junction"
-"""The network in which a target has a lane of its own, whatever its direction."""
+"""The network in which a target has a separate lane, in any direction."""
 APPROACH = "approach_0"
-"""The vehicle's lane before it."""
+"""The vehicle's lane before the junction."""
 ACROSS, INSIDE, ACROSS_ON = "across_0", ":junction_0_0", "across_on_0"
 """The target's lanes: before the junction, on it, and beyond."""
 
 
 def lanes_across(frame: Frame, entry: Coordinates, exit_: Coordinates, direction: Direction, length: float = 300.0) -> Actors:
-    """The target's lanes, straight in a direction: on the junction from one place to another, and `length` before and after that [m].
+    """The target's lanes, straight in a direction: from `entry` to `exit_` on the junction, and `length` metres before and after it.
 
-    Places are those along the vehicle's lane and to its left [m].
+    Points are given along the vehicle's lane and to its left [m].
     """
     begin, end = ((x + sign * length * direction.along, y + sign * length * direction.left) for (x, y), sign in ((entry, -1), (exit_, 1)))
-    return {f"edge/lane[@id='{lane}']": {"shape": " ".join(",".join(map(repr, frame.point(*place))) for place in places),
-                                         "length": repr(math.dist(*places))}
-            for lane, places in ((ACROSS, (begin, entry)), (INSIDE, (entry, exit_)), (ACROSS_ON, (exit_, end)))}
+    return {f"edge/lane[@id='{lane}']": {"shape": " ".join(",".join(map(repr, frame.point(*end))) for end in ends),
+                                         "length": repr(math.dist(*ends))}
+            for lane, ends in ((ACROSS, (begin, entry)), (INSIDE, (entry, exit_)), (ACROSS_ON, (exit_, end)))}
 
 
 def target_type(target: str) -> dict[str, str]:
@@ -99,7 +99,7 @@ class Range(NamedTuple):
     locations: tuple[float, ...]
 
     def remarks(self, test: str, speed: float, location: float, grade: float) -> list[str]:
-        """Remarks on what is outside the protocol's ranges or its level road."""
+        """Remarks on parameters outside the protocol's ranges and on a road that is not level."""
         remarks = []
         if not self.slowest <= speed <= self.fastest:
             remarks.append(f"{test}: speed = {speed:g} km/h is outside the protocol's {self.slowest:g} to {self.fastest:g} km/h")
@@ -112,31 +112,32 @@ class Range(NamedTuple):
 
 
 class Walk(NamedTuple):
-    """A target that stands, sets off at `begin` [s], reaches `speed` [m/s] with constant acceleration within `run_up` [m], and walks on."""
+    """A target that stands, sets off at `begin` [s], accelerates evenly to `speed` [m/s] within `run_up` [m], and goes on."""
 
     begin: float
     speed: float
     run_up: float
 
     @classmethod
-    def reaching(cls, way: float, time: float, speed: float, run_up: float) -> Walk:
-        """The walk that covers `way` [m] until `time` [s]: way = speed t - run_up once the run-up is over."""
-        if way < run_up:
-            raise InputError("scenario.parameters", f"acceleration_distance = {run_up:g} m is longer than the way of {way:g} m")
-        begin = time - (way + run_up) / speed
+    def reaching(cls, distance: float, time: float, speed: float, run_up: float) -> Walk:
+        """The walk that covers `distance` [m] by `time` [s]: distance = speed t - run_up once the run-up is over."""
+        if distance < run_up:
+            raise InputError("scenario.parameters", f"acceleration_distance = {run_up:g} m is longer than the distance of {distance:g} m")
+        begin = time - (distance + run_up) / speed
         if begin < 0:
-            raise InputError("scenario.parameters", f"the target needs {(way + run_up) / speed:.2f} s to the impact and has {time:g} s",
-                             "a faster target, a shorter way or a longer time_to_impact")
+            needed = (distance + run_up) / speed
+            raise InputError("scenario.parameters", f"the target needs {needed:.2f} s to the impact and has {time:g} s",
+                             "a faster target, a shorter distance or a longer time_to_impact")
         return cls(begin, speed, run_up)
 
     def travelled(self, time: float) -> float:
-        """Way covered [m] at a time [s]."""
+        """Distance covered [m] at a time [s]."""
         since = max(time - self.begin, 0.0)
         if not self.run_up or since >= 2 * self.run_up / self.speed:
             return self.speed * since - self.run_up
         return self.speed * self.speed / (4 * self.run_up) * since * since
 
-    def pace(self, time: float) -> float:
+    def speed_at(self, time: float) -> float:
         """Speed [m/s] at a time [s]."""
         if time < self.begin:
             return 0.0
@@ -147,7 +148,7 @@ class Walk(NamedTuple):
 
 
 def lateral_of(location: float, width: float) -> float:
-    """Offset of an impact location, % of the vehicle's width from the left, to the right of the middle of its front [m]."""
+    """Offset to the right of the middle of the front [m] of an impact location, given from the left [% of the vehicle's width]."""
     return (location / 100 - 0.5) * width
 
 

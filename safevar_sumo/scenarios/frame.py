@@ -1,4 +1,4 @@
-"""Coordinates along the vehicle's lane and to its left, whatever its direction."""
+"""Coordinates along the vehicle's lane and to its left, for a lane in any direction."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios.base import BentLane, Coordinates, Lane
 
 SKEW = 0.05
-"""Largest extent along the road of a crossing at right angles [m]."""
+"""Largest offset along the road between the ends of a crossing that counts as being at right angles [m]."""
 
 
 class Frame(NamedTuple):
@@ -26,37 +26,37 @@ class Frame(NamedTuple):
         Raises
         ------
         InputError
-            If it is not straight.
+            If the lane is not straight.
         """
         (x, y), (to_x, to_y) = lane.start, lane.end
         if isinstance(lane, BentLane):
-            raise InputError("scenario.parameters.network", f"lane {lane.name!r} strays {lane.bend:.2f} m from the straight",
+            raise InputError("scenario.parameters.network", f"lane {lane.name!r} deviates {lane.bend:.2f} m from a straight line",
                              "a straight lane")
         length = math.sqrt((to_x - x) * (to_x - x) + (to_y - y) * (to_y - y))
         return cls(lane.start, ((to_x - x) / length, (to_y - y) / length))
 
     @classmethod
     def through_origin(cls, lane: Lane) -> Frame:
-        """The frame of the network's coordinates turned the way that a lane leads: to the bit the same where it leads east."""
+        """The network's coordinates rotated into the direction of a lane; identical to the bit for a lane that leads east."""
         return cls((0.0, 0.0), cls.of(lane).direction)
 
     def along(self, positions: FloatArray) -> FloatArray:
         """Distance along the lane [m], shape (N,), of positions of shape (N, 2)."""
-        (x, y), (forth_x, forth_y) = self.origin, self.direction
-        return (positions[:, 0] - x) * forth_x + (positions[:, 1] - y) * forth_y
+        (x, y), (dir_x, dir_y) = self.origin, self.direction
+        return (positions[:, 0] - x) * dir_x + (positions[:, 1] - y) * dir_y
 
     def left(self, positions: FloatArray) -> FloatArray:
         """Distance to the left of the lane's middle [m], shape (N,), of positions of shape (N, 2)."""
-        (x, y), (forth_x, forth_y) = self.origin, self.direction
-        return (positions[:, 1] - y) * forth_x - (positions[:, 0] - x) * forth_y
+        (x, y), (dir_x, dir_y) = self.origin, self.direction
+        return (positions[:, 1] - y) * dir_x - (positions[:, 0] - x) * dir_y
 
     def place_of(self, point: Coordinates) -> tuple[float, float]:
         """Distances of one point along the lane and to its left [m]."""
-        (x, y), (forth_x, forth_y) = self.origin, self.direction
+        (x, y), (dir_x, dir_y) = self.origin, self.direction
         right, up = point[0] - x, point[1] - y
-        return right * forth_x + up * forth_y, up * forth_x - right * forth_y
+        return right * dir_x + up * dir_y, up * dir_x - right * dir_y
 
     def point(self, along: float, left: float) -> Coordinates:
-        """The point that is so far along the lane and to its left [m]."""
-        (x, y), (forth_x, forth_y) = self.origin, self.direction
-        return x + along * forth_x - left * forth_y, y + along * forth_y + left * forth_x
+        """The point at these distances along the lane and to its left [m]."""
+        (x, y), (dir_x, dir_y) = self.origin, self.direction
+        return x + along * dir_x - left * dir_y, y + along * dir_y + left * dir_x

@@ -15,11 +15,11 @@ PARKED = "parked_ahead"
 
 
 class _Memory(NamedTuple):
-    """The way ahead, rear bumper of the parked vehicle along it [m] and arrays that never change; shape (N,)."""
+    """The frame of the lane, position of the parked vehicle's rear bumper along it [m], and zeros; shape (N,)."""
 
     frame: Frame
     rear: FloatArray
-    nothing: FloatArray
+    zeros: FloatArray
 
 
 class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -30,11 +30,11 @@ class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_field
     duration
         Length of a run [s].
     grade
-        By how much the road rises over the way, negative where it falls [%].
+        Rise of the road over its length, negative downhill [%].
 
     Notes
     -----
-    A run ends with a collision or with its time: whoever stands may drive on.
+    A run ends with a collision or after `duration`: a vehicle that has stopped may start again.
     """
 
     network: str = "lead_vehicle_stopped"
@@ -50,7 +50,7 @@ class LeadVehicleStopped(Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
         gap = memory.rear - memory.frame.along(world.vehicle_positions(VUT))
-        return Scene(gap, memory.nothing, memory.nothing, memory.nothing > 0), memory
+        return Scene(gap, memory.zeros, memory.zeros, memory.zeros > 0), memory
 
     def encounter(self, trace: Trace) -> Encounter:
         """Safety degree from centre to centre of two vehicles of one length; TTC = (centre distance - length) / v (method section 4)."""

@@ -18,12 +18,14 @@ CROSSING_LANE = ":crossing_c0_0"
 
 
 class _Memory(NamedTuple):
-    """The way ahead, where the paths cross, what lies behind it, the pedestrian's last place [m]; whether it has turned round."""
+    """The frame of the lane; positions along it where the conflict begins and where the vehicle has cleared it, the pedestrian's last
+    lateral position [m]; whether the pedestrian has turned round.
+    """
 
     frame: Frame
     conflict_point: float
     clear_point: float
-    place: FloatArray
+    lateral: FloatArray
     turned: bool
 
 
@@ -35,11 +37,11 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
     duration
         Length of a run [s].
     turns_after
-        How far past the middle of the lane the pedestrian turns round [m]; nothing: it walks on.
+        Distance past the middle of the lane at which the pedestrian turns round [m]; None if the pedestrian walks on.
     lane_width
-        Beyond half of it from the lane's middle the pedestrian has left the lane [m].
+        Width of the lane, which the pedestrian leaves at half of it from the middle [m].
     grade
-        By how much the road rises over the way, negative where it falls [%].
+        Rise of the road over its length, negative downhill [%].
 
     Notes
     -----
@@ -56,10 +58,10 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     def begin(self, world: World) -> _Memory:
         frame, crossing = Frame.through_origin(world.lane_of(VUT)), world.lane(CROSSING_LANE)
-        (path, _), (leaves, _) = frame.place_of(crossing.start), frame.place_of(crossing.end)
-        if abs(leaves - path) > SKEW:
-            raise InputError("scenario.parameters.network", f"lane {CROSSING_LANE!r} leads {abs(leaves - path):.2f} m along the road",
-                             "a way across at right angles")
+        (path, _), (end, _) = frame.place_of(crossing.start), frame.place_of(crossing.end)
+        if abs(end - path) > SKEW:
+            raise InputError("scenario.parameters.network", f"lane {CROSSING_LANE!r} leads {abs(end - path):.2f} m along the road",
+                             "a crossing at right angles")
         lateral = frame.left(world.person_positions(PEDESTRIAN)) - frame.left(world.vehicle_positions(VUT))
         if self.turns_after is not None and lateral[0] > self.turns_after:
             raise InputError("scenario.parameters.network", f"the pedestrian begins {lateral[0]:.2f} m to the left of the vehicle",
@@ -70,7 +72,7 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
         vehicle = world.vehicle_positions(VUT)
         lateral = memory.frame.left(world.person_positions(PEDESTRIAN)) - memory.frame.left(vehicle)
-        lateral_speed = (lateral - memory.place) / step
+        lateral_speed = (lateral - memory.lateral) / step
         goes_past = self.turns_after is not None and lateral[0] + step * lateral_speed[0] > self.turns_after
         if goes_past and not memory.turned:
             world.turn_back(PEDESTRIAN)
@@ -78,7 +80,7 @@ class PedestrianCrossing(Struct, frozen=True, kw_only=True, forbid_unknown_field
         front = memory.frame.along(vehicle)
         left = (np.abs(lateral) > self.lane_width / 2) & (lateral * lateral_speed > 0)
         passed = front > memory.clear_point
-        return Scene(memory.conflict_point - front, lateral, lateral_speed, left | passed), memory._replace(place=lateral)
+        return Scene(memory.conflict_point - front, lateral, lateral_speed, left | passed), memory._replace(lateral=lateral)
 
     def encounter(self, trace: Trace) -> Encounter:
         """Front bumper to the pedestrian's path; TTC along the line of sight from the vehicle's centre.

@@ -1,7 +1,7 @@
-"""A target that nobody changes, and vehicles that meet it: what Euro NCAP's scenarios have in common.
+"""A target that does not react, and vehicles that meet it: the common part of Euro NCAP's scenarios.
 
-Where the target is and where the vehicles are is worked out apart, so that a recorded scene has its target once, at all samples, for
-vehicles by the thousand and in as many scenes as share a road.
+The motion of the target is computed independently of the vehicles, so that a recorded scene needs it only once, at all samples, for
+thousands of vehicles and for all scenes on one road.
 """
 
 from __future__ import annotations
@@ -16,35 +16,35 @@ from safevar_sumo.records import EVERYWHERE, BoolArray, FloatArray
 from safevar_sumo.scenarios.base import VUT, Scene, World
 from safevar_sumo.scenarios.frame import Frame
 
-CLOSED_IN = 0.5
-"""Closing speed [m/s] after which a vehicle that is no longer faster has avoided a target ahead."""
+APPROACHES = 0.5
+"""Closing speed that counts as approaching [m/s]: once reached, a vehicle that is no longer faster has avoided a target ahead."""
 PARKED_GAP = 1.0
-"""From the vehicle's side to the parked cars, from the nearer one's front to the target's path, and between the two [m]."""
+"""Gap between vehicle and parked cars, between the nearer car's front and the target's path, and between the two cars [m]."""
 Times = float | Sequence[float]
-"""One time, or those of all samples [s]."""
+"""One time, or the times of all samples [s]."""
 
 
 class Target(NamedTuple):
-    """Where a target is and how fast: numbers, or arrays of shape (M,), of M copies at one time or of M samples.
+    """Position and speed of a target: numbers, or arrays of shape (M,), of M copies at one time or of M samples.
 
-    `edge` is the place along the lane of the side of its body that vehicles reach first, `ahead` that of its middle beyond the point of
-    the impact [m]; `speed` is the one along the lane [m/s]; it is `gone` once it has left the vehicle's way.
+    `edge` is the position along the lane of the side of its body that vehicles reach first, `ahead` the distance of its middle beyond
+    the point of impact [m]; `speed` is its speed along the lane [m/s]; `has_left` is true once it has left the vehicle's path.
     """
 
     edge: FloatArray
     lateral: FloatArray
     lateral_speed: Any = 0.0
     speed: Any = 0.0
-    gone: Any = False
+    has_left: Any = False
     ahead: Any = 0.0
 
 
 class Course(NamedTuple):
-    """What stays as it is in a run: numbers, or arrays of shape (N,).
+    """Constants of a run: numbers, or arrays of shape (N,).
 
-    A vehicle is past the target below a gap [m]. One that cannot pass has avoided it once it has closed in and is no longer faster.
-    Parked cars hide a `hidden` target: `to_middle` is from its edge to its middle, `setback` from the sensors to the front bumper, `kerb`
-    from the middle of the lane to the cars' sides [m].
+    A vehicle is past the target when the gap is below `past` [m]. A vehicle that `follows` the target cannot pass: it has avoided the
+    target once it has approached and is no longer faster. Parked cars hide a `hidden` target: `to_middle` is the distance from its edge
+    to its middle, `setback` from the sensors to the front bumper, `kerb` from the middle of the lane to the cars' sides [m].
     """
 
     past: Any = -np.inf
@@ -60,66 +60,66 @@ class Meeting(Protocol):
 
     @property
     def frame(self) -> Frame:
-        """Of the lane that vehicles are on."""
+        """Frame of the lane that vehicles are on."""
 
     @property
     def course(self) -> Course:
-        """What stays as it is."""
+        """Constants of the run."""
 
     def begin(self, world: World) -> float:
-        """Have the target move as at the start; returns its speed [m/s]."""
+        """Set the target's speed of the start; returns it [m/s]."""
 
     def positions(self, world: World) -> FloatArray:
-        """Front of the target; shape (N, 2) [m]."""
+        """Positions of the target's front; shape (N, 2) [m]."""
 
     def target(self, positions: FloatArray, times: Times) -> Target:
-        """The target with its front at these positions, shape (M, 2) [m], at one time or at M; its lateral speed is left out."""
+        """The target with its front at `positions`, shape (M, 2) [m], at one time or at M times; without its lateral speed."""
 
-    def pace(self, sample: int, step: float) -> float:
+    def next_speed(self, sample: int, step: float) -> float:
         """The target's speed in the step after a sample [m/s]."""
 
-    def go(self, world: World, pace: float) -> None:
-        """Have the target move at a speed [m/s]."""
+    def set_speed(self, world: World, speed: float) -> None:
+        """Set the target's speed [m/s]."""
 
 
 class Memory(NamedTuple):
-    """The meeting; where the target was; step number; speed that it was last given [m/s]; which vehicles have closed in."""
+    """The meeting; the target's last lateral position [m]; step number; last speed that was set [m/s]; which vehicles have approached."""
 
     meeting: Meeting
     lateral: FloatArray
     sample: int
-    given: float
-    closed_in: BoolArray
+    speed: float
+    approached: BoolArray
 
 
 class TargetTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of a scenario whose target nobody changes."""
+    """Base of a scenario whose target does not react."""
 
     reactive_actors = False
 
     def begin(self, world: World) -> Memory:
         meeting = self._meeting(world)
-        given = meeting.begin(world)
+        speed = meeting.begin(world)
         lateral = meeting.target(meeting.positions(world), 0.0).lateral
-        return Memory(meeting, lateral, 0, given, np.zeros(len(lateral), dtype=bool))
+        return Memory(meeting, lateral, 0, speed, np.zeros(len(lateral), dtype=bool))
 
     def observe(self, world: World, step: float, memory: Memory) -> tuple[Scene, Memory]:
         meeting = memory.meeting
         target = meeting.target(meeting.positions(world), memory.sample * step)
         target = target._replace(lateral_speed=(target.lateral - memory.lateral) / step)
         front = meeting.frame.along(world.vehicle_positions(VUT))
-        scene, closed_in = scene_of(meeting.course, target, front, world.speeds(), memory.closed_in)
-        return scene, self.move(world, step, memory)._replace(lateral=target.lateral, closed_in=closed_in)
+        scene, approached = scene_of(meeting.course, target, front, world.speeds(), memory.approached)
+        return scene, self.move(world, step, memory)._replace(lateral=target.lateral, approached=approached)
 
     def move(self, world: World, step: float, memory: Memory) -> Memory:
-        """Have the target move on, as `observe` does, without a look at the scene."""
-        pace = memory.meeting.pace(memory.sample, step)
-        if pace != memory.given:
-            memory.meeting.go(world, pace)
-        return memory._replace(sample=memory.sample + 1, given=pace)
+        """Move the target on, as `observe` does, without computing the scene."""
+        speed = memory.meeting.next_speed(memory.sample, step)
+        if speed != memory.speed:
+            memory.meeting.set_speed(world, speed)
+        return memory._replace(sample=memory.sample + 1, speed=speed)
 
     def at_all_samples(self, world: World, samples: World, step: float) -> tuple[Meeting, Target]:
-        """The meeting in a recorded scene, and its target at all samples; the scene as `samples` has its T samples for N copies."""
+        """The meeting in a recorded scene, and its target at all samples; `samples` presents the T samples as N copies."""
         meeting = self._meeting(world)
         positions = meeting.positions(samples)
         target = meeting.target(positions, [sample * step for sample in range(len(positions))])
@@ -130,24 +130,24 @@ class TargetTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         raise NotImplementedError
 
 
-def scene_of(course: Course, target: Target, front: FloatArray, speed: FloatArray, closed_in: BoolArray) -> tuple[Scene, BoolArray]:
-    """The scene of vehicles by their front's place along the lane [m] and their speed [m/s], and which have closed in; shape (N,)."""
-    gap, nothing = target.edge - front, np.zeros_like(front)
-    over = np.asarray(target.gone | (gap < course.past))
+def scene_of(course: Course, target: Target, front: FloatArray, speed: FloatArray, approached: BoolArray) -> tuple[Scene, BoolArray]:
+    """The scene of vehicles with their fronts along the lane [m] and their speeds [m/s], and which have approached; shape (N,)."""
+    gap, zeros = target.edge - front, np.zeros_like(front)
+    over = np.asarray(target.has_left | (gap < course.past))
     if course.follows is not False:
-        closed_in = closed_in | (speed - target.speed > CLOSED_IN)
-        over = over | course.follows & closed_in & (speed <= target.speed)
+        approached = approached | (speed - target.speed > APPROACHES)
+        over = over | course.follows & approached & (speed <= target.speed)
     visible = EVERYWHERE if course.hidden is False else _visible(course, target, gap)
-    return Scene(gap, nothing + target.lateral, nothing + target.lateral_speed, over, nothing + target.speed, visible), closed_in
+    return Scene(gap, zeros + target.lateral, zeros + target.lateral_speed, over, zeros + target.speed, visible), approached
 
 
 def _visible(course: Course, target: Target, gap: FloatArray) -> BoolArray:
-    """Where the line from the sensors to the target's middle passes the front corner of the nearer parked car."""
-    away = gap + course.to_middle + course.setback
-    corner = away - target.ahead - PARKED_GAP
-    return np.asarray(~np.asarray(course.hidden) | (corner <= 0) | (-target.lateral * corner < course.kerb * away))
+    """Whether the line from the sensors to the target's middle clears the front corner of the nearer parked car; shape (N,)."""
+    distance = gap + course.to_middle + course.setback
+    corner = distance - target.ahead - PARKED_GAP
+    return np.asarray(~np.asarray(course.hidden) | (corner <= 0) | (-target.lateral * corner < course.kerb * distance))
 
 
-def at(times: Times, of: Callable[[float], float]) -> Any:
-    """A number at one time, or an array at those of all samples."""
-    return np.array([of(time) for time in times]) if isinstance(times, Sequence) else of(times)
+def at(times: Times, function: Callable[[float], float]) -> Any:
+    """A function's value at one time, or an array of its values at all times."""
+    return np.array([function(time) for time in times]) if isinstance(times, Sequence) else function(times)

@@ -1,4 +1,4 @@
-"""The contract of a search algorithm, which knows nothing of SUMO, processes or files, and checks of algorithms from outside."""
+"""The contract of a search algorithm, which is independent of SUMO, processes and files, and checks of algorithms from outside."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ Search = Generator[FloatArray, Evaluations, Evaluations]
 class Problem:
     """The characteristics to vary, the original vehicle's evaluation and the budget of evaluations.
 
-    `population` is the number of settings of a generation, for algorithms with generations; `scoring` gives the objectives. Where a study
-    has constraints, `region` has its feasible settings: what is asked for must be among them once it is filtered.
+    `population` is the number of settings of a generation, for algorithms with generations; `scoring` defines the objectives. `region` is
+    the feasible region of a study with constraints: yielded settings must lie in it after the filter.
     """
 
     characteristics: CharacteristicSet
@@ -34,19 +34,19 @@ class Problem:
     region: FeasibleRegion | None = None
 
     def uniform(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Unfiltered settings drawn uniformly in the domains, which are feasible once they are filtered; shape (number, n)."""
+        """Unfiltered settings drawn uniformly in the domains that are feasible after the filter; shape (number, n)."""
         lower, upper = self.characteristics.lower, self.characteristics.upper
         if not self.region:
             return rng.uniform(lower, upper, (number, len(lower)))
-        return self.region.sampled(lambda some: rng.uniform(lower, upper, (some, len(lower))), number, rng, filtered=True)
+        return self.region.sampled(lambda count: rng.uniform(lower, upper, (count, len(lower))), number, rng, filtered=True)
 
     def feasible(self, settings: FloatArray) -> BoolArray:
-        """Which settings, shape (k, n), satisfy the study's constraints once they are filtered; shape (k,)."""
+        """Which settings, shape (k, n), satisfy the study's constraints after the filter; shape (k,)."""
         filtered = self.characteristics.filter(settings)
         return self.region.feasible(filtered) if self.region else np.ones(len(filtered), dtype=bool)
 
     def repaired(self, settings: FloatArray) -> FloatArray:
-        """Settings moved towards the original as far as it takes to be feasible once they are filtered; shape (k, n)."""
+        """Settings moved towards the original until they are feasible after the filter; shape (k, n)."""
         return self.region.repaired(settings) if self.region else settings
 
 
@@ -54,10 +54,10 @@ class Algorithm(Protocol):
     """A search algorithm. Its fields are the parameters that a study gives in a table such as [search.nsga2]."""
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        """One run, which asks for at most the problem's number of evaluations.
+        """One run, which requests at most `problem.evaluations` evaluations.
 
-        All randomness comes from `rng`: a resumed run is repeated from its journal. Yielded settings are in the domains and filtered.
-        The result holds valid evaluations (`problem.scoring.valid`) that the run was sent.
+        All randomness comes from `rng`, because a resumed run is repeated from its journal. Yielded settings are in the domains and
+        filtered. The result holds valid evaluations (`problem.scoring.valid`) that the run was sent.
         """
 
 
@@ -65,7 +65,7 @@ ALGORITHM_CONTRACT = Contract.of(Algorithm, "an algorithm")
 
 
 class GuardedAlgorithm:
-    """An algorithm from outside: it gets read-only copies, and what it asks for and returns is checked."""
+    """An algorithm from outside: it gets read-only copies, and its settings and its result are checked."""
 
     def __init__(self, algorithm: Algorithm, guard: Guard) -> None:
         self._algorithm, self._guard = algorithm, guard
@@ -78,22 +78,22 @@ class GuardedAlgorithm:
         answer: Evaluations | None = None
         left = problem.evaluations
         while True:
-            asked, over = self._guard.call("search", _next, search, answer)
-            if over:
-                return self._result(asked, sent, problem)
-            settings = self._settings(asked, problem, left)
+            output, finished = self._guard.call("search", _next, search, answer)
+            if finished:
+                return self._result(output, sent, problem)
+            settings = self._settings(output, problem, left)
             left -= len(settings)
             evaluated = yield settings
             for i, row in enumerate(settings):
                 sent[row.tobytes()] = evaluated.take([i])
             answer = read_only_copy(evaluated)
 
-    def _settings(self, asked: Any, problem: Problem, left: int) -> FloatArray:
+    def _settings(self, output: Any, problem: Problem, left: int) -> FloatArray:
         members = problem.characteristics
         legal = f"an array of shape (k, {len(members)}) with k from 1 to the {left} evaluations that are left"
-        if not isinstance(asked, np.ndarray) or asked.ndim != 2 or asked.shape[1] != len(members) or not 1 <= len(asked) <= left:
-            raise self._guard.wrong("search", "settings", asked, legal)
-        settings = self._guard.numbers("search", "settings", asked, asked.shape)
+        if not isinstance(output, np.ndarray) or output.ndim != 2 or output.shape[1] != len(members) or not 1 <= len(output) <= left:
+            raise self._guard.wrong("search", "settings", output, legal)
+        settings = self._guard.numbers("search", "settings", output, output.shape)
         for column, member in enumerate(members):
             self._guard.numbers("search", member.name, settings[:, column], (len(settings),), member.lower, member.upper)
         unfiltered = np.argwhere(members.filter(settings) != settings)
@@ -102,7 +102,7 @@ class GuardedAlgorithm:
             raise self._guard.wrong("search", members.names[column], float(settings[row, column]),
                                     "filtered settings: problem.characteristics.filter(settings)")
         if problem.region and not problem.region.feasible(settings).all():
-            problem.region.check(settings, self._guard.source, otherwise=f", of every setting that {self._guard.name} asks for: "
+            problem.region.check(settings, self._guard.source, otherwise=f", for every setting that {self._guard.name} yields: "
                                  "problem.characteristics.filter(problem.repaired(settings))")
         return settings
 
@@ -111,13 +111,13 @@ class GuardedAlgorithm:
         if not isinstance(result, Evaluations):
             raise self._guard.wrong("search", "its result", result, legal)
         if not sent:
-            raise ForeignError(self._guard.source, f"{self._guard.name} ended in search without asking for any setting",
+            raise ForeignError(self._guard.source, f"{self._guard.name} ended in search without yielding any setting",
                                f"a generator that yields from 1 to {problem.evaluations} settings before it returns")
         rows = self._guard.numbers("search", "its result's settings", result.settings, (len(result), len(problem.characteristics)))
         if any(row.tobytes() not in sent for row in rows):
-            raise self._guard.wrong("search", "its result", "settings that it never asked for", legal)
-        nothing = next(iter(sent.values())).take([])
-        evaluations = Evaluations.concatenate([nothing, *(sent[row.tobytes()] for row in rows)])
+            raise self._guard.wrong("search", "its result", "settings that it never yielded", legal)
+        empty = next(iter(sent.values())).take([])
+        evaluations = Evaluations.concatenate([empty, *(sent[row.tobytes()] for row in rows)])
         return evaluations.take(problem.scoring.valid(evaluations))
 
 

@@ -21,9 +21,9 @@ Index = Annotated[float, Meta(ge=0, le=1000)]
 Size = Annotated[int, Meta(ge=1, le=100_000)]
 TournamentSize = Annotated[int, Meta(ge=2, le=1000)]
 REDRAWS = 10
-"""Times that a child equal to an individual that exists is drawn again, before it is accepted."""
+"""Number of times that a child equal to an existing individual is drawn again before it is accepted."""
 MISSES = 50
-"""Groups of children in a row without a feasible one, after which the next group is repaired."""
+"""Number of consecutive groups without a feasible child after which the next group is repaired."""
 
 
 @cache
@@ -33,9 +33,9 @@ def fitness_of(objectives: int) -> type[Any]:
 
 
 class Individual(list[float]):
-    """Unfiltered values of a setting; once evaluated, its fitness, and its `evaluation`: a batch and its row in it.
+    """Unfiltered values of a setting; once evaluated, also its fitness and its `evaluation`, a batch and a row of it.
 
-    `failed` tells whether it was simulated in vain. A survivor's `standing` is what its algorithm compares: less is better.
+    `failed` is true if the evaluation is not valid. A survivor's `standing` is the value that its algorithm compares: less is better.
     """
 
     fitness: base.Fitness
@@ -47,7 +47,7 @@ class Individual(list[float]):
 class Operators(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Simulated binary crossover and polynomial mutation, both bounded by the domains.
 
-    Mutation has by default the probability 1/n per variable. Tournaments are between `tournament_size` individuals.
+    The default mutation probability is 1/n per variable. Tournaments are between `tournament_size` individuals.
     """
 
     crossover_probability: Probability = 0.9
@@ -65,20 +65,20 @@ class Variation:
         self._operators, self._state = operators, random.Random(int(rng.integers(2**63))).getstate()
         self._candidates: list[Individual] = []
         self._missed = 0
-        given = operators.mutation_probability
-        self._mutation = 1 / len(characteristics) if given is None else given
+        probability = operators.mutation_probability
+        self._mutation = 1 / len(characteristics) if probability is None else probability
         self._lower, self._upper = characteristics.lower.tolist(), characteristics.upper.tolist()
 
     @contextmanager
     def randomness(self) -> Iterator[None]:
-        """Run with this run's state of the global `random`, which DEAP draws from; restore the caller's."""
-        callers = random.getstate()
+        """Set the global `random`, from which DEAP draws, to this run's state; restore the caller's state afterwards."""
+        callers_state = random.getstate()
         random.setstate(self._state)
         try:
             yield
         finally:
             self._state = random.getstate()
-            random.setstate(callers)
+            random.setstate(callers_state)
 
     def offspring(self, population: list[Individual], number: int) -> list[Individual]:
         """`number` new individuals: two tournaments, crossover, mutation, pair by pair."""
@@ -90,20 +90,20 @@ class Variation:
         return children[:number]
 
     def distinct_offspring(self, population: list[Individual], number: int) -> list[Individual]:
-        """As `offspring`, but every individual is in as many tournaments, and children equal to individuals that exist are drawn again."""
-        there, children, drawn = set(map(tuple, population)), list[Individual](), 0
+        """As `offspring`, but all individuals enter equally many tournaments, and children equal to existing ones are drawn again."""
+        existing, children, drawn = set(map(tuple, population)), list[Individual](), 0
         self._candidates = []
         with self.randomness():
             while population and len(children) < number:
                 for child in self._feasible([self._mutated(child) for child in self._crossed(*self._winners(population))]):
-                    repeated, drawn = tuple(child) in there, drawn + 1
+                    repeated, drawn = tuple(child) in existing, drawn + 1
                     if not repeated or drawn > REDRAWS * number:
-                        there.add(tuple(child))
+                        existing.add(tuple(child))
                         children.append(child)
         return children[:number]
 
     def child(self, first: list[Individual], second: list[Individual]) -> Individual:
-        """A new individual, not in either group, whose parents win a tournament in each group; call it within `randomness`."""
+        """A new individual, in neither group; its parents are the winners of a tournament in each group; call it within `randomness`."""
         feasible: list[Individual] = []
         for _ in range(REDRAWS):
             while not feasible:
@@ -131,13 +131,13 @@ class Variation:
 
     def _winners(self, population: list[Individual]) -> tuple[Individual, Individual]:
         """The winners of two tournaments; candidates are drawn without replacement until the population is used up."""
-        size, won = min(self._operators.tournament_size, len(population)), list[Individual]()
+        size, winners = min(self._operators.tournament_size, len(population)), list[Individual]()
         for _ in range(2):
             if len(self._candidates) < size:
                 self._candidates = random.sample(population, len(population))
-            won.append(tournament(self._candidates[:size], size))
+            winners.append(tournament(self._candidates[:size], size))
             del self._candidates[:size]
-        return won[0], won[1]
+        return winners[0], winners[1]
 
     def winner(self, population: list[Individual]) -> Individual:
         return tournament(population, self._operators.tournament_size)
@@ -159,7 +159,7 @@ def initial_population(problem: Problem, rng: np.random.Generator) -> list[Indiv
 
 
 def simulated(individuals: Sequence[Individual], problem: Problem) -> Generator[FloatArray, Evaluations, int]:
-    """Have individuals evaluated; returns how many evaluations that took."""
+    """Request the evaluation of individuals; returns the number of evaluations."""
     evaluated = yield problem.characteristics.filter(np.array(individuals))
     fitness, valid = fitness_of(len(problem.scoring.objectives)), problem.scoring.valid(evaluated).tolist()
     for i, (individual, objectives) in enumerate(zip(individuals, problem.scoring.values(evaluated).tolist(), strict=True)):
@@ -168,12 +168,12 @@ def simulated(individuals: Sequence[Individual], problem: Problem) -> Generator[
 
 
 def objectives_of(individuals: Sequence[Individual]) -> FloatArray:
-    """Their objectives, shape (M, objectives)."""
+    """Objectives of individuals, shape (M, objectives)."""
     return np.array([individual.fitness.values for individual in individuals])
 
 
 def fronts(individuals: Sequence[Individual]) -> list[list[Individual]]:
-    """Individuals by non-domination rank, in their given order."""
+    """Individuals grouped by non-domination rank, in their given order."""
     if not individuals:
         return []
     ranks = moocore.pareto_rank([individual.fitness.wvalues for individual in individuals], maximise=True).tolist()
@@ -184,7 +184,7 @@ def fronts(individuals: Sequence[Individual]) -> list[list[Individual]]:
 
 
 def stand_by_crowding(individuals: Sequence[Individual]) -> list[list[Individual]]:
-    """The fronts of individuals, whose `standing` becomes their rank, from 0, and minus their crowding distance."""
+    """The fronts of individuals; sets their `standing` to their rank, from 0, and minus their crowding distance."""
     ranked = fronts(individuals)
     for rank, front in enumerate(ranked):
         tools.emo.assignCrowdingDist(front)
@@ -194,7 +194,7 @@ def stand_by_crowding(individuals: Sequence[Individual]) -> list[list[Individual
 
 
 def tournament(population: list[Individual], size: int = 2) -> Individual:
-    """The best of `size` individuals drawn without replacement: by their standing, then by chance."""
+    """The best by standing of `size` individuals drawn without replacement; ties are decided at random."""
     if len(population) == 1:
         return population[0]
     best, *others = random.sample(population, min(size, len(population)))
@@ -204,7 +204,7 @@ def tournament(population: list[Individual], size: int = 2) -> Individual:
     return best
 
 
-def result_of(individuals: Sequence[Individual], nothing: Problem) -> Evaluations:
+def result_of(individuals: Sequence[Individual], problem: Problem) -> Evaluations:
     """The evaluations of individuals."""
     rows = [evaluations.take([row]) for evaluations, row in (individual.evaluation for individual in individuals)]
-    return Evaluations.concatenate(rows) if rows else nothing.original.take([])
+    return Evaluations.concatenate(rows) if rows else problem.original.take([])

@@ -1,4 +1,4 @@
-"""MAP-Elites (Mouret and Clune 2015) on pyribs: an atlas of failures, the one of the smallest changes in every cell."""
+"""MAP-Elites (Mouret and Clune 2015) on pyribs: an atlas with the failure of the smallest changes in every cell."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from safevar_sumo.search.base import Problem, Search
 from safevar_sumo.search.evolution import Probability, TournamentSize
 
 MOST_CELLS = 2**16
-"""Cells of an atlas at the most; of more than 16 characteristics not every set can be one."""
+"""Maximum number of cells of an atlas: with more than 16 characteristics, not every set of changes can be a cell."""
 FASTEST = 20.0
 """Speed of a collision at which the last cell begins [m/s]."""
 
@@ -24,22 +24,22 @@ NEVER_REACHED = 1e6
 class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An atlas of distinct failures, an elite for every cell; needs the extra `qd`.
 
-    The elite of a cell is its collision with the smallest largest change; while nothing in it collides, its most severe setting. A child
-    has an elite's changes: one is taken back or added, the others are moved. The result is all elites that collide, or if none does, those
-    that are more severe than the original.
+    The elite of a cell is the collision whose largest change is smallest or, without a collision, the most severe setting. A child has an
+    elite's changes: one may be removed or added, the others are moved. The result is all elites that collide or, if none collides, the
+    elites that are more severe than the original.
 
     Parameters
     ----------
     behaviour
-        What makes a cell: which characteristics are changed (changes), or the number of changes and the speed of the collision (speed).
+        Definition of a cell: the set of characteristics changed (changes), or the number of changes and the speed of the collision (speed).
     added, removed
-        Probability that a child changes a further characteristic, and that it takes a change back.
+        Probabilities that a child changes a further characteristic, and that it removes a change.
     reach
-        Standard deviation by which changed values are moved [share of the domain].
+        Standard deviation of the mutation of changed values [share of the domain].
     speeds
-        Cells over the speed of a collision, and one for none.
+        Number of cells over the speed of a collision; one more cell holds settings without a collision.
     tournament_size
-        Elites in the tournament for a parent.
+        Number of elites in the tournament for a parent.
     """
 
     behaviour: Literal["changes", "speed"] = "changes"
@@ -50,12 +50,12 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     tournament_size: TournamentSize = 6
 
     def cells(self, characteristics: int, source: str = "search.map_elites") -> int:
-        """How many cells there are.
+        """Number of cells.
 
         Raises
         ------
         InputError
-            If there are too many, or pyribs is not installed.
+            If there are too many cells, or pyribs is not installed.
         """
         number = 2**characteristics if self.behaviour == "changes" else characteristics * (self.speeds + 1)
         if number > MOST_CELLS:
@@ -68,26 +68,26 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return number
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        number = self.cells(len(problem.characteristics))
+        cell_count = self.cells(len(problem.characteristics))
         from ribs.archives import GridArchive  # takes a second to load
 
-        archive = GridArchive(solution_dim=1, dims=[number], ranges=[(-0.5, number - 0.5)])
-        batches, settings, asked = list[Evaluations](), np.zeros((problem.evaluations, len(problem.characteristics))), 0
+        archive = GridArchive(solution_dim=1, dims=[cell_count], ranges=[(-0.5, cell_count - 0.5)])
+        batches, settings, used = list[Evaluations](), np.zeros((problem.evaluations, len(problem.characteristics))), 0
         quality = np.full(problem.evaluations, -np.inf)
-        while asked < problem.evaluations:
-            some, whole = min(problem.population, problem.evaluations - asked), problem.population
+        while used < problem.evaluations:
+            number, generation = min(problem.population, problem.evaluations - used), problem.population
             elites = np.sort(archive.data("solution")[:, 0]).astype(int) if len(archive) else np.zeros(0, dtype=int)
-            parents = settings[self._chosen(elites, quality, whole, rng)] if len(elites) else None
-            children = self._children(parents, whole, problem, rng)  # whole, so that a run goes on alike with a larger budget
-            evaluated = yield problem.characteristics.filter(children[:some])
+            parents = settings[self._chosen(elites, quality, generation, rng)] if len(elites) else None
+            children = self._children(parents, generation, problem, rng)  # all, so that a run does not depend on its budget
+            evaluated = yield problem.characteristics.filter(children[:number])
             batches.append(evaluated)
-            settings[asked:asked + some] = evaluated.settings
+            settings[used:used + number] = evaluated.settings
             valid = np.flatnonzero(problem.scoring.valid(evaluated))
             if len(valid):
-                quality[asked + valid] = _quality(evaluated, problem)[valid]
+                quality[used + valid] = _quality(evaluated, problem)[valid]
                 cells = self._cell(evaluated, problem)[valid, np.newaxis]
-                archive.add((asked + valid)[:, np.newaxis].astype(float), quality[asked + valid], cells)
-            asked += some
+                archive.add((used + valid)[:, np.newaxis].astype(float), quality[used + valid], cells)
+            used += number
         everything = Evaluations.concatenate(batches)
         rows = np.sort(archive.data("solution")[:, 0]).astype(int) if len(archive) else np.zeros(0, dtype=int)
         atlas = everything.take(rows)
@@ -95,12 +95,12 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return atlas.take(atlas.collided if atlas.collided.any() else better)
 
     def _chosen(self, elites: IntArray, quality: FloatArray, number: int, rng: np.random.Generator) -> IntArray:
-        """The best of `tournament_size` elites each, drawn at random."""
+        """`number` parents, each the best of `tournament_size` elites drawn at random."""
         candidates = rng.choice(elites, (number, self.tournament_size))
         return np.asarray(candidates[np.arange(number), np.argmax(quality[candidates], axis=1)])
 
     def _children(self, parents: FloatArray | None, number: int, problem: Problem, rng: np.random.Generator) -> FloatArray:
-        """Unfiltered settings, feasible once filtered; without parents, a few changes each."""
+        """Unfiltered settings, feasible after the filter; without parents, each has some random changes."""
         members = problem.characteristics
         size, width = len(members), members.upper - members.lower
         if parents is None:
@@ -127,5 +127,5 @@ class MapElites(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def _quality(evaluated: Evaluations, problem: Problem) -> FloatArray:
-    """More is better: for a collision the smaller its largest change, for other settings, always worse, the smaller the first objective."""
+    """More is better: collisions by a small largest change; other settings, always worse, by a small first objective; shape (M,)."""
     return np.where(evaluated.collided, NEVER_REACHED - evaluated.f_diff, -problem.scoring.values(evaluated)[:, 0])

@@ -25,28 +25,28 @@ from safevar_sumo.search.evolution import (
 Side = Annotated[int, Meta(ge=1, le=100_000)]
 CROSS = ((-1, 0), (1, 0), (0, 1), (0, -1))
 NEIGHBOURHOODS = {"von_neumann": CROSS, "moore": (*CROSS, (-1, 1), (-1, -1), (1, 1), (1, -1))}
-"""Rows and columns from a cell to its neighbours: 4 or 8 of them."""
+"""Offsets in rows and columns from a cell to its 4 or 8 neighbours."""
 
 
 class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Cells on a toroidal grid that mate with their neighbours and with an archive of non-dominated individuals.
 
-    All cells reproduce at once, from the grid as it was. A child takes its cell if it dominates what is there, or if neither does and it is
-    not the worst of the neighbourhood. The variables are the characteristics' unfiltered values; what is simulated and reported is
-    filtered. The result is the archive.
+    All cells reproduce at once, from the previous grid. A child replaces its cell's individual if it dominates that individual, or if
+    neither dominates and the child is not the worst of the neighbourhood. The variables are the characteristics' unfiltered values;
+    simulation and results use filtered ones. The result is the archive.
 
     Parameters
     ----------
     crossover_probability, crossover_index
-        Of simulated binary crossover.
+        Probability and distribution index of simulated binary crossover.
     mutation_probability, mutation_index
-        Of polynomial mutation; by default the probability 1/n per variable.
+        Probability per variable, by default 1/n, and distribution index of polynomial mutation.
     tournament_size
-        Individuals of a tournament.
+        Number of individuals in a tournament.
     archive
-        Size of the archive, by default the population's; it is thinned by crowding distance.
+        Size of the archive, by default the population size; the archive is thinned by crowding distance.
     grid
-        Rows and columns, together the population; by default as near to a square as it can be.
+        Rows and columns, whose product is the population; by default as close to a square as possible.
     neighbourhood
         The 4 (von_neumann) or 8 (moore) cells around a cell.
     """
@@ -61,7 +61,7 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
         Raises
         ------
         InputError
-            If they do not make the population.
+            If their product is not the population.
         """
         if self.grid is None:
             rows = next(side for side in range(math.isqrt(population), 0, -1) if population % side == 0)
@@ -75,21 +75,21 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
         neighbours = self._neighbours(problem.population)
         variation, size = Variation(self, problem, rng), self.archive or problem.population
         cells = initial_population(problem, rng)
-        asked = yield from simulated(cells, problem)
+        used = yield from simulated(cells, problem)
         archive = archived([], cells, size)
-        while asked < problem.evaluations and archive:
+        while used < problem.evaluations and archive:
             alive = [cell for cell in cells if not cell.failed]
             stand_by_crowding(alive)
             around = [[cells[i] for i in place if not cells[i].failed] for place in neighbours]
             with variation.randomness():
-                offspring = [variation.child(mates or archive, archive) for mates in around[:problem.evaluations - asked]]
-            asked += yield from simulated(offspring, problem)
+                offspring = [variation.child(mates or archive, archive) for mates in around[:problem.evaluations - used]]
+            used += yield from simulated(offspring, problem)
             cells[:len(offspring)] = [replaced(cell, child, mates) for cell, child, mates in zip(cells, offspring, around, strict=False)]
             archive = archived(archive, offspring, size)
         return result_of(archive, problem)
 
     def _neighbours(self, population: int) -> list[list[int]]:
-        """Each cell and those around it, once each."""
+        """Indices of each cell and its neighbours, without repetition."""
         rows, columns = self.sides(population)
         steps = ((0, 0), *NEIGHBOURHOODS[self.neighbourhood])
         return [list(dict.fromkeys((row + down) % rows * columns + (column + right) % columns for down, right in steps))
@@ -107,16 +107,16 @@ def replaced(cell: Individual, child: Individual, mates: list[Individual]) -> In
 
 
 def archived(archive: list[Individual], offspring: list[Individual], size: int) -> list[Individual]:
-    """The non-dominated individuals of archive and offspring, equals once, without the most crowded; `standing` is by crowding distance.
+    """The non-dominated individuals of archive and offspring, without duplicates and without the most crowded; sets their `standing`.
 
-    Offspring are copied into the archive: the same individual has another standing as a cell.
+    Offspring are copied into the archive, as the same individual has another standing in its cell.
     """
-    distinct = {one.fitness.values: one for one in archive}
+    distinct = {member.fitness.values: member for member in archive}
     for child in offspring:
         if not child.failed and child.fitness.values not in distinct:
             distinct[child.fitness.values] = copy(child)
-    left = next(iter(stand_by_crowding(list(distinct.values()))), [])
-    while len(left) > size:
-        del left[max(range(len(left)), key=lambda i: left[i].standing)]
-        stand_by_crowding(left)
-    return left
+    kept = next(iter(stand_by_crowding(list(distinct.values()))), [])
+    while len(kept) > size:
+        del kept[max(range(len(kept)), key=lambda i: kept[i].standing)]
+        stand_by_crowding(kept)
+    return kept

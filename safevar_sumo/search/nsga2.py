@@ -1,4 +1,4 @@
-"""NSGA-II (Deb et al. 2002) on DEAP, set as in the published study (method section 6)."""
+"""NSGA-II (Deb et al. 2002) on DEAP, configured as in the published study (method section 6)."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from safevar_sumo.search.evolution import Individual, Operators, Variation, init
 class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Elitist search by rank and crowding distance; population = offspring, SBX, polynomial mutation.
 
-    The variables are the characteristics' unfiltered values; what is simulated and reported is filtered.
-    Mutation has by default the probability 1/n per variable. The result is the non-dominated part of the last population.
+    The variables are the characteristics' unfiltered values; simulation and results use filtered ones.
+    The default mutation probability is 1/n per variable. The result is the non-dominated part of the last population.
     A setting whose simulation failed does not survive.
     """
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         variation = Variation(self, problem, rng)
-        offspring, population, asked = initial_population(problem, rng), list[Individual](), 0
+        offspring, population, used = initial_population(problem, rng), list[Individual](), 0
         while offspring:
-            asked += yield from simulated(offspring, problem)
+            used += yield from simulated(offspring, problem)
             population = survivors(population + [individual for individual in offspring if not individual.failed], problem.population)
-            offspring = variation.offspring(population, min(problem.population, problem.evaluations - asked))
+            offspring = variation.offspring(population, min(problem.population, problem.evaluations - used))
         return result_of([best for best in population if best.standing[0] == 0], problem)
 
 

@@ -12,7 +12,7 @@ from safevar_sumo.search.base import Problem, Search
 
 
 class RandomSearch(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Uniform in the domains; the result is the non-dominated archive over all evaluations."""
+    """Samples uniformly in the domains; the result is the non-dominated archive over all evaluations."""
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         settings = problem.characteristics.filter(problem.uniform(problem.evaluations, rng))
@@ -25,6 +25,6 @@ class RandomSearch(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 def _non_dominated(evaluations: Evaluations, scoring: Scoring) -> Evaluations:
-    """The valid evaluations that no other one dominates; those with equal objectives all stay."""
+    """The valid non-dominated evaluations, including all with equal objectives."""
     valid = evaluations.take(scoring.valid(evaluations))
     return valid.take(moocore.is_nondominated(scoring.values(valid), keep_weakly=True)) if len(valid) else valid

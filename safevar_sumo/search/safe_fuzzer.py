@@ -14,25 +14,25 @@ from safevar_sumo.search.base import Problem, Search
 KEPT = 50
 SAFETY_WEIGHT = 6.0
 REDRAWS = 100
-"""How often a setting that is not feasible is drawn anew."""
+"""Number of times that an infeasible setting is drawn again."""
 Number = Annotated[int, Meta(ge=1, le=1_000_000)]
 
 
 class SafeFuzzer(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Changes a few characteristics of the original vehicle, in ranges that narrow towards what was less safe.
+    """Changes a few characteristics of the original vehicle, in ranges that narrow towards less safe settings.
 
     Parameters
     ----------
     generation
-        Settings of a generation.
+        Number of settings of a generation.
     kept
-        How many of the best scores are the result.
+        Number of settings with the best scores in the result.
     warm_up
         Evaluations before ranges are narrowed or a generation must improve.
     generations_between_updates, generations_without_improvement
-        After how many generations ranges are narrowed, and the search ends.
+        Number of generations between two updates of the ranges, and without an improvement before the search ends.
     safety_weight
-        Weight of the first objective in the score, in which each of the others weighs 1.
+        Weight of the first objective in the score; the other objectives have weight 1.
     """
 
     generation: Number = 50
@@ -46,17 +46,17 @@ class SafeFuzzer(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         ranges = _Ranges(problem)
         done: list[Evaluations] = []
         window: list[Evaluations] = []
-        asked = generation = lean = 0
-        while asked < problem.evaluations and lean < self.generations_without_improvement:
-            settings = ranges.draw(min(self.generation, problem.evaluations - asked), rng)
+        used = generation = unimproved = 0
+        while used < problem.evaluations and unimproved < self.generations_without_improvement:
+            settings = ranges.draw(min(self.generation, problem.evaluations - used), rng)
             earlier = Evaluations.concatenate(done) if done else None
             evaluated = yield settings
-            asked, generation = asked + len(settings), generation + 1
+            used, generation = used + len(settings), generation + 1
             done.append(evaluated)
             window.append(evaluated)
             if earlier is not None and len(earlier) >= self.warm_up:
-                lean = 0 if _improves(evaluated, earlier, problem.scoring, self.safety_weight, self.kept) else lean + 1
-            if asked >= self.warm_up and generation % self.generations_between_updates == 0:
+                unimproved = 0 if _improves(evaluated, earlier, problem.scoring, self.safety_weight, self.kept) else unimproved + 1
+            if used >= self.warm_up and generation % self.generations_between_updates == 0:
                 ranges.narrow(Evaluations.concatenate(window))
                 window = []
         everything = Evaluations.concatenate(done)
@@ -65,7 +65,7 @@ class SafeFuzzer(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class _Ranges:
-    """Where values are drawn, and how many characteristics change at the most."""
+    """Ranges from which values are drawn, and the largest number of characteristics changed."""
 
     def __init__(self, problem: Problem) -> None:
         self._problem, self._characteristics, self._scoring = problem, problem.characteristics, problem.scoring
@@ -79,7 +79,7 @@ class _Ranges:
         return self._characteristics.filter(settings)
 
     def _feasible_setting(self, rng: np.random.Generator) -> FloatArray:
-        """A setting drawn until it is feasible; after `REDRAWS`, moved towards the original as far as that takes."""
+        """A setting drawn until it is feasible; after `REDRAWS`, one moved towards the original until it is feasible."""
         setting = self._setting(rng)
         for _ in range(REDRAWS):
             if self._problem.feasible(setting[np.newaxis])[0]:
@@ -94,7 +94,7 @@ class _Ranges:
         return setting
 
     def _value(self, i: int, rng: np.random.Generator) -> float:
-        """Uniform in the range outside the filter's band; the original where nothing of the range lies outside it."""
+        """A value drawn uniformly from the range outside the filter's band; the original value if the band covers the range."""
         original, threshold = self._characteristics.original[i], self._characteristics.threshold[i]
         below = max(original - threshold - self.lower[i], 0.0)
         above = max(self.upper[i] - original - threshold, 0.0)
@@ -104,7 +104,7 @@ class _Ranges:
         return float(self.lower[i] + place if place < below else self.upper[i] - (place - below))
 
     def narrow(self, window: Evaluations) -> None:
-        """Towards the mean change, up and down, of what was less safe than the original since the last time."""
+        """Narrow the ranges to the mean change, up and down, of the settings in `window` that are less safe than the original."""
         unsafe = window.take(self._scoring.valid(window) & (self._scoring.values(window)[:, 0] < self._original))
         if not len(unsafe):
             return
@@ -119,18 +119,18 @@ class _Ranges:
 
 def _improves(generation: Evaluations, earlier: Evaluations, scoring: Scoring = SAFEVAR, safety_weight: float = SAFETY_WEIGHT,
               kept: int = KEPT) -> bool:
-    """Whether a generation's best score is lower than the worst of the best of all earlier ones."""
+    """Whether a generation's best score is lower than the worst of the `kept` best earlier scores."""
     scores = _scores(Evaluations.concatenate([earlier, generation]), scoring, safety_weight)
-    before, now = scores[:len(earlier)], scores[len(earlier):]
+    before, new = scores[:len(earlier)], scores[len(earlier):]
     best = np.sort(before[~np.isnan(before)])[:kept]
-    now = now[~np.isnan(now)]
-    return bool(now.size and (not best.size or now.min() < best[-1]))
+    new = new[~np.isnan(new)]
+    return bool(new.size and (not best.size or new.min() < best[-1]))
 
 
 def _scores(evaluations: Evaluations, scoring: Scoring = SAFEVAR, safety_weight: float = SAFETY_WEIGHT) -> FloatArray:
-    """(6 SD_norm + f_diff + num_norm) / 8, lower is better; SD by min-max over `evaluations`; NaN where it failed.
+    """(6 SD_norm + f_diff + num_norm) / 8, lower is better; SD is normalised by min-max over `evaluations`; NaN where invalid.
 
-    Of other objectives the first one stands for SD, and the others count by min-max as well.
+    With other objectives the first one takes the place of SD, and further objectives are normalised by min-max, too.
     """
     values = np.where(scoring.valid(evaluations)[:, np.newaxis], scoring.values(evaluations), np.nan)
     score = safety_weight * _normalised(values[:, 0])
@@ -145,7 +145,7 @@ def _scores(evaluations: Evaluations, scoring: Scoring = SAFEVAR, safety_weight:
 
 
 def _normalised(values: FloatArray) -> FloatArray:
-    """Between 0 and 1 by the least and the greatest of them; those that are undefined stay so."""
+    """Values normalised to [0, 1] by their minimum and maximum; NaN stays NaN."""
     if np.all(np.isnan(values)):
         return values
     least, spread = np.nanmin(values), np.nanmax(values) - np.nanmin(values)

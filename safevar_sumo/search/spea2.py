@@ -12,22 +12,22 @@ from safevar_sumo.search.evolution import Individual, Operators, Size, Variation
 class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Elitist search by strength and density; an archive, thinned where it is densest, produces the next population.
 
-    The variables are the characteristics' unfiltered values; what is simulated and reported is filtered. The result is the
+    The variables are the characteristics' unfiltered values; simulation and results use filtered ones. The result is the
     non-dominated part of the last archive. A setting whose simulation failed does not survive.
 
     Parameters
     ----------
     crossover_probability, crossover_index
-        Of simulated binary crossover.
+        Probability and distribution index of simulated binary crossover.
     mutation_probability, mutation_index
-        Of polynomial mutation; by default the probability 1/n per variable.
+        Probability per variable, by default 1/n, and distribution index of polynomial mutation.
     tournament_size
-        Individuals of a tournament.
+        Number of individuals in a tournament.
     archive
-        Size of the archive, by default the population's.
+        Size of the archive, by default the population size.
     normalised
-        Whether objectives are divided by their range before distances are measured: metres, fractions and counts
-        have no common unit. The publication leaves them as they are.
+        Whether objectives are divided by their range before distances are computed, as metres, fractions and counts
+        have no common unit. The publication does not normalise.
     """
 
     archive: Size | None = None
@@ -35,17 +35,17 @@ class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         variation, size = Variation(self, problem, rng), self.archive or problem.population
-        offspring, archive, asked = initial_population(problem, rng), list[Individual](), 0
+        offspring, archive, used = initial_population(problem, rng), list[Individual](), 0
         while offspring:
-            asked += yield from simulated(offspring, problem)
+            used += yield from simulated(offspring, problem)
             good = [individual for individual in offspring if not individual.failed]
             archive = survivors(archive + good, size, normalised=self.normalised)
-            offspring = variation.distinct_offspring(archive, min(problem.population, problem.evaluations - asked))
+            offspring = variation.distinct_offspring(archive, min(problem.population, problem.evaluations - used))
         return result_of([best for best in archive if best.standing[0] < 1], problem)
 
 
 def survivors(individuals: list[Individual], number: int, *, normalised: bool = False) -> list[Individual]:
-    """Environmental selection; `standing` becomes the fitness, below 1 for non-dominated individuals."""
+    """Environmental selection; sets `standing` to the fitness, which is below 1 for non-dominated individuals."""
     if not individuals:
         return []
     objectives = objectives_of(individuals)
@@ -63,8 +63,8 @@ def survivors(individuals: list[Individual], number: int, *, normalised: bool = 
 
 def domination(objectives: FloatArray) -> BoolArray:
     """Whether row i dominates row j; shape (M, M)."""
-    mine, theirs = objectives[:, np.newaxis], objectives[np.newaxis]
-    return np.asarray((mine <= theirs).all(axis=2) & (mine < theirs).any(axis=2))
+    first, second = objectives[:, np.newaxis], objectives[np.newaxis]
+    return np.asarray((first <= second).all(axis=2) & (first < second).any(axis=2))
 
 
 def _raw(dominates: BoolArray) -> FloatArray:
@@ -80,7 +80,7 @@ def _density(distances: FloatArray) -> FloatArray:
 
 
 def _distances(points: FloatArray) -> FloatArray:
-    """Euclidean distances, infinite to itself; added objective by objective, so that they do not depend on the array's shape."""
+    """Euclidean distances, infinite from a point to itself; summed by objective, so that they do not depend on the array's shape."""
     squares = np.zeros((len(points), len(points)))
     for column in points.T:
         squares += (column[:, np.newaxis] - column) ** 2
@@ -97,11 +97,11 @@ def _unit_range(objectives: FloatArray) -> FloatArray:
 
 
 def _truncated(places: np.ndarray, distances: FloatArray, number: int) -> list[int]:
-    """Places without those that have the nearest neighbours, removed one by one; ties by the second nearest, and so on."""
-    left: list[int] = places.tolist()
-    while len(left) > number:
-        among = distances[np.ix_(left, left)]
-        nearest = among.min(axis=1)
+    """Remove the places with the nearest neighbour, one by one; ties are decided by the second nearest, and so on."""
+    kept: list[int] = places.tolist()
+    while len(kept) > number:
+        between = distances[np.ix_(kept, kept)]
+        nearest = between.min(axis=1)
         tied = np.flatnonzero(nearest == nearest.min())
-        del left[tied[np.lexsort(np.sort(among[tied], axis=1).T[::-1])[0]]]
-    return left
+        del kept[tied[np.lexsort(np.sort(between[tied], axis=1).T[::-1])[0]]]
+    return kept

@@ -186,7 +186,7 @@ class Mine:
 
 @pytest.mark.parametrize(("module", "problem"), [
     (GREEDY, "read-only"),
-    (IDLE.format(body="if problem.evaluations == 0:\n            yield"), "ended in search without asking for any setting"),
+    (IDLE.format(body="if problem.evaluations == 0:\n            yield"), "ended in search without yielding any setting"),
     (IDLE.format(body="yield problem.characteristics.original[None][:0]"), "returned settings = .* from search"),
 ], ids=["lower", "nothing", "empty"])
 def test_an_algorithm_that_changes_its_problem_or_asks_for_nothing(module: str, problem: str, mine: Mine, folder: Path,

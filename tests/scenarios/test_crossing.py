@@ -130,7 +130,7 @@ def test_the_original_with_aeb_avoids_and_with_half_its_brakes_does_not(test: st
 @pytest.mark.parametrize(("parameters", "message"), [
     ({"speed": -10}, "speed"), ({"speed": 0}, "speed"), ({"impact_location": 151}, "impact_location"), ({"test": "CPXX"}, "test"),
     ({"time_to_impact": 2}, "needs 3.38 s to the impact"), ({"lateral_start": 2.0}, "lateral_start"),
-    ({"acceleration_distance": 9}, "acceleration_distance"), ({"speed": 250, "time_to_impact": 20}, "begin before the road does"),
+    ({"acceleration_distance": 9}, "acceleration_distance"), ({"speed": 250, "time_to_impact": 20}, "is longer than the road"),
 ])
 def test_impossible_parameters_are_refused(parameters: dict[str, object], message: str) -> None:
     with pytest.raises((InputError, msgspec.ValidationError), match=message):

@@ -230,7 +230,7 @@ class _Seen(Hold):
 
 
 @pytest.mark.parametrize(("kind", "parameters", "message"), [
-    (CarToCar, {"test": "CCRm", "heading": 10}, "a target that moves"),
+    (CarToCar, {"test": "CCRm", "heading": 10}, "a moving target"),
     (Crossing, {"test": "CBFA", "target_speed": 90, "time_to_impact": 13}, "has no lane"),
     (Crossing, {"test": "CBNA", "acceleration_distance": 1.0}, "lateral_start"),
 ])
