@@ -73,7 +73,7 @@ def failures_of(source: Study | Case, evaluator: Evaluator, original: Evaluation
     """
     if isinstance(source, Study):
         if named:
-            raise InputError("solution", f"{source.name!r} is a study and has no solutions", "a results directory")
+            raise InputError("solutions", f"{source.name!r} is a study and has no solutions", "a results directory")
         number = SEARCHED_IF_RATED if is_rated(source) else SEARCHED
         settings = evaluator.characteristics.filter(evaluator.spread(number, source.search.seed, filtered=True))
         solution_handles: list[SolutionId | None] = [None] * len(settings)
@@ -82,7 +82,7 @@ def failures_of(source: Study | Case, evaluator: Evaluator, original: Evaluation
     else:
         solutions = source.solutions
         all_handles, all_settings = handles(solutions), solutions[list(evaluator.characteristics.names)].to_numpy(dtype=float)
-        named_rows = list(dict.fromkeys(position_of(solutions, handle) for handle in named))
+        named_rows = list(dict.fromkeys(position_of(solutions, handle, "solutions") for handle in named))
         distinct = [*named_rows, *(row for row in _distinct_rows(all_settings) if row not in set(named_rows))]
         settings, solution_handles = all_settings[distinct], [all_handles[row] for row in distinct]
         recorded = solutions["outcome"].to_numpy(dtype=str)[distinct]
@@ -186,7 +186,7 @@ class Chosen(NamedTuple):
 def chosen_failures(source: Study | Case, options: ExplainOptions, evaluator: Evaluator) -> Chosen:
     """Choose failures by name, or those that matter; raises as `explain_failures`."""
     unsafe = None if options.unsafe is None else Unsafe.parse(options.unsafe)
-    named = [SolutionId.parse(text) for text in options.solutions]
+    named = [SolutionId.parse(text, "solutions") for text in options.solutions]
     limit = options.limit // len(assemble(evaluator.study).points)
     original = evaluator.original()
     failures = failures_of(source, evaluator, original, named, unsafe)

@@ -76,7 +76,8 @@ def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Poo
         As `second_system` and `chosen_failures`, and if `source` is a study, which has no failures yet.
     """
     if isinstance(source, Study):
-        raise InputError("opinion", f"{source.name!r} is a study and has no solutions", "a directory that the command study has written")
+        raise InputError(source.origin.called or source.name, "is a study and has no solutions",
+                         "a directory that the command study has written")
     second_system(source.study)
     explain_options = ExplainOptions(solutions=options.solutions, unsafe=options.unsafe, limit=LIMIT)
     with open_evaluator(source.study, pool, jobs, progress) as evaluator:
