@@ -1,4 +1,4 @@
-"""Reference data: read, compared with a study, fitted to, and imported as results."""
+"""Reference data: reading, comparison with a study, calibration, import as results."""
 
 from safevar_sumo.analysis.parameters import with_values
 from safevar_sumo.reference.calibration import (

@@ -1,4 +1,4 @@
-"""The fit of studies to published data, one or several together, and in words for the head of a study file how its values were found."""
+"""Fit one study, or several together, to published data; describe the fit for the head of a study file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.effects import error_beyond_spread
-from safevar_sumo.reference.fit import LARGEST, Search, Together, original_cost, reference_cost
+from safevar_sumo.reference.fit import MAX_COST, Search, Together, original_cost, reference_cost
 from safevar_sumo.reference.parameters import Free, free_parameters
 from safevar_sumo.reference.profiles import Profiles
 from safevar_sumo.reference.rows import ReferenceData
@@ -32,35 +32,35 @@ from safevar_sumo.workers.interrupts import result_of
 from safevar_sumo.workers.retrying import RetryingPool
 
 EDGE = 0.01
-"""Nearer than this share of its width to an end, a value stands on its bound."""
+"""A value nearer to a bound than this share of the bounds' width lies on its bound."""
 
 
 def calibration_comment(result: Calibration, study: Study, references: Mapping[str, ReferenceData], *, from_scratch: bool) -> str:
-    """Data with fingerprints, search, cost, agreement on both parts, what is shared, and what stands on its bound."""
+    """A fit in words: data with fingerprints, search, cost, agreement on both parts, shared parameters, values on a bound."""
     fit = result.search
-    start = "random places alone" if from_scratch else f"its own values and {fit.starts} random places" if fit.starts else "its own values"
+    start = "random places only" if from_scratch else f"its own values and {fit.starts} random places" if fit.starts else "its own values"
     parts = [
         f"  {name}: rho of the safety degree {_rho(result.used[name])} on the rows used, {_rho(result.held_back[name])} on those held back"
         for name in result.used]
-    others = f" and to all but each {_ordinal(study.fit.hold_out)} row of" if references else "."
+    rows = f" and to all but every {_ordinal(study.fit.hold_out)} row of" if references else "."
     together = f" together with {' and '.join(map(repr, result.together))}" if result.together else ""
     own = [name for name in result.values if name not in result.shared]
     return "\n".join([
         f"Study {study.name!r}, calibrated{together} by CMA-ES ({fit.trials} trials, seed {fit.seed}, from {start})",
-        f"to the original vehicle's published values{others}", *(_data_line(name, data) for name, data in references.items()),
-        *([f"Its own are {', '.join(own) or 'none'}; the other parameters are shared."] if result.together else []),
+        f"to the original vehicle's published values{rows}", *(_data_line(name, data) for name, data in references.items()),
+        *([f"Parameters of its own: {', '.join(own) or 'none'}; it shares the others."] if result.together else []),
         f"{cost_line(result)}.", *parts,
-        *(f"{name} stands on its bound." for name in on_a_bound(result.values, result.bounds))])
+        *(f"{name} lies on its bound." for name in on_a_bound(result.values, result.bounds))])
 
 
 def cost_line(calibration: Calibration) -> str:
-    """The cost of what was found, and what each search came to if there was any."""
+    """The lowest cost, and the lowest cost of each search, if any."""
     reached = ", ".join(f"{cost:.4f}" for cost in calibration.reached)
-    return f"Cost {calibration.cost:.4f}" + (f"; each search came to {reached}" if reached else "")
+    return f"Cost {calibration.cost:.4f}" + (f"; lowest cost of each search: {reached}" if reached else "")
 
 
 def on_a_bound(values: Mapping[str, float], free: Mapping[str, FreeParameter]) -> list[str]:
-    """Names of the values that a search would have moved farther."""
+    """Names of the parameters whose values lie on a bound."""
     return [name for name, value in values.items()
             if min(value - free[name].lower, free[name].upper - value) <= EDGE * (free[name].upper - free[name].lower)]
 
@@ -80,15 +80,11 @@ def _rho(result: Agreement) -> str:
 
 
 NEAR = 0.02
-"""Standard deviation of the first trials around known values, as a share of a parameter's bounds."""
-
-
+"""Initial standard deviation of a search around known values, as a share of the bounds' width."""
 STAGES = (64, 16)
-"""Of 100 trials from scratch those of the first study alone, and those of what the others have of their own; the rest are of all."""
-
-
+"""Percentages of the trials from scratch that fit the first study alone, and then the others' own parameters; the rest fit all."""
 MILLIMETRES = 3
-"""Decimals of a study's model error."""
+"""Decimals of a study's model error [m]."""
 
 
 class Subject(NamedTuple):
@@ -99,12 +95,12 @@ class Subject(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """Found values by parameter with their bounds, the study with them, their cost, and both parts of every reference by its name.
+    """Fitted values and bounds by parameter, the study with these values, their cost, and agreement with both parts of each reference.
 
-    `reached` is the lowest cost that each search came to, the last one from the studies' own values unless these were forgotten.
-    `together` are the studies that were fitted with this one, `shared` the parameters that it has in common with one of them,
-    `search` is the table [fit] whose trials, seed and starts counted, `intervals` are the least and the greatest value of each
-    parameter that fit as well, `profiles` what the trials came to.
+    `reached` is the lowest cost of each search; the last search starts at the studies' own values, except in a fit from scratch.
+    `together` names the studies that were fitted with this one, `shared` the parameters that it shares with one of them,
+    `search` is the table [fit] that set trials, seed and starts, `intervals` are the least and the greatest value of each
+    parameter that fit as well, `profiles` are the costs of the trials.
     """
 
     values: dict[str, float]
@@ -129,21 +125,21 @@ def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
 
 def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[float, Together], None] = lambda cost, best: None, *,
                        from_scratch: bool = False) -> list[Calibration]:
-    """Fit by CMA-ES (Hansen 2016), as the studies' tables [fit] say; trials, seed, starts and population are the first one's.
+    """Fit by CMA-ES (Hansen 2016), as the studies' tables [fit] say; trials, seed, starts and population are the first study's.
 
     Parameters
     ----------
     subjects
-        Studies with their data, which may be none: then only the original vehicle's values count.
+        Studies with their data; without data, only the original vehicle's values count.
     done
-        Is called after every trial with the lowest cost so far, and the studies that have it.
+        Called after every trial with the lowest cost so far, and the studies that have it.
     from_scratch
-        Forget the studies' own values of what is free: only the random places count.
+        Ignore the studies' own values of the free parameters: start only at random places.
 
     Raises
     ------
     InputError
-        If a study declares nothing to fit, or something that cannot be, or has nothing to fit it to.
+        If no study has free parameters, one of them cannot be fitted, or a study has nothing to fit it to.
     SimulationError
         If the studies cannot be simulated with their own values.
     """
@@ -160,75 +156,75 @@ def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[
         rows = {name: np.arange(len(data.settings)) % study.fit.hold_out == study.fit.hold_out - 1 for name, data in references.items()}
         used.append({name: data.take(~rows[name]) for name, data in references.items()})
         held_back.append({name: data.take(rows[name]) for name, data in references.items()})
-    begin, trials, rng = studies, fit.trials, np.random.default_rng(fit.seed)
+    start, trials, rng = studies, fit.trials, np.random.default_rng(fit.seed)
     if staged := from_scratch and (len(studies) > 1 or fit.thinning > 1):
-        begin, trials = _by_stages(subjects, free, used, pool, rng, done)
-    trial = _Trial(free, [_Fitted(study, data, pool) for study, data in zip(begin, used, strict=True)])
+        start, trials = _by_stages(subjects, free, used, pool, rng, done)
+    trial = _Trial(free, [_Fitted(study, data, pool) for study, data in zip(start, used, strict=True)])
     search = Search(trial, fit.population, trials, done, fit.alike)
-    if not from_scratch and search.tried([studies])[0] >= LARGEST:
+    if not from_scratch and search.try_studies([studies])[0] >= MAX_COST:
         names = " and ".join(f"study {study.name!r}" for study in studies)
         raise SimulationError(f"{names} cannot be simulated with {'its' if len(studies) == 1 else 'their'} own values")
-    searches = [] if staged else search.from_random_places(_same(free), fit.starts, fit.screened, fit.width, rng)
+    searches = [] if staged else search.from_random_places(_first_of_key(free), fit.starts, fit.screened, fit.width, rng)
     if staged or not from_scratch:
-        searches.append(search.begun(trial.shares(begin), NEAR, fit.seed + 1))
+        searches.append(search.begin(trial.shares(start), NEAR, fit.seed + 1))
     search.race(searches)
     assert search.best is not None, "there is a trial at least"
     reached, results = [one.lowest for one in searches if one.lowest < np.inf], []
     profiles = Profiles.of(free, trial, search, trial.shares(search.best))
     for k, best in enumerate(search.best):
-        mine = [one for one in free if k in one.studies]
+        parameters = [one for one in free if k in one.studies]
         best = msgspec.structs.replace(best, spread=profiles.spread(k))
         beyond = {SAFETY_DEGREE: round(error_beyond_spread(best, used[k]), MILLIMETRES)} if used[k] else {}
         best = msgspec.structs.replace(best, model_error=beyond)
         results.append(Calibration(
-            {one.key: value_of(best, one.key) for one in mine}, best, search.cost, reached, _agreements(best, used[k], pool),
-            _agreements(best, held_back[k], pool), {one.key: one.bounds for one in mine}, fit,
+            {one.key: value_of(best, one.key) for one in parameters}, best, search.cost, reached, _agreements(best, used[k], pool),
+            _agreements(best, held_back[k], pool), {one.key: one.bounds for one in parameters}, fit,
             tuple(study.name for study in studies if study is not studies[k]),
-            frozenset(one.key for one in mine if len(one.studies) > 1),
+            frozenset(one.key for one in parameters if len(one.studies) > 1),
             {one.key: profiles.interval(i) for i, one in enumerate(free) if k in one.studies}, profiles))
     return results
 
 
-def _same(free: Sequence[Free]) -> list[int]:
-    """What several studies have of their own begins at one place: it is one model in other conditions."""
+def _first_of_key(free: Sequence[Free]) -> list[int]:
+    """For each parameter, the first one with its key: studies' own values start at one place, for they describe one model."""
     keys = [one.key for one in free]
     return [keys.index(key) for key in keys]
 
 
 def _by_stages(subjects: Sequence[Subject], free: Sequence[Free], used: Sequence[Mapping[str, ReferenceData]], pool: Pool,
                rng: np.random.Generator, done: Callable[[float, Together], None]) -> tuple[Together, int]:
-    """On some rows the first study alone from random places, then with its values what only the others have; and the trials left."""
+    """Fit, on thinned rows, the first study from random places, then the others' own parameters; also returns the trials left."""
     studies = tuple(subject.study for subject in subjects)
-    fit, left = studies[0].fit, studies[0].fit.trials
+    fit, trials_left = studies[0].fit, studies[0].fit.trials
     first = [one._replace(studies=(0,)) for one in free if 0 in one.studies]
     others = [one._replace(studies=tuple(k - 1 for k in one.studies)) for one in free if 0 not in one.studies]
-    for mine, numbers, share in zip((first, others), ([0], list(range(1, len(studies)))), STAGES, strict=True):
+    for parameters, indices, share in zip((first, others), ([0], list(range(1, len(studies)))), STAGES, strict=True):
         trials = fit.trials * share // 100
-        if mine and trials:
-            some = [{name: _thinned(data, fit.thinning) for name, data in used[k].items()} for k in numbers]
-            trial = _Trial(mine, [_Fitted(studies[k], data, pool) for k, data in zip(numbers, some, strict=True)])
-            search = Search(trial, fit.population, trials, partial(_done_with_some, done, studies, numbers))
-            search.race(search.from_random_places(_same(mine), fit.starts, fit.screened, fit.width, rng))
+        if parameters and trials:
+            thinned = [{name: _thinned(data, fit.thinning) for name, data in used[k].items()} for k in indices]
+            trial = _Trial(parameters, [_Fitted(studies[k], data, pool) for k, data in zip(indices, thinned, strict=True)])
+            search = Search(trial, fit.population, trials, partial(_done_with_some, done, studies, indices))
+            search.race(search.from_random_places(_first_of_key(parameters), fit.starts, fit.screened, fit.width, rng))
             assert search.best is not None, "there is a trial at least"
-            studies, left = _replaced(studies, numbers, search.best), left - trials
+            studies, trials_left = _replaced(studies, indices, search.best), trials_left - trials
             values = [(one, value_of(studies[0], one.key)) for one in free if 0 in one.studies]
             studies = tuple(with_values(study, {one.key: value for one, value in values if k in one.studies})
                             for k, study in enumerate(studies))
-    return studies, left
+    return studies, trials_left
 
 
-def _done_with_some(done: Callable[[float, Together], None], studies: Together, numbers: Sequence[int], cost: float,
+def _done_with_some(done: Callable[[float, Together], None], studies: Together, indices: Sequence[int], cost: float,
                     best: Together) -> None:
-    done(cost, _replaced(studies, numbers, best))
+    done(cost, _replaced(studies, indices, best))
 
 
-def _replaced(studies: Together, numbers: Sequence[int], some: Together) -> Together:
-    """Studies with those of some numbers replaced."""
-    return tuple(some[numbers.index(k)] if k in numbers else study for k, study in enumerate(studies))
+def _replaced(studies: Together, indices: Sequence[int], replacements: Together) -> Together:
+    """Studies with those at some indices replaced."""
+    return tuple(replacements[indices.index(k)] if k in indices else study for k, study in enumerate(studies))
 
 
 def _thinned(data: ReferenceData, thinning: int) -> ReferenceData:
-    """One row in so many, in the order of the safety degree, so that few rows are spread as all are."""
+    """Every `thinning`-th row in the order of the safety degree, so that the few rows are distributed as all rows are."""
     rows = np.zeros(len(data.settings), dtype=bool)
     rows[np.argsort(data.metrics[SAFETY_DEGREE], kind="stable")[thinning // 2::thinning]] = True
     return data.take(rows)
@@ -272,13 +268,13 @@ class _Trial:
         values = np.array([value_of(studies[free.studies[0]], free.key) for free in self._free])
         return np.asarray(np.clip((self._scaled(values) - self._start) / self._width, 0, 1))
 
-    def costs(self, tried: Sequence[Together]) -> list[float]:
-        submitted = [[one.submit(study) for one, study in zip(self._fitted, together, strict=True)] for together in tried]
-        return [float(np.mean([one.cost(parts) for one, parts in zip(self._fitted, of_one, strict=True)])) for of_one in submitted]
+    def costs(self, studies: Sequence[Together]) -> list[float]:
+        submitted = [[one.submit(study) for one, study in zip(self._fitted, together, strict=True)] for together in studies]
+        return [float(np.mean([one.cost(parts) for one, parts in zip(self._fitted, batches, strict=True)])) for batches in submitted]
 
 
 class _Fitted:
-    """A study that is fitted, and the data that it is fitted to."""
+    """A study to fit, and the data to fit it to."""
 
     def __init__(self, study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> None:
         self.study, self._references = study, references
@@ -286,7 +282,7 @@ class _Fitted:
         self._inputs, self._pool = inputs_of(study, pool), RetryingPool(pool, study)
         settings = [self._characteristics.original[np.newaxis], *(data.settings for data in references.values())]
         self._settings, self._row_of = np.unique(np.concatenate(settings), axis=0, return_inverse=True)
-        batches = max(1, round(len(self._settings) / settings_per_batch(assemble(study), Engine.RECORDED)))  # few rows more cost less
+        batches = max(1, round(len(self._settings) / settings_per_batch(assemble(study), Engine.RECORDED)))  # larger ones cost less
         self._size = math.ceil(len(self._settings) / batches)
 
     def submit(self, study: Study) -> list[Future[Evaluations]]:
@@ -296,7 +292,7 @@ class _Fitted:
     def cost(self, parts: Sequence[Future[Evaluations]]) -> float:
         unique = Evaluations.concatenate([result_of(part) for part in parts])
         if not unique.valid.all():
-            return LARGEST
+            return MAX_COST
         evaluations = unique.take(self._row_of.ravel())
         cost = original_cost(evaluations.take([0]), self.study.published, self.study.fit)
         row = 1
@@ -318,5 +314,5 @@ def _agreements(study: Study, references: Mapping[str, ReferenceData], pool: Poo
 
 
 def fitted_as(study: Study, fitted: Study) -> Study:
-    """The found study under a name of its own: nobody is to take it for the one whose published values it stands beside."""
+    """The fitted study under a name of its own, so that nobody takes it for the study that it was fitted from."""
     return msgspec.structs.replace(fitted, name=f"{study.name}-calibrated")

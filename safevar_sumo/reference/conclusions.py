@@ -1,4 +1,4 @@
-"""Tables of two sides, cell beside cell; the conclusions of the published side, and whether they hold here."""
+"""Tables of published results beside ours; the published conclusions, and whether they hold here."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ KEYS: Mapping[str, Sequence[str]] = {
     "rq3.2": ("setting", "characteristic", "j"), "rq3.3": ("setting", "characteristic", "direction", "j"),
     "rq3.3-safety": ("setting", "quantity", "j"), "collisions": ("setting", "algorithm"), "combinations": ("setting", "place"),
     "weather": ("setting", "other", "characteristic")}
-"""Columns that identify a row of a table."""
-NO_CELLS = ("method", "n1", "n2")
+"""Columns that identify a row of each table."""
+NOT_COMPARED = ("method", "n1", "n2")
 
 
 class Pairs(NamedTuple):
-    """Cases by setting, on both sides, and settings that stand on one side alone."""
+    """Cases of the same studies on both sides, and names of studies that only one side has."""
 
     here: list[Case]
     there: list[Case]
@@ -35,7 +35,7 @@ class Pairs(NamedTuple):
 
 
 class Beside(NamedTuple):
-    """A table of both sides: keys, then each quantity as two columns; and notes."""
+    """A table of both sides: key columns, then two columns for each quantity; and notes."""
 
     name: str
     frame: pd.DataFrame
@@ -59,7 +59,7 @@ def paired(here: Sequence[Case], there: Sequence[Case]) -> Pairs:
     for name in common:
         one, other = (side[name].characteristics for side in sides)
         if one.names != other.names or not np.array_equal(one.original, other.original):
-            raise InputError("published", f"{name} is of another vehicle there", "results of one and the same study")
+            raise InputError("published", f"{name} has another vehicle there", "results of the same study")
     cases = [[side[name] for name in common] for side in sides]
     alone = [[name for name in side if name not in common] for side in sides]
     return Pairs(cases[0], cases[1], alone[0], alone[1])
@@ -79,15 +79,15 @@ def tables_beside(pairs: Pairs) -> list[Beside]:
     sides = [{one.name: one for one in answer(cases)} for cases in (pairs.here, pairs.there)]
     tables = []
     for name, keys in KEYS.items():
-        answers = [side.get(name, Answer(name, pd.DataFrame(), ())) for side in sides]  # a footer is missing with its table
+        answers = [side.get(name, Answer(name, pd.DataFrame(), ())) for side in sides]  # a table that is missing has no footer
         frames = [_shares(cases) for cases in pairs[:2]] if name == "rq3.1" else [one.frame for one in answers]
         notes = [f"{side}: {note}" for side, one in zip((HERE, THERE), answers, strict=True) for note in one.notes]
-        frames = [_with_places(frame) for frame in frames]
+        frames = [_with_ranks(frame) for frame in frames]
         if any(frame.empty for frame in frames):
-            lacking = [side for side, frame in zip((HERE, THERE), frames, strict=True) if frame.empty]
-            tables.append(Beside(name, pd.DataFrame(), [], [*notes, f"No table: nothing to show {' and '.join(lacking)}."]))
+            empty = [side for side, frame in zip((HERE, THERE), frames, strict=True) if frame.empty]
+            tables.append(Beside(name, pd.DataFrame(), [], [*notes, f"No table: nothing to show {' and '.join(empty)}."]))
             continue
-        quantities = [str(column) for column in frames[0] if column not in (*keys, *NO_CELLS) and column in frames[1]]
+        quantities = [str(column) for column in frames[0] if column not in (*keys, *NOT_COMPARED) and column in frames[1]]
         both = frames[0][[*keys, *quantities]].merge(frames[1][[*keys, *quantities]], on=list(keys), how="outer", sort=False,
                                                      suffixes=(f" {HERE}", f" {THERE}"))
         tables.append(Beside(name, both, quantities, notes))
@@ -107,37 +107,37 @@ def _shares(cases: Sequence[Case]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _with_places(frame: pd.DataFrame) -> pd.DataFrame:
-    """Combinations stand in the order of their frequency: the first beside the first."""
+def _with_ranks(frame: pd.DataFrame) -> pd.DataFrame:
+    """Number combinations in the order of their frequency, to compare first with first."""
     if "characteristics" not in frame:
         return frame
     return frame.assign(place=frame.groupby("setting").cumcount() + 1, characteristics=frame["characteristics"].map(", ".join))
 
 
-HOLDS, DIRECTION, DIFFERS, OPEN = "holds", "holds in direction", "differs", "cannot be told"
+HOLDS, DIRECTION, DIFFERS, OPEN = "holds", "holds in direction", "differs", "cannot be decided"
 CLOSE, ALIKE = 0.7, 0.4
 """Rank correlations from which an order holds, and from which it holds in direction."""
 FACTOR = 1.5
-"""Shares and means that differ by no more than this factor are the same."""
+"""Shares and means that differ by at most this factor count as equal."""
 MOSTLY, PARTLY = 0.8, 0.6
-"""Shares of the characteristics that are changed the same way, from which that holds, and holds in direction."""
+"""Shares of characteristics changed in the same direction from which directions hold, and hold in direction."""
 LEANING = 0.2
-"""Least difference between the shares of increases and decreases at which a characteristic leans to one of them."""
+"""Least difference between the shares of increases and decreases for a characteristic to lean to one of them."""
 RULES = (
     f"Tests (RQ1, RQ2): *{HOLDS}* if both are significant (p < {ALPHA:g}) or neither is, both effect sizes are of the same magnitude "
     f"(Kitchenham's negligible, small, medium, large) and, where they are significant and not negligible, on the same side of 0.5; "
     f"*{DIRECTION}* if they only lie on the same side of 0.5; else *{DIFFERS}*.",
     f"Numbers of changes (RQ3.1): *{HOLDS}* if the most frequent number is the same, *{DIRECTION}* if the means differ by at most 1.",
     f"Orders (RQ3.2, weather): *{HOLDS}* from a rank correlation of {CLOSE:g}, *{DIRECTION}* from {ALIKE:g}.",
-    f"Directions of changes (RQ3.3): *{HOLDS}* if at least {100 * MOSTLY:.0f} % of the characteristics that lean to one side there "
-    f"(by {100 * LEANING:.0f} % of their changes) lean to it here, *{DIRECTION}* from {100 * PARTLY:.0f} %.",
+    f"Directions of changes (RQ3.3): *{HOLDS}* if at least {100 * MOSTLY:.0f} % of the characteristics that lean to one direction in the "
+    f"published results (by {100 * LEANING:.0f} % of their changes) lean to it here, *{DIRECTION}* from {100 * PARTLY:.0f} %.",
     f"Shares and means (collisions, safety): *{HOLDS}* within a factor of {FACTOR:g}, *{DIRECTION}* if both are above zero.",
-    f"Combinations: *{HOLDS}* if the most frequent one is the same, *{DIRECTION}* if it is among those shown on the other side or "
-    "shares three of its four characteristics with the most frequent one there.")
+    f"Combinations: *{HOLDS}* if the most frequent one is the same, *{DIRECTION}* if it is among the combinations shown on the other "
+    "side, or shares three of its four characteristics with the most frequent published one.")
 
 
 class Conclusion(NamedTuple):
-    """A published conclusion in words, whether it holds here, and the numbers that say so."""
+    """A published conclusion in words, whether it holds here, and the numbers that show it."""
 
     question: str
     setting: str
@@ -147,21 +147,23 @@ class Conclusion(NamedTuple):
 
 
 def conclusions(tables: Sequence[Beside]) -> list[Conclusion]:
-    """All of them, in the order of the questions."""
+    """All published conclusions, in the order of the questions."""
     return [one for table in tables if not table.frame.empty for one in READERS[table.name](table.frame)]
 
 
-def _tests(question: str, who: str, better: str) -> Any:
+def _tests(question: str, subject_column: str, directions: str) -> Any:
     def read(frame: pd.DataFrame) -> Iterator[Conclusion]:
         for row in frame.to_dict("records"):
-            (a, p), (b, q) = ((_number(row[f"effect_size {side}"]), _number(row[f"p_value {side}"])) for side in (HERE, THERE))
-            subject = f"{ALGORITHM_TITLES.get(row[who], row[who])}, {row['metric']}"
-            if a is None or b is None or p is None or q is None:
-                yield Conclusion(question, row["setting"], subject, OPEN, "there is no test " + (HERE if a is None else THERE))
+            (effect, p), (published, published_p) = (
+                (_number(row[f"effect_size {side}"]), _number(row[f"p_value {side}"])) for side in (HERE, THERE))
+            subject = f"{ALGORITHM_TITLES.get(row[subject_column], row[subject_column])}, {row['metric']}"
+            if effect is None or published is None or p is None or published_p is None:
+                yield Conclusion(question, row["setting"], subject, OPEN, f"no test {HERE if effect is None else THERE}")
                 continue
-            yield Conclusion(question, row["setting"], f"{subject}: {_difference(b, q, better)}", grade(a, p, b, q),
-                             f"effect size {a:.2f} here ({row[f'magnitude {HERE}']}, p {p:.2g}), {b:.2f} published "
-                             f"({row[f'magnitude {THERE}']}, p {q:.2g})")
+            words = f"{subject}: {_difference(published, published_p, directions)}"
+            yield Conclusion(question, row["setting"], words, grade(effect, p, published, published_p),
+                             f"effect size {effect:.2f} here ({row[f'magnitude {HERE}']}, p {p:.2g}), {published:.2f} published "
+                             f"({row[f'magnitude {THERE}']}, p {published_p:.2g})")
     return read
 
 
@@ -175,10 +177,10 @@ def grade(effect: float, p: float, published_effect: float, published_p: float) 
     return DIRECTION if same_side else DIFFERS
 
 
-def _difference(effect: float, p: float, better: str) -> str:
+def _difference(effect: float, p: float, directions: str) -> str:
     if p >= ALPHA:
         return "no difference"
-    high, low = better.split("/")
+    high, low = directions.split("/")
     return high if effect > 0.5 else low
 
 
@@ -200,8 +202,8 @@ def _orders(frame: pd.DataFrame) -> Iterator[Conclusion]:
         if both.empty:
             continue
         first = both.sort_values(f"percent {THERE}", ascending=False, kind="stable")["characteristic"].head(3)
-        mine = both.sort_values(f"percent {HERE}", ascending=False, kind="stable")["characteristic"].head(3)
-        yield _by_rank("RQ3.2", str(setting), f"changed most often: {', '.join(first)}", both, "percent", f"; here {', '.join(mine)}")
+        first_here = both.sort_values(f"percent {HERE}", ascending=False, kind="stable")["characteristic"].head(3)
+        yield _by_rank("RQ3.2", str(setting), f"changed most often: {', '.join(first)}", both, "percent", f"; here {', '.join(first_here)}")
 
 
 def _weather(frame: pd.DataFrame) -> Iterator[Conclusion]:
@@ -230,20 +232,20 @@ def _directions(frame: pd.DataFrame) -> Iterator[Conclusion]:
             continue
         share = float(same.mean())
         verdict = HOLDS if share >= MOSTLY else DIRECTION if share >= PARTLY else DIFFERS
-        other = ", ".join(map(str, same.index[~same]))
+        opposite = ", ".join(map(str, same.index[~same]))
         yield Conclusion("RQ3.3", str(setting), f"{int(clear.sum())} characteristics are changed mostly one way", verdict,
-                         f"{int(same.sum())} of them the same way here" + (f", but not {other}" if other else ""))
+                         f"{int(same.sum())} of them the same way here" + (f", but not {opposite}" if opposite else ""))
 
 
-def _ratios(question: str, who: str, value: str, words: str) -> Any:
+def _ratios(question: str, subject_column: str, value: str, words: str) -> Any:
     def read(frame: pd.DataFrame) -> Iterator[Conclusion]:
         rows = frame[frame["j"] == "any"] if "j" in frame else frame
         for row in rows.to_dict("records"):
             here, there = (_number(row[f"{value} {side}"]) for side in (HERE, THERE))
-            subject = f"{ALGORITHM_TITLES.get(row[who], row[who])}: {words}"
+            subject = f"{ALGORITHM_TITLES.get(row[subject_column], row[subject_column])}: {words}"
             if here is None or there is None:
                 missing = " and ".join(side for side, number in ((HERE, here), (THERE, there)) if number is None)
-                yield Conclusion(question, row["setting"], subject, OPEN, f"there is none {missing}")
+                yield Conclusion(question, row["setting"], subject, OPEN, f"no value {missing}")
                 continue
             yield Conclusion(question, row["setting"], subject, _ratio(here, there), f"{here:.3g} here, {there:.3g} published")
     return read
@@ -262,7 +264,7 @@ def _combinations(frame: pd.DataFrame) -> Iterator[Conclusion]:
             continue
         shared = len(set(here[0].split(", ")) & set(there[0].split(", ")))
         verdict = HOLDS if here[0] == there[0] else DIRECTION if there[0] in here or here[0] in there or shared >= 3 else DIFFERS
-        yield Conclusion("combinations", str(setting), f"four changed most often together: {there[0]}", verdict,
+        yield Conclusion("combinations", str(setting), f"the four most often changed together: {there[0]}", verdict,
                          f"here {here[0]}; {shared} of four the same")
 
 

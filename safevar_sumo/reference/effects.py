@@ -1,4 +1,4 @@
-"""How strongly each characteristic acts on the safety degree, there and here; and how many rows the model's uncertainty covers."""
+"""Effects of the characteristics on the safety degree, in a reference and here; rows that the model's uncertainty covers."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 SHARE, LEAST = 0.2, 0.1
-"""Effects agree that differ by no more than this share of the published one, or by no more than so many metres."""
+"""Effects agree if they differ by at most this share of the published effect, or by at most this many metres."""
 ROWS_EACH = 10
-"""Rows for each characteristic below which a regression says nothing."""
+"""Minimum number of rows for each coefficient of a regression."""
 
 
 class Effect(NamedTuple):
-    """Effect of a characteristic on the safety degree over its whole domain [m], there and here; None where it hardly varies."""
+    """Effect of a characteristic on the safety degree over its whole domain [m], in the reference and here; None if undefined."""
 
     name: str
     reference: float | None
@@ -36,7 +36,7 @@ class Effect(NamedTuple):
 
 
 def linear_effects(settings: FloatArray, safety_degree: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
-    """Slopes of a linear regression on all characteristics, times the widths of their domains; shape (n,) [m], NaN where one is fixed."""
+    """Slopes of a linear regression on all characteristics, times the widths of their domains; shape (n,) [m]; NaN if undefined."""
     width = characteristics.upper - characteristics.lower
     defined = np.isfinite(safety_degree)
     shares = (settings[defined] - characteristics.original) / width
@@ -52,24 +52,25 @@ def _varies(shares: FloatArray) -> BoolArray:
     return np.asarray(np.ptp(shares, axis=0) > 0) if len(shares) else np.zeros(shares.shape[1], dtype=bool)
 
 
-def effects_apart(data: ReferenceData, here: Evaluations, characteristics: CharacteristicSet) -> FloatArray:
-    """Effects here minus those there [m]; zero where the rows tell neither."""
-    there, ours = (linear_effects(data.settings, values, characteristics) for values in (data.metrics[SAFETY_DEGREE], here.f_safe))
-    return np.nan_to_num(ours - there)
+def effect_differences(data: ReferenceData, here: Evaluations, characteristics: CharacteristicSet) -> FloatArray:
+    """Effects here minus those in the reference [m]; zero where they are undefined."""
+    published, simulated = (linear_effects(data.settings, values, characteristics)
+                            for values in (data.metrics[SAFETY_DEGREE], here.f_safe))
+    return np.nan_to_num(simulated - published)
 
 
 def effects_of(data: ReferenceData, here: Evaluations, characteristics: CharacteristicSet) -> list[Effect]:
     """The effects of all characteristics, in the study's order."""
-    there, ours = (linear_effects(data.settings, values, characteristics) for values in (data.metrics[SAFETY_DEGREE], here.f_safe))
+    effects = (linear_effects(data.settings, values, characteristics) for values in (data.metrics[SAFETY_DEGREE], here.f_safe))
     return [Effect(name, *(None if np.isnan(value) else float(value) for value in pair))
-            for name, *pair in zip(characteristics.names, there, ours, strict=True)]
+            for name, *pair in zip(characteristics.names, *effects, strict=True)]
 
 
 class Coverage(NamedTuple):
-    """How many sets of parameters there are, and the share of rows within the band of their predictions and of repeats.
+    """Numbers of parameter sets and rows, and the share of rows within the band of the sets' predictions and of repeats.
 
-    `held_back` is the share of those that were not used for the fit, `width` the band's median width [m], `needed` by how much it would
-    have to be wider on each side to cover 90 % of the rows held back [m].
+    `held_back` is the share of the rows that the fit did not use, `width` the band's median width [m], `needed` how much wider on each
+    side the band must be to cover 90 % of the rows held back [m].
     """
 
     sets: int
@@ -85,12 +86,12 @@ class Coverage(NamedTuple):
 
     def __str__(self) -> str:
         return (f"The {BAND:.0%} band of {self.sets} parameter sets, of repeats and of the model's error is {self.width:.2f} m wide "
-                f"(median) and covers {self.all_rows:.0%} of {self.rows} rows, {self.held_back:.0%} of those held back; {self.needed:.2f} "
-                f"m more on each side would cover {BAND:.0%} of these.")
+                f"(median) and covers {self.all_rows:.0%} of {self.rows} rows, {self.held_back:.0%} of the rows held back; "
+                f"{self.needed:.2f} m more on each side would cover {BAND:.0%} of the latter.")
 
 
 def covered_by_spread(data: ReferenceData, study: Study) -> Coverage:
-    """How many published rows lie within the model's own uncertainty.
+    """The published rows within the band of the model's own uncertainty.
 
     Raises
     ------
@@ -102,32 +103,32 @@ def covered_by_spread(data: ReferenceData, study: Study) -> Coverage:
     there = data.metrics[SAFETY_DEGREE]
     outside = _outside(there, lower, upper)
     held_back = np.arange(len(there)) % study.fit.hold_out == study.fit.hold_out - 1
-    of = held_back if held_back.any() else np.ones(len(there), dtype=bool)
-    return Coverage(len(evaluations), len(there), float(np.mean(outside == 0)), float(np.mean(outside[of] == 0)),
-                    float(np.median(upper - lower)), float(np.quantile(outside[of], BAND)))
+    chosen = held_back if held_back.any() else np.ones(len(there), dtype=bool)
+    return Coverage(len(evaluations), len(there), float(np.mean(outside == 0)), float(np.mean(outside[chosen] == 0)),
+                    float(np.median(upper - lower)), float(np.quantile(outside[chosen], BAND)))
 
 
 def _outside(there: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """By how much values miss a band; zero inside it."""
+    """Distance of values from a band; zero inside it."""
     return np.asarray(np.maximum(np.maximum(lower - there, there - upper), 0.0))
 
 
 def error_beyond_spread(study: Study, references: Mapping[str, ReferenceData]) -> float:
-    """By how much a band is to be wider on each side for `BAND` of new rows to lie in it [m per domain's width from the original].
+    """How much wider on each side a band must be to hold `BAND` of new rows [m per domain's width from the original].
 
-    Split conformal prediction (Lei et al. 2018), the score being what a row misses the band by over its distance; each file counts alike.
+    Split conformal prediction (Lei et al. 2018), with a row's distance from the band over its `distance` as score; files weigh alike.
     """
     bare = msgspec.structs.replace(study, model_error={})
     scores, weights = [], []
     for data in references.values():
-        away, there = distance(study, data.settings), data.metrics[SAFETY_DEGREE]
-        counts = (away > 0) & np.isfinite(there)
-        if counts.any():
-            lower, upper = band_of(bare, evaluations_of_sets(bare, data.settings[counts]))
-            scores.append(_outside(there[counts], lower, upper) / away[counts])
+        distances, there = distance(study, data.settings), data.metrics[SAFETY_DEGREE]
+        used = (distances > 0) & np.isfinite(there)
+        if used.any():
+            lower, upper = band_of(bare, evaluations_of_sets(bare, data.settings[used]))
+            scores.append(_outside(there[used], lower, upper) / distances[used])
             weights.append(np.full(len(scores[-1]), 1 / len(scores[-1])))
     if not scores:
         return 0.0
-    every = np.concatenate(scores)
-    share = min(1.0, BAND * (1 + 1 / len(every)))  # a new row is one more among them
-    return float(np.quantile(every, share, weights=np.concatenate(weights), method="inverted_cdf"))
+    all_scores = np.concatenate(scores)
+    share = min(1.0, BAND * (1 + 1 / len(all_scores)))  # the new row counts too
+    return float(np.quantile(all_scores, share, weights=np.concatenate(weights), method="inverted_cdf"))

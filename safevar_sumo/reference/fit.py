@@ -1,4 +1,4 @@
-"""What a study's disagreement with its references costs; see `FitTable`."""
+"""The cost of a study's disagreement with its references (see `FitTable`), and searches for the lowest cost."""
 
 from __future__ import annotations
 
@@ -9,39 +9,39 @@ import numpy as np
 
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.reference.effects import effects_apart
+from safevar_sumo.reference.effects import effect_differences
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.reference.validation import Agreement
 from safevar_sumo.study import SAFETY_DEGREE, FitTable, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
-LARGEST = 1e5
-"""Of what a reference can cost; that of a study which cannot be simulated at all."""
-FARTHEST = 10.0
-"""Tolerances beyond which the original vehicle's miss costs no more: a value that there is not is so far away."""
+MAX_COST = 1e5
+"""Largest cost of a reference; also the cost of a study that cannot be simulated."""
+MAX_DEVIATION = 10.0
+"""Largest deviation of the original vehicle's values [tolerances]; also that of an undefined value."""
 
 
 def original_cost(original: Evaluations, published: Mapping[str, float], fit: FitTable) -> float:
-    """Misses of the original vehicle's values, weighted by metric; mean.
+    """Mean deviation of the original vehicle's values from the published ones, weighted by metric.
 
-    Squared up to the tolerance and in proportion beyond it (Huber 1964): squares would have a search fit one vehicle first, and
-    the rows only as far as that leaves it room.
+    Deviations are squared up to the tolerance and linear beyond it (Huber 1964): with squares alone a search would fit this one
+    vehicle first, and the rows only as far as that allows.
     """
-    misses = [fit.weights.get(name, 0.0) * _huber(original.metrics[name][0] / value - 1, fit.tolerance)
-              for name, value in published.items() if name in METRICS]
-    return fit.original * float(np.mean(misses)) if misses else 0.0
+    deviations = [fit.weights.get(name, 0.0) * _huber(original.metrics[name][0] / value - 1, fit.tolerance)
+                  for name, value in published.items() if name in METRICS]
+    return fit.original * float(np.mean(deviations)) if deviations else 0.0
 
 
-def _huber(miss: float, tolerance: float) -> float:
-    """A relative miss in tolerances, squared up to one; twice as much, less one, beyond."""
-    distance = min(abs(miss) / tolerance, FARTHEST) if np.isfinite(miss) else FARTHEST
-    return distance * distance if distance <= 1 else 2 * distance - 1
+def _huber(deviation: float, tolerance: float) -> float:
+    """Huber's loss of a relative deviation, x tolerances large: x^2 up to 1, 2 x - 1 beyond."""
+    x = min(abs(deviation) / tolerance, MAX_DEVIATION) if np.isfinite(deviation) else MAX_DEVIATION
+    return x * x if x <= 1 else 2 * x - 1
 
 
 def reference_cost(result: Agreement, data: ReferenceData, here: Evaluations, study: Study) -> float:
-    """Lost rank correlation and absolute error, weighted by metric, differences of effects, and collisions.
+    """The cost of lost rank correlation and absolute errors, weighted by metric, of differing effects and of differing collisions.
 
-    Errors count in standard deviations of repeats of one setting there; where these are not known, in those of the reference.
+    Errors are in standard deviations of repeats of one setting in the reference, or, if unknown, of the reference's values.
     """
     fit, cost = study.fit, 0.0
     for name, weight in fit.weights.items():
@@ -52,11 +52,11 @@ def reference_cost(result: Agreement, data: ReferenceData, here: Evaluations, st
         unit = study.repeatability.get(name) or float(np.std(values))
         cost += weight * (fit.rank * (1 - (rho or 0.0)) + (np.inf if error is None else error) / unit)
         if name == SAFETY_DEGREE and fit.effects:
-            apart = effects_apart(data, here, CharacteristicSet.of(study.vehicle.characteristics))
-            cost += fit.effects * float(np.mean(np.abs(apart))) / unit
+            differences = effect_differences(data, here, CharacteristicSet.of(study.vehicle.characteristics))
+            cost += fit.effects * float(np.mean(np.abs(differences))) / unit
     collisions = result.collisions
-    missed = collisions["reference"] + collisions["here"] - 2 * collisions["both"]
-    return min(cost, LARGEST) + fit.collisions * missed / max(result.rows, 1)
+    differing = collisions["reference"] + collisions["here"] - 2 * collisions["both"]
+    return min(cost, MAX_COST) + fit.collisions * differing / max(result.rows, 1)
 
 
 Together = tuple[Study, ...]
@@ -64,44 +64,42 @@ Together = tuple[Study, ...]
 
 
 class Trial(Protocol):
-    """What is tried: studies that are fitted together, by their place in the unit cube of the bounds, and what they cost."""
+    """Studies that are fitted together, by their place in the unit cube of the bounds, and their costs."""
 
     def at(self, shares: FloatArray) -> Together: ...
 
-    def costs(self, tried: Sequence[Together]) -> list[float]: ...
+    def costs(self, studies: Sequence[Together]) -> list[float]: ...
 
 
-NOTED = 1.25
-"""Times the lowest cost up to which a trial is kept: what profiles and the spread are made of."""
-
-
+KEPT_COST = 1.25
+"""Trials up to this multiple of the lowest cost are kept, for profiles and the spread."""
 SCREENING = 4
-"""Screening takes one trial in so many at most."""
+"""Screening takes at most one in this number of trials."""
 
 
 class Search:
-    """Keeps the best of all that are tried, and count of the trials that are left.
+    """Keeps the best studies of all trials, and counts the trials left.
 
     Parameters
     ----------
     population
         Trials in a generation.
     done
-        Is called after every trial with the lowest cost so far, and the studies that have it.
+        Called after every trial with the lowest cost so far, and the studies that have it.
     alike
-        Share of the lowest cost within which trials fit as well.
+        Trials whose cost exceeds the lowest by at most this share of it fit as well as the best.
     """
 
     def __init__(self, trial: Trial, population: int, trials: int, done: Callable[[float, Together], None], alike: float = 0.0) -> None:
         self.alike = alike
         self.best: Together | None = None
         self.cost, self.left = np.inf, trials
-        self.seen: list[tuple[float, FloatArray]] = []
-        """Costs and places of what was tried and came to no more than `NOTED` times the lowest cost until then."""
+        self.kept: list[tuple[float, FloatArray]] = []
+        """Costs and places of the trials that cost at most `KEPT_COST` times the lowest cost until then."""
         self.trial, self.population, self._done = trial, population, done
 
-    def tried(self, studies: Sequence[Together]) -> list[float]:
-        """What studies cost."""
+    def try_studies(self, studies: Sequence[Together]) -> list[float]:
+        """The costs of studies, a trial each."""
         costs = self.trial.costs(studies)
         self.left -= len(costs)
         for together, cost in zip(studies, costs, strict=True):
@@ -110,28 +108,28 @@ class Search:
             self._done(self.cost, self.best)
         return costs
 
-    def begun(self, place: FloatArray, spread: float, seed: int) -> OneSearch:
+    def begin(self, place: FloatArray, spread: float, seed: int) -> OneSearch:
         """A search from a place in the unit cube, `spread` wide at first (standard deviation)."""
         return OneSearch(self, place, spread, seed)
 
     def from_random_places(self, same: Sequence[int], starts: int, screened: int, spread: float,
                            rng: np.random.Generator) -> list[OneSearch]:
-        """Searches from random places, or from the best of `screened` ones, on which a share of the trials at most is spent.
+        """Searches from random places, or from the best of `screened` random places; `SCREENING` limits their number.
 
-        Each parameter begins at the same share of its bounds as the one whose number `same` says.
+        Parameter i starts at the same share of its bounds as parameter `same[i]`.
         """
         screened = min(screened, self.left // SCREENING) if starts else 0
         if screened < max(starts, 1):
-            return [self.begun(rng.random(len(same))[same], spread, int(rng.integers(1, 2**31))) for _ in range(starts)]
+            return [self.begin(rng.random(len(same))[same], spread, int(rng.integers(1, 2**31))) for _ in range(starts)]
         places = rng.random((screened, len(same)))[:, same]
         costs = [cost for k in range(0, screened, self.population)
-                 for cost in self.tried([self.trial.at(place) for place in places[k:k + self.population]])]
-        return [self.begun(places[k], spread, int(rng.integers(1, 2**31))) for k in np.argsort(costs, kind="stable")[:starts]]
+                 for cost in self.try_studies([self.trial.at(place) for place in places[k:k + self.population]])]
+        return [self.begin(places[k], spread, int(rng.integers(1, 2**31))) for k in np.argsort(costs, kind="stable")[:starts]]
 
     def race(self, searches: Sequence[OneSearch]) -> None:
-        """Successive halving (Jamieson and Talwalkar 2016) of all trials that are left.
+        """Spend all trials left by successive halving (Jamieson and Talwalkar 2016).
 
-        Rounds have as many trials each, shared by half as many searches each time; the last has one, and what is left over.
+        All rounds have the same number of trials, and each has half as many searches as the one before; the last search gets the remainder.
         """
         racing = list(searches)
         rounds = 1 + (len(racing) - 1).bit_length()
@@ -139,28 +137,28 @@ class Search:
         for _ in range(rounds):
             each = share // len(racing)
             for one in racing:
-                one.go_on(each - each % self.population if each > self.population else each)
+                one.advance(each - each % self.population if each > self.population else each)
             racing = sorted(racing, key=lambda one: one.lowest)[:(len(racing) + 1) // 2]
-        racing[0].go_on(self.left)
+        racing[0].advance(self.left)
 
 
 class OneSearch:
-    """CMA-ES (Hansen 2016) from one place; `lowest` is the least that it has found to cost."""
+    """CMA-ES (Hansen 2016) from one place; `lowest` is its lowest cost so far."""
 
     def __init__(self, search: Search, place: FloatArray, spread: float, seed: int) -> None:
-        import cma  # only here: it takes longer to load than all the rest
+        import cma  # takes longer to load than all the rest
 
         self._search, self.lowest = search, np.inf
         self._strategy: Any = cma.CMAEvolutionStrategy(place, spread, {
             "bounds": [0, 1], "seed": seed, "verbose": -9, "popsize": search.population, "maxstd": np.inf})
 
-    def go_on(self, trials: int) -> None:
-        """Generation after generation; nothing is learnt from a last one that is cut short."""
+    def advance(self, trials: int) -> None:
+        """Run generations; CMA-ES does not learn from a last generation that is cut short."""
         search = self._search
         for left in range(trials, 0, -search.population):
             shares = self._strategy.ask()
-            costs = search.tried([search.trial.at(share) for share in shares[:left]])
-            search.seen += [(cost, share) for cost, share in zip(costs, shares, strict=False) if cost <= NOTED * search.cost]
+            costs = search.try_studies([search.trial.at(share) for share in shares[:left]])
+            search.kept += [(cost, share) for cost, share in zip(costs, shares, strict=False) if cost <= KEPT_COST * search.cost]
             self.lowest = min(self.lowest, min(costs))
             if len(costs) == len(shares):
                 self._strategy.tell(shares, costs)

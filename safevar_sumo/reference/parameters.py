@@ -1,4 +1,4 @@
-"""Free parameters of studies, one's own or shared by several studies that are fitted together."""
+"""Free parameters of studies that are fitted together: a study's own, or shared by several."""
 
 from __future__ import annotations
 
@@ -12,45 +12,45 @@ from safevar_sumo.sumo.system import models_of
 
 
 class Free(NamedTuple):
-    """A free parameter: its key, the numbers of the studies that take its value, and its bounds."""
+    """A free parameter: its key, the indices of the studies that take its value, and its bounds."""
 
     key: str
     studies: tuple[int, ...]
     bounds: FreeParameter
 
     def label(self, studies: Sequence[Study]) -> str:
-        """Its key; with the study's name where only one of several takes it."""
+        """The key; after the names of its studies if not all of them share it."""
         return self.key if len(self.studies) == len(studies) else f"{', '.join(studies[k].name for k in self.studies)}: {self.key}"
 
 
 def free_parameters(studies: Sequence[Study]) -> list[Free]:
-    """What is free in some studies that are fitted together.
+    """The free parameters of studies that are fitted together.
 
-    A parameter is shared by all studies that give it the same value now, unless a study's table says that it is its `own`. What the
-    others give another value, or do not give at all, they keep.
+    All studies that give a parameter the same value share it, except a study whose table marks it as `own`. A study that gives it
+    another value, or none, does not take part.
 
     Raises
     ------
     InputError
-        If a study declares something that cannot be fitted, or its value is outside its bounds.
+        If a declared parameter cannot be fitted, or its value is outside its bounds.
     """
     free: list[Free] = []
-    for number, study in enumerate(studies):
+    for index, study in enumerate(studies):
         for key, bounds in study.calibration.items():
-            if any(key == one.key and number in one.studies for one in free):
+            if any(key == one.key and index in one.studies for one in free):
                 continue
             value = value_of(study, key)
             if not bounds.lower <= value <= bounds.upper:
                 legal = f"a value in its bounds, [{bounds.lower:g}, {bounds.upper:g}]"
                 raise InputError(study.source, f"{key} = {value}", legal)
             check_bounds(study, key, bounds)
-            others = () if bounds.own else (k for k, other in enumerate(studies) if k > number and _shares(other, key, value))
-            free.append(Free(key, (number, *others), bounds))
+            others = () if bounds.own else (k for k, other in enumerate(studies) if k > index and _shares(other, key, value))
+            free.append(Free(key, (index, *others), bounds))
     return free
 
 
 def _shares(study: Study, key: str, value: float) -> bool:
-    """Whether a study takes the value that another one gives a parameter."""
+    """Whether a study shares a parameter to which another study gives `value`."""
     declared = study.calibration.get(key)
     if declared is not None and declared.own:
         return False
@@ -61,7 +61,7 @@ def _shares(study: Study, key: str, value: float) -> bool:
 
 
 def check_bounds(study: Study, name: str, bounds: FreeParameter) -> None:
-    """A search goes as far as its bounds: the models must take them."""
+    """Refuse bounds that the models do not accept: a search goes that far."""
     if bounds.log and bounds.lower <= 0:
         raise InputError(study.source, f"calibration.{name!r} has log = true and lower = {bounds.lower:g}",
                          "a lower bound above 0")

@@ -1,4 +1,4 @@
-"""What the data does not tell of parameters: profiles of the loss over a search's trials, and sets of values that fit as well."""
+"""Uncertainty of fitted parameters: profiles of the loss over a search's trials, and sets of values that fit as well."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from safevar_sumo.reference.parameters import Free
 from safevar_sumo.study import Study
 
 SETS = 20
-"""Sets of values in a spread, at the most, the best among them."""
+"""Maximum number of sets of values in a spread, including the best."""
 DIGITS = 6
 """Significant digits of a spread's values."""
 
@@ -34,9 +34,9 @@ class Profiles(NamedTuple):
     free
         The parameters.
     costs, values
-        Of the trials that came near the lowest cost, shape (K,), and their values, shape (K, parameters); the best first.
+        Costs of the trials near the lowest cost, shape (K,), and their values, shape (K, parameters); the best first.
     sets
-        Rows of up to `SETS` trials that fit as well as the best and are as far apart as can be; the best first.
+        Rows of up to `SETS` trials that fit as well as the best and are as far apart as possible; the best first.
     limit
         The cost up to which a trial fits as well.
     """
@@ -49,9 +49,9 @@ class Profiles(NamedTuple):
 
     @classmethod
     def of(cls, free: Sequence[Free], places: Places, search: Search, best: FloatArray) -> Profiles:
-        """The trials of a search that is over, and where the best of them lies."""
+        """The profiles of a finished search, whose best trial lies at `best`."""
         limit = search.cost * (1 + search.alike)
-        near = sorted((one for one in search.seen if search.cost < one[0]), key=lambda one: one[0])
+        near = sorted((one for one in search.kept if search.cost < one[0]), key=lambda one: one[0])
         costs = np.array([search.cost, *(cost for cost, _ in near)])
         shares = np.array([best, *(share for _, share in near)])
         return cls(free, costs, places.values(shares), _apart(shares[costs <= limit]), limit)
@@ -68,7 +68,7 @@ class Profiles(NamedTuple):
 
 
 def _apart(shares: FloatArray) -> list[int]:
-    """Rows that are as far apart as can be, one after the other, the first one first (farthest-point sampling)."""
+    """Rows that are as far apart as possible, beginning with the first (farthest-point sampling)."""
     chosen = [0]
     nearest = np.linalg.norm(shares - shares[0], axis=1)
     while len(chosen) < min(SETS, len(shares)) and nearest.max() > 0:

@@ -36,8 +36,8 @@ NEIGHBOURS = 5
 class Nearness(NamedTuple):
     """Solutions of one algorithm and the published rows nearest to each.
 
-    Distances are Euclidean in widths of the domains, medians over the five nearest: of the solutions to published rows, and of
-    published rows to each other. Safety degrees are means [m, -m/s]; `also_collide` is the share of collisions among the rows
+    Distances are Euclidean in widths of the domains, medians over the five nearest: `distance` from solutions to
+    published rows, `distance_there` between published rows. Safety degrees are means [m, -m/s]; `also_collide` is the share of collisions among the rows
     next to solutions that collide.
     """
 
@@ -53,13 +53,13 @@ class Nearness(NamedTuple):
 
 
 def nearness(case: Case, references: Sequence[ReferenceData]) -> list[Nearness]:
-    """For each algorithm its solutions beside the nearest rows of the references, which are of this study's vehicle."""
+    """Compare each algorithm's solutions with the nearest rows of the references, which must have the study's vehicle."""
     domains = case.characteristics
     width = domains.upper - domains.lower
     rows = np.concatenate([data.settings for data in references]) / width
     safety = np.concatenate([data.metrics[SAFETY_DEGREE] for data in references])
     tree, number = scipy.spatial.cKDTree(rows), min(NEIGHBOURS, len(rows))
-    among = tree.query(rows, number + 1)[0][:, 1:] if len(rows) > number else np.full((1, 1), np.nan)
+    between = tree.query(rows, number + 1)[0][:, 1:] if len(rows) > number else np.full((1, 1), np.nan)
     near = []
     for algorithm in case.algorithms:
         solutions = case.solutions_of(algorithm)
@@ -69,25 +69,25 @@ def nearness(case: Case, references: Sequence[ReferenceData]) -> list[Nearness]:
         distance, nearest = (np.reshape(part, (len(places), number)) for part in tree.query(places, number))
         hit = collided(solutions).to_numpy()
         near.append(Nearness(
-            case.name, algorithm, len(solutions), float(np.median(distance)), float(np.median(among)),
+            case.name, algorithm, len(solutions), float(np.median(distance)), float(np.median(between)),
             float(np.nanmean(solutions[SAFETY_DEGREE])), float(safety[nearest].mean()), int(hit.sum()),
             float((safety[nearest[hit]] <= 0).mean()) if hit.any() else None))
     return near
 
 
-COUNTED = {HOLDS: "hold", DIRECTION: "hold in direction", DIFFERS: "differ", OPEN: "cannot be told"}
+COUNTED = {HOLDS: "hold", DIRECTION: "hold in direction", DIFFERS: "differ", OPEN: "cannot be decided"}
 TITLES = {
     "rq1": "RQ1: solutions against the original vehicle", "rq2": "RQ2: NSGA-II against the others",
     "rq3.1": "RQ3.1: how many characteristics are changed [% of the critical solutions]",
     "rq3.2": "RQ3.2: which characteristics are changed [% of the critical solutions]", "rq3.3": "RQ3.3: how large the changes are",
-    "rq3.3-safety": "RQ3.3: what they do to safety", "collisions": "Collisions", "combinations": "Four changed together",
+    "rq3.3-safety": "RQ3.3: how the changes affect safety", "collisions": "Collisions", "combinations": "Four changed together",
     "weather": "One weather against another"}
 
 NOT_COMPARED = "; RQ2, RQ3 and the weathers need them and are not compared"
 
 
 def replication(pairs: Pairs, near: Sequence[Nearness]) -> str:
-    """The whole page."""
+    """The page, as Markdown."""
     tables = tables_beside(pairs)
     verdicts = conclusions(tables)
     parts = [_head(pairs, verdicts), _conclusions(verdicts)]
@@ -119,7 +119,7 @@ def _solutions(frame: pd.DataFrame) -> str:
 
 def _conclusions(verdicts: Sequence[Conclusion]) -> str:
     rows = [(one.question, one.setting, one.words, f"*{one.verdict}*", one.why) for one in verdicts]
-    return "\n".join(["## Conclusions", "", "What the published results say, and whether it holds here. The rules:", "",
+    return "\n".join(["## Conclusions", "", "Conclusions of the published results, and whether they hold here. The rules:", "",
                       *(f"- {rule}" for rule in RULES), "",
                       _markdown(("question", "setting", "published conclusion", "here", "why"), rows), ""])
 
@@ -131,7 +131,7 @@ def _nearest_rows(near: Sequence[Nearness]) -> str:
              "mean SD there", "collisions here", "published rows next to them that collide [%]")
     return "\n".join([
         "## Does the search exploit the model?", "",
-        f"The {NEIGHBOURS} published rows nearest to each solution, distances in widths of the domains (median). If the search found "
+        f"Each solution beside its {NEIGHBOURS} nearest published rows; distances are medians, in widths of the domains. If the search found "
         "holes in the model, the published rows next to its solutions would be as safe as others.", "", _markdown(heads, rows), ""])
 
 

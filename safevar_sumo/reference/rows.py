@@ -1,4 +1,4 @@
-"""The published package's CSV format: settings before the filter, with what the reference simulators measured.
+"""The published package's CSV format: settings before the filter, with the reference simulators' measurements.
 
 One row is one solution: the characteristics, then `MaxPercentage`, `SaftyDegree` (sic), `numbers`, `TIT`, `TET` and,
 in most files, `Dece`. There is no run column.
@@ -28,9 +28,9 @@ from safevar_sumo.vehicles import CharacteristicSet
 COLUMNS = {SAFETY_DEGREE: "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
 OPTIONAL = "ave_dece"
 ALIASES = {"dampratezeroce": "dampratezerotce", "dampratezerocd": "dampratezerotcd", "wheelradius": "radius"}
-"""Names of characteristics in the package's files that are not those of its paper, without case and underscores."""
+"""Characteristics whose names in the package's files differ from its paper's; in lower case, without underscores."""
 SHARE_DECIMALS = 3
-"""The package rounds a change's share of the domain before it compares it with beta."""
+"""Decimals to which the package rounds a change's share of the domain before comparing the share with beta."""
 
 
 class ReferenceData(NamedTuple):
@@ -43,7 +43,7 @@ class ReferenceData(NamedTuple):
     metrics
         Name -> values, shape (M,); NaN where undefined: TET and TIT of a collision, a column that is missing.
     skipped
-        How many rows had a value outside its domain and were left out.
+        Number of rows left out because a value was outside its domain.
     fingerprint
         SHA-256 of the file's bytes.
     """
@@ -68,16 +68,16 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     Raises
     ------
     InputError
-        If it cannot be read, lacks a column or a row, or holds a cell that is no number; names file, row and column.
+        If the file cannot be read, lacks a column or a row, or has a cell that is not a number; names file, row and column.
     """
     content = _content(path)
     table = _table(path, content)
     columns = _characteristic_columns(path, table, characteristics)
-    wanted = [*columns, *(column for name, column in COLUMNS.items() if name != OPTIONAL or column in table)]
-    missing = [column for column in wanted if column not in table]
+    required = [*columns, *(column for name, column in COLUMNS.items() if name != OPTIONAL or column in table)]
+    missing = [column for column in required if column not in table]
     if missing:
         raise InputError(path, f"lacks the columns {', '.join(missing)}", "the format of the published package")
-    numbers = {column: _numbers(path, table, column) for column in wanted}
+    numbers = {column: _numbers(path, table, column) for column in required}
     settings = np.stack([numbers[column] for column in columns], axis=1)
     inside = np.all((settings >= characteristics.lower) & (settings <= characteristics.upper), axis=1)
     if not inside.any():
@@ -92,14 +92,14 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
 
 
 def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> FloatArray:
-    """The filter as the package has it: at least beta, of a share that is rounded to three decimals."""
+    """The package's filter: it keeps a change whose share of the domain, rounded to three decimals, is at least beta."""
     width = characteristics.upper - characteristics.lower
     share = np.round(np.abs(settings - characteristics.original) / width, SHARE_DECIMALS)
     return np.where(share >= characteristics.threshold / width - 1e-12, settings, characteristics.original)
 
 
 def _content(path: Path) -> bytes:
-    """A file's bytes, read once: what comes through a pipe cannot be read again."""
+    """A file's bytes, read once, for a pipe cannot be read again."""
     try:
         refuse_other_than_file(path, streams=True)
         with open(path, "rb") as file:
@@ -109,11 +109,11 @@ def _content(path: Path) -> bytes:
 
 
 def _table(path: Path, content: bytes) -> pd.DataFrame:
-    """Its rows as they stand there, by their line less two; lines without anything are none."""
+    """The file's rows as text, without empty lines; the index is the line number minus two."""
     try:
         text = content.decode("utf-8-sig")
         header = [name.strip() for name in next(csv.reader(io.StringIO(text, newline="")), [])]
-        twice = [name for name, number in Counter(header).items() if number > 1]
+        duplicates = [name for name, number in Counter(header).items() if number > 1]
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
             table = pd.read_csv(io.StringIO(text, newline=""), dtype=str, skipinitialspace=True, index_col=False, na_filter=False,
@@ -126,8 +126,8 @@ def _table(path: Path, content: bytes) -> pd.DataFrame:
         raise InputError(path, f"is not CSV: {str(error).splitlines()[0]}", "a CSV file with a header and rows") from None
     table.columns = table.columns.str.strip()
     table = table[(table != "").any(axis=1)]
-    if twice:
-        raise InputError(path, f"has the column {twice[0]!r} twice", "one column of a name")
+    if duplicates:
+        raise InputError(path, f"has the column {duplicates[0]!r} twice", "each column once")
     if len(header) == 1:
         raise InputError(path, f"has one column, {header[0][:40]!r}", "values that are separated by commas")
     if table.empty:
@@ -155,16 +155,16 @@ def _characteristic_columns(path: Path, table: pd.DataFrame, characteristics: Ch
 
 def _numbers(path: Path, table: pd.DataFrame, column: str) -> FloatArray:
     values = pd.to_numeric(table[column], errors="coerce").to_numpy(dtype=float)
-    wrong = np.flatnonzero(~np.isfinite(values))
-    if wrong.size:
-        cell = table[column].iloc[wrong[0]]
-        problem = f"row {table.index[wrong[0]] + 2}, column {column} " + (f"= {cell!r}" if cell.strip() else "is empty")
+    invalid = np.flatnonzero(~np.isfinite(values))
+    if invalid.size:
+        cell = table[column].iloc[invalid[0]]
+        problem = f"row {table.index[invalid[0]] + 2}, column {column} " + (f"= {cell!r}" if cell.strip() else "is empty")
         raise InputError(path, problem, "a finite number")
     return np.asarray(values)
 
 
 SHORT = {short: metric.name for metric in METRICS.values() for short in (metric.name, metric.title.lower())}
-"""What a command calls the metrics."""
+"""Metrics by the names that a command accepts."""
 ORIGINAL_FORM = "sd=NUMBER,tet=NUMBER,tit=NUMBER,ave_dece=NUMBER"
 
 
@@ -177,12 +177,12 @@ def evaluations_of(data: ReferenceData, characteristics: CharacteristicSet) -> E
 
 
 def original_metrics(given: str | None, published: Mapping[str, float]) -> dict[str, float | None]:
-    """The original vehicle's metrics, as given (sd=2.7,tet=1.2,...) or else as published; None where neither tells.
+    """The original vehicle's metrics, as given (sd=2.7,tet=1.2,...) or else as published; None where neither has a value.
 
     Raises
     ------
     InputError
-        If what is given has another form, or nothing tells the safety degree.
+        If `given` has another form, or neither has a safety degree.
     """
     original: dict[str, float | None] = {name: published.get(name) for name in METRICS}
     for part in given.split(",") if given is not None else ():

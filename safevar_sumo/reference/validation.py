@@ -1,4 +1,4 @@
-"""How well simulated settings agree with reference data: numbers, a picture, and the totals that travel with the package."""
+"""Agreement of simulated settings with reference data: numbers, a figure, and the totals that ship with the package."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 BINS = 8
-"""Number of equally full bins of a characteristic's values in the picture."""
+"""Number of bins, with equally many rows, of a characteristic's values in the figure."""
 FLIP = 2.0
-"""Standard deviations of the repeats within which an outcome may turn into the other."""
+"""Repeats may change an outcome whose safety degree is within this many of their standard deviations of a collision."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,25 +39,25 @@ class Agreement:
     Attributes
     ----------
     rows
-        How many settings.
+        Number of settings.
     spearman, mean_absolute_error, bias
         By metric: rank correlation; mean |here - reference| and mean here - reference in the metric's unit.
         TET and TIT over settings without collision on either side.
     collisions
-        How many the reference has, how many are here, how many both have.
+        Number of collisions in the reference, here, and in both.
     original
-        By metric: the original vehicle's value there and here.
+        By metric: the original vehicle's value in the reference and here.
     precision, recall
-        Share of the collisions here that are some there, and the other way round.
+        Share of the collisions here that the reference has too, and of the reference's collisions that happen here too.
     collision_speed
-        Mean over the collisions on both sides, there and here [m/s].
+        Mean over the collisions of both sides, in the reference and here [m/s].
     in_repeats
-        By metric: mean absolute error over the standard deviation of repeats of one setting there.
+        By metric: mean absolute error over the standard deviation of repeats of one setting in the reference.
     undecided
-        How many settings differ in whether they collide, and how many of these are within what repeats differ by: their
-        safety degree there or here is no more than two standard deviations from a collision.
+        Number of settings that collide only in the reference or only here, and how many of these repeats may explain: their
+        safety degree in the reference or here is at most two standard deviations from a collision.
     by_predicted
-        Bins of equally many settings by their safety degree here: its ends, how many settings, and the mean error [m].
+        Bins of equally many settings by their safety degree here: ends, number of settings, and mean error [m].
     """
 
     rows: int
@@ -79,7 +79,7 @@ class Agreement:
 
 
 def agreement(reference: ReferenceData, here: Evaluations, study: Study, original: Evaluations) -> Agreement:
-    """Compare row by row; the study has the original vehicle's reference values and the repeatability, as far as they are known."""
+    """Compare row by row; the original vehicle's reference values and the repeatability are the study's, where it has them."""
     both = {name: _both(reference, here, name) for name in reference.metrics}
     differences = {name: here.metrics[name][rows] - reference.metrics[name][rows] for name, rows in both.items()}
     errors = {name: _mean(np.abs(values)) for name, values in differences.items()}
@@ -103,7 +103,7 @@ def agreement(reference: ReferenceData, here: Evaluations, study: Study, origina
 
 
 def may_be_either(reference: ReferenceData, here: Evaluations, repeatability: float) -> BoolArray:
-    """Which settings collide on one side alone, though repeats of them may do either."""
+    """Which settings collide only in the reference or only here, though repeats of them may do either."""
     nearest = np.minimum(np.abs(reference.metrics[SAFETY_DEGREE]), np.abs(here.f_safe))
     return np.asarray((reference.collided != here.collided) & (nearest <= FLIP * repeatability))
 
@@ -131,8 +131,8 @@ def _bins(values: FloatArray) -> list[npt.NDArray[np.intp]]:
         return []
     edges = np.unique(np.quantile(defined, np.linspace(0, 1, BINS + 1)))
     bin_of = np.where(np.isnan(values), -1, np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0)))
-    filled = [np.flatnonzero(bin_of == i) for i in range(max(len(edges) - 1, 1))]
-    return [rows for rows in filled if rows.size]
+    bins = [np.flatnonzero(bin_of == i) for i in range(max(len(edges) - 1, 1))]
+    return [rows for rows in bins if rows.size]
 
 
 def rank_correlation(one: FloatArray, other: FloatArray) -> float | None:
@@ -155,7 +155,7 @@ def plot_agreement(path: Path, title: str, characteristics: CharacteristicSet, r
                    repeatability: float | None = None) -> None:
     """Draw simulated against reference values, and errors against simulated values; those of the safety degree by characteristic.
 
-    A ring marks a setting whose outcome differs by no more than its repeats do.
+    A ring marks a setting that collides on one side only, though its repeats may do either.
 
     Raises
     ------
@@ -200,10 +200,10 @@ def _scatter(axis: Axes, metric: str, reference: ReferenceData, here: Evaluation
     x, y = reference.metrics[metric][rows], here.metrics[metric][rows]
     axis.scatter(x[~collided], y[~collided], s=6, alpha=0.35, color="#0072b2", linewidths=0, label="no collision")
     if collided.any():
-        axis.scatter(x[collided], y[collided], s=14, alpha=0.7, color="#d55e00", marker="x", linewidths=0.8, label="collision on a side")
+        axis.scatter(x[collided], y[collided], s=14, alpha=0.7, color="#d55e00", marker="x", linewidths=0.8, label="collision, either side")
         if either[rows].any():
             axis.scatter(x[either[rows]], y[either[rows]], s=40, facecolors="none", edgecolors="black", linewidths=0.6,
-                         label="either, in repeats")
+                         label="repeats may do either")
         axis.legend(loc="upper left", fontsize=7, frameon=True)
     if x.size:
         ends = [min(x.min(), y.min()), max(x.max(), y.max())]
@@ -216,13 +216,13 @@ def _scatter(axis: Axes, metric: str, reference: ReferenceData, here: Evaluation
 
 
 def _error_by(axis: Axes, values: FloatArray, error: FloatArray) -> tuple[float, float]:
-    """Mean error and its quartiles over bins of a characteristic; returns the lowest and highest value drawn."""
-    filled = _bins(np.where(np.isnan(error), np.nan, values))
-    if not filled:
+    """Draw the mean error and its quartiles over bins of a characteristic; returns the lowest and highest value drawn."""
+    bins = _bins(np.where(np.isnan(error), np.nan, values))
+    if not bins:
         return 0.0, 0.0
-    centres = np.array([values[rows].mean() for rows in filled])
-    means = np.array([error[rows].mean() for rows in filled])
-    quartiles = np.array([np.quantile(error[rows], [0.25, 0.75]) for rows in filled])
+    centres = np.array([values[rows].mean() for rows in bins])
+    means = np.array([error[rows].mean() for rows in bins])
+    quartiles = np.array([np.quantile(error[rows], [0.25, 0.75]) for rows in bins])
     axis.fill_between(centres, quartiles[:, 0], quartiles[:, 1], color="#0072b2", alpha=0.2, linewidth=0)
     axis.plot(centres, means, marker="o", markersize=3, color="#0072b2")
     axis.axhline(0, color="black", linewidth=0.8, linestyle="--")
@@ -230,9 +230,9 @@ def _error_by(axis: Axes, values: FloatArray, error: FloatArray) -> tuple[float,
 
 
 TOTALS = Path(__file__).with_name("published.toml")
-WHAT = "How well studies agree with published data: totals, no row of it. Each entry by `validate STUDY FILE --totals THIS_FILE`."
+HEADER = "Agreement of studies with published data: totals, no row of it. `validate STUDY FILE --totals THIS_FILE` writes an entry."
 COMPARED = ("scenario", "vehicle", "ads", "weather", "metrics", "step_length", "matrix")
-"""Keys of a study that a simulated setting's metrics depend on."""
+"""Keys of a study on which the metrics of a simulated setting depend."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,13 +242,13 @@ class Totals:
     Attributes
     ----------
     rows
-        How many settings were compared.
+        Number of settings compared.
     spearman
-        Rank correlation by metric, for those that are defined.
+        Rank correlation by metric, where defined.
     mean_absolute_error
         By metric, in its unit.
     reference, here, both
-        How many of the settings collide in the published data, in this simulation, and in both.
+        Number of settings that collide in the published data, in this simulation, and in both.
     """
 
     study: str
@@ -267,13 +267,13 @@ class Totals:
 
     @property
     def precision(self) -> float | None:
-        """Share of the collisions here that are published ones; None if there are none."""
+        """Share of the collisions here that the published data has too; None if there are none."""
         return self.both / self.here if self.here else None
 
 
 def quoted(study: Study) -> list[Totals]:
-    """What is known of a study's agreement with published data: the entries of shipped studies that simulate the same."""
-    names = {name for name in _read(TOTALS) if name in study_names() and _simulates(load_study(name)) == _simulates(study)}
+    """The known agreement of a study with published data: entries of the shipped studies that simulate the same."""
+    names = {name for name in _read(TOTALS) if name in study_names() and _simulation(load_study(name)) == _simulation(study)}
     return [_totals(name, file, entry) for name, files in _read(TOTALS).items() if name in names for file, entry in files.items()]
 
 
@@ -285,11 +285,11 @@ def keep_totals(path: Path, study: Study, file: str, result: Agreement) -> None:
     InputError
         If the file holds something else or cannot be written.
     """
-    kept = _read(path) if path.exists() else {}
+    totals = _read(path) if path.exists() else {}
     entry = {"rows": result.rows, "spearman": _rounded(result.spearman), "mean_absolute_error": _rounded(result.mean_absolute_error),
              "collisions": result.collisions}
-    kept = {**kept, study.name: {**kept.get(study.name, {}), file: entry}}
-    write_whole(path, f"# {WHAT}\n\n{tomli_w.dumps(kept)}")
+    totals = {**totals, study.name: {**totals.get(study.name, {}), file: entry}}
+    write_whole(path, f"# {HEADER}\n\n{tomli_w.dumps(totals)}")
 
 
 def _rounded(values: Mapping[str, float | None]) -> dict[str, float]:
@@ -300,13 +300,13 @@ def _rounded(values: Mapping[str, float | None]) -> dict[str, float]:
 def _read(path: Path) -> dict[str, dict[str, Any]]:
     refuse_other_than_file(path)
     try:
-        kept: dict[str, dict[str, Any]] = tomllib.loads(path.read_text(encoding="utf-8"))
-        for name, files in kept.items():
+        totals: dict[str, dict[str, Any]] = tomllib.loads(path.read_text(encoding="utf-8"))
+        for name, files in totals.items():
             for file, entry in files.items():
                 _totals(name, file, entry)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         raise InputError(path, "holds no totals", "a new file, or one that `validate --totals` has written") from None
-    return kept
+    return totals
 
 
 def _totals(study: str, file: str, entry: Mapping[str, Any]) -> Totals:
@@ -314,6 +314,6 @@ def _totals(study: str, file: str, entry: Mapping[str, Any]) -> Totals:
                   **{name: entry["collisions"][name] for name in ("reference", "here", "both")})
 
 
-def _simulates(study: Study) -> dict[str, Any]:
-    everything = fixed(study)
-    return {name: everything.get(name) for name in COMPARED}
+def _simulation(study: Study) -> dict[str, Any]:
+    keys = fixed(study)
+    return {name: keys.get(name) for name in COMPARED}

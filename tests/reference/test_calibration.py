@@ -197,7 +197,7 @@ class Runner:
     def __init__(self, lowest: float) -> None:
         self.lowest, self.rounds = lowest, list[int]()
 
-    def go_on(self, trials: int) -> None:
+    def advance(self, trials: int) -> None:
         self.rounds.append(trials)
 
 
@@ -224,7 +224,7 @@ def test_searches_begin_at_the_best_of_many_places_with_what_is_the_same_at_one_
 
     bowl = Noted()
     search = Search(bowl, 7, 200, silent)
-    search.from_random_places([0, 1, 0], 2, 80, 1e-9, np.random.default_rng(4))[1].go_on(1)
+    search.from_random_places([0, 1, 0], 2, 80, 1e-9, np.random.default_rng(4))[1].advance(1)
     screened = bowl.places[:-1]
     assert len(screened) == 50, "a quarter of the trials at most"
     assert all(place[2] == place[0] for place in screened)
@@ -251,7 +251,7 @@ def test_the_models_error_covers_nine_tenths_of_rows_each_file_counted_alike(dat
 def test_no_trial_is_lost_and_none_too_many(starts: int, trials: int) -> None:
     bowl, costs = Bowl(), list[float]()
     search = Search(bowl, 6, trials, lambda cost, best: costs.append(cost))
-    searches = [search.begun(np.full(2, 0.9), 0.3, seed) for seed in range(1, starts + 1)]
+    searches = [search.begin(np.full(2, 0.9), 0.3, seed) for seed in range(1, starts + 1)]
     search.race(searches)
     assert bowl.tried == trials == len(costs)
     assert search.left == 0
@@ -260,7 +260,7 @@ def test_no_trial_is_lost_and_none_too_many(starts: int, trials: int) -> None:
 
 def test_a_race_finds_the_bottom_from_whatever_half() -> None:
     search = Search(Bowl(), 8, 1200, silent)
-    search.race([search.begun(np.array([place, 0.9]), 0.1, 3) for place in (0.9, 0.8, 0.1, 0.7)])
+    search.race([search.begin(np.array([place, 0.9]), 0.1, 3) for place in (0.9, 0.8, 0.1, 0.7)])
     assert search.best == pytest.approx([0.2, 0.2], abs=0.01)
 
 
@@ -277,7 +277,7 @@ class Basin(Bowl):
 def test_what_fits_as_well_is_an_interval_and_sets_that_are_far_apart() -> None:
     basin = Basin()
     search = Search(basin, 8, 800, silent, alike=0.04)
-    search.race([search.begun(np.array([place, 0.6]), 0.3, 3) for place in (0.3, 0.5)])
+    search.race([search.begin(np.array([place, 0.6]), 0.3, 3) for place in (0.3, 0.5)])
     assert search.best is not None
     bounds = FreeParameter(lower=0, upper=1, unit="-", meaning="place")
     profiles = Profiles.of([Free("a", (0,), bounds), Free("b", (1,), bounds)], basin, search, np.asarray(search.best))
