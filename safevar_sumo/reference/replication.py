@@ -37,8 +37,8 @@ class Nearness(NamedTuple):
     """Solutions of one algorithm and the published rows nearest to each.
 
     Distances are Euclidean in widths of the domains, medians over the five nearest: `distance` from solutions to
-    published rows, `distance_there` between published rows. Safety degrees are means [m, -m/s]; `also_collide` is the share of collisions among the rows
-    next to solutions that collide.
+    published rows, `distance_there` between published rows. Safety degrees are means [m, -m/s]; `also_collide` is the share of
+    collisions among the rows next to solutions that collide.
     """
 
     setting: str
@@ -131,8 +131,8 @@ def _nearest_rows(near: Sequence[Nearness]) -> str:
              "mean SD there", "collisions here", "published rows next to them that collide [%]")
     return "\n".join([
         "## Does the search exploit the model?", "",
-        f"Each solution beside its {NEIGHBOURS} nearest published rows; distances are medians, in widths of the domains. If the search found "
-        "holes in the model, the published rows next to its solutions would be as safe as others.", "", _markdown(heads, rows), ""])
+        f"Each solution beside its {NEIGHBOURS} nearest published rows; distances are medians, in widths of the domains. If the search "
+        "found holes in the model, the published rows next to its solutions would be as safe as others.", "", _markdown(heads, rows), ""])
 
 
 def _side_by_side(table: Beside) -> str:

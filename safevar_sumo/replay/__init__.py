@@ -1,1 +1,1 @@
-"""What a finding looks like: a changed vehicle beside the original, as figure, as animation and in sumo-gui."""
+"""Show a changed vehicle beside the original: as figure, as animation and in sumo-gui."""

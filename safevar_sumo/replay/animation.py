@@ -1,4 +1,4 @@
-"""A comparison that moves: as a gif, a film, or a page that plays in a browser; and the pictures of pixels that these are made of."""
+"""A comparison as an animation: gif, mp4 or HTML page; and the frames of gif and mp4."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ if TYPE_CHECKING:
 Points = list[tuple[float, float]]
 
 WIDTH = 880
-"""Of a picture [pixels]."""
-FINER = 2
-"""Factor by which pictures are drawn larger and then reduced, for smooth edges."""
+"""Width of a frame [pixels]."""
+OVERSAMPLING = 2
+"""Frames are drawn larger by this factor and then reduced, for smooth edges."""
 COLUMNS = (164, 250, 340, 450)
-"""Left edges of the words [pixels]."""
+"""Left edges of the columns of text [pixels]."""
 PANEL = 62
-"""Height of the words above the road [pixels]."""
+"""Height of the text above the road [pixels]."""
 GROUND, ROAD, SEAM, PATH, WHITE, INK, FAINT = "#eef0ec", "#9aa1a9", "#e8eaec", "#cfd3cf", "#ffffff", "#1d2329", "#5d666f"
 VEHICLES = {ORIGINAL: "#0072b2", CHANGED: "#d55e00"}
 OTHER, PERSON, BRAKE = "#3f464d", "#1d2329", "#e60000"
 STRIPE = 0.5
-"""Length of a crossing's stripe and of the space between two [m]."""
+"""Length of a crossing's stripes, and of the space between them [m]."""
 
 
-def pictures(scene: FlatScene, stride: int) -> Iterator[Image]:
-    """Every `stride`-th sample of a scene, and the last one."""
+def frames_of(scene: FlatScene, stride: int) -> Iterator[Image]:
+    """Pictures of every `stride`-th sample of a scene, and of the last one."""
     canvas = _Canvas(scene)
     for sample in [*range(0, scene.length - 1, stride), scene.length - 1]:
         yield canvas.picture(sample)
@@ -50,8 +50,9 @@ class _Canvas:
     """Draws the samples of one scene."""
 
     def __init__(self, scene: FlatScene) -> None:
-        self._scene, self._scale = scene, FINER * WIDTH / scene.view.width
-        self._size = (FINER * WIDTH, FINER * PANEL + round(self._scale * scene.view.height / 2 / FINER) * 2 * FINER)
+        self._scene, self._scale = scene, OVERSAMPLING * WIDTH / scene.view.width
+        height = round(self._scale * scene.view.height / 2 / OVERSAMPLING) * 2 * OVERSAMPLING
+        self._size = (OVERSAMPLING * WIDTH, OVERSAMPLING * PANEL + height)
 
     def picture(self, sample: int) -> Image:
         from PIL import Image, ImageDraw
@@ -62,30 +63,30 @@ class _Canvas:
             for lane in self._scene.road:
                 if lane.kind == kind:
                     self._lane(draw, lane, sample)
-        there = [body for body in self._scene.bodies if not np.isnan(body.x[sample])]
-        for body in sorted(there, key=lambda one: (one.is_vut, one.row)):
+        present = [body for body in self._scene.bodies if not np.isnan(body.x[sample])]
+        for body in sorted(present, key=lambda body: (body.is_vut, body.row)):
             self._body(draw, body, sample)
-        for body in there:
-            if body.is_vut and body.row == ORIGINAL:  # once more, over a changed vehicle that hides it
-                draw.polygon(self._pixels(body.corners(sample), sample), outline=VEHICLES[ORIGINAL], width=2 * FINER)
+        for body in present:
+            if body.is_vut and body.row == ORIGINAL:  # its outline again, over a changed vehicle that hides it
+                draw.polygon(self._pixels(body.corners(sample), sample), outline=VEHICLES[ORIGINAL], width=2 * OVERSAMPLING)
         self._scale_marks(draw, sample)
-        draw.rectangle((0, 0, self._size[0], FINER * PANEL), fill=WHITE)
+        draw.rectangle((0, 0, self._size[0], OVERSAMPLING * PANEL), fill=WHITE)
         self._words(draw, sample)
-        return image.resize((WIDTH, self._size[1] // FINER), Image.Resampling.BOX)
+        return image.resize((WIDTH, self._size[1] // OVERSAMPLING), Image.Resampling.BOX)
 
     def _pixels(self, points: FloatArray, sample: int) -> Points:
         view = self._scene.view
-        grid = FINER / self._scale  # a following camera moves by whole pixels: what stands still stays as sharp as it is
+        grid = OVERSAMPLING / self._scale  # a following camera moves by whole pixels, so that the road stays sharp
         x, y = points[:, 0] - np.round(view.left[sample] / grid) * grid, points[:, 1] - view.bottom
         return list(zip((x * self._scale).tolist(), (self._size[1] - y * self._scale).tolist(), strict=True))
 
     def _scale_marks(self, draw: ImageDraw, sample: int) -> None:
-        """A mark at every ten metres from where the front bumper sets off."""
+        """Draw a mark every ten metres from where the front bumper starts."""
         view = self._scene.view
-        for mark in self._scene.tens(sample):
+        for mark in self._scene.marks(sample):
             (x, y), = self._pixels(np.array([[mark, view.bottom]]), sample)
-            draw.line((x, y - 12 * FINER, x, y), fill=FAINT, width=FINER)
-            self._word(draw, (round(x / FINER) + 4, round(y / FINER) - 16), f"{mark:g} m", FAINT, 12)
+            draw.line((x, y - 12 * OVERSAMPLING, x, y), fill=FAINT, width=OVERSAMPLING)
+            self._word(draw, (round(x / OVERSAMPLING) + 4, round(y / OVERSAMPLING) - 16), f"{mark:g} m", FAINT, 12)
 
     def _lane(self, draw: ImageDraw, lane: Lane, sample: int) -> None:
         if lane.kind == "area":
@@ -107,12 +108,12 @@ class _Canvas:
         if body.is_person:
             radius = max(body.length, body.width) / 2 * self._scale
             (x, y), = self._pixels(np.array([[body.x[sample], body.y[sample]]]), sample)
-            draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=PERSON, outline=WHITE, width=FINER)
+            draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=PERSON, outline=WHITE, width=OVERSAMPLING)
             return
         colour = VEHICLES[body.row] if body.is_vut else OTHER
         corners = body.corners(sample)
-        see_through = "99" if body.is_vut and body.row == ORIGINAL and len(self._scene.moments) > 1 else "e6"
-        draw.polygon(self._pixels(corners, sample), fill=colour + see_through, outline=colour, width=2 * FINER)
+        opacity = "99" if body.is_vut and body.row == ORIGINAL and len(self._scene.moments) > 1 else "e6"
+        draw.polygon(self._pixels(corners, sample), fill=colour + opacity, outline=colour, width=2 * OVERSAMPLING)
         window = corners[[0, 1]] * [[0.72], [0.72]] + corners[[3, 2]] * 0.28
         back = corners[[0, 1]] * 0.56 + corners[[3, 2]] * 0.44
         draw.polygon(self._pixels(np.concatenate([window, back[::-1]]), sample), fill="#ffffff90")
@@ -128,17 +129,17 @@ class _Canvas:
         return bool(trace.brake[min(sample, self._scene.moments[row].end), row] > 0)
 
     def _words(self, draw: ImageDraw, sample: int) -> None:
-        """Time, and for each vehicle its speed and distance, and at last how it ended."""
+        """Draw the time and, for each vehicle, its speed, its gap and, at the end, its outcome."""
         trace = self._scene.comparison.film.drives.trace
         self._word(draw, (12, 14), f"{sample * self._scene.step:.2f} s", INK, 26)
         for row in self._scene.comparison.rows:
-            ended = self._scene.moments[row]
-            at = min(sample, ended.end)
+            moments = self._scene.moments[row]
+            at = min(sample, moments.end)
             gap = trace.gap[at, row]
-            over = sample >= (ended.end if ended.nearest is None else ended.nearest)
-            state = self._scene.comparison.verdict(row) if over else "brakes" if self._brakes(row, at) else ""
+            finished = sample >= (moments.end if moments.nearest is None else moments.nearest)
+            state = self._scene.comparison.verdict(row) if finished else "brakes" if self._brakes(row, at) else ""
             y = 8 + 26 * row
-            draw.rectangle((FINER * 132, FINER * (y + 3), FINER * 154, FINER * (y + 17)), fill=VEHICLES[row])
+            draw.rectangle((OVERSAMPLING * 132, OVERSAMPLING * (y + 3), OVERSAMPLING * 154, OVERSAMPLING * (y + 17)), fill=VEHICLES[row])
             gap_text = f"gap {max(gap, 0):.1f} m" if np.isfinite(gap) else ""
             words = (self._scene.comparison.name(row), f"{trace.speed[at, row]:.1f} m/s", gap_text, state)
             for x, word in zip(COLUMNS, words, strict=True):
@@ -147,7 +148,7 @@ class _Canvas:
     def _word(self, draw: ImageDraw, place: tuple[int, int], text: str, colour: str, size: int) -> None:
         from PIL import ImageFont
 
-        draw.text((FINER * place[0], FINER * place[1]), text, fill=colour, font=ImageFont.load_default(FINER * size))
+        draw.text((OVERSAMPLING * place[0], OVERSAMPLING * place[1]), text, fill=colour, font=ImageFont.load_default(OVERSAMPLING * size))
 
 
 def quad(start: FloatArray, end: FloatArray, width: float) -> FloatArray:
@@ -158,28 +159,29 @@ def quad(start: FloatArray, end: FloatArray, width: float) -> FloatArray:
 
 
 def stripes(lane: Lane) -> Iterator[FloatArray]:
+    """The stripes of a crossing, each of shape (4, 2)."""
     for start, end in pairwise(lane.line):
         along = (end - start) / (np.hypot(*(end - start)) or 1.0)
         for place in np.arange(STRIPE / 2, np.hypot(*(end - start)) - STRIPE, 2 * STRIPE):
             yield quad(start + along * place, start + along * (place + STRIPE), lane.width)
 
 
-SECONDS_PER_PICTURE = 0.1
-"""Of a gif; it knows hundredths of a second only."""
-LAST_PICTURE = 2.0
-"""Duration of a gif's last picture [s]."""
+SECONDS_PER_FRAME = 0.1
+"""Duration of a gif's frame; gifs resolve 0.01 s."""
+LAST_FRAME = 2.0
+"""Duration of the last frame [s]."""
 COLOURS = 64
 LARGEST_GIF = 1_000_000
-"""A longer one gets fewer pictures [bytes]."""
+"""A larger gif gets fewer frames [bytes]."""
 
 
 def animate(comparison: Comparison, path: Path) -> None:
-    """Write a comparison as an animation, of the kind that the file's ending says; the same one gives the same bytes.
+    """Write a comparison as an animation in the format of the file's ending; the same comparison gives the same bytes.
 
     Raises
     ------
     InputError
-        If the ending is unknown, the file cannot be written, or a film is asked for and there is no ffmpeg.
+        If the ending is unknown, the file cannot be written, or an mp4 cannot be encoded because ffmpeg is missing.
     """
     ending = path.suffix.lower()
     if ending not in ANIMATIONS:
@@ -191,34 +193,34 @@ def animate(comparison: Comparison, path: Path) -> None:
 
 
 def check_animation(path: Path) -> None:
-    """Refuse a file that `animate` cannot write, before anything is simulated."""
+    """Refuse an mp4 if ffmpeg is missing, before any simulation."""
     if path.suffix.lower() == ".mp4":
         _ffmpeg()
 
 
 def _gif(scene: FlatScene, path: Path) -> None:
-    """As many pictures as fit into the largest size."""
-    stride = max(1, round(SECONDS_PER_PICTURE / scene.step))
-    while len(written := _gif_of(scene, stride)) > LARGEST_GIF and stride < scene.length:
+    """Write as many frames as `LARGEST_GIF` allows."""
+    stride = max(1, round(SECONDS_PER_FRAME / scene.step))
+    while len(content := _gif_of(scene, stride)) > LARGEST_GIF and stride < scene.length:
         stride *= 2
-    path.write_bytes(written)
+    path.write_bytes(content)
 
 
 def _gif_of(scene: FlatScene, stride: int) -> bytes:
     from PIL.Image import Dither
 
-    frames = list(pictures(scene, stride))
+    frames = list(frames_of(scene, stride))
     palette = frames[len(frames) * 2 // 3].quantize(COLOURS)
     frames = [frame.quantize(palette=palette, dither=Dither.NONE) for frame in frames]
     pause, buffer = round(stride * scene.step * 1000), BytesIO()
     frames[0].save(buffer, "GIF", save_all=True, append_images=frames[1:], loop=0, optimize=False,
-                   duration=[pause] * (len(frames) - 1) + [round(LAST_PICTURE * 1000)])
+                   duration=[pause] * (len(frames) - 1) + [round(LAST_FRAME * 1000)])
     return buffer.getvalue()
 
 
 def _film(scene: FlatScene, path: Path) -> None:
-    frames = list(pictures(scene, 1))
-    frames += frames[-1:] * round(LAST_PICTURE / scene.step)
+    frames = list(frames_of(scene, 1))
+    frames += frames[-1:] * round(LAST_FRAME / scene.step)
     width, height = frames[0].size
     command = [_ffmpeg(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
                "-r", f"{1 / scene.step:.6g}", "-i", "-", "-threads", "1", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "26",
@@ -229,7 +231,7 @@ def _film(scene: FlatScene, path: Path) -> None:
 
 
 def _ffmpeg() -> str:
-    """The program that encodes films: on the path, or the one that the package imageio-ffmpeg brings."""
+    """The ffmpeg program: the one on the PATH, or that of the package imageio-ffmpeg."""
     program = shutil.which("ffmpeg")
     if program is not None:
         return program
@@ -238,7 +240,7 @@ def _ffmpeg() -> str:
 
         return str(imageio_ffmpeg.get_ffmpeg_exe())
     except (ImportError, RuntimeError):
-        raise InputError("animate", "there is no ffmpeg to encode an mp4 with",
+        raise InputError("animate", "an mp4 needs ffmpeg, which is not installed",
                          "ffmpeg on the PATH, or pip install 'safevar_sumo[film]'; a .gif or .html needs neither") from None
 
 
@@ -249,4 +251,4 @@ def _page(scene: FlatScene, path: Path) -> None:
 
 
 ANIMATIONS: Mapping[str, Callable[[FlatScene, Path], None]] = {".gif": _gif, ".mp4": _film, ".html": _page}
-"""How an animation is written, by its file's ending."""
+"""Functions that write an animation, by the file's ending."""

@@ -1,4 +1,4 @@
-"""A changed vehicle beside the original: braking, nearest moment and end of each run, and when their speeds part."""
+"""A changed vehicle beside the original: braking, nearest moment and end of each run, and when their speeds diverge."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from safevar_sumo.sumo.staging import staged
 from safevar_sumo.sumo.system import Measuring, System
 from safevar_sumo.vehicles import CharacteristicSet
 
-APART = 0.1
-"""Two vehicles have parted when their speeds differ by more [m/s]."""
+DIVERGED = 0.1
+"""Two vehicles have diverged when their speeds differ by more [m/s]."""
 
 
 class Moments(NamedTuple):
-    """Numbers of a run's samples; None where there is no such moment.
+    """Indices of a run's samples; None where there is no such moment.
 
     `brake`: it begins to brake for the obstacle; `nearest`: the obstacle is nearest (the impact, on a collision); `end`: the
     run's last sample.
@@ -43,12 +43,12 @@ def moments(drives: SimulationRuns, row: int) -> Moments:
     return Moments(drives.brake_onset(row), drives.nearest(row), int(np.flatnonzero(drives.trace.active[:, row])[-1]))
 
 
-def divergence(drives: SimulationRuns, one: int = 0, other: int = 1) -> int | None:
-    """The first sample at which the speeds of two of N runs have parted, None if they never do."""
+def divergence(drives: SimulationRuns, first: int = 0, second: int = 1) -> int | None:
+    """The first sample at which the speeds of two of N runs have diverged, None if they never do."""
     trace = drives.trace
-    both = trace.active[:, one] & trace.active[:, other]
-    apart = np.flatnonzero(both & (np.abs(trace.speed[:, one] - trace.speed[:, other]) > APART))
-    return int(apart[0]) if apart.size else None
+    both = trace.active[:, first] & trace.active[:, second]
+    diverged = np.flatnonzero(both & (np.abs(trace.speed[:, first] - trace.speed[:, second]) > DIVERGED))
+    return int(diverged[0]) if diverged.size else None
 
 
 ORIGINAL, CHANGED = 0, 1
@@ -60,7 +60,7 @@ class Comparison:
     """Runs of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is changed).
 
     `title` is the study's, `network` the scenario's, with the lanes that its parameters make; `evaluations` and `film` have one row for
-    each vehicle. `objectives` are metrics beyond the paper's that the study searches.
+    each vehicle. `objectives` are metrics beyond the paper's that the study optimises.
     """
 
     title: str
@@ -86,10 +86,10 @@ class Comparison:
         return changes_in_words(self.characteristics, self.evaluations.settings[CHANGED])
 
     def verdict(self, row: int) -> str:
-        """How a run ended, in words: hits at 3.9 m/s, or stops with 2.22 m to spare."""
+        """How a run ended, in words: collides at 3.9 m/s, or stops with 2.22 m to spare."""
         drives = self.film.drives
         if not math.isnan(drives.collision_speed[row]):
-            return f"hits at {drives.collision_speed[row]:.1f} m/s"
+            return f"collides at {drives.collision_speed[row]:.1f} m/s"
         nearest = moments(drives, row).nearest
         word = ENDS[Outcome(str(drives.outcome[row]))]
         if nearest is not None and drives.outcome[row] == Outcome.STOPPED:
@@ -99,7 +99,7 @@ class Comparison:
 
 
 def changes_in_words(characteristics: CharacteristicSet, setting: FloatArray) -> list[str]:
-    """What differs from the original: `tireFric 3.5 → 1.1 (-69 %)`."""
+    """The changes from the original: `tireFric 3.5 → 1.1 (-69 %)`."""
     return [f"{member.name} {number(member.original)} → {number(value)}{spaced(member.unit)} "
             f"({(value - member.original) / abs(member.original) * 100:+.0f}\N{NO-BREAK SPACE}%)"
             for member, value in zip(characteristics, setting.tolist(), strict=True) if value != member.original]
@@ -111,28 +111,28 @@ def number(value: float) -> str:
 
 
 def spaced(unit: str) -> str:
-    """A unit as it follows a number, its powers raised; nothing for a pure number."""
+    """A unit to follow a number, with raised powers; empty for a pure number."""
     return "" if unit == "-" else " " + raised(unit)
 
 
 def raised(text: str) -> str:
-    """A text with units such as m/s^2 as they are printed: m/s²."""
+    """A text with raised powers in its units: m/s² for m/s^2."""
     return text.replace("^2", "²").replace("^3", "³")
 
 
 def compare(study: StudyLike, changes: Mapping[str, float] | None = None, *, filtered: bool = True, beyond: bool = False) -> Comparison:
-    """Simulate one setting beside the original vehicle, in this process; in a matrix, at the point where the setting comes off worst.
+    """Simulate one setting beside the original vehicle, in this process; in a matrix, at the setting's worst point.
 
     Parameters
     ----------
     study
-        A study, or what `load_study` makes one of.
+        A study, or anything that `load_study` accepts.
     changes
-        Values by characteristic, in their table units; all others are the original's.
+        Values by characteristic, in their table units; all other characteristics keep the original's value.
     filtered
         Put changes that are smaller than their thresholds back to the original, as every search does.
     beyond
-        Take values outside the domains, and a setting that violates the study's constraints, too.
+        Also accept values outside the domains, and a setting that violates the study's constraints.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def compare(study: StudyLike, changes: Mapping[str, float] | None = None, *, fil
 
 
 def compare_setting(study: Study, system: System, setting: FloatArray) -> Comparison:
-    """Simulate a filtered setting, shape (n,), beside the original vehicle; in a matrix, where the setting comes off worst.
+    """Simulate a filtered setting, shape (n,), beside the original vehicle; in a matrix, at the setting's worst point.
 
     Raises
     ------
@@ -156,23 +156,23 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     """
     original = system.characteristics.original
     settings = np.stack([original]) if np.array_equal(original, setting) else np.stack([original, setting])
-    there = at_worst(system, settings)
-    where = [f" ({point.name})" for point in system.matrix if (point.scenario, point.weather) == (there.scenario, there.weather)]
-    recording = film(there, settings)
-    return Comparison(title=study.title + "".join(where[:1]), characteristics=system.characteristics,
-                      ttc_threshold=system.metrics.ttc_threshold, network=staged(there.scenario).folder,
-                      evaluations=score(there, settings, recording.drives),
-                      film=replace(recording, drives=_up_to_impacts(recording.drives)), objectives=_further_objectives(there.measuring))
+    worst = at_worst(system, settings)
+    names = [f" ({point.name})" for point in system.matrix if (point.scenario, point.weather) == (worst.scenario, worst.weather)]
+    recording = film(worst, settings)
+    return Comparison(title=study.title + "".join(names[:1]), characteristics=system.characteristics,
+                      ttc_threshold=system.metrics.ttc_threshold, network=staged(worst.scenario).folder,
+                      evaluations=score(worst, settings, recording.drives),
+                      film=replace(recording, drives=_up_to_impacts(recording.drives)), objectives=_further_objectives(worst.measuring))
 
 
 def _further_objectives(measuring: Measuring) -> tuple[MetricFacts, ...]:
-    """Metrics of one run beyond the paper's; the points of a rating are those of all its cells."""
-    searched = {objective.name for objective in measuring.scoring.objectives}
-    return tuple(metric for metric in measuring.scoring.metrics if metric.name in searched - {*METRICS, RATING_POINTS.name})
+    """Objectives beyond the paper's that one run has; the points of a rating belong to all its cells."""
+    objectives = {objective.name for objective in measuring.scoring.objectives}
+    return tuple(metric for metric in measuring.scoring.metrics if metric.name in objectives - {*METRICS, RATING_POINTS.name})
 
 
 def _up_to_impacts(drives: SimulationRuns) -> SimulationRuns:
-    """Runs with the pedals in force at an impact: those of the sample before; a command after it moves nothing any more."""
+    """Runs with the pedals of the sample before as those at an impact: a command at the impact has no effect any more."""
     trace = drives.trace
     throttle, brake = trace.throttle.copy(), trace.brake.copy()
     for row in np.flatnonzero(~np.isnan(drives.collision_speed)).tolist():
@@ -183,7 +183,7 @@ def _up_to_impacts(drives: SimulationRuns) -> SimulationRuns:
 
 
 def differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:
-    """Where the only row of a replay differs from its row of solutions.csv: each with both values."""
+    """The differences of a replay of one setting from its row of solutions.csv, with both values."""
     problems = [f"{name} is {recorded[name]:.6g} there and {replayed.metrics[name][0]:.6g} here" for name in replayed.metrics
             if name in recorded and not np.array_equal(float(recorded[name]), float(replayed.metrics[name][0]), equal_nan=True)]
     if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):

@@ -24,7 +24,7 @@ SHOWN_TTC = 6.0
 """Longest time to collision that is drawn [s]."""
 FONT = 9
 LINE = 118
-"""Letters in a line of the heading."""
+"""Characters in a line of the heading."""
 
 
 def draw_comparison(comparison: Comparison) -> Figure:
@@ -64,7 +64,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
 
 
 def _end_time(comparison: Comparison) -> float:
-    """Time at which the last vehicle is nearest or comes to rest [s]."""
+    """Time at which the last of the vehicles is nearest or comes to rest [s]."""
     drives = comparison.film.drives
     ends = [at for row in comparison.rows for at in (moments(drives, row).nearest, _comes_to_rest(drives, row)) if at is not None]
     return float(drives.trace.time[min(max(ends) + 1, len(drives.trace.time) - 1)])
@@ -76,7 +76,7 @@ def _comes_to_rest(drives: SimulationRuns, row: int) -> int:
 
 
 def _legend(figure: Figure, comparison: Comparison) -> None:
-    """The legend: vehicles and marks."""
+    """Draw the legend: vehicles and marks."""
     from matplotlib.lines import Line2D
 
     hit = bool(np.isfinite(comparison.film.drives.collision_speed).any())
@@ -84,21 +84,21 @@ def _legend(figure: Figure, comparison: Comparison) -> None:
     entries = [Line2D([], [], color=COLOURS[row], linestyle=DASHES[row], label=f"{comparison.name(row)} vehicle: {comparison.verdict(row)}")
                for row in comparison.rows]
     entries += [Line2D([], [], color="0.35", marker=mark, linestyle="", markersize=7, label=label) for label, mark in marks.items()]
-    entries.append(Line2D([], [], color="0.35", linestyle="-.", linewidth=0.9, label="their speeds part (by 0.1 m/s)"))
+    entries.append(Line2D([], [], color="0.35", linestyle="-.", linewidth=0.9, label="speeds diverge (by 0.1 m/s)"))
     entries.append(Line2D([], [], color="0.4", linestyle=":", linewidth=0.9,
                           label=f"TTC* = {comparison.ttc_threshold:g} s: critical below"))
     figure.legend(entries, [str(entry.get_label()) for entry in entries], loc="outside lower center", ncols=3, frameon=False)
 
 
 def _line(axis: Axes, comparison: Comparison, row: int, values: FloatArray) -> None:
-    """A quantity of one run until its end."""
+    """Draw a quantity of one run until its end."""
     end = moments(comparison.film.drives, row).end + 1
     time = comparison.film.drives.trace.time[:end]
     axis.plot(time, values[:end], color=COLOURS[row], linestyle=DASHES[row], linewidth=1.6, zorder=3 + row)
 
 
 def _mark(axis: Axes, row: int, place: tuple[float, float], mark: str, text: str = "", *, is_speed: bool = False) -> None:
-    """A mark on a line; the original's is larger, so that it shows below the changed vehicle's, and has its text above."""
+    """Draw a mark on a line; the original's is larger, so that it shows below the changed vehicle's, and has its text above."""
     axis.plot(*place, marker=mark, color=COLOURS[row], markersize=12 - 4 * row + 2 * (mark == IMPACT), linestyle="", zorder=6 + row,
               markeredgecolor="white")
     offset, side = ((3, 7), "left") if is_speed else ((0, 9 if row == ORIGINAL else -17), "center")
@@ -131,14 +131,14 @@ def _pedals(axis: Axes, comparison: Comparison, row: int) -> None:
 
 
 def _mark_divergence(axes: np.ndarray, comparison: Comparison) -> None:
-    apart = divergence(comparison.film.drives)
-    if apart is not None:
+    sample = divergence(comparison.film.drives)
+    if sample is not None:
         for axis in axes:
-            axis.axvline(comparison.film.drives.trace.time[apart], color="0.35", linewidth=0.9, linestyle="-.", zorder=1)
+            axis.axvline(comparison.film.drives.trace.time[sample], color="0.35", linewidth=0.9, linestyle="-.", zorder=1)
 
 
 def _heading(figure: Figure, comparison: Comparison) -> None:
-    """The study's title, and below it the changes; lines break between changes alone."""
+    """Draw the study's title and, below it, the changes; lines break only between changes."""
     lines = textwrap.wrap(comparison.title, LINE)
     line = "changed:" if comparison.changes else "the original vehicle"
     for i, change in enumerate(comparison.changes):

@@ -1,4 +1,4 @@
-"""A simulation as it looks from above: where everybody was at every step, and the road that they were on."""
+"""A simulation seen from above: the position of every actor at every time step, and the road."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from safevar_sumo.sumo.world import SumoWorld
 
 
 class Lane(NamedTuple):
-    """A lane as SUMO has it: its middle line, shape (P, 2), and width [m]; an area's `line` goes round it and has no width.
+    """A lane of SUMO: its middle line, shape (P, 2), and width [m]; an area's `line` is its outline, its width 0.
 
-    `kind` is road, path (for persons alone), crossing or area (for persons, between paths).
+    `kind` is road, path (only for persons), crossing or area (for persons, between paths).
     """
 
     kind: str
@@ -32,7 +32,7 @@ class Lane(NamedTuple):
 class Track(NamedTuple):
     """Where one actor was: front bumper of a vehicle or middle of a person [m], heading clockwise from north [degrees].
 
-    Arrays of shape (T, N), NaN while it was not there; `length` and `width` in m.
+    Arrays of shape (T, N), NaN while the actor was absent; `length` and `width` in m.
     """
 
     is_person: bool
@@ -45,10 +45,10 @@ class Track(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Film:
-    """N drives seen from above.
+    """N simulations seen from above.
 
-    `tracks` are everybody's by name, each drive with its own; `last` is every drive's last sample, shape (N,): what
-    comes after it is whatever SUMO did with the rest of the batch.
+    `tracks` are the actors' by name; `last` is the last sample of every simulation, shape (N,): later samples are
+    meaningless, for SUMO goes on with the rest of the batch.
     """
 
     drives: SimulationRuns
@@ -62,9 +62,9 @@ class Film:
 
 
 def film(system: System, settings: FloatArray) -> Film:
-    """Simulate settings, shape (N, n), as `simulate` does, and keep where everybody was.
+    """Simulate settings, shape (N, n), as `simulate` does, and record the positions of all actors.
 
-    In a matrix all of them are at the one point in which the last of them comes off worst.
+    In a matrix all settings are simulated at the worst point of the last setting.
 
     Raises
     ------
@@ -72,40 +72,40 @@ def film(system: System, settings: FloatArray) -> Film:
         As `simulate`.
     """
     camera, system = _Camera(len(settings)), at_worst(system, settings)
-    drives = simulate(system, settings, watch=camera.take)
+    drives = simulate(system, settings, watch=camera.record)
     return Film(drives=drives, tracks=camera.tracks(), road=road_of(staged(system.scenario).folder))
 
 
 class _Camera:
-    """Takes down where everybody is in N copies at every sample."""
+    """Records the position of every actor in N copies at every sample."""
 
     def __init__(self, n: int) -> None:
         self._n = n
         self._frames: list[dict[str, tuple[float, float, float]]] = []
         self._measures: dict[str, tuple[bool, float, float]] = {}
 
-    def take(self, world: SumoWorld) -> None:
+    def record(self, world: SumoWorld) -> None:
         frame = world.whereabouts()
         for name in frame.keys() - self._measures.keys():
             self._measures[name] = world.measures(name)
         self._frames.append(frame)
 
     def tracks(self) -> dict[str, Track]:
-        """What was taken down, in alphabetical order."""
+        """The recorded tracks, in alphabetical order."""
         by_name: dict[str, Track] = {}
-        for copied in sorted(self._measures):
-            copy, name = copy_and_name(copied)
+        for actor in sorted(self._measures):
+            copy, name = copy_and_name(actor)
             if name not in by_name:
-                by_name[name] = Track(*self._measures[copied], *(np.full((len(self._frames), self._n), np.nan) for _ in range(3)))
+                by_name[name] = Track(*self._measures[actor], *(np.full((len(self._frames), self._n), np.nan) for _ in range(3)))
             for sample, frame in enumerate(self._frames):
-                if copied in frame:
-                    for row, value in zip(by_name[name][3:], frame[copied], strict=True):
+                if actor in frame:
+                    for row, value in zip(by_name[name][3:], frame[actor], strict=True):
                         row[sample, copy] = value
         return by_name
 
 
 def road_of(network: str) -> tuple[Lane, ...]:
-    """The lanes of a network, as netconvert built one copy of it."""
+    """The lanes of one copy of a network, as netconvert built it."""
     root = ElementTree.parse(built_network(network)).getroot()
     return tuple(_lane(edge.get("function", ""), lane) for edge in root.iter("edge") for lane in edge.iter("lane"))
 

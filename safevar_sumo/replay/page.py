@@ -1,4 +1,4 @@
-"""A scene as a piece of HTML that plays without anything else, and the data of its template."""
+"""A scene as an HTML animation, and the data of its template."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ import numpy as np
 
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL
-from safevar_sumo.replay.scene import SEAM_WIDTH, TEN, FlatBody, FlatScene
+from safevar_sumo.replay.scene import MARK_DISTANCE, SEAM_WIDTH, FlatBody, FlatScene
 
 if TYPE_CHECKING:
     from jinja2 import Environment
 
 WEB = Path(__file__).parent / "web"
 LETTERS = 65
-"""Width of the scene in heights of a letter."""
+"""Width of the scene [heights of the text]."""
 CENTIMETRES = 2
-"""Decimals of a place [m]; a heading has one [degrees]."""
+"""Decimals of a position [m]; a heading has one decimal [degrees]."""
 
 
 @cache
 def player_parts() -> dict[str, str]:
-    """The style sheet and the script of the player, as they stand in a page."""
+    """The style sheet and the script of the player, to include in a page."""
     from markupsafe import Markup
 
     return {name: Markup((WEB / f"player.{name}").read_text(encoding="utf-8")) for name in ("css", "js")}
 
 
 def environment(*folders: Path) -> Environment:
-    """Templates of these folders and of the player; everything from outside them is escaped."""
+    """The templates of these folders and of the player; they escape all values."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     return Environment(loader=FileSystemLoader([*folders, WEB]), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
@@ -39,14 +39,14 @@ def environment(*folders: Path) -> Environment:
 
 
 def animation_page(scene: FlatScene) -> str:
-    """A page that shows one scene, whole in itself."""
+    """A self-contained page that shows one scene."""
     template = environment().get_template("animation.html.j2")
     comparison = scene.comparison
     return template.render(title=comparison.title, changes=comparison.changes, data=player_data(scene), **player_parts())
 
 
 def player_data(scene: FlatScene) -> dict[str, Any]:
-    """The data of the template `player`: the still picture, and under `played` what the script plays. y points down."""
+    """The data of the template `player`: the still picture, and under `played` the data of the script. y points down."""
     view, key = scene.view, scene.key_sample
     drives = [_drive(scene, row) for row in scene.comparison.rows]
     bodies = sorted(scene.bodies, key=lambda body: (body.is_vut, body.row))
@@ -59,7 +59,8 @@ def player_data(scene: FlatScene) -> dict[str, Any]:
         "description": _description(scene), "moments": _moments(scene), "bottom": round(-view.bottom, CENTIMETRES),
         "letters": round(view.width / LETTERS, CENTIMETRES),
         "road": [_lane(lane) for kind in ("area", "path", "road", "crossing") for lane in scene.road if lane.kind == kind],
-        "ticks": list(range(int(np.floor(view.left.min() / TEN)) * TEN, int(view.left.max() + view.width) + TEN, TEN)),
+        "ticks": list(range(int(np.floor(view.left.min() / MARK_DISTANCE)) * MARK_DISTANCE,
+                            int(view.left.max() + view.width) + MARK_DISTANCE, MARK_DISTANCE)),
         "bodies": [_still(body, scene) for body in bodies],
         "played": {**shared, "bodies": [_moving(body) for body in bodies]}}
 
@@ -67,29 +68,29 @@ def player_data(scene: FlatScene) -> dict[str, Any]:
 def _description(scene: FlatScene) -> str:
     """The picture in words."""
     comparison = scene.comparison
-    who = " and ".join(f"the {comparison.name(row)} vehicle, which {comparison.verdict(row)}" for row in comparison.rows)
-    return f"Seen from above after {scene.key_sample * scene.step:.2f} s: {who}"
+    vehicles = " and ".join(f"the {comparison.name(row)} vehicle, which {comparison.verdict(row)}" for row in comparison.rows)
+    return f"Seen from above after {scene.key_sample * scene.step:.2f} s: {vehicles}"
 
 
 def _moments(scene: FlatScene) -> list[dict[str, Any]]:
     """Moments that the player's buttons jump to."""
     jumps = []
-    for row, one in enumerate(scene.moments):
+    for row, moments in enumerate(scene.moments):
         name = scene.comparison.name(row)
-        if one.brake is not None:
-            jumps.append({"name": f"{name} brakes", "sample": one.brake})
-        if one.nearest is not None:
+        if moments.brake is not None:
+            jumps.append({"name": f"{name} brakes", "sample": moments.brake})
+        if moments.nearest is not None:
             hit = not np.isnan(scene.comparison.film.drives.collision_speed[row])
-            jumps.append({"name": f"{name} {'hits' if hit else 'is nearest'}", "sample": one.nearest})
+            jumps.append({"name": f"{name} {'collides' if hit else 'is nearest'}", "sample": moments.nearest})
     return sorted(jumps, key=lambda moment: moment["sample"])
 
 
 def _drive(scene: FlatScene, row: int) -> dict[str, Any]:
-    trace, marks = scene.comparison.film.drives.trace, scene.moments[row]
-    shown = slice(0, marks.end + 1)
-    return {"name": scene.comparison.name(row), "verdict": scene.comparison.verdict(row), "end": marks.end,
-            "nearest": marks.end if marks.nearest is None else marks.nearest, "speed": _list(trace.speed[shown, row]),
-            "gap": _list(trace.gap[shown, row]), "brakes": (trace.brake[shown, row] > 0).astype(int).tolist()}
+    trace, moments = scene.comparison.film.drives.trace, scene.moments[row]
+    samples = slice(0, moments.end + 1)
+    return {"name": scene.comparison.name(row), "verdict": scene.comparison.verdict(row), "end": moments.end,
+            "nearest": moments.end if moments.nearest is None else moments.nearest, "speed": _list(trace.speed[samples, row]),
+            "gap": _list(trace.gap[samples, row]), "brakes": (trace.brake[samples, row] > 0).astype(int).tolist()}
 
 
 def _lane(lane: Any) -> dict[str, Any]:
@@ -115,11 +116,11 @@ def _still(body: FlatBody, scene: FlatScene) -> dict[str, Any]:
 
 
 def _list(values: FloatArray, decimals: int = CENTIMETRES) -> list[float | None]:
-    """Numbers as JSON has them; what is undefined is null."""
+    """Rounded numbers for JSON; null for an undefined number."""
     return [round(value, decimals) + 0.0 if np.isfinite(value) else None for value in values.tolist()]
 
 
 def _numbers(values: FloatArray, decimals: int = CENTIMETRES) -> list[float | None] | float | None:
-    """One number where all are the same."""
+    """Rounded numbers, or a single one if all are the same."""
     numbers = _list(values, decimals)
     return numbers[0] if len(set(numbers)) == 1 else numbers

@@ -1,4 +1,4 @@
-"""A comparison as a flat scene: the road turned so that the vehicle under test sets off to the right, everything in metres."""
+"""A comparison as a flat scene: turned so that the vehicle under test starts to the right, in metres."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ from safevar_sumo.replay.film import Film, Lane, Track
 from safevar_sumo.scenarios import VUT
 
 SEAM_WIDTH = 0.12
-"""Of the line between two lanes, as it is drawn [m]."""
+"""Width of the line drawn between two lanes [m]."""
 MARGIN = 4.0
 """Free space around the actors [m]."""
-LEAST_HEIGHT = 11.0
+MIN_HEIGHT = 11.0
+"""Smallest height of a view [m]."""
 WIDEST = 75.0
 """A scene up to this long is shown whole; in a longer one the camera follows the vehicles [m]."""
 FOLLOWED = 48.0
 """Length of road that a following camera shows [m]."""
 NEAR = 30.0
 """Actors that never come nearer to the vehicle under test are not shown [m]."""
-TEN = 10
-"""Distance of two marks beside the road [m]."""
+MARK_DISTANCE = 10
+"""Distance between two marks beside the road [m]."""
 SAME = 0.05
 """Distance below which two copies of an actor are drawn as one [m]."""
 
 
 class FlatBody(NamedTuple):
-    """An actor of one drive: front bumper or person's middle, x to the right and y up [m], heading [rad from x]; shape (T,)."""
+    """An actor of one simulation: front bumper or person's middle, x to the right and y up [m], heading [rad from x]; shape (T,)."""
 
     name: str
     row: int
@@ -62,7 +63,7 @@ class View(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class FlatScene:
-    """What there is to see of a comparison; `length` samples, `step` seconds apart."""
+    """A comparison laid out for drawing; `length` samples, `step` seconds apart."""
 
     comparison: Comparison
     step: float
@@ -78,10 +79,10 @@ class FlatScene:
         last = self.moments[-1]
         return last.nearest if last.nearest is not None else last.end
 
-    def tens(self, sample: int) -> list[int]:
-        """The tens of metres from the start that are in view."""
+    def marks(self, sample: int) -> list[int]:
+        """The marks in view, by their distance from the start [m]."""
         left = float(self.view.left[sample])
-        return list(range(math.ceil(left / TEN) * TEN, math.floor(left + self.view.width) + 1, TEN))
+        return list(range(math.ceil(left / MARK_DISTANCE) * MARK_DISTANCE, math.floor(left + self.view.width) + 1, MARK_DISTANCE))
 
 
 def scene_of(comparison: Comparison) -> FlatScene:
@@ -95,43 +96,43 @@ def scene_of(comparison: Comparison) -> FlatScene:
     length = max(one.end for one in all_moments) + 1
     bodies = tuple(_body(name, track, row, all_moments[row].end, length, to_scene, start, turn)
                    for name, track in film.tracks.items() for row in comparison.rows
-                   if name == VUT or (_shown(film, name, row) and not _seen_already(comparison, name, row)))
+                   if name == VUT or (_is_near(film, name, row) and not _is_duplicate(comparison, name, row)))
     road = tuple(lane._replace(line=(lane.line - start) @ to_scene.T) for lane in film.road)
     return FlatScene(comparison=comparison, step=film.drives.trace.step, length=length, road=road, bodies=bodies, moments=all_moments,
                  view=_view(bodies, length))
 
 
 def _body(name: str, track: Track, row: int, end: int, length: int, to_scene: FloatArray, start: FloatArray, turn: float) -> FlatBody:
-    """An actor as long as its drive lasts; afterwards it stays where it was."""
+    """An actor until its simulation ends; afterwards it stays where it is."""
     until = np.minimum(np.arange(length), end)
     x, y = to_scene @ (np.stack([track.x[until, row], track.y[until, row]]) - start[:, np.newaxis])
     return FlatBody(name, row, name == VUT, track.is_person, track.length, track.width, x, y,
                 np.deg2rad(90 - track.angle[until, row]) - turn)
 
 
-def _shown(film: Film, name: str, row: int) -> bool:
-    """Whether an actor ever comes near."""
+def _is_near(film: Film, name: str, row: int) -> bool:
+    """Whether an actor ever comes near the vehicle under test."""
     track, vut, end = film.tracks[name], film.tracks[VUT], film.last[row] + 1
     distance = np.hypot(track.x[:end, row] - vut.x[:end, row], track.y[:end, row] - vut.y[:end, row])
     return bool(np.any(distance < NEAR + track.length))
 
 
-def _seen_already(comparison: Comparison, name: str, row: int) -> bool:
-    """Whether the changed vehicle's copy of an actor stands for the original's."""
+def _is_duplicate(comparison: Comparison, name: str, row: int) -> bool:
+    """Whether the changed vehicle's copy of an actor is always at the same place, and drawn instead."""
     if row == CHANGED or len(comparison.rows) == 1:
         return False
     track, end = comparison.film.tracks[name], int(comparison.film.last.min()) + 1
     apart = np.hypot(track.x[:end, 0] - track.x[:end, CHANGED], track.y[:end, 0] - track.y[:end, CHANGED])
-    return _shown(comparison.film, name, CHANGED) and bool(np.all((apart < SAME) | np.isnan(apart)))
+    return _is_near(comparison.film, name, CHANGED) and bool(np.all((apart < SAME) | np.isnan(apart)))
 
 
 def _view(bodies: tuple[FlatBody, ...], length: int) -> View:
-    """The whole road, or in a long scene the part in the view of a camera that follows the vehicles."""
+    """The whole road or, in a long scene, the part that a camera shows that follows the vehicles."""
     low = min(float(np.nanmin(body.x)) - body.length for body in bodies) - MARGIN / 2
     high = max(float(np.nanmax(body.x)) + (0 if body.is_vut else body.length) for body in bodies) + MARGIN
     sides = [side for body in bodies for side in (np.nanmin(body.y) - body.width / 2, np.nanmax(body.y) + body.width / 2)]
     bottom, top = float(min(sides)) - MARGIN / 2, float(max(sides)) + MARGIN / 2
-    missing = max(0.0, LEAST_HEIGHT - (top - bottom)) / 2
+    missing = max(0.0, MIN_HEIGHT - (top - bottom)) / 2
     if high - low <= WIDEST:
         return View(np.full(length, low), bottom - missing, high - low, top - bottom + 2 * missing)
     front = np.mean([body.x for body in bodies if body.is_vut], axis=0)

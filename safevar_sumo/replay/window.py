@@ -1,4 +1,4 @@
-"""A recorded film in sumo-gui's window: SUMO's own vehicles and persons on its network, put where they were."""
+"""A film played in sumo-gui: SUMO draws vehicles and persons on its network, at their recorded places."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from safevar_sumo.sumo.network import copied_network
 BRAKE_LIGHT = 8
 """Signal of a vehicle (TraCI, "change vehicle state": bit 3)."""
 ANYWHERE = 2
-"""Keep no route: a place beside every road is one too (TraCI, "move to XY")."""
+"""Value of keepRoute that allows places beside every road (TraCI, "move to XY")."""
 VIEW = "View #0"
-LETTERS = 85
+TEXT_SIZE = 85
 SETTINGS = """<viewsettings>
     <scheme name="safevar">
         <opengl antialiase="1" dither="0"/>
@@ -30,7 +30,7 @@ SETTINGS = """<viewsettings>
         </junctions>
         <vehicles vehicleMode="0" vehicleQuality="2" showBlinker="1" vehicle_minSize="1.00" vehicle_exaggeration="1.00"/>
         <persons personMode="0" personQuality="2" person_minSize="1.00" person_exaggeration="1.00"/>
-        <pois poiTextParam="words" poi_minSize="0.00" poi_exaggeration="0.01" poiText_show="1" poiText_size="{letters}"
+        <pois poiTextParam="words" poi_minSize="0.00" poi_exaggeration="0.01" poiText_show="1" poiText_size="{text_size}"
               poiText_color="29,35,41" poiText_bgColor="255,255,255,0" poiText_constantSize="1"/>
     </scheme>
 </viewsettings>
@@ -40,7 +40,7 @@ Points = Sequence[tuple[float, float]]
 
 
 class Place(NamedTuple):
-    """Where somebody is: front bumper or person [m], heading clockwise from north [degrees], and whether it brakes."""
+    """Where an actor is: front bumper or person [m], heading clockwise from north [degrees], and whether it brakes."""
 
     name: str
     x: float
@@ -50,7 +50,7 @@ class Place(NamedTuple):
 
 
 class Window:
-    """sumo-gui under our hands; made by `open_window`. Everybody is a vehicle to it, persons by their shape alone."""
+    """Controls sumo-gui; made by `open_window`. Every actor is a vehicle there, persons only have another shape."""
 
     def __init__(self, api: Any) -> None:
         self._api = api
@@ -58,7 +58,7 @@ class Window:
         api.route.add("route", [api.lane.getEdgeID(lane)])
 
     def add(self, name: str, is_person: bool, length: float, width: float, colour: Colour) -> None:
-        """Somebody of that size [m] who will be put somewhere."""
+        """Add an actor of this size [m]; `show` places it."""
         self._api.vehicletype.copy("DEFAULT_VEHTYPE", name)
         self._api.vehicletype.setShapeClass(name, "pedestrian" if is_person else "evehicle")
         self._api.vehicletype.setLength(name, max(length, width) if is_person else length)
@@ -70,11 +70,11 @@ class Window:
         self._api.vehicle.setLaneChangeMode(name, 0)
 
     def paint(self, name: str, points: Points, colour: Colour, layer: int) -> None:
-        """An area of that colour."""
+        """Paint an area."""
         self._api.polygon.add(name, list(points), colour, fill=True, layer=layer)
 
     def write(self, name: str, x: float, y: float, words: str) -> None:
-        """Words at a place; again: other words or another place."""
+        """Write words at a place; a second call changes words and place."""
         if name in self._api.poi.getIDList():
             self._api.poi.setPosition(name, x, y)
         else:
@@ -86,21 +86,21 @@ class Window:
         self._api.gui.setBoundary(VIEW, left, bottom, right, top)
 
     def show(self, places: Sequence[Place]) -> None:
-        """Everybody where they are now."""
-        for one in places:
-            self._api.vehicle.moveToXY(one.name, "", 0, one.x, one.y, one.angle, keepRoute=ANYWHERE)
-            self._api.vehicle.setSignals(one.name, BRAKE_LIGHT if one.brakes else 0)
+        """Move all actors to their places."""
+        for place in places:
+            self._api.vehicle.moveToXY(place.name, "", 0, place.x, place.y, place.angle, keepRoute=ANYWHERE)
+            self._api.vehicle.setSignals(place.name, BRAKE_LIGHT if place.brakes else 0)
         self._api.simulationStep()
 
     def picture(self, path: Path) -> None:
-        """Write what the window shows, with the next step."""
+        """Write a picture of the window, in the next time step."""
         self._api.gui.screenshot(VIEW, str(path))
         self._api.simulationStep()
 
 
 @contextmanager
 def open_window(network: str, step: float, width: int = 1200, height: int = 700) -> Iterator[Window]:
-    """A window on one copy of a network without traffic, `width` times `height` pixels.
+    """Open a window on one copy of a network without traffic, `width` times `height` pixels.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def open_window(network: str, step: float, width: int = 1200, height: int = 700)
     """
     with tempfile.TemporaryDirectory() as folder:
         settings = Path(folder) / "view.xml"
-        settings.write_text(SETTINGS.format(letters=LETTERS), encoding="utf-8")
+        settings.write_text(SETTINGS.format(text_size=TEXT_SIZE), encoding="utf-8")
         api = engine_api(Engine.GUI)
         command = ["-n", str(copied_network(network, 1).network), "--step-length", repr(step), "--collision.action", "none",
                    "--gui-settings-file", str(settings), "--start", "true", "--quit-on-end", "true", "--no-step-log", "true",

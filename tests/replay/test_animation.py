@@ -14,7 +14,7 @@ from PIL import Image
 
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.errors import InputError
-from safevar_sumo.replay.animation import PANEL, VEHICLES, WIDTH, animate, check_animation, pictures
+from safevar_sumo.replay.animation import PANEL, VEHICLES, WIDTH, animate, check_animation, frames_of
 from safevar_sumo.replay.comparison import Comparison, compare_setting
 from safevar_sumo.replay.page import animation_page
 from safevar_sumo.replay.scene import scene_of
@@ -36,13 +36,13 @@ def where(picture: Image.Image, colour: str) -> tuple[np.ndarray, np.ndarray]:
 
 def test_both_vehicles_are_where_they_were_to_scale(crash: Comparison) -> None:
     scene = scene_of(crash)
-    picture = next(pictures(scene, scene.length))  # the start: the changed vehicle stands on the original's place
+    picture = next(frames_of(scene, scene.length))  # the start: the changed vehicle stands on the original's place
     scale = WIDTH / scene.view.width
     rows, columns = where(picture, VEHICLES[0])
     vut = next(body for body in scene.bodies if body.is_vut)
     assert columns.max() - columns.min() == pytest.approx(vut.length * scale, abs=4)
     assert rows.max() - rows.min() == pytest.approx(vut.width * scale, abs=4)
-    end = list(pictures(scene, scene.length))[-1]
+    end = list(frames_of(scene, scene.length))[-1]
     for row, body in enumerate(one for one in scene.bodies if one.is_vut):
         _, columns = where(end, VEHICLES[row])
         assert columns.max() == pytest.approx((body.x[-1] - scene.view.left[-1]) * scale, abs=4)

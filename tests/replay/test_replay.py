@@ -113,7 +113,7 @@ def test_moments_of_a_drive(case: Case) -> None:
     assert trace.gap[original.nearest, 0] == comparison.evaluations.f_safe[0]
     assert hit.nearest == hit.end
     assert comparison.verdict(0) == f"stops with {comparison.evaluations.f_safe[0]:.2f} m to spare"
-    assert comparison.verdict(1) == f"hits at {-comparison.evaluations.f_safe[1]:.1f} m/s"
+    assert comparison.verdict(1) == f"collides at {-comparison.evaluations.f_safe[1]:.1f} m/s"
     apart = divergence(drives)
     assert apart is not None
     assert abs(trace.speed[apart, 0] - trace.speed[apart, 1]) > 0.1
@@ -167,7 +167,7 @@ def test_at_an_impact_the_pedals_are_those_that_were_in_force() -> None:
         setting[system.characteristics.names.index(name)] = value
     shown, drives = compare_setting(study, system, setting), simulate(system, setting[np.newaxis])
     trace, end = shown.film.drives.trace, shown.film.last[-1]
-    assert shown.verdict(1).startswith("hits")
+    assert shown.verdict(1).startswith("collides")
     assert drives.trace.brake[end, 0] == 0
     assert trace.brake[end, 1] == trace.brake[end - 1, 1] == drives.trace.brake[end - 1, 0] == 1
     assert shown.evaluations.metrics["safety_degree"][1] == -drives.collision_speed[0]

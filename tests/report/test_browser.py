@@ -82,7 +82,7 @@ def try_player(browser: Chrome, player: object) -> None:
     assert 0.1 < shown_time(player) < 5
     browser.execute_script("arguments[0].value = arguments[0].max; arguments[0].dispatchEvent(new Event('input'))", slider)
     assert find(By.CSS_SELECTOR, "[data-body]:has(.changed)").get_attribute("transform") != start
-    assert "hits at" in player.text  # type: ignore[attr-defined]
+    assert "collides at" in player.text  # type: ignore[attr-defined]
     find(By.CSS_SELECTOR, "[data-sample]").click()
     assert "brakes" in player.text  # type: ignore[attr-defined]
 
@@ -178,7 +178,7 @@ def test_without_javascript_it_stands_still_and_tells_the_same(browser: Chrome, 
         opened(browser, report)
         assert "Smallest robust failure" in browser.find_element(By.TAG_NAME, "main").text
         player = browser.find_element(By.CSS_SELECTOR, ".player")
-        assert "hits at" in player.text
+        assert "collides at" in player.text
         assert not player.find_element(By.CSS_SELECTOR, ".controls").is_displayed()
         assert player.find_element(By.CSS_SELECTOR, ".changed").is_displayed()
     finally:

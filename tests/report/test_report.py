@@ -123,7 +123,7 @@ def test_the_sections_stand_in_their_order_and_tell_what_was_found(page: str, sl
     assert f"collision at {-worst:.1f} m/s" in page
     assert f"{-3.6 * worst:.0f} km/h" in page
     assert f"stops with {case.original['safety_degree']:.2f} m to spare" in page
-    assert re.search(r"\d+ changes lead to a collision that is robust \(\d of them suffices? to be unsafe\): the vehicle hits at", page)
+    assert re.search(r"\d+ changes lead to a collision that is robust \(\d of them suffices? to be unsafe\): the vehicle collides at", page)
     assert "^2" not in re.sub("<(style|script).*?</(style|script)>", "", page, flags=re.DOTALL)
     by_reason = {reason: one for one in explained.explanations for reason in one.reasons}
     fewest = by_reason["fewest changes"]
@@ -170,7 +170,7 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
     assert result["headline"].startswith(f"{number} changes lead to a collision that is robust ({needed} of them suffice")
     robust["minimal_causes"] = [{"changes": {one["text"]: 1.0 for one in first["changes"]}}]
     every = verdict(material, [fewest, robust, summary], None)["headline"]
-    assert every.startswith(f"{number} changes suffice for a collision that is robust: the vehicle hits")
+    assert every.startswith(f"{number} changes suffice for a collision that is robust: the vehicle collides")
     assert [one["value"] for one in result["figures"][2:]] == ["14% of the collisions", "42.0% of the way"]
     assert result["figures"][0]["value"].startswith(f"{len(first['changes'])} changes")
 
@@ -184,7 +184,7 @@ def test_every_replay_that_is_linked_is_there_and_hits_as_recorded(page: str, sl
         changed = json.loads(data)["drives"][1]
         row = by_anchor[anchor]
         if row["outcome"] == "collision":
-            assert changed["verdict"] == f"hits at {-row['f_safe']:.1f} m/s"
+            assert changed["verdict"] == f"collides at {-row['f_safe']:.1f} m/s"
         else:
             assert changed["gap"][changed["nearest"]] == pytest.approx(row["f_safe"], abs=0.006)
 

@@ -114,7 +114,7 @@ def test_all_of_it_is_of_the_point(results: Path) -> None:
     assert (there.case.solutions["f_safe"] > whole.case.solutions["f_safe"]).any()
     page = make_report([results], ["tested", "verdict", "reproduce"], jobs=1, point=DAY)
     worst = there.case.solutions["f_safe"].min()
-    assert (f"hits at {-worst:.1f} m/s" if worst < 0 else f"with {worst:.2f} m to spare") in page
+    assert (f"collides at {-worst:.1f} m/s" if worst < 0 else f"with {worst:.2f} m to spare") in page
     assert f"at the point {DAY} of its matrix alone" in page
 
 

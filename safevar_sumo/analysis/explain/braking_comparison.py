@@ -167,7 +167,7 @@ PARTS = {
 def ending(run: RunSummary) -> str:
     """How a run ended, in words."""
     if run.outcome == Outcome.COLLISION:
-        return f"hits at {run.collision_speed:.2f} m/s"
+        return f"collides at {run.collision_speed:.2f} m/s"
     end = ENDS.get(Outcome(run.outcome), run.outcome)
     return end if run.safety_degree != run.safety_degree else f"{end}, safety degree {run.safety_degree:.2f} m"
 
