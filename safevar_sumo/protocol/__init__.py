@@ -1,4 +1,4 @@
-"""Euro NCAP's crash avoidance protocol as data: its matrices, what a colour is, and how points come about."""
+"""Euro NCAP's crash avoidance protocol as data: matrices, colours, and the computation of points."""
 
 from safevar_sumo.protocol.cells import EURO_NCAP_2026, NOT_RED, PROTOCOLS, Block, Cell, CellScenario, Layer, Protocol, part_of, protocol_of
 from safevar_sumo.protocol.points import COLOURS, RED, Points, points_of

@@ -1,4 +1,4 @@
-"""The cells of a rating: every matrix of the protocol, and every robustness layer that a simulation can vary, as scenario parameters."""
+"""The cells of a rating as scenario parameters: all matrices of the protocol, and all robustness layers that can be simulated."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ NIGHT = "Illumination (Night)"
 SPEED, ACCELERATION, OFFSET, HEADING = "Speed", "Acceleration", "Initial position offset", "Trajectory/Heading"
 IN_DARKNESS = "Performance in darkness (1 lux)"
 WARNED = ("CPLA", "CBLA")
-"""Tests whose rows with a choice of AEB or FCW are rated by the warning; elsewhere the calculator rates the impact either way."""
+"""Tests whose rows with a choice of AEB or FCW are rated by the warning; in other tests the calculator always rates the impact."""
 MODELS = {"CCR": "car_to_car", "CMR": "car_to_car", "CPLA": "along", "CBLA": "along"}
-"""Scenario models by how a test's name begins; all others cross the way."""
+"""Scenario models by the beginning of a test's name; all other tests are crossings."""
 BRAKING, HEADWAY_AT_START = 4.0, 1.0
-"""Of the target in CCRb and CMRb, which the layers vary [m/s^2, s]."""
+"""Deceleration and headway of the target in CCRb and CMRb, which the layers vary [m/s^2, s]."""
 
 
 class Row(Struct, frozen=True, forbid_unknown_fields=True):
@@ -38,9 +38,9 @@ class Row(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Block(Struct, frozen=True, forbid_unknown_fields=True):
-    """A matrix: of a test, in one light where it is tested by day and by night.
+    """A matrix of a test, in one light if the test is driven by day and by night.
 
-    `sheet`, `label`, `first` and `function` are where the official template has it: its name, its first cell, its column of functions.
+    `sheet`, `label`, `first` and `function` locate it in the official template: sheet, name, first cell, column of functions.
     """
 
     test: str
@@ -65,7 +65,7 @@ class Block(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Condition(Struct, frozen=True, forbid_unknown_fields=True):
-    """A variation of a robustness layer as the calculator words it, and what must hold."""
+    """A variation of a robustness layer in the calculator's words, and the criterion that must hold."""
 
     condition: str
     criterion: str
@@ -82,14 +82,14 @@ class Layer(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def simulated(self) -> tuple[Condition, ...]:
-        """Its variations, if a simulation can make them; the calculator has no words for CBLA by night, which is judged as the others."""
+        """Its variations, if they can be simulated; the calculator has no words for CBLA by night, which is judged as the other tests."""
         if self.layer == NIGHT:
             return self.conditions or (Condition(IN_DARKNESS, NOT_RED),)
         return self.conditions if self.layer in (SPEED, ACCELERATION, OFFSET, HEADING) else ()
 
 
 class CellScenario(NamedTuple):
-    """What is simulated for a cell: a scenario model, its parameters, and whether by night."""
+    """The simulation of a cell: scenario model, parameters, and whether by night."""
 
     model: str
     parameters: dict[str, Any]
@@ -102,13 +102,13 @@ class Cell(NamedTuple):
     Attributes
     ----------
     block, row, column
-        Its place in the matrices.
+        Its position in the matrices.
     range
         `standard`, `extended`, or the robustness layer that it varies.
     condition, criterion
-        The variation in the calculator's words and what must hold; "" in the matrices themselves.
+        The variation in the calculator's words and the criterion that must hold; "" in the matrices themselves.
     judged
-        What gives the colour: `mitigation`, `avoidance` or `warning`.
+        Measure that determines the colour: `mitigation`, `avoidance` or `warning`.
     target
         Speed of the target [km/h].
     """
@@ -138,11 +138,11 @@ class Cell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """In words, such as `CPNA night, 40 km/h, 75 %, Speed +3 km/h`."""
-        what = f"target {self.block.target_speeds[self.column]:g} km/h" if self.location is None else f"{self.location:g} %"
+        """The cell in words, such as `CPNA night, 40 km/h, 75 %, Speed +3 km/h`."""
+        column = f"target {self.block.target_speeds[self.column]:g} km/h" if self.location is None else f"{self.location:g} %"
         choice = " FCW" if self.judged == WARNING else ""
         varied = f", {self.range} {self.condition}" if self.is_varied else ""
-        return f"{self.block.name}, {self.vut:g} km/h{choice}, {what}{varied}"
+        return f"{self.block.name}, {self.vut:g} km/h{choice}, {column}{varied}"
 
     @property
     def scene(self) -> CellScenario:
@@ -164,14 +164,14 @@ class Cell(NamedTuple):
 
 
 def _number(condition: str) -> float:
-    """The number that a condition begins with."""
-    found = re.match(r"\s*([+-]?[\d.]+)", condition)
-    assert found is not None, condition
-    return float(found[1])
+    """The number at the beginning of a condition."""
+    match = re.match(r"\s*([+-]?[\d.]+)", condition)
+    assert match is not None, condition
+    return float(match[1])
 
 
 class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=True):
-    """A protocol: `mitigation` and `criteria` say from which value on a cell has a colour, `scenarios` what every test can earn."""
+    """A protocol: `mitigation` and `criteria` hold the values from which a cell has a colour, `scenarios` the points of every test."""
 
     calculator: str
     colours: dict[str, str]
@@ -183,17 +183,17 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """Every simulation: the matrices' cells first, then those of the layers, of the standard range alone."""
+        """All simulations: the cells of the matrices, then those of the layers, which vary only the standard range."""
         return (*self._matrices(), *self._varied())
 
     @cached_property
     def matrix_of(self) -> dict[tuple[str, int, int], int]:
-        """Numbers of the matrices' own cells by name of the block, row and column."""
+        """Numbers of the matrices' own cells, by block name, row and column."""
         return {(cell.block.name, cell.row, cell.column): number for number, cell in enumerate(self.cells) if not cell.is_varied}
 
     @property
     def tests(self) -> dict[str, list[Block]]:
-        """The simulated tests, each by day and by night where it is tested in both."""
+        """The blocks of every simulated test: one, or two if the test is driven by day and by night."""
         tests: dict[str, list[Block]] = {}
         for block in self.blocks:
             tests.setdefault(block.test, []).append(block)
@@ -204,17 +204,17 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
 
     @property
     def not_simulated(self) -> dict[str, float]:
-        """Points of the tests that no simulation here can make, by test."""
+        """Points of tests that cannot be simulated here, by test."""
         return {test: sum(points) for test, points in self.scenarios.items() if test not in self.tests}
 
     def _matrices(self) -> Iterator[Cell]:
         for block in self.blocks:
-            for row, line in enumerate(block.rows):
-                for column, letter in enumerate(line.ranges):
+            for row, values in enumerate(block.rows):
+                for column, letter in enumerate(values.ranges):
                     if letter != "-":
                         yield Cell(block, row, column, STANDARD if letter == "S" else EXTENDED, "", "",
                                    WARNING if block.is_warning(row) else block.criterion,
-                                   block.target_speeds[column] if line.target is None else line.target)
+                                   block.target_speeds[column] if values.target is None else values.target)
 
     def _varied(self) -> Iterator[Cell]:
         standard = [cell for cell in self._matrices() if cell.range == STANDARD]
@@ -228,7 +228,7 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
 
 
 def part_of(protocol: Protocol, part: int, parts: int) -> list[int]:
-    """Numbers of the cells in one of several parts, of 0 to `parts` - 1; cells on one network are in one part as far as possible."""
+    """Numbers of the cells in part `part` of `parts`, counted from 0; cells on one network are in the same part as far as possible."""
     def network(number: int) -> tuple[Any, ...]:
         cell = protocol.cells[number]
         varied = (cell.scene.parameters.get("heading", 0.0), "start_share" in cell.scene.parameters)

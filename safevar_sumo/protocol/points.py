@@ -14,41 +14,41 @@ from safevar_sumo.protocol.cells import EXTENDED, NO_WORSE, NOT_RED, STANDARD, W
 from safevar_sumo.records import BoolArray, CellResults, FloatArray
 
 COLOURS = ("green", "yellow", "orange", "brown", "red")
-"""From best to worst; arrays hold their numbers."""
+"""Colours from best to worst; arrays hold their indices."""
 GREEN, RED = 0, len(COLOURS) - 1
 UNKNOWN = -1
-"""Of a cell whose test is not valid; it earns nothing."""
+"""Colour of a cell whose test is invalid; it earns nothing."""
 WEIGHTS = np.array([1.0, 0.75, 0.5, 0.25, 0.0, 0.0])
-"""What a cell of the standard range is worth by its colour, the last one of an unknown one (protocol 5.2)."""
+"""Worth of a cell of the standard range by colour; the last value is for an unknown colour (protocol 5.2)."""
 STEPS = ((1.0, 1.0), (0.75, 0.75), (0.5, 0.5))
-"""Shares of the extended range's cells that are not red, and the shares of its points that they earn; fewer earn none."""
+"""Minimum shares of cells of the extended range that are not red, and the shares of its points that they earn; fewer earn none."""
 HALF = 0.5
-"""Share of the standard range's points from which on robustness counts."""
+"""Share of the standard range's points that is needed for robustness to count."""
 DECIMALS = 2
-"""The calculator rounds measured values so, half up."""
+"""Decimals to which the calculator rounds measured values, half up."""
 SHARE_DECIMALS = 6
-"""And shares, before it compares them."""
+"""Decimals to which the calculator rounds shares before it compares them."""
 REQUIRED = ("CCRs", 20.0)
-"""Cells of the standard range that are green or all frontal collisions score nothing: of this test, up to this speed [km/h].
+"""Unless the cells of this test up to this speed [km/h] in the standard range are green, all frontal collisions score nothing.
 
-The calculator means to require CPNA at 10 km/h and 75 % as well; 5.4.9 does not find those cells, and so does not.
+The calculator is meant to require CPNA at 10 km/h and 75 % as well, but version 5.4.9 does not find those cells.
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Points:
-    """What M vehicles earn.
+    """Points of M vehicles.
 
     Attributes
     ----------
     colours
         Numbers of `COLOURS`, shape (M, cells).
     tests
-        By name of a block: points of its standard and extended range and of its robustness, shape (M, 3).
+        By block name: points of the standard range, the extended range and robustness, shape (M, 3).
     layers
-        By test and layer: whether the layer holds, shape (M,); only of those that are simulated.
+        By test and layer: whether the layer holds, shape (M,); simulated layers only.
     fails
-        Whether a required cell is not green, so that nothing is earned, shape (M,).
+        Whether a required cell is not green, so that the vehicle earns nothing, shape (M,).
     """
 
     colours: npt.NDArray[np.int8]
@@ -67,13 +67,13 @@ class Points:
 
 
 def half_up(values: FloatArray, decimals: int) -> FloatArray:
-    """Rounded, halves away from zero."""
+    """Values rounded, halves upwards."""
     scale = 10.0**decimals
     return np.asarray(np.floor(np.round(values * scale, 4) + 0.5) / scale)
 
 
 class _Columns(NamedTuple):
-    """Cells by what the rules ask of them, as numbers of columns."""
+    """Cells by the rules that apply to them, as column numbers."""
 
     bands: Sequence[tuple[npt.NDArray[np.intp], Sequence[tuple[int, float]], bool]]
     nominal: npt.NDArray[np.intp]
@@ -94,13 +94,13 @@ def _columns(protocol: Protocol) -> _Columns:
         starts = protocol.mitigation[speed] if speed else protocol.criteria[judged]
         bands.append((np.array(numbers), [(COLOURS.index(name), start) for name, start in starts.items()], judged == WARNING))
 
-    def numbers_of(wanted: object) -> npt.NDArray[np.intp]:
-        return np.array([number for number, cell in enumerate(cells) if wanted(cell)], dtype=np.intp)  # type: ignore[operator]
+    def numbers_of(condition: object) -> npt.NDArray[np.intp]:
+        return np.array([number for number, cell in enumerate(cells) if condition(cell)], dtype=np.intp)  # type: ignore[operator]
 
     ranges = {(block.name, kind): numbers_of(lambda cell, b=block, k=kind: cell.block is b and cell.range == k)
               for block in protocol.blocks for kind in (STANDARD, EXTENDED)}
-    varied = [(layer, condition.criterion, numbers_of(lambda cell, one=layer, c=condition: cell.block.test == one.test
-                                                      and cell.range == one.layer and cell.condition == c.condition))
+    varied = [(layer, condition.criterion, numbers_of(lambda cell, varied_by=layer, c=condition: cell.block.test == varied_by.test
+                                                      and cell.range == varied_by.layer and cell.condition == c.condition))
               for layer in protocol.layers for condition in layer.simulated]
     nominal = np.array([protocol.matrix_of[cell.block.name, cell.row, cell.column] for cell in cells])
     required = numbers_of(lambda cell: cell.block.test == REQUIRED[0] and cell.range == STANDARD and cell.vut <= REQUIRED[1])
@@ -108,21 +108,21 @@ def _columns(protocol: Protocol) -> _Columns:
 
 
 def colours_of(protocol: Protocol, results: CellResults) -> npt.NDArray[np.int8]:
-    """The colour of every cell, shape (M, cells): a bound belongs to the worse colour of an impact, and to the better one of a warning."""
+    """The colour of every cell, shape (M, cells): a value at a bound has the worse colour for an impact, the better for a warning."""
     colours = np.full(results.impact.shape, UNKNOWN, dtype=np.int8)
     impact = half_up(np.maximum(np.nan_to_num(results.impact, nan=0.0), 0.0), DECIMALS)
     warning = half_up(np.nan_to_num(results.warning, nan=-1.0), DECIMALS)
     for numbers, starts, is_warning in _columns(protocol).bands:
         values = (warning if is_warning else impact)[:, numbers]
-        of_these = np.full(values.shape, starts[0][0], dtype=np.int8)
+        band_colours = np.full(values.shape, starts[0][0], dtype=np.int8)
         for colour, start in starts[1:]:
-            of_these = np.where(values >= start, np.int8(colour), of_these)
-        colours[:, numbers] = of_these
+            band_colours = np.where(values >= start, np.int8(colour), band_colours)
+        colours[:, numbers] = band_colours
     return np.where(results.valid, colours, np.int8(UNKNOWN))
 
 
 def points_of(protocol: Protocol, results: CellResults, claims: Mapping[str, Sequence[str]] | None = None) -> Points:
-    """What vehicles earn; `claims` are layers by test that nothing simulates and that count as if they held."""
+    """Points of vehicles; `claims` are layers by test that are not simulated and that count as if they held."""
     colours, columns = colours_of(protocol, results), _columns(protocol)
     layers = _layers(protocol, colours)
     fails = (colours[:, columns.required] != GREEN).any(axis=1)
@@ -140,34 +140,34 @@ def _ranges(block: Block, colours: npt.NDArray[np.int8], columns: _Columns) -> t
     """Points of the standard and of the extended range, shape (M,) each."""
     weights = WEIGHTS[colours[:, columns.ranges[block.name, STANDARD]]]
     total = np.zeros(len(colours))
-    for column in range(weights.shape[1]):  # one after the other: numpy's own sum groups by the shape
+    for column in range(weights.shape[1]):  # column by column: numpy's own sum groups by the shape
         total = total + weights[:, column]
     extended = colours[:, columns.ranges[block.name, EXTENDED]]
     share = np.count_nonzero((extended != RED) & (extended != UNKNOWN), axis=1) / extended.shape[1]
     reached = _rounded(share * block.points[1])
     earned = np.zeros(len(colours))
-    for least, worth in reversed(STEPS):
-        earned = np.where(reached >= _rounded(np.array(least * block.points[1])), worth * block.points[1], earned)
+    for needed, worth in reversed(STEPS):
+        earned = np.where(reached >= _rounded(np.array(needed * block.points[1])), worth * block.points[1], earned)
     return total / weights.shape[1] * block.points[0], earned
 
 
 def _layers(protocol: Protocol, colours: npt.NDArray[np.int8]) -> dict[tuple[str, str], BoolArray]:
-    """Whether simulated layers hold: in every variation of every cell of the standard range that is not red itself, of which there are."""
+    """Whether simulated layers hold: in every variation of all cells of the standard range that are not red; there must be such cells."""
     columns = _columns(protocol)
     holds: dict[tuple[str, str], BoolArray] = {}
     for layer, criterion, numbers in columns.varied:
-        here, nominal = colours[:, numbers], colours[:, columns.nominal[numbers]]
+        varied, nominal = colours[:, numbers], colours[:, columns.nominal[numbers]]
         counts = (nominal != RED) & (nominal != UNKNOWN)
         assert criterion in (NOT_RED, NO_WORSE)
-        passes = (here != UNKNOWN) & ((here != RED) if criterion == NOT_RED else (here <= nominal))
-        held = (passes | ~counts).all(axis=1) & counts.any(axis=1)
+        passes = (varied != UNKNOWN) & ((varied != RED) if criterion == NOT_RED else (varied <= nominal))
+        holds_now = (passes | ~counts).all(axis=1) & counts.any(axis=1)
         key = (layer.test, layer.layer)
-        holds[key] = held & holds[key] if key in holds else held
+        holds[key] = holds_now & holds[key] if key in holds else holds_now
     return holds
 
 
 def _robust_share(protocol: Protocol, test: str, layers: Mapping[tuple[str, str], BoolArray], claimed: Sequence[str], n: int) -> FloatArray:
-    """Share of the layers that count for a test which hold or are claimed, shape (M,)."""
+    """Share of a test's layers that hold or are claimed, shape (M,)."""
     of_test, number = protocol.layers_of(test), np.zeros(n)
     for layer in of_test:
         number = number + layers.get((test, layer.layer), np.full(n, layer.layer in claimed))

@@ -1,4 +1,4 @@
-"""The matrix of a protocol as points that are simulated, and the rating of what vehicles did there."""
+"""The matrix of a protocol as points to simulate, and the rating of the simulated vehicles."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import OBJECTIVES, MatrixTable, MatrixTest, RatingTable, Study, Weather
 
 SHARED = ("vut_length", "vut_width", "grade")
-"""Parameters of a study's scenario that every cell takes over."""
+"""Parameters of a study's scenario that apply to every cell."""
 
 
 IN_SUMO = 8
-"""Cells of a protocol in which SUMO drives settings, too: all of them would take it hours."""
+"""Number of cells of a protocol that SUMO simulates, too: all cells would take hours."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rater:
-    """Rates vehicles that were simulated at all points of a protocol's matrix, in their order; `claims` are layers by test."""
+    """Rates vehicles simulated at all points of a protocol's matrix, in the order of the points; `claims` are layers by test."""
 
     protocol: Protocol
     claims: dict[str, list[str]]
@@ -35,13 +35,13 @@ class Rater:
 
 
 def cell_columns(runs: SimulationRuns) -> tuple[FloatArray, FloatArray, Any]:
-    """What N simulations of a cell are for a rating: impact [km/h], warning [s], validity; shape (N,) each, see `CellResults`."""
+    """Rated quantities of N simulations of a cell: impact [km/h], warning [s], validity; shape (N,) each, see `CellResults`."""
     warning = np.broadcast_to(runs.warning_ttc, runs.relative_speed.shape)
     return runs.relative_speed * KMH_PER_MS, warning, (runs.outcome != Outcome.INVALID_TEST) & (runs.outcome != Outcome.SIMULATOR_ERROR)
 
 
 def joined_cells(columns: Sequence[tuple[FloatArray, FloatArray, Any]]) -> CellResults:
-    """The cells of M vehicles, of what `cell_columns` has for each cell."""
+    """The cells of M vehicles, from the `cell_columns` of each cell."""
     return CellResults(*(np.stack(list(values), axis=1) for values in zip(*columns, strict=True)))
 
 
@@ -50,17 +50,17 @@ def is_rated(study: Study) -> bool:
 
 
 def rated_study(study: Study, protocol: str) -> Study:
-    """The study in the matrix of a protocol."""
+    """The study with the matrix of a protocol."""
     return study if is_rated(study) else replace(study, matrix=MatrixTable(protocol=protocol))  # type: ignore[arg-type]
 
 
 def rater_of(study: Study, source: str) -> Rater | None:
-    """The rater of a study in a protocol's matrix; None of another.
+    """The rater of a study with a protocol's matrix; None for other studies.
 
     Raises
     ------
     InputError
-        If a claim is of no test, or of a layer that does not count for it or is simulated.
+        If a claim names an unknown test, or a layer that does not count for the test or is simulated.
     """
     if study.matrix is None or not study.matrix.protocol:
         return None
@@ -68,19 +68,19 @@ def rater_of(study: Study, source: str) -> Rater | None:
     for test, layers in study.rating.claims.items():
         key = f"rating.claims.{test}"
         if test not in protocol.tests:
-            raise unknown(source, f"{key}: there is no such test, or none that is simulated", test, protocol.tests)
+            raise unknown(source, f"{key}: there is no such test, or it is not simulated", test, protocol.tests)
         simulated = {layer.layer: bool(layer.simulated) for layer in protocol.layers_of(test)}
         for layer in layers:
             if layer not in simulated:
                 raise unknown(source, f"{key}: {layer!r} does not count for {test}", layer, simulated)
             if simulated[layer]:
                 raise InputError(source, f"{key}: {layer!r} is simulated for {test} and cannot be claimed",
-                                 "one of " + ", ".join(one for one, is_simulated in simulated.items() if not is_simulated))
+                                 "one of " + ", ".join(name for name, is_simulated in simulated.items() if not is_simulated))
     return Rater(protocol=protocol, claims=study.rating.claims)
 
 
 def driven_in_sumo(study: Study, weather: Weather) -> Study:
-    """What SUMO drives of a study beside recorded scenes: the study itself; of a rated one a few cells, spread over the matrices."""
+    """The study for a check in SUMO: the study itself or, for a rated study, a few of its cells, spread over the matrices."""
     if not is_rated(study):
         return study
     number = len(protocol_of(study.matrix.protocol).cells)  # type: ignore[union-attr]
@@ -88,7 +88,7 @@ def driven_in_sumo(study: Study, weather: Weather) -> Study:
 
 
 def in_some_cells(study: Study, weather: Weather, numbers: Sequence[int]) -> Study:
-    """A rated study in some of its cells, which have no points."""
+    """A rated study reduced to some of its cells; it has no rating points."""
     everything = rated(study, weather)
     assert everything.matrix is not None
     tests = [everything.matrix.tests[number] for number in numbers]
@@ -97,7 +97,7 @@ def in_some_cells(study: Study, weather: Weather, numbers: Sequence[int]) -> Stu
 
 
 def by_night(weather: Weather) -> Weather:
-    """A weather by night: its road, and what darkness leaves of what its sensors see."""
+    """A weather by night: the same road, with visibility and recognition delay changed by darkness."""
     night = weather_of("night", "weather")
     if weather.light == "night":
         return weather
@@ -107,7 +107,7 @@ def by_night(weather: Weather) -> Weather:
 
 
 def rated(study: Study, weather: Weather) -> Study:
-    """A study whose protocol is written out as tests, one for each cell; by day in the study's weather."""
+    """The study with its protocol expanded to tests, one for each cell; tests by day have the study's weather."""
     assert study.matrix is not None
     shared = {name: value for name, value in study.scenario.parameters.items() if name in SHARED}
     night, tests = by_night(weather), []
@@ -115,5 +115,5 @@ def rated(study: Study, weather: Weather) -> Study:
         scene = cell.scene
         tests.append(MatrixTest(name=cell.name, model=scene.model, parameters={**shared, **scene.parameters},
                                 weathers=[night if scene.night else weather]))
-    scenario = replace(study.scenario, parameters={})  # each test has all of its own
+    scenario = replace(study.scenario, parameters={})  # each test has its own parameters
     return replace(study, matrix=MatrixTable(tests=tests), scenario=scenario)
