@@ -1,4 +1,4 @@
-"""Many settings driven at once, in recorded scenes or in copies of a network in SUMO, and scored."""
+"""Simulates and scores many settings at once, in recorded scenes or in copies of a network in SUMO."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from safevar_sumo.scenarios.frame import Frame
 from safevar_sumo.sumo.contact import Contacts
 from safevar_sumo.sumo.engine import Engine, open_world
 from safevar_sumo.sumo.network import copied_network
-from safevar_sumo.sumo.perception import Parts
+from safevar_sumo.sumo.perception import PointBatch
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Recording, recorded_scenes
 from safevar_sumo.sumo.staging import staged
@@ -48,7 +48,7 @@ def score(system: System, settings: FloatArray, run: SimulationRuns) -> Evaluati
 
 
 def reason_for_sumo(system: System) -> str:
-    """Why a system's vehicles are driven in SUMO, each in a copy of the network; "" where they drive in a recorded scene."""
+    """The reason why a system is simulated in SUMO, with a copy of the network for each vehicle; "" if it runs in recorded scenes."""
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
     scenes = recorded_scenes([point.scenario for point in system.points], step_options(system))
@@ -57,11 +57,11 @@ def reason_for_sumo(system: System) -> str:
 
 def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = (),
               watch: Watcher | None = None) -> SimulationRuns:
-    """Drive every setting, shape (N, n), at every one of the points; `watch` is shown SUMO at every sample.
+    """Simulate every setting, shape (N, n), at every point; `watch` is called with SUMO's world at every sample.
 
-    The points share a network and are recorded; in SUMO there is one.
+    Several points must share a network and have recorded scenes; SUMO simulates one point only.
 
-    The drives at the first point come first, then those at the second, and so on.
+    The runs at the first point come first, then those at the second, and so on.
 
     Raises
     ------
@@ -83,22 +83,22 @@ def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECO
 
 
 def step_options(system: System) -> tuple[str, ...]:
-    """SUMO's options for the time step that the study asks for."""
+    """SUMO's options for the study's time step."""
     return () if system.step_length is None else ("--step-length", repr(system.step_length))
 
 
 @np.errstate(all="ignore")
 def drive(system: System, settings: FloatArray, world: SumoWorld | RecordedWorld, watch: Watcher | None = None) -> SimulationRuns:
-    """Drive the vehicles of an open world that nobody has stepped yet; see `drive_all`.
+    """Simulate the vehicles of an open world before its first step; see `drive_all`.
 
-    With several points the k-th part of the settings is in the k-th of them.
+    With several points the k-th part of the settings is at the k-th point.
     """
     guards = [member.guard for member in system.members if member.guard is not None]
     with guard_process_state(guards[0].source if guards else "", [guard.name for guard in guards]):
-        return _driven(system, settings, world, watch)
+        return _simulated(system, settings, world, watch)
 
 
-def _driven(system: System, settings: FloatArray, world: Any, watch: Watcher | None) -> SimulationRuns:
+def _simulated(system: System, settings: FloatArray, world: Any, watch: Watcher | None) -> SimulationRuns:
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_surface(system.points, n))
@@ -106,28 +106,28 @@ def _driven(system: System, settings: FloatArray, world: Any, watch: Watcher | N
     world.set_types(types._replace(decel=np.maximum(types.decel, SURE_BRAKES)))
     world.depart()
     world.set_decelerations(types.decel)
-    length, way = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
+    length, frame = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
 
     state = at_start(vehicle, prepared, world.speeds())
-    if isinstance(system.ads, TraciController):  # any other is given what is sensed
+    if isinstance(system.ads, TraciController):  # other ADSs get sensed observations
         world.sensors = _sensors(system, prepared, n)
     driver = system.ads.start(n, system.nominal, step)
-    parts = Parts(system.points, world, n)
-    log = _Log(n, int(parts.last.max()) + 1, way)
+    batch = PointBatch(system.points, world, n)
+    log = _Log(n, int(batch.last.max()) + 1, frame)
     verdict, robot = _Verdict(n), DrivingRobot(system.points, vehicle, prepared, state, step)
     contacts, warnings = Contacts(n, robot.tested), _Warnings(system.ads, n)
     for sample in range(log.length):
         if watch is not None:
             watch(world)
         speed = world.speeds()
-        scene = parts.scene(verdict.open)
-        active = verdict.judge(speed, scene.over, contacts.collisions(world, verdict.open, scene), last=sample >= parts.last)
-        seen = parts.seen(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
+        scene = batch.scene(verdict.open)
+        active = verdict.judge(speed, scene.over, contacts.collisions(world, verdict.open, scene), last=sample >= batch.last)
+        seen = batch.observe(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
         seen, state = vehicle.sense(prepared, state, seen)
         command, driver = system.ads.drive(seen, driver)
-        warnings.take(driver, speed, scene, verdict.open)
+        warnings.update(driver, speed, scene, verdict.open)
         command, state = robot.drive(command, state, verdict.open)
-        log.write(sample, place=world.vehicle_positions(VUT), speed=speed, gap=scene.gap, lateral=scene.lateral,
+        log.write(sample, position=world.vehicle_positions(VUT), speed=speed, gap=scene.gap, lateral=scene.lateral,
                   lateral_speed=scene.lateral_speed, throttle=command.throttle, brake=command.brake, gear=state.gear, active=active,
                   obstacle_speed=scene.obstacle_speed, pedal=state.brake)
         if not np.count_nonzero(verdict.open):
@@ -135,24 +135,24 @@ def _driven(system: System, settings: FloatArray, world: Any, watch: Watcher | N
         if watch is None:
             world.leave(verdict.ended)
         state = vehicle.advance(prepared, state, command)
-        _refuse_no_number(state.speed, settings, system.characteristics)
+        _refuse_nan(state.speed, settings, system.characteristics)
         world.advance(np.where(verdict.open, state.speed, 0.0))
     trace = log.trace(sample + 1, step, length)
     return SimulationRuns(
-        trace=trace, encounter=parts.encounter(trace), outcome=np.where(robot.invalid, Outcome.INVALID_TEST, verdict.outcome()),
+        trace=trace, encounter=batch.encounter(trace), outcome=np.where(robot.invalid, Outcome.INVALID_TEST, verdict.outcome()),
         collision_speed=np.where(robot.invalid, np.nan, verdict.collision_speed), contact=contacts.contact(),
         test_speed_error=robot.error, warning_ttc=warnings.time_to_collision)
 
 
-def _refuse_no_number(speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet) -> None:
-    """SUMO takes a speed that is no number for 0: a vehicle whose physics have broken down would pass for a careful one.
+def _refuse_nan(speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet) -> None:
+    """Refuse speeds that are not finite: SUMO would take them for 0, and a vehicle whose model diverged would seem to stand.
 
-    It stands for numpy's warnings of overflows, which tell neither characteristic nor value.
+    The error replaces numpy's warnings of overflows, which name neither characteristic nor value.
     """
     if np.count_nonzero(np.isfinite(speed)) < len(speed):
         copy = np.flatnonzero(~np.isfinite(speed))[0]
-        values = ", ".join(f"{one.name} = {value:g}" for one, value in zip(characteristics, settings[copy], strict=True)
-                           if value != one.original) or "the original's values"
+        values = ", ".join(f"{member.name} = {value:g}" for member, value in zip(characteristics, settings[copy], strict=True)
+                           if value != member.original) or "the original's values"
         raise InputError("vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with")
 
 
@@ -165,7 +165,7 @@ def _road_friction(points: Sequence[Point], n: int) -> Any:
 def _surface(points: Sequence[Point], n: int) -> list[Any]:
     """Slope and wetness of the points' roads, each for its part of the vehicles.
 
-    Nothing where all are level and dry: not every vehicle takes them.
+    Empty if all are level and dry, as not every vehicle model accepts them.
     """
     grades, wet = [getattr(point.scenario, "grade", 0.0) for point in points], [point.weather.wet for point in points]
     slope = slope_of(np.repeat(grades, n // len(points))) if any(grades) else LEVEL
@@ -173,9 +173,9 @@ def _surface(points: Sequence[Point], n: int) -> list[Any]:
 
 
 def _sensors(system: System, prepared: Any, n: int) -> Sensors:
-    """The vehicles' sensors in the weathers of their points, where it takes longer to recognise somebody and one does not see so far."""
-    of_vehicle = getattr(system.vehicle, "sensors", None)
-    own = (None if of_vehicle is None else of_vehicle(prepared)) or Sensors.perfect(n)
+    """The vehicles' sensors in the weathers of their points, with recognition delay and visibility applied."""
+    method = getattr(system.vehicle, "sensors", None)
+    own = (None if method is None else method(prepared)) or Sensors.perfect(n)
     weathers = [point.weather for point in system.points]
     delay = np.repeat([weather.recognition_delay for weather in weathers], n // len(weathers))
     visibility = np.repeat([weather.visibility for weather in weathers], n // len(weathers))
@@ -183,14 +183,14 @@ def _sensors(system: System, prepared: Any, n: int) -> Sensors:
 
 
 class _Warnings:
-    """The times to collision at which N drivers are first warned [s], NaN where they are not; an ADS without `warns` never does."""
+    """The times to collision at which N drivers are first warned [s], NaN if never; an ADS without `warns` never warns."""
 
     def __init__(self, ads: Any, n: int) -> None:
         self._warns = getattr(ads, "warns", None)
         self.time_to_collision = np.full(n, np.nan)
 
-    def take(self, memory: Any, speed: FloatArray, scene: Scene, open_: BoolArray) -> None:
-        """Take in one sample: what counts is where the obstacle is, not where sensors have it."""
+    def update(self, memory: Any, speed: FloatArray, scene: Scene, open_: BoolArray) -> None:
+        """Process one sample, with the true position of the obstacle instead of the sensed one."""
         if self._warns is None:
             return
         closing = speed - scene.obstacle_speed
@@ -200,29 +200,29 @@ class _Warnings:
 
 
 class _Log:
-    """Samples of a run in arrays of shape (T, N), and where the vehicles were on SUMO's plane, shape (T, N, 2)."""
+    """Samples of a run in arrays of shape (T, N), and positions of the vehicles on SUMO's plane, shape (T, N, 2)."""
 
     _COLUMNS = ("speed", "gap", "lateral", "lateral_speed", "throttle", "brake", "gear", "active", "obstacle_speed",
                 "pedal")
 
-    def __init__(self, n: int, length: int, way: Frame) -> None:
-        self.length, self._way = length, way
+    def __init__(self, n: int, length: int, frame: Frame) -> None:
+        self.length, self._frame = length, frame
         self._rows = {name: np.zeros((length, n), dtype=bool if name == "active" else float) for name in self._COLUMNS}
-        self._places = np.zeros((length, n, 2))
+        self._positions = np.zeros((length, n, 2))
 
-    def write(self, sample: int, place: FloatArray, **columns: FloatArray | BoolArray) -> None:
-        self._places[sample] = place
+    def write(self, sample: int, position: FloatArray, **columns: FloatArray | BoolArray) -> None:
+        self._positions[sample] = position
         for name, values in columns.items():
             self._rows[name][sample] = values
 
     def trace(self, length: int, step: float, vehicle_length: float) -> Trace:
         rows = {name: values[:length] for name, values in self._rows.items()}
-        rows["position"] = self._way.along(self._places[:length].reshape(-1, 2)).reshape(length, -1)
+        rows["position"] = self._frame.along(self._positions[:length].reshape(-1, 2)).reshape(length, -1)
         return Trace(step=step, vehicle_length=vehicle_length, time=np.round(np.arange(length) * step, TIME_DECIMALS), **rows)
 
 
 class _Verdict:
-    """How N simulations end; `open` where the outcome can still change, `ended` those that ended last. Method section 4."""
+    """Outcomes of N simulations (method section 4); `open` where the outcome can still change, `ended` those that ended in this step."""
 
     def __init__(self, n: int) -> None:
         self.open = np.ones(n, dtype=bool)
@@ -233,7 +233,7 @@ class _Verdict:
         self._over = np.zeros(n, dtype=bool)
 
     def judge(self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: BoolArray | bool) -> BoolArray:
-        """Take in one sample; returns for which vehicles it still belongs to the run."""
+        """Process one sample; returns for which vehicles the sample still belongs to the run."""
         before, active = self.open.copy(), self.open & ~over
         for copy, collision_speed in collisions.items():
             if self.open[copy]:
@@ -248,7 +248,7 @@ class _Verdict:
         return active
 
     def outcome(self) -> npt.NDArray[np.str_]:
-        """The outcome of every simulation, once none is open."""
+        """The outcome of every simulation, when no run is open."""
         outcome = np.full(len(self.open), Outcome.TIMEOUT.value, dtype="U16")
         outcome[self._over] = Outcome.PASSED
         outcome[self._stood] = Outcome.STOPPED

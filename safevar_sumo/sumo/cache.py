@@ -1,4 +1,4 @@
-"""Built files that are kept in the user's cache folder: by all that they are made from, whole, and checked before use."""
+"""Built files in the user's cache folder: named by their sources, written atomically, and checked before use."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ CHECKSUM = ".sha256"
 
 
 def cached(folder: str, name: str, build: Callable[[Path], None]) -> Path:
-    """A file of the cache, built if it is not there as it was built.
+    """A file of the cache, built if it is missing or damaged.
 
     Parameters
     ----------
     folder
-        Where in the cache; tells contents apart.
+        Folder within the cache, different for different contents.
     build
-        Writes the file of that name, always the same bytes, into the directory that it is given.
+        Function that writes the file `name`, always with the same bytes, into the directory that is its argument.
 
     Raises
     ------
@@ -34,9 +34,9 @@ def cached(folder: str, name: str, build: Callable[[Path], None]) -> Path:
     if not _intact(target):
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=target.parent) as made:
-                build(Path(made))
-                built = Path(made) / name
+            with tempfile.TemporaryDirectory(dir=target.parent) as temporary:
+                build(Path(temporary))
+                built = Path(temporary) / name
                 checksum = built.with_name(name + CHECKSUM)
                 checksum.write_text(_sha256(built), encoding="ascii")
                 for file in (built, checksum):

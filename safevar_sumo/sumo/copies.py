@@ -1,4 +1,4 @@
-"""Copies of what XML says of a network and its traffic: every id with the copy's number in front."""
+"""Copies of the XML of a network and its traffic: every id is prefixed with the copy's number."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ ROADS: Ids = {
     "tlLogic": ("id",), "phase": (), "junction": ("id", "incLanes", "intLanes"), "request": (),
     "connection": ("from", "to", "via", "tl"), "roundabout": ("nodes", "edges"), "param": (),
 }
-"""Of a built network."""
+"""Elements of a built network."""
 SHARED = ("location", "type", "prohibition")
-"""What a built network says once for all copies; prohibitions are in its junctions already, SUMO does not read them."""
+"""Elements of a built network that are written once for all copies; SUMO ignores prohibitions, as its junctions contain them."""
 DEMAND: Ids = {
     "vType": ("id",), "route": ("id", "edges"), "vehicle": ("id", "type", "route", "via"),
     "trip": ("id", "type", "from", "to", "via"),
@@ -30,22 +30,22 @@ DEMAND: Ids = {
     "personTrip": ("from", "to", "via", "vTypes"),
     "stop": ("lane", "edge", "expected", "permitted", "join", "split"), "param": (),
 }
-"""Of a traffic file."""
+"""Elements of a traffic file."""
 SIGNALS = re.compile(
     r"(max|min|detector)-gap|passing-time|show-detectors|freq|(jam|inactive)-threshold|coordinated|cycleTime|cycleOffset|link(Max|Min)Dur:\d+"
     r"|minTimeLoss|detectorRange|ring[12]|barrier2?Phases|coordinate-mode|whetherOutputState|fixForceOff|controllerType|total-cycle-length")
-"""Parameters of a traffic light that name no detectors or files."""
+"""Parameters of a traffic light that refer to no detectors or files."""
 _COPY = "\x01"
-"""Stands for the copy's number; no XML may contain it."""
+"""Placeholder for the copy's number; XML cannot contain this character."""
 
 
 def copied_id(copy: int | str, name: str) -> str:
-    """Id of `name` in a copy; internal edges keep their colon in front."""
+    """Id of `name` in a copy; internal edges keep their leading colon."""
     return f":{copy}.{name[1:]}" if name.startswith(":") else f"{copy}.{name}"
 
 
 def copy_and_name(copied: str) -> tuple[int, str]:
-    """The copy that an id belongs to and what it is called in the original: the inverse of `copied_id`."""
+    """The copy that an id belongs to and its name in the original: the inverse of `copied_id`."""
     colon = ":" if copied.startswith(":") else ""
     copy, _, name = copied.removeprefix(":").partition(".")
     return int(copy), colon + name
@@ -66,23 +66,23 @@ def parsed(source: Path) -> ElementTree.Element:
 
 
 def write_roads(root: ElementTree.Element, n: int, file: Path) -> None:
-    """N copies of a built network, kind after kind: SUMO wants edges before junctions, and those before connections."""
+    """Write N copies of a built network, kind by kind: SUMO requires edges before junctions, and junctions before connections."""
     parts = []
     for tag, children in groupby(root, key=lambda child: child.tag):
-        once = "".join(_text(child, {} if tag in SHARED else ROADS) for child in children)
-        parts.append(once if tag in SHARED else _times(once, n))
+        elements = "".join(_text(child, {} if tag in SHARED else ROADS) for child in children)
+        parts.append(elements if tag in SHARED else _times(elements, n))
     _write(root, parts, file)
 
 
 def write_demand(original: ElementTree.Element, n: int, file: Path) -> None:
-    """N copies of a traffic, in the order of departure: SUMO leaves out whoever comes too late in the file."""
+    """Write N copies of a traffic in the order of departure: SUMO drops actors that come too late in the file."""
     texts = [(begin, _text(child, DEMAND)) for child, begin in _departures(original)]
-    copies = sorted(((begin, copy, text) for copy in range(n) for begin, text in texts), key=lambda one: one[0])
+    copies = sorted(((begin, copy, text) for copy in range(n) for begin, text in texts), key=lambda entry: entry[0])
     _write(original, [text.replace(_COPY, str(copy)) for _, copy, text in copies], file)
 
 
 def check_roads(root: ElementTree.Element, file: Path) -> None:
-    """Refuse what we cannot copy of a built network.
+    """Refuse elements of a built network that cannot be copied.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def _check_signals(light: ElementTree.Element, file: Path) -> None:
 
 
 def _departures(root: ElementTree.Element) -> Iterable[tuple[ElementTree.Element, float]]:
-    """Children with the time at which each sets off [s], types and routes first of all."""
+    """Children with their time of departure [s]; types and routes come first."""
     last = 0.0
     for child in root:
         if child.tag in ("vType", "route"):
@@ -121,7 +121,7 @@ def _departures(root: ElementTree.Element) -> Iterable[tuple[ElementTree.Element
 
 
 def seconds(text: str) -> float | None:
-    """A time of SUMO's, in seconds or as [days:]hours:minutes:seconds; None if it is none [s]."""
+    """A time in SUMO's format, seconds or [days:]hours:minutes:seconds, in seconds; None if the text is no time."""
     try:
         total, parts = 0.0, text.split(":")
         for factor, part in zip((86400, 3600, 60, 1)[-len(parts):], parts, strict=True):

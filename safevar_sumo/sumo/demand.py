@@ -1,4 +1,4 @@
-"""Where a traffic file puts people: places that are on the road, and a road under the vehicle under test that is as it drives on it."""
+"""Checks of a traffic file: positions on the road, a level road for the vehicle under test, and no randomness."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.copies import DEMAND, seconds
 
 LEVEL = 0.005
-"""So much may a road climb that counts as level, a part of its length."""
+"""Largest climb of a road that counts as level, over its length [-]."""
 
 Lanes = dict[str, list[ElementTree.Element]]
-"""By edge."""
+"""Lanes by edge."""
 
 
 def check_places(root: ElementTree.Element, file: Path, roads: ElementTree.Element) -> None:
-    """Refuse places beyond the end of a lane, and a way of the vehicle under test that climbs or is slippery.
+    """Refuse positions beyond the end of a lane, and a road of the vehicle under test that climbs or is slippery.
 
     Raises
     ------
@@ -29,29 +29,29 @@ def check_places(root: ElementTree.Element, file: Path, roads: ElementTree.Eleme
     lanes = {edge.get("id", ""): list(edge.iter("lane")) for edge in roads.iter("edge")}
     routes = {route.get("id", ""): route for route in root.findall("route")}
     for actor in root:
-        way = _way(actor, routes)
-        if way:
-            _check_on(actor, ("departPos",), way[0], lanes, file)
+        edges = _edges_of(actor, routes)
+        if edges:
+            _check_on(actor, ("departPos",), edges[0], lanes, file)
         if actor.get("id") == VUT and actor.tag in ("vehicle", "trip"):
-            for edge in way:
+            for edge in edges:
                 _check_surface(lanes[edge], file)
     for stop in root.iter("stop"):
         _check_on(stop, ("startPos", "endPos"), stop.get("edge") or stop.get("lane", "").rpartition("_")[0], lanes, file)
 
 
-def way_of_vut(root: ElementTree.Element) -> list[str]:
-    """The edges on which the vehicle under test drives, as far as the traffic file says so."""
+def edges_of_vut(root: ElementTree.Element) -> list[str]:
+    """The edges of the vehicle under test, as far as the traffic file names them."""
     routes = {route.get("id", ""): route for route in root.findall("route")}
-    return [edge for actor in root if actor.get("id") == VUT and actor.tag in ("vehicle", "trip") for edge in _way(actor, routes)]
+    return [edge for actor in root if actor.get("id") == VUT and actor.tag in ("vehicle", "trip") for edge in _edges_of(actor, routes)]
 
 
-def _way(actor: ElementTree.Element, routes: dict[str, ElementTree.Element]) -> list[str]:
-    """The edges on which an actor sets off and, as far as the file says so, goes on."""
+def _edges_of(actor: ElementTree.Element, routes: dict[str, ElementTree.Element]) -> list[str]:
+    """The edges on which an actor starts and, as far as the file names them, continues."""
     for part in (actor.find("route"), routes.get(actor.get("route", "")), actor, actor.find("walk"), actor.find("personTrip")):
         if part is not None:
-            found = " ".join(part.get(name, "") for name in ("edges", "from", "via", "to")).split()
-            if found:
-                return found
+            edges = " ".join(part.get(name, "") for name in ("edges", "from", "via", "to")).split()
+            if edges:
+                return edges
     return []
 
 
@@ -60,8 +60,7 @@ def _check_on(element: ElementTree.Element, names: tuple[str, ...], edge: str, l
     for name in names:
         value = element.get(name, "0")
         if is_number(value) and not abs(float(value)) <= length:
-            called = f"{element.tag} {element.get('id')!r}" if "id" in element.attrib else element.tag
-            raise InputError(file, f"{called}: {name} = {value} is not on {edge!r}", f"at most its length, {length:g} m")
+            raise InputError(file, f"{_called(element)}: {name} = {value} is not on {edge!r}", f"at most its length, {length:g} m")
 
 
 def _check_surface(lanes: list[ElementTree.Element], file: Path) -> None:
@@ -92,28 +91,28 @@ CHILDREN: Mapping[str, tuple[str, ...]] = {
     "trip": ("stop", "param"), "flow": _RIDING, "person": _WALKING, "personFlow": _WALKING, "walk": ("param",), "personTrip": ("param",),
     "stop": ("param",), "param": (),
 }
-"""What may be in an element of a traffic file."""
+"""Legal children of the elements of a traffic file."""
 ELSEWHERE = frozenset({
     "fromTaz", "toTaz", "fromJunction", "toJunction", "busStop", "trainStop", "containerStop", "chargingStation",
     "parkingArea", "overheadWireSegment", "lines", "line", "group", "departEdge", "arrivalEdge", "imgFile", "osgFile"})
-"""Attributes that name what no traffic file holds."""
+"""Attributes that refer to things outside a traffic file."""
 DEVICES = re.compile(r"(has\.|device\.).*")
-"""Parameters of devices, which write files or draw at random."""
+"""Parameters of devices, which write files or use random numbers."""
 RANDOM = frozenset({"lcSigma", "jmIgnoreFoeProb", "jmIgnoreJunctionFoeProb", "jmSigmaMinor", "probability"})
-"""Attributes that make something random, unless 0."""
+"""Attributes that introduce randomness unless they are 0."""
 SIGMA = frozenset({"Krauss", "KraussOrig1", "KraussPS"})
 STEADY = frozenset({"IDM", "IDMM", "ACC", "CACC"})
-"""Models of following that draw at random as far as sigma is not 0, and never."""
+"""Car-following models that are random unless sigma is 0, and that are never random."""
 
 SET_BY_SETTINGS = ("mass", "accel", "decel", "emergencyDecel", "apparentDecel", "maxSpeed", "tau")
-"""Attributes of the type of the vehicle under test in whose place its model puts the setting's."""
-OF_SUMOS_DRIVER = re.compile("carFollowModel|speedFactor|speedDev|sigma.*|desiredMaxSpeed|impatience|laneChangeModel|lc[A-Z].*|jm[A-Z].*"
+"""Attributes of the type of the vehicle under test that the vehicle model replaces by those of the setting."""
+SUMO_DRIVER = re.compile("carFollowModel|speedFactor|speedDev|sigma.*|desiredMaxSpeed|impatience|laneChangeModel|lc[A-Z].*|jm[A-Z].*"
                              "|actionStepLength|startupDelay|delta|stepping|minGapLat|maxSpeedLat|latAlignment")
-"""Attributes that say how SUMO's own driver drives."""
+"""Attributes of SUMO's own driver."""
 
 
 def check_demand(root: ElementTree.Element, file: Path, roads: ElementTree.Element, options: Mapping[str, str]) -> None:
-    """Refuse traffic that cannot be copied, or not in the same way, or that is not on the roads of the built network.
+    """Refuse traffic that cannot be copied, that would differ between copies, or that is not on the built network.
 
     Raises
     ------
@@ -141,8 +140,8 @@ def _check_element(element: ElementTree.Element, file: Path) -> None:
     for name, value in element.attrib.items():
         if name in ELSEWHERE:
             raise InputError(file, f"{_called(element)}: {name} = {value!r}", "edges and lanes of the network; no other file is read")
-        chosen = name.startswith(("depart", "arrival")) and value.startswith("random")
-        if chosen or (name == "period" and value.startswith("exp")) or (name in RANDOM and not _zero(value)):
+        random_place = name.startswith(("depart", "arrival")) and value.startswith("random")
+        if random_place or (name == "period" and value.startswith("exp")) or (name in RANDOM and not _zero(value)):
             raise InputError(file, f"{_called(element)}: {name} = {value!r} draws at random", "the same in every copy of the network")
     if element.tag == "param" and DEVICES.fullmatch(element.get("key", "")):
         raise InputError(file, f"param {element.get('key')!r} gives a device", "no devices: they write files, or draw at random")
@@ -157,13 +156,13 @@ def _check_ids(root: ElementTree.Element, file: Path, roads: ElementTree.Element
     for kinds in (("vehicle", "trip", "flow"), ("person", "personFlow")):
         _unique(root, kinds, file)
     edges = {edge.get("id", "") for edge in roads.iter("edge")}
-    known = {"type": types, "vTypes": types, "route": routes, "edges": edges, "from": edges, "to": edges, "via": edges, "edge": edges,
+    names = {"type": types, "vTypes": types, "route": routes, "edges": edges, "from": edges, "to": edges, "via": edges, "edge": edges,
              "lane": {lane.get("id", "") for lane in roads.iter("lane")}}
     for element in root.iter():
         for name in DEMAND.get(element.tag, ()):
-            for one in element.get(name, "").split():
-                if name in known and one not in known[name]:
-                    raise InputError(file, f"{_called(element)}: {name} = {one!r} is not there", _some_of(known[name]))
+            for reference in element.get(name, "").split():
+                if name in names and reference not in names[name]:
+                    raise InputError(file, f"{_called(element)}: {name} = {reference!r} does not exist", _some_of(names[name]))
 
 
 def _some_of(names: set[str]) -> str:
@@ -172,23 +171,23 @@ def _some_of(names: set[str]) -> str:
 
 
 def _unique(root: ElementTree.Element, kinds: tuple[str, ...], file: Path) -> set[str]:
-    found: set[str] = set()
+    names: set[str] = set()
     for element in root:
         if element.tag in kinds:
             name = element.get("id", "")
-            if not name or name in found or name.split() != [name]:
-                raise InputError(file, f"{element.tag} has the id {name!r}", "an id of its own, without spaces")
-            found.add(name)
-    return found
+            if not name or name in names or name.split() != [name]:
+                raise InputError(file, f"{element.tag} has the id {name!r}", "a unique id without spaces")
+            names.add(name)
+    return names
 
 
 def _check_vut(root: ElementTree.Element, file: Path) -> None:
-    """There is one vehicle under test, of a type that is its alone, from the beginning on."""
-    vut = next((one for one in root if one.tag in ("vehicle", "trip") and one.get("id") == VUT), None)
+    """Refuse traffic without a vehicle under test that departs at time 0, has no stops, and alone has its type."""
+    vut = next((actor for actor in root if actor.tag in ("vehicle", "trip") and actor.get("id") == VUT), None)
     if vut is None:
         raise InputError(file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>, the vehicle under test')
     if vut.get("type") != VUT:
-        raise InputError(file, f"vehicle {VUT!r}: type = {vut.get('type')!r}", f"{VUT!r}, a vType that becomes what a setting says")
+        raise InputError(file, f"vehicle {VUT!r}: type = {vut.get('type')!r}", f"{VUT!r}, a vType that each setting changes")
     if seconds(vut.get("depart", "")) != 0:
         raise InputError(file, f"vehicle {VUT!r}: depart = {vut.get('depart')!r}", "0")
     routes = [route for route in root if route.tag == "route" and route.get("id") == vut.get("route")]
@@ -200,7 +199,7 @@ def _check_vut(root: ElementTree.Element, file: Path) -> None:
 
 
 def _check_chance(root: ElementTree.Element, file: Path, options: Mapping[str, str]) -> None:
-    """What SUMO draws at random differs from copy to copy, so that a result would depend on its batch."""
+    """Refuse randomness in SUMO: it differs between copies, so that a result would depend on its batch."""
     types = {kind.get("id", ""): kind for kind in root if kind.tag == "vType"}
     for actor in root:
         if actor.tag in _ACTORS and actor.get("id") != VUT:
@@ -235,28 +234,28 @@ def _zero(text: str) -> bool:
 
 
 def unused(root: ElementTree.Element, roads: ElementTree.Element, fastest: float, *, sumo_drives: bool) -> list[str]:
-    """What a network says of the vehicle under test and the simulation does not use.
+    """Remarks on attributes of the vehicle under test in a network that the simulation does not use.
 
     Parameters
     ----------
     fastest
-        How fast the original vehicle can drive; a higher speed limit limits nothing [m/s].
+        Top speed of the original vehicle; higher speed limits have no effect [m/s].
     sumo_drives
-        Whether SUMO's own driver has a say, as beside a controller written for TraCI.
+        Whether SUMO's own driver takes part, as with a controller written for TraCI.
     """
     mentioned = []
-    for element in (one for one in root if one.get("id") == VUT):
+    for element in (child for child in root if child.get("id") == VUT):
         for name, value in element.attrib.items():
-            if name in SET_BY_SETTINGS or (OF_SUMOS_DRIVER.fullmatch(name) and not sumo_drives and not _says_nothing(name, value)):
+            if name in SET_BY_SETTINGS or (SUMO_DRIVER.fullmatch(name) and not sumo_drives and not _has_no_effect(name, value)):
                 mentioned.append(f"{name} = {value}")
-    slow = [] if sumo_drives else [lane for edge in way_of_vut(root) for lane in roads.findall(f"edge[@id='{edge}']/lane")
+    slow = [] if sumo_drives else [lane for edge in edges_of_vut(root) for lane in roads.findall(f"edge[@id='{edge}']/lane")
                                    if float(lane.get("speed", "inf")) < fastest]
     if slow:
         mentioned.append(f"the speed limit of lane {slow[0].get('id')!r} ({float(slow[0].get('speed', 'nan')):g} m/s)"
                          f"{f' and of {len(slow) - 1} more' if len(slow) > 1 else ''}")
-    driver = "the study's vehicle and ADS say how it drives"
+    driver = "the study's vehicle and ADS determine how it drives"
     return [f"not used of vehicle {VUT!r}: {', '.join(dict.fromkeys(mentioned))}; {driver}"] if mentioned else []
 
 
-def _says_nothing(name: str, value: str) -> bool:
+def _has_no_effect(name: str, value: str) -> bool:
     return (name in ("sigma", "speedDev") and _zero(value)) or (name == "speedFactor" and is_number(value) and float(value) == 1)

@@ -20,12 +20,12 @@ from safevar_sumo.sumo.network import CopiedNetwork
 from safevar_sumo.sumo.world import SumoWorld
 
 CONNECTION_ATTEMPTS = 15
-"""How often, a second apart, traci tries to reach a SUMO that it has started."""
+"""Number of attempts, one per second, of traci to connect to a SUMO process that it has started."""
 
 
 class Engine(StrEnum):
-    """Who moves the vehicles: numpy in a recorded scene where nobody reacts to them (else as LIBSUMO), or SUMO in this process, in
-    another one, or in another one with a window.
+    """The program that moves the vehicles: numpy in a recorded scene (LIBSUMO if somebody may react to the vehicles), or SUMO in this
+    process, in another process, or in another process with a window.
     """
 
     RECORDED = "recorded"
@@ -36,12 +36,12 @@ class Engine(StrEnum):
 
 @contextmanager
 def open_world(files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, options: Sequence[str] = ()) -> Iterator[SumoWorld]:
-    """Start SUMO on `n` copies of a network with their traffic, and close it whatever happens.
+    """Start SUMO on `n` copies of a network with their traffic, and close it in every case.
 
     Raises
     ------
     SimulationError
-        With SUMO's own words, if it cannot load or loses a step.
+        With SUMO's own message, if it cannot load a network or simulate a step.
     """
     api = engine_api(engine)
     try:
@@ -73,7 +73,7 @@ def sumo_command(engine: Engine, files: CopiedNetwork) -> list[str]:
 
 
 def start_engine(api: Any, engine: Engine, command: list[str]) -> None:
-    """Start an engine's program with this command line."""
+    """Start an engine with a command line."""
     if engine is Engine.LIBSUMO:
         try:
             api.start(command)
@@ -82,7 +82,7 @@ def start_engine(api: Any, engine: Engine, command: list[str]) -> None:
         return
     if engine is Engine.GUI and sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise InputError("gui", "sumo-gui has no display to open its window on", "a desktop session, or DISPLAY in the environment")
-    with redirect_stdout(StringIO()), warnings.catch_warnings():  # traci tells how it waits for SUMO
+    with redirect_stdout(StringIO()), warnings.catch_warnings():  # traci prints that it waits for SUMO
         warnings.simplefilter("ignore")
         api.start(command, numRetries=CONNECTION_ATTEMPTS)
 
@@ -97,6 +97,6 @@ def binary(engine: Engine) -> str:
 
 
 def stop_engine(api: Any) -> None:
-    """Release SUMO; if it never started or its window was closed, there is nothing left to release."""
+    """Close SUMO; errors are ignored, as SUMO may never have started or its window may be closed."""
     with suppress(api.TraCIException, api.FatalTraCIError):
         api.close()

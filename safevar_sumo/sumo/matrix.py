@@ -1,4 +1,4 @@
-"""Settings at the points of a study: at its one scenario, or at all of a matrix, where the worst point counts."""
+"""Settings at the points of a study: its one scenario, or all points of a matrix, where the worst point counts."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from safevar_sumo.sumo.recording import Recording, recorded_scenes
 from safevar_sumo.sumo.system import System, assemble
 
 LARGEST_WORLD = 200
-"""Copies of a network in one simulation; more cost more each, as SUMO then works beyond the processor's caches."""
+"""Largest number of copies of a network in one simulation; beyond it, SUMO exceeds the processor's caches and each copy costs more."""
 LARGEST_BATCH = 2000
-"""Vehicles in recorded scenes at once; two hundred steps of so many take some 100 MB."""
+"""Largest number of vehicles in recorded scenes at once; two hundred steps of this number take some 100 MB."""
 LARGEST_ROADS = 100_000
-"""Lanes of all copies in one simulation: beyond, loading takes minutes and gigabytes."""
+"""Largest number of lanes of all copies in one simulation: beyond it, loading takes minutes and gigabytes."""
 NEAREST = 4
-"""Points that are told to who names one that there is not."""
+"""Number of similar points that the error about an unknown point lists."""
 
 
 class Scored(NamedTuple):
-    """What N settings are worth at one point of a study."""
+    """Evaluations of N settings at one point of a study."""
 
     point: Point
     evaluations: Evaluations
 
 
 class AtPoint(NamedTuple):
-    """N settings at one point of a study."""
+    """Simulation runs and evaluations of N settings at one point of a study."""
 
     point: Point
     evaluations: Evaluations
@@ -51,8 +51,8 @@ class AtPoint(NamedTuple):
 
 
 def point_record(result: AtPoint, row: int = 0) -> dict[str, Any]:
-    """One setting at one point as plain values: where that is, how it ended, speeds of the impact [m/s], the worst deviation from the
-    test's speed before the system acted [km/h], the time to collision at the first warning [s], who was touched where [%]; None if
+    """One setting at one point as plain values: the point, the outcome, impact speeds [m/s], the largest deviation from the test speed
+    before the system acted [km/h], the time to collision at the first warning [s], the side and place of the contact [%]; None if
     undefined.
     """
     evaluations, relative = result.evaluations, result.drives.relative_speed
@@ -67,13 +67,13 @@ def point_record(result: AtPoint, row: int = 0) -> dict[str, Any]:
 
 
 def remarks_of(scenario: Any) -> list[str]:
-    """What a user should know of a scenario's parameters."""
+    """Remarks for the user on a scenario's parameters."""
     remarks = getattr(scenario, "remarks", None)
     return [] if remarks is None else remarks()
 
 
 def vehicle_remarks(system: System) -> list[str]:
-    """What a user should know of a vehicle that is tested faster than what it was fitted to."""
+    """Remarks for the user on a vehicle that is tested at higher speeds than those it was fitted to."""
     fitted = getattr(system.vehicle, "FITTED_UP_TO", None)
     speeds = [getattr(point.scenario, "test_speed", None) or 0.0 for point in system.points]
     if fitted is None or max(speeds) <= fitted:
@@ -82,7 +82,7 @@ def vehicle_remarks(system: System) -> list[str]:
     fastest = min(max(speeds), float(tables.speeds[-1]))
     drag = float(np.interp(fastest, tables.speeds, tables.coasting))
     return [f"the vehicle was fitted to drives of up to {fitted / KMH:.0f} km/h, and is tested at up to {max(speeds) / KMH:.0f} km/h: "
-            f"what it does above is its equations alone, such as losing {drag:.1f} m/s^2 at {fastest / KMH:.0f} km/h with the "
+            f"beyond that speed only its equations apply, such as losing {drag:.1f} m/s^2 at {fastest / KMH:.0f} km/h with the "
             "accelerator released"]
 
 
@@ -90,7 +90,7 @@ def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     """Simulate filtered settings, shape (N, n), in one batch and score them.
 
     A pure function: row i of the result depends on row i of `settings` alone, to the bit. In a matrix a setting's row is that
-    of the point in which it comes off worst.
+    of its worst point.
     """
     most = _most_vehicles(system, engine)
     parts = [settings[first:first + most] for first in range(0, len(settings), most)] or [settings]
@@ -107,23 +107,24 @@ def _evaluated(system: System, settings: FloatArray, engine: Engine) -> Evaluati
 
 
 def rated_settings(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> tuple[Evaluations, CellResults]:
-    """Settings, shape (N, n), in all cells of a protocol: what they are worth, with their points, and what they did in every cell.
+    """Settings, shape (N, n), in all cells of a protocol: their evaluations with rating points, and their results in every cell.
 
-    Nothing else of the simulations is kept: their traces would take gigabytes.
+    Traces are dropped, as they would take gigabytes.
     """
     scored, columns = dict[str, Scored](), dict[str, Any]()
     for group in _groups(system, settings, engine):
-        for one in group:
-            scored[one.point.name], columns[one.point.name] = Scored(one.point, one.evaluations), cell_columns(one.drives)
+        for result in group:
+            name = result.point.name
+            scored[name], columns[name] = Scored(result.point, result.evaluations), cell_columns(result.drives)
     cells = joined_cells([columns[point.name] for point in system.points])
     evaluations = aggregated([scored[point.name] for point in system.points])
-    if system.rater is None:  # in some of the cells
+    if system.rater is None:  # only some of the cells are simulated
         return evaluations, cells
     return replace(evaluations, metrics={**evaluations.metrics, RATING_POINTS.name: system.rater.points(cells).total}), cells
 
 
 def in_cells(system: System, settings: FloatArray, part: tuple[int, int], engine: Engine = Engine.RECORDED) -> Evaluations:
-    """Settings, shape (N, n), in the k-th of n parts of a protocol's cells, `part` being (k, n): evaluations with their `cells`."""
+    """Evaluations, with `cells`, of settings, shape (N, n), in part k of m of a protocol's cells; `part` is (k, m)."""
     assert system.rater is not None
     points = tuple(system.matrix[number] for number in part_of(system.rater.protocol, *part))
     evaluations, cells = rated_settings(replace(system, matrix=points, rater=None), settings, engine)
@@ -131,18 +132,18 @@ def in_cells(system: System, settings: FloatArray, part: tuple[int, int], engine
 
 
 def settings_per_batch(system: System, engine: Engine) -> int:
-    """How many settings a batch pays to have."""
+    """Number of settings of an efficient batch."""
     recorded = engine is Engine.RECORDED and not reason_for_sumo(system)
     return max(largest_batch(system) // len(system.points), LARGEST_WORLD) if recorded else LARGEST_WORLD
 
 
 def largest_batch(system: System) -> int:
-    """How many vehicles drive at once: fewer where each has an instance of an FMU."""
+    """Largest number of vehicles at once: smaller if each has an instance of an FMU."""
     return min(LARGEST_BATCH, *(getattr(model, "most_vehicles", LARGEST_BATCH) for model in (system.vehicle, system.ads)))
 
 
 def _most_vehicles(system: System, engine: Engine) -> int:
-    """How many vehicles one simulation may have: in a recorded scene, or in copies of the largest of the networks."""
+    """Largest number of vehicles of one simulation: in recorded scenes, or in copies of the largest network."""
     if engine is Engine.RECORDED and not reason_for_sumo(system):
         return largest_batch(system)
     lanes = max(lanes_of(network) for network in {point.scenario.network for point in system.points})
@@ -150,19 +151,19 @@ def _most_vehicles(system: System, engine: Engine) -> int:
 
 
 def aggregated(at_points: Sequence[AtPoint | Scored]) -> Evaluations:
-    """What settings that were simulated at every point are worth."""
+    """Evaluations of settings at their worst points."""
     settings = at_points[0].evaluations.settings
     row_of, columns = worst_points(at_points), np.arange(len(settings))
-    every = Evaluations.concatenate([one.evaluations for one in at_points])
-    return every.take(row_of * len(settings) + columns)
+    evaluations = Evaluations.concatenate([result.evaluations for result in at_points])
+    return evaluations.take(row_of * len(settings) + columns)
 
 
 def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = (),
              watch: Watcher | None = None) -> SimulationRuns:
-    """Run the scenario once for every setting; shape (N, n). `watch` is shown the world at every sample.
+    """Run the scenario once for every setting; shape (N, n). `watch` is called with the world at every sample.
 
-    In a matrix a setting's drive is that of the point in which it comes off worst; who watches sees all settings at the
-    point in which the last of them does.
+    In a matrix the result is each setting's run at its worst point; with `watch` or a window, all settings run at the worst point of
+    the last setting.
 
     Raises
     ------
@@ -176,17 +177,17 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     if watch is not None or engine is Engine.GUI:
         return drive_all(at_worst(system, settings), settings, engine, options, watch)
     at_points = at_every_point(system, settings, engine, options)
-    return _picked([one.drives for one in at_points], worst_points(at_points))
+    return _selected_runs([result.drives for result in at_points], worst_points(at_points))
 
 
 def at_every_point(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = ()) -> list[AtPoint]:
     """Settings, shape (N, n), at every point, in the points' order; raises as `simulate`."""
-    by_name = {one.point.name: one for group in _groups(system, settings, engine, options) for one in group}
+    by_name = {result.point.name: result for group in _groups(system, settings, engine, options) for result in group}
     return [by_name[point.name] for point in system.points]
 
 
 def _groups(system: System, settings: FloatArray, engine: Engine, options: tuple[str, ...] = ()) -> Iterator[list[AtPoint]]:
-    """Settings at every point, group by group of the points that are simulated together."""
+    """Settings at every point, in groups of points that are simulated together."""
     n = len(settings)
     recorded = engine is Engine.RECORDED and not reason_for_sumo(system)
     most, all_options = largest_batch(system) // max(n, 1), (*step_options(system), *options)
@@ -199,19 +200,19 @@ def _groups(system: System, settings: FloatArray, engine: Engine, options: tuple
 
 
 def at_worst(system: System, settings: FloatArray) -> System:
-    """The system at the one point in which the last of the settings comes off worst."""
+    """The system at the worst point of the last setting."""
     if not system.matrix:
         return system
     return system.at(system.points[worst_points(at_every_point(system, settings[-1:]))[0]])
 
 
 def named_point(system: System, name: str, source: object) -> System:
-    """The system at the point of a matrix that is named.
+    """The system at a named point of a matrix.
 
     Raises
     ------
     InputError
-        If there is none of that name.
+        If there is no point of that name.
     """
     for point in system.matrix:
         if point.name == name:
@@ -220,17 +221,17 @@ def named_point(system: System, name: str, source: object) -> System:
 
 
 def _nearest(name: str, names: Sequence[str]) -> str:
-    """What is legal in the place of a name: those that have most of its parts, the most alike first."""
+    """Points similar to an unknown name: those that share most of its parts, then the most similar ones."""
     if not names:
         return "a study with a matrix"
-    asked = {part.strip() for part in name.split(",")}
-    order = sorted(names, key=lambda one: (-len(asked & set(one.split(", "))), -SequenceMatcher(None, one, name).ratio()))
+    parts = {part.strip() for part in name.split(",")}
+    order = sorted(names, key=lambda known: (-len(parts & set(known.split(", "))), -SequenceMatcher(None, known, name).ratio()))
     legal = "; ".join(order[:NEAREST])
-    return legal if len(names) <= NEAREST else f"one of {len(names)} points, the nearest of them: {legal}"
+    return legal if len(names) <= NEAREST else f"one of {len(names)} points, the most similar: {legal}"
 
 
 def study_at(study: Study, name: str, source: object) -> Study:
-    """A study with the one point of its matrix that is named; raises as `named_point`."""
+    """The study reduced to a named point of its matrix; raises the errors of `named_point`."""
     system = assemble(study)
     named_point(system, name, source)
     assert study.matrix is not None
@@ -238,14 +239,14 @@ def study_at(study: Study, name: str, source: object) -> Study:
         return in_some_cells(study, system.weather, [next(k for k, point in enumerate(system.matrix) if point.name == name)])
     place = dict(next(point for point in system.matrix if point.name == name).place)
     title, weather = place.pop("test"), place.pop("weather")
-    test = next(one for one in study.matrix.tests
-                if one.name == title and one.over.keys() == place.keys() and all(value in one.over[key] for key, value in place.items()))
+    test = next(row for row in study.matrix.tests
+                if row.name == title and row.over.keys() == place.keys() and all(value in row.over[key] for key, value in place.items()))
     only = replace_in(test, over={key: [value] for key, value in place.items()}, weathers=[weather] if test.weathers else [])
     return replace_in(study, matrix=replace_in(study.matrix, tests=[only]))
 
 
 def _together(points: Sequence[Point], most: int, options: Sequence[str]) -> Iterator[tuple[Point, ...]]:
-    """Points with recorded scenes of one road, as many as one simulation may have; those of short runs first."""
+    """Groups of at most `most` points with recorded scenes of one road, sorted by duration."""
     groups: dict[Hashable, list[Point]] = {}
     for point, scene in zip(points, recorded_scenes([point.scenario for point in points], options), strict=True):
         groups.setdefault(scene.road if isinstance(scene, Recording) else "", []).append(point)
@@ -256,10 +257,10 @@ def _together(points: Sequence[Point], most: int, options: Sequence[str]) -> Ite
 
 
 def worst_points(at_points: Sequence[AtPoint | Scored]) -> npt.NDArray[np.intp]:
-    """For every setting the number of the point with the least safety degree; among equals the first by name.
+    """For every setting the number of the point with the least safety degree; ties are decided by name.
 
-    A collision at a valid point stands, whatever the others are. Without one, a single invalid test makes it unknown whether the
-    setting is safe: then that point counts.
+    A collision at a valid point counts in every case. Without a collision, a single invalid test leaves open whether the setting is
+    safe: then that point counts.
     """
     order = sorted(range(len(at_points)), key=lambda k: at_points[k].point.name)
     degrees = np.stack([at_points[k].evaluations.f_safe for k in order])
@@ -271,26 +272,26 @@ def worst_points(at_points: Sequence[AtPoint | Scored]) -> npt.NDArray[np.intp]:
     return np.asarray(np.array(order)[np.argmin(degrees, axis=0)])
 
 
-def _picked(drives: Sequence[SimulationRuns], number: npt.NDArray[np.intp]) -> SimulationRuns:
-    """For every vehicle its drive among several; shorter ones stay at their last sample, where nothing counts any more."""
-    length, columns = max(len(one.trace.time) for one in drives), np.arange(len(number))
+def _selected_runs(drives: Sequence[SimulationRuns], number: npt.NDArray[np.intp]) -> SimulationRuns:
+    """For every vehicle one of several runs; shorter runs repeat their last sample, marked as inactive."""
+    length, columns = max(len(runs.trace.time) for runs in drives), np.arange(len(number))
 
-    def picked(values: list[np.ndarray]) -> np.ndarray:
-        whole = [np.concatenate([one, np.repeat(one[-1:], length - len(one), axis=0)]) for one in values]
-        return np.stack(whole)[number, :, columns].T
+    def select_samples(values: list[np.ndarray]) -> np.ndarray:
+        padded = [np.concatenate([samples, np.repeat(samples[-1:], length - len(samples), axis=0)]) for samples in values]
+        return np.stack(padded)[number, :, columns].T
 
-    longest = max((one.trace for one in drives), key=lambda trace: len(trace.time))
-    def of_each(values: list[np.ndarray]) -> np.ndarray:
-        return np.stack([np.broadcast_to(one, number.shape) for one in values])[number, columns]
+    longest = max((runs.trace for runs in drives), key=lambda trace: len(trace.time))
+    def select(values: list[np.ndarray]) -> np.ndarray:
+        return np.stack([np.broadcast_to(column, number.shape) for column in values])[number, columns]
 
-    names = [one.name for one in fields(Trace) if np.ndim(getattr(longest, one.name)) == 2]
-    columns_of: dict[str, Any] = {name: picked([getattr(one.trace, name) for one in drives]) for name in names}
+    names = [field.name for field in fields(Trace) if np.ndim(getattr(longest, field.name)) == 2]
+    columns_of: dict[str, Any] = {name: select_samples([getattr(runs.trace, name) for runs in drives]) for name in names}
     trace = replace(longest, **columns_of)
-    ended = np.array([len(one.trace.time) for one in drives])[number]
+    ended = np.array([len(runs.trace.time) for runs in drives])[number]
     active = trace.active & (np.arange(length)[:, np.newaxis] < ended)
-    encounters = zip(*(one.encounter for one in drives), strict=True)
+    encounters = zip(*(runs.encounter for runs in drives), strict=True)
     return SimulationRuns(
-        trace=replace(trace, active=active), encounter=Encounter._make(picked(list(values)) for values in encounters),
-        outcome=of_each([one.outcome for one in drives]), collision_speed=of_each([one.collision_speed for one in drives]),
-        contact=Contact._make(of_each(list(values)) for values in zip(*(one.contact for one in drives), strict=True)),
-        test_speed_error=of_each([one.test_speed_error for one in drives]), warning_ttc=of_each([one.warning_ttc for one in drives]))
+        trace=replace(trace, active=active), encounter=Encounter._make(select_samples(list(values)) for values in encounters),
+        outcome=select([runs.outcome for runs in drives]), collision_speed=select([runs.collision_speed for runs in drives]),
+        contact=Contact._make(select(list(values)) for values in zip(*(runs.contact for runs in drives), strict=True)),
+        test_speed_error=select([runs.test_speed_error for runs in drives]), warning_ttc=select([runs.warning_ttc for runs in drives]))

@@ -1,7 +1,7 @@
 """N copies of a SUMO network and its traffic: same coordinates, no connection between them.
 
-Netconvert builds the network once, as its folder's recipe says, and its elements are copied. Both are kept in the
-user's cache folder by the content that they are made of.
+Netconvert builds the network once, by its folder's recipe, and its elements are copied. Both are kept in the
+user's cache folder, named by the content of their sources.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from safevar_sumo.sumo.sources import OPTIONS, TRAFFIC, Sources, check_options, 
 ROADS = "network.net.xml"
 TRIED = "tried.txt"
 RECIPE = ("--xml-validation", "never")
-"""Options of netconvert in every network."""
+"""Options of netconvert for every network."""
 
 
 class CopiedNetwork(NamedTuple):
@@ -56,18 +56,18 @@ def copied_network(folder: str, n: int) -> CopiedNetwork:
 
 
 def built_network(folder: str) -> Path:
-    """The network itself, as netconvert built it or as it was given; raises as `copied_network`."""
+    """The original network, built by netconvert or given as built; raises the errors of `copied_network`."""
     return _built(sources_of(folder))
 
 
 def try_network(folder: str) -> None:
-    """Have SUMO itself load a network with its options and traffic, once for each content; raises as `copied_network`."""
+    """Load a network with its options and traffic in SUMO, once for each content; raises the errors of `copied_network`."""
     sources = sources_of(folder)
     cached(_name(sources, 0, sources.files), TRIED, partial(_try_all, sources, _built(sources)))
 
 
 def lanes_of(folder: str) -> int:
-    """How many lanes a network has, those of junctions included; raises as `copied_network`."""
+    """Number of lanes of a network, including those of junctions; raises the errors of `copied_network`."""
     file = built_network(folder)
     return _lanes(file, file.stat().st_mtime_ns)
 
@@ -78,19 +78,19 @@ def _lanes(file: Path, changed: int) -> int:
 
 
 def network_fingerprint(folder: str) -> str:
-    """Tells networks of different content apart: sources, traffic and options."""
+    """A fingerprint of a network's content: sources, traffic and options."""
     return ":".join(network_files(folder).values())
 
 
 def network_files(folder: str) -> dict[str, str]:
-    """A digest of every file that a network is made of, by name."""
+    """A digest of every source file of a network, by name."""
     sources = sources_of(folder)
     contents = sources.contents(*sources.files)
     return {name: hashlib.sha256(content).hexdigest()[:16] for name, content in zip(sources.files, contents, strict=True)}
 
 
 def netconvert_version() -> str:
-    """Version of the SUMO that builds and simulates."""
+    """Version of SUMO, which builds and simulates."""
     from importlib.metadata import version
 
     return version("eclipse-sumo")
@@ -107,14 +107,14 @@ def round_up(n: int) -> int:
 
 
 def _name(sources: Sources, n: int, files: Sequence[str]) -> str:
-    """Where in the cache `n` copies are that are made from these files."""
+    """Folder in the cache of `n` copies made from these files."""
     digest = _digest(sources.contents(*files), f"{n} {sources.plain} {sources.options}")
-    return f"{re.sub(r'[^a-zA-Z0-9_.-]', '_', sources.place.name)}-{n}-{digest}"  # SUMO takes a comma for the beginning of another file
+    return f"{re.sub(r'[^a-zA-Z0-9_.-]', '_', sources.place.name)}-{n}-{digest}"  # SUMO splits file names at commas
 
 
 @cache
 def _digest(contents: tuple[bytes, ...], build: str) -> str:
-    """Of all that copies come from: sources, how they are built (`build`), netconvert and its recipe, and our code."""
+    """A digest of everything that determines copies: sources, build options (`build`), netconvert and its recipe, and our code."""
     code = b"".join(Path(str(module)).read_bytes() for module in (__file__, copies.__file__))
     digest = hashlib.sha256(f"{build} {netconvert_version()} {RECIPE}".encode() + code)
     for content in contents:
@@ -144,17 +144,17 @@ def _checked(file: Path) -> ElementTree.Element:
 
 
 def _run(sources: Sources, program: str, *arguments: str) -> tuple[int, str]:
-    """Run a program of SUMO's in a network's folder: how it ended, and the errors that it told."""
+    """Run a program of SUMO in a network's folder; returns its exit code and its errors."""
     import sumo
 
-    done = subprocess.run([str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments, *RECIPE], capture_output=True, text=True,
+    process = subprocess.run([str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments, *RECIPE], capture_output=True, text=True,
                           errors="replace", check=False, cwd=sources.place, env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME})
-    lines = [line.strip() for line in done.stderr.splitlines() if line.strip() and not line.startswith(("Warning:", "Quitting"))]
-    return done.returncode, " ".join(lines).removeprefix("Error: ")[:500]
+    lines = [line.strip() for line in process.stderr.splitlines() if line.strip() and not line.startswith(("Warning:", "Quitting"))]
+    return process.returncode, " ".join(lines).removeprefix("Error: ")[:500]
 
 
 def _try(sources: Sources, into: Path) -> None:
-    """Have SUMO load a network that somebody else built, in a process of its own: it dies of some that are broken."""
+    """Load a network that the user built in a separate SUMO process, which some broken networks crash."""
     _checked(sources.place / sources.built)
     code, errors = _run(sources, "sumo", "-n", sources.built, "--no-step-log", "true", "--end", "0")
     if code != 0:
@@ -183,46 +183,46 @@ def _build(sources: Sources, into: Path) -> None:
         if code < 0 or not errors or ("Could not" in errors and "output" in errors) or "bad_alloc" in errors:
             raise EnvironmentFault(f"{sources.place}: netconvert fails: {errors or f'exit code {code}'}")
         raise InputError(sources.place, f"netconvert refuses the network: {errors}", "sources that netconvert builds a network from")
-    _keep_the_net_alone(into / ROADS)
+    _drop_header(into / ROADS)
 
 
-def _keep_the_net_alone(file: Path) -> None:
-    """Without the head, which tells time and place of its making; a file that is not whole is an error."""
+def _drop_header(file: Path) -> None:
+    """Drop the header, which holds time and options of the build; raise an error if the file is incomplete."""
     try:
         text = file.read_text(encoding="utf-8")
         ElementTree.fromstring(text)
     except (ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise EnvironmentFault(f"{file}: netconvert left half a network: {error}") from None
+        raise EnvironmentFault(f"{file}: netconvert left an incomplete network: {error}") from None
     file.write_text(text[text.index("<net "):], encoding="utf-8")
 
 
 SHORTEST_STEP, LONGEST_STEP = 0.001, 1.0
-"""SUMO's shortest time step, and the longest in which anybody could react [s]."""
+"""SUMO's shortest time step, and the longest in which a vehicle could react in time [s]."""
 ABOVE_0: Mapping[str, tuple[str, ...]] = {
     "vType": ("length", "width", "height", "maxSpeed", "accel", "decel", "mass"),
     "edge": ("length", "width", "speed"), "lane": ("length", "width", "speed"),
 }
 FROM_0: Mapping[str, tuple[str, ...]] = {"vType": ("minGap", "tau", "actionStepLength"), "walk": ("speed",)}
-"""Attributes of elements that have to be numbers above 0, and from 0 on."""
-UNSAID = "-1"
-"""What netconvert takes for an attribute that is not there, in its sources."""
+"""Attributes of elements that must be positive numbers, and those that must not be negative."""
+UNSET = "-1"
+"""Value of an attribute in netconvert's sources that means that the attribute is not set."""
 
 
 def check_network(network: str) -> None:
-    """Refuse a network that cannot be simulated as it is meant.
+    """Refuse a network that cannot be simulated correctly.
 
     Raises
     ------
     InputError
-        Naming the file, what it says, and what it may say.
+        Naming the file, the illegal value, and legal ones.
     EnvironmentFault
-        If the network cannot be built for reasons beside it.
+        If the network cannot be built for reasons outside it.
     """
     _check(network, network_fingerprint(network))
 
 
 def network_remarks(network: str, fastest: float, *, sumo_drives: bool) -> list[str]:
-    """What a user's network says and the simulation does not use; see `unused`. Of those that come with the package nobody expects it."""
+    """Remarks on parts of a user's network that the simulation does not use; see `unused`. None for shipped networks."""
     if is_shipped(network):
         return []
     file = sources_of(network).place / TRAFFIC
@@ -235,7 +235,7 @@ def _check(network: str, fingerprint: str) -> None:
     check_options(sources.place / OPTIONS)
     _check_step(sources.place / OPTIONS)
     for name in (*(name for option, names in sources.plain if option == "edge-files" for name in names), TRAFFIC):
-        _check_numbers(parsed(sources.place / name), sources.place / name, UNSAID if name != TRAFFIC else "")
+        _check_numbers(parsed(sources.place / name), sources.place / name, UNSET if name != TRAFFIC else "")
     for name in (*sources.roads, TRAFFIC):
         if b"<include" in (sources.place / name).read_bytes():
             raise InputError(sources.place / name, "includes another file", "one file, that holds everything")
@@ -251,14 +251,14 @@ def _check(network: str, fingerprint: str) -> None:
 
 
 def _check_edited(sources: Sources, built: str) -> None:
-    """Refuse a network that was drawn on in netedit after its sources, which do not say so."""
+    """Refuse a network that was edited in netedit after its sources, which lack those changes."""
     file = sources.place / (sources.builds or ROADS)
     if sources.built or not file.is_file() or any((sources.place / name).stat().st_mtime >= file.stat().st_mtime for name in sources.roads):
         return
     head, _, net = file.read_text(encoding="utf-8", errors="replace").partition("<net ")
     if "netedit" in head and f"<net {net}".strip() != built.strip():
         raise InputError(file, f"was saved by netedit after {', '.join(sources.roads)}, which build another network",
-                         "save plain XML there too; or move those files away, to have the network as it is")
+                         "plain XML saved from netedit, too; or a folder without those files, to use the network as it is")
 
 
 def _check_step(file: Path) -> None:
@@ -267,20 +267,20 @@ def _check_step(file: Path) -> None:
         raise InputError(file, f"step-length = {step!r}", f"a number from {SHORTEST_STEP:g} to {LONGEST_STEP:g} [s]")
 
 
-def _check_numbers(root: ElementTree.Element, file: Path, unsaid: str = "") -> None:
-    """Refuse lengths, speeds and accelerations that nothing can have."""
+def _check_numbers(root: ElementTree.Element, file: Path, unset: str = "") -> None:
+    """Refuse impossible lengths, speeds and accelerations."""
     for element in root.iter():
         for names, above, legal in ((ABOVE_0, True, "a number above 0"), (FROM_0, False, "a number from 0 on")):
             for name in names.get(element.tag, ()):
-                text = element.get(name, unsaid)
-                if text == unsaid or (number := _number(text)) > 0 or (number == 0 and not above):
+                text = element.get(name, unset)
+                if text == unset or (number := _number(text)) > 0 or (number == 0 and not above):
                     continue
                 called = f"{element.tag} {element.get('id')!r}" if "id" in element.attrib else element.tag
                 raise InputError(file, f"{called}: {name} = {text!r}", legal)
 
 
 def _number(text: str) -> float:
-    """A finite number, or -infinity for what is none."""
+    """A finite number, or -infinity if the text is none."""
     try:
         number = float(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""What an ADS makes out of the scene: its own speed at once, everything else as late as the weather has the sensors tell it."""
+"""Observations of an ADS: its own speed without delay, everything else with the recognition delay of the weather."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.world import begin
 
 HIDDEN = np.array([[np.inf], [np.inf], [0.0], [0.0]])
-"""Gap and lateral place [m], lateral speed and speed [m/s] of somebody who is not seen."""
+"""Gap and lateral position [m], lateral speed and speed [m/s] of an occluded obstacle."""
 
 
 class Perception:
@@ -27,7 +27,7 @@ class Perception:
         self._visibility, self._scenes = weather.visibility, Late.by(weather.recognition_delay, step)
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
-        """What is seen at this step; every step is to be shown. Who is hidden is infinitely far away and still."""
+        """The observation at this step; must be called in every step. An occluded obstacle is infinitely far away and still."""
         now = np.empty((len(HIDDEN) + 1, len(speed)))
         now[0], now[1], now[2], now[3], now[4] = scene.gap, scene.lateral, scene.lateral_speed, scene.obstacle_speed, speed
         if scene.visible is not EVERYWHERE:
@@ -39,8 +39,8 @@ class Perception:
 R = TypeVar("R", Scene, Observation)
 
 
-class Parts:
-    """A batch whose k-th part of equally many vehicles is in the k-th point."""
+class PointBatch:
+    """A batch of vehicles in equal parts, of which the k-th part is at the k-th point."""
 
     def __init__(self, points: Sequence[Point], world: Any, n: int) -> None:
         self._size = size = n // len(points)
@@ -48,27 +48,27 @@ class Parts:
         self._rows = [slice(k * size, (k + 1) * size) for k in range(len(points))]
         self._worlds = [world] if len(points) == 1 else [world.part(rows.start, size) for rows in self._rows]
         weathers = [point.weather for point in points]
-        self._perceptions = [(Perception(weather, self._step), np.repeat([one == weather for one in weathers], size).nonzero()[0])
+        self._perceptions = [(Perception(weather, self._step), np.repeat([other == weather for other in weathers], size).nonzero()[0])
                              for k, weather in enumerate(weathers) if weather not in weathers[:k]]
         self._order = np.argsort(np.concatenate([rows for _, rows in self._perceptions]))
-        self._rests, self._scenes, self._memories = isinstance(world, RecordedWorld), list[Scene](), list[Any]()
+        self._recorded, self._scenes, self._memories = isinstance(world, RecordedWorld), list[Scene](), list[Any]()
         self.last = np.repeat([round(point.scenario.duration / self._step) for point in points], size)
-        self._meetings = Meetings.of([point.scenario for point in points], self._worlds, world, size) if self._rests else None
+        self._meetings = Meetings.of([point.scenario for point in points], self._worlds, world, size) if self._recorded else None
         if self._meetings is None:
             self._memories = [begin(point.scenario, part) for point, part in zip(points, self._worlds, strict=True)]
 
     def scene(self, open_: BoolArray) -> Scene:
-        """Where the obstacles of all vehicles are now; where they were in a recorded scene in which no run is open any more."""
+        """The scene of all vehicles now; a recorded scene without open runs keeps its last state."""
         if self._meetings is not None:
             return self._meetings.scene(open_)
         for k, (point, world) in enumerate(zip(self._points, self._worlds, strict=True)):
-            if not self._rests or k >= len(self._scenes) or np.count_nonzero(open_[self._rows[k]]):
+            if not self._recorded or k >= len(self._scenes) or np.count_nonzero(open_[self._rows[k]]):
                 scene, self._memories[k] = point.scenario.observe(world, self._step, self._memories[k])
                 self._scenes[k:k + 1] = [scene]
         return self._scenes[0] if len(self._scenes) == 1 else _joined(self._scenes, [self._size] * len(self._scenes))
 
-    def seen(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
-        """What all vehicles see of it."""
+    def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
+        """The observations of all vehicles."""
         if len(self._perceptions) == 1:
             return self._perceptions[0][0].observe(time, speed, scene)
         observations = [perception.observe(time, speed[rows], Scene._make(values[rows] if values.ndim else values for values in scene))
@@ -85,11 +85,11 @@ class Parts:
 
 
 def _joined(records: Sequence[R], sizes: Sequence[int]) -> R:
-    """Records of arrays of shape (size,), or of what stands for one, as a record of longer arrays, or of what stands for all."""
+    """Several records with arrays of shape (size,) or scalars as one record of longer arrays; shared scalars stay scalars."""
     return type(records[0])._make(_concatenated(column, sizes) for column in zip(*records, strict=True))
 
 
 def _concatenated(parts: Sequence[Any], sizes: Sequence[int]) -> Any:
-    if np.ndim(parts[0]) == 0 and all(one is parts[0] for one in parts):
+    if np.ndim(parts[0]) == 0 and all(part is parts[0] for part in parts):
         return parts[0]
-    return np.concatenate([one if np.ndim(one) else np.full(size, one) for one, size in zip(parts, sizes, strict=True)])
+    return np.concatenate([part if np.ndim(part) else np.full(size, part) for part, size in zip(parts, sizes, strict=True)])

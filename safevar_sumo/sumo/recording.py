@@ -1,6 +1,6 @@
-"""Scenes that SUMO plays once: where nobody reacts to the vehicle under test, everybody else moves alike in every simulation.
+"""Scenes that SUMO plays once: if nobody reacts to the vehicle under test, all other actors move identically in every simulation.
 
-The vehicle under test stays where it starts meanwhile; `recorded_world.py` has vehicles drive in a scene.
+Meanwhile the vehicle under test stays at its start; `recorded_world.py` moves vehicles in a recorded scene.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from safevar_sumo.sumo.staging import all_staged
 from safevar_sumo.sumo.world import SumoWorld, begin, direction_of
 
 SCENES = 4000
-"""Recorded scenes that a process keeps; one of ten seconds takes some ten kilobytes."""
+"""Largest number of recorded scenes that a process keeps; a scene of ten seconds takes some ten kilobytes."""
 KEPT = "scenes.msgpack"
 LEEWAY = 0.01
-"""Added to extents, which sort out who is far away [m]."""
+"""Added to extents, which exclude distant actors [m]."""
 POSITION_EPS = 0.1
-"""Least length of a lane's shape (SUMO, utils/common/StdDefs.h) [m]."""
+"""Smallest length of a lane's shape (SUMO, utils/common/StdDefs.h) [m]."""
 
 
 class UnrecordableError(Exception):
-    """A scene cannot be recorded; its text says why."""
+    """A scene cannot be recorded; the message is the reason."""
 
 
 class Track(NamedTuple):
-    """Somebody at every step: position [m], shape (T, 2), heading clockwise from north [degrees] and speed [m/s], shape (T,).
+    """An actor at every step: position [m], shape (T, 2), heading clockwise from north [degrees] and speed [m/s], shape (T,).
 
-    NaN while not on the road; `length` and `width` in m.
+    Values are NaN while the actor is not on the road; `length` and `width` in m.
     """
 
     position: FloatArray
@@ -54,9 +54,9 @@ class Track(NamedTuple):
 
 
 class Way(NamedTuple):
-    """The straight lanes that the vehicle under test drives on, one after the other; shape (L,) or (L, 2) [m].
+    """The straight lanes that the vehicle under test follows, in order; shape (L,) or (L, 2) [m].
 
-    `end` is the place on a lane where it ends, `stretch` the length of a lane's shape over the lane's length.
+    `end` is the position on a lane at its end, `stretch` the length of a lane's shape over the lane's length.
     """
 
     first: FloatArray
@@ -66,21 +66,21 @@ class Way(NamedTuple):
     shape_length: FloatArray
 
     def at(self, lane: Any) -> Way:
-        """Of each of N vehicles the lane that it is on, by its number; then L is N."""
+        """The lanes of N vehicles, given by number; L becomes N."""
         return Way._make(column[lane] for column in self)
 
     def positions(self, place: FloatArray) -> FloatArray:
-        """Front bumpers, shape (N, 2) [m], of vehicles at a place on their lanes, shape (N,)."""
+        """Front bumpers, shape (N, 2) [m], of vehicles at positions on their lanes, shape (N,)."""
         share = place * self.stretch / self.shape_length
         return np.asarray(self.first + self.vector * share[:, np.newaxis])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """A scene without a vehicle under test that drives: `start` and `speed` are where it departs on its `way` [m, m/s].
+    """A scene in which the vehicle under test does not drive: `start` and `speed` are those of its departure on its `way` [m, m/s].
 
-    `extents`, shape (2, T, A), are for each of the A tracks between which places along the way the front of a vehicle is when the two
-    are side by side [m].
+    `extents`, shape (2, T, A), hold for each of the A tracks the range of positions along the way of a vehicle's front in which the
+    vehicle is beside that actor [m].
     """
 
     step_length: float
@@ -97,14 +97,14 @@ class Recording:
 
     @property
     def road(self) -> tuple[Hashable, ...]:
-        """What scenes have in common whose vehicles may be in one batch."""
+        """Key of scenes whose vehicles may be in one batch."""
         return self.step_length, self.length, self.width, self.along.tobytes(), *(column.tobytes() for column in self.way)
 
 
 def recorded_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list[Recording | str]:
-    """The scenes of scenarios with further options of SUMO, or why one is driven in SUMO, each vehicle in a copy of its own.
+    """Recorded scenes of scenarios, with further options of SUMO, or the reason why a scenario needs SUMO and copies.
 
-    SUMO plays a scene once in a process; those of our own scenarios are kept in the user's cache folder, too.
+    SUMO plays a scene once per process; scenes of shipped scenarios are also kept in the user's cache folder.
 
     Raises
     ------
@@ -127,19 +127,19 @@ def recorded_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> li
 def _reason_for_copies(scenario: Scenario) -> str:
     if getattr(scenario, "reactive_actors", True):
         return "somebody in the scenario may react to the vehicle under test"
-    if not isinstance(scenario, GuardedScenario) and not is_shipped(scenario.network):  # ours speak for our own networks alone
+    if not isinstance(scenario, GuardedScenario) and not is_shipped(scenario.network):  # its claim holds for our networks alone
         return f"the traffic of the network {scenario.network!r} may react to the vehicle under test"
     return ""
 
 
 _Key = tuple[Scenario, str, tuple[str, ...]]
-"""A scenario, the fingerprint of its network with its traffic, and further options."""
+"""A scenario, the fingerprint of its network and traffic, and further options."""
 _scenes: dict[_Key, Recording | str] = {}
-"""Scenes of this process, or why there is none."""
+"""Scenes of this process, or the reason why a scene cannot be recorded."""
 
 
 def _scenes_of(missing: Mapping[_Key, str]) -> list[Recording | str]:
-    """Scenes by their key and the folder of their network, from the cache or as SUMO plays them."""
+    """Scenes for keys and network folders, from the cache or played by SUMO."""
     def play() -> list[Recording | str]:
         return [_play(scenario, folder, options) for (scenario, _, options), folder in missing.items()]
 
@@ -155,9 +155,9 @@ def _scenes_of(missing: Mapping[_Key, str]) -> list[Recording | str]:
 
 @cache
 def _code() -> bytes:
-    """Of what scenes are made beside their scenario: SUMO, and our rooms that play them."""
-    rooms = sorted(file for room in ("sumo", "scenarios") for file in (Path(__file__).parents[1] / room).glob("*.py"))
-    return b"".join([netconvert_version().encode(), *(file.read_bytes() for file in rooms)])
+    """Everything but the scenario that determines a scene: SUMO's version, and our code that plays scenes."""
+    files = sorted(file for folder in ("sumo", "scenarios") for file in (Path(__file__).parents[1] / folder).glob("*.py"))
+    return b"".join([netconvert_version().encode(), *(file.read_bytes() for file in files)])
 
 
 def _packed_array(array: Any) -> tuple[tuple[int, ...], bytes]:
@@ -170,33 +170,33 @@ def _unpacked_array(kind: Any, packed: Any) -> FloatArray:
 
 
 def _play(scenario: Any, folder: str, options: tuple[str, ...]) -> Recording | str:
-    """The scene, or why there is none."""
+    """The scene, or the reason why it cannot be recorded."""
     with open_world(copied_network(folder, 1), 1, Engine.LIBSUMO, options) as world:
         world.let_depart()
         world.depart()
         try:
-            return _played(scenario, world)
+            return _record(scenario, world)
         except UnrecordableError as error:
             return str(error)
 
 
-def _played(scenario: Scenario, world: SumoWorld) -> Recording:
+def _record(scenario: Scenario, world: SumoWorld) -> Recording:
     api, vut, step = world.api, copied_id(0, VUT), world.step_length
     way, along = _way_of(api, vut)
     start, speed = float(api.vehicle.getLanePosition(vut)), float(api.vehicle.getSpeed(vut))
-    lane_of = {name: copy_and_name(api.vehicle.getLaneID(one))[1] for one, name in _named(api.vehicle.getIDList())}
-    lanes = {name: tuple((float(x), float(y)) for x, y in api.lane.getShape(one)) for one, name in _named(api.lane.getIDList())}
+    lane_of = {name: copy_and_name(api.vehicle.getLaneID(id_))[1] for id_, name in _named(api.vehicle.getIDList())}
+    lanes = {name: tuple((float(x), float(y)) for x, y in api.lane.getShape(id_)) for id_, name in _named(api.lane.getIDList())}
     length = round(scenario.duration / step) + 1
     states, sizes, memory = dict[str, FloatArray](), dict[str, tuple[bool, float, float]](), begin(scenario, world)
     for sample in range(length):
         for kind in (api.vehicle, api.person):
-            for one, name in _named(kind.getIDList()):
+            for id_, name in _named(kind.getIDList()):
                 if name == VUT:
                     continue
                 if name not in states:
                     states[name] = np.full((length, 4), np.nan)
-                    sizes[name] = kind is api.person, float(kind.getLength(one)), float(kind.getWidth(one))
-                states[name][sample] = *kind.getPosition(one), kind.getAngle(one), kind.getSpeed(one)
+                    sizes[name] = kind is api.person, float(kind.getLength(id_)), float(kind.getWidth(id_))
+                states[name][sample] = *kind.getPosition(id_), kind.getAngle(id_), kind.getSpeed(id_)
         if sample < length - 1:
             memory = scenario.move(world, step, memory) if isinstance(scenario, TargetTest) else scenario.observe(world, step, memory)[1]
             world.advance(np.zeros(1))
@@ -211,20 +211,20 @@ def _played(scenario: Scenario, world: SumoWorld) -> Recording:
 
 
 def _extent(track: Track, along: FloatArray, own_length: float) -> FloatArray:
-    """Between which places along the way the front of a vehicle is beside somebody at every step, and a little more; shape (2, T) [m]."""
+    """Range of positions along the way of a vehicle's front beside an actor at every step, plus a margin; shape (2, T) [m]."""
     angle = np.radians(track.angle)
     cosine, sine = along @ np.array([np.sin(angle), np.cos(angle)]), along @ np.array([np.cos(angle), -np.sin(angle)])
     middle = track.position @ along - cosine * (track.length / 2)
-    reach = (np.abs(cosine) * track.length + np.abs(sine) * track.width) / 2 + LEEWAY
-    return np.array([middle - reach, middle + reach + own_length])
+    half_extent = (np.abs(cosine) * track.length + np.abs(sine) * track.width) / 2 + LEEWAY
+    return np.array([middle - half_extent, middle + half_extent + own_length])
 
 
 def _named(ids: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Those of the first copy, and what they are called in the original."""
-    for one in ids:
-        copy, name = copy_and_name(one)
+    """Ids of the first copy, and their names in the original."""
+    for id_ in ids:
+        copy, name = copy_and_name(id_)
         if copy == 0:
-            yield one, name
+            yield id_, name
 
 
 def _way_of(api: Any, vut: str) -> tuple[Way, FloatArray]:
@@ -233,10 +233,10 @@ def _way_of(api: Any, vut: str) -> tuple[Way, FloatArray]:
     Raises
     ------
     UnrecordableError
-        If they are not one straight.
+        If the lanes do not form a straight line.
     """
     if api.vehicle.getLateralLanePosition(vut):
-        raise UnrecordableError("the vehicle under test departs beside the middle of its lane")
+        raise UnrecordableError("the vehicle under test does not depart in the middle of its lane")
     lanes = [api.vehicle.getLaneID(vut)]
     for edge in api.vehicle.getRoute(vut)[api.vehicle.getRouteIndex(vut) + 1:]:
         links = [link for link in api.lane.getLinks(lanes[-1]) if api.lane.getEdgeID(link[0]) == edge]
@@ -256,5 +256,5 @@ def _way_of(api: Any, vut: str) -> tuple[Way, FloatArray]:
     shape_length = np.sqrt((vector * vector).sum(axis=1))
     direction = vector / shape_length[:, np.newaxis]
     if np.abs(direction - direction[0]).max() > 1e-6 or np.abs(first[1:] - last[:-1]).max(initial=0.0) > 1e-6:
-        raise UnrecordableError("the lanes of the vehicle under test are not one straight")
+        raise UnrecordableError("the lanes of the vehicle under test do not form a straight line")
     return Way(first, vector, end, np.maximum(shape_length, POSITION_EPS) / end, shape_length), direction_of(api.vehicle.getAngle(vut))

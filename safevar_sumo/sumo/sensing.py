@@ -1,4 +1,4 @@
-"""What the sensors of N vehicles leave of the others to controllers that read the world themselves: late, and within reach."""
+"""Other actors as sensed by N vehicles, for controllers that read the world themselves: with latency and limited range."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.sumo.world import SumoWorld
 
-LOOKS_AHEAD = 1000.0  # m, for a leader
-STEP_DECIMALS = 6  # of a delay in steps: a whole number of steps is whole
+LEADER_RANGE = 1000.0  # m, within which SUMO looks for a leader
+STEP_DECIMALS = 6  # to which a delay in steps is rounded, so that a whole number of steps is exact
 PLACE = ("getPosition", "getPosition3D", "getSpeed", "getAngle", "getRoadID", "getLaneID", "getLanePosition")
 SENSED: Mapping[str, tuple[str, ...]] = {
     "vehicle": (*PLACE, "getLaneIndex", "getAcceleration", "getLateralSpeed", "getLateralLanePosition", "getSignals"), "person": PLACE}
-"""TraCI's functions that tell what sensors can tell of others, by domain."""
+"""TraCI's functions whose values of other actors sensors can measure, by domain."""
 STEADY = ("getAngle", "getSignals", "getLaneIndex")
-"""Of them those between whose values there is nothing: they stay until they change."""
+"""Those of these functions whose values are not interpolated: they stay until they change."""
 
 Values = dict[str, Any]
-"""What one function after the other tells of somebody."""
+"""Values of an actor by function."""
 
 
 class Look(NamedTuple):
-    """One look around: the vehicle itself, others by their names in the traffic file, and the leader with the gap to it [m]."""
+    """One observation: the vehicle itself, other actors by their names in the traffic file, and the leader with the gap to it [m]."""
 
     own: Values
     vehicle: dict[str, Values]
@@ -42,7 +42,7 @@ NOTHING = Look({}, {}, {}, None)
 
 
 class Sensing:
-    """Looks of N vehicles around their copies of the network, and what of them their sensors have told so far."""
+    """Observations of N vehicles in their copies of the network, delayed and limited by their sensors."""
 
     def __init__(self, world: SumoWorld, step: float) -> None:
         self._world, self._sensors = world, world.sensors
@@ -53,14 +53,14 @@ class Sensing:
         self._lengths: dict[str, float] = {}
 
     def look(self) -> None:
-        """Take note of this step; every step has to be noted."""
+        """Record this step; must be called in every step."""
         self._seen, self._present = {}, None
         for copy, age in enumerate(self._age):
             if age > 0:
                 self._looks[copy].append(self._look(copy))
 
     def seen(self, copy: int) -> Look:
-        """What a vehicle's sensors tell now."""
+        """The observation of a vehicle through its sensors now."""
         if copy not in self._seen:
             looks, age = self._looks[copy], self._age[copy]
             late = _between(looks, age) if age > 0 else self._look(copy)
@@ -76,37 +76,37 @@ class Sensing:
         values = {kind: {name: {function: getattr(getattr(api, kind), function)(copied_id(copy, name)) for function in SENSED[kind]}
                          for name in names} for kind, names in self._present[copy].items()}
         own = values["vehicle"].pop(VUT)
-        leader = api.vehicle.getLeader(vut, LOOKS_AHEAD)
-        found = (copy_and_name(leader[0])[1], float(leader[1])) if leader and leader[0] else None
-        return Look(own, values["vehicle"], values["person"], found)
+        leader = api.vehicle.getLeader(vut, LEADER_RANGE)
+        named_leader = (copy_and_name(leader[0])[1], float(leader[1])) if leader and leader[0] else None
+        return Look(own, values["vehicle"], values["person"], named_leader)
 
     def _by_copy(self) -> list[dict[str, list[str]]]:
-        """Who is about in each copy."""
-        found: list[dict[str, list[str]]] = [{kind: [] for kind in SENSED} for _ in range(self._world.n)]
+        """Names of the actors on the road in each copy, by domain."""
+        names: list[dict[str, list[str]]] = [{kind: [] for kind in SENSED} for _ in range(self._world.n)]
         for kind in SENSED:
-            for one in getattr(self._world.api, kind).getIDList():
-                copy, name = copy_and_name(one)
-                if copy < len(found):
-                    found[copy][kind].append(name)
-        return found
+            for id_ in getattr(self._world.api, kind).getIDList():
+                copy, name = copy_and_name(id_)
+                if copy < len(names):
+                    names[copy][kind].append(name)
+        return names
 
     def _within_reach(self, look: Look, copy: int) -> Look:
-        """Without those who are too far away, the others as far away as the sensors have it."""
+        """The observation without actors beyond the range, and with distances scaled as the sensors measure them."""
         reach, scale = float(self._sensors.reach[copy]), float(self._sensors.scale[copy])
         if not look.own or (reach == math.inf and scale == 1):
             return look
-        here = look.own["getPosition"]
+        own_position = look.own["getPosition"]
 
         def sensed(kind: str) -> dict[str, Values]:
             return {name: _scaled(values, look.own, scale) for name, values in look.others(kind).items()
-                    if _distance(here, values, self._length(kind, copy, name)) <= reach}
+                    if _distance(own_position, values, self._length(kind, copy, name)) <= reach}
 
         vehicles = sensed("vehicle")
         leader = (look.leader[0], look.leader[1] * scale) if look.leader and look.leader[0] in vehicles else None
         return Look(look.own, vehicles, sensed("person"), leader)
 
     def _length(self, kind: str, copy: int, name: str) -> float:
-        """From the point that SUMO calls the position, a vehicle's front bumper, backwards [m]."""
+        """Length of an actor behind its SUMO position, which is a vehicle's front bumper; 0 for persons [m]."""
         if kind == "person":
             return 0.0
         if name not in self._lengths:
@@ -114,11 +114,11 @@ class Sensing:
         return self._lengths[name]
 
 
-def _distance(here: tuple[float, float], values: Values, length: float) -> float:
-    """From a point to the nearest one of the line from somebody's front to the back [m]."""
+def _distance(point: tuple[float, float], values: Values, length: float) -> float:
+    """Distance from a point to the line between an actor's front and back [m]."""
     heading = math.radians(values["getAngle"])
     back = -math.sin(heading), -math.cos(heading)
-    x, y = (here[i] - values["getPosition"][i] for i in range(2))
+    x, y = (point[i] - values["getPosition"][i] for i in range(2))
     along = min(max(x * back[0] + y * back[1], 0.0), length)
     return math.hypot(x - along * back[0], y - along * back[1])
 
@@ -126,16 +126,16 @@ def _distance(here: tuple[float, float], values: Values, length: float) -> float
 def _scaled(values: Values, own: Values, scale: float) -> Values:
     if scale == 1:
         return values
-    found = dict(values)
+    result = dict(values)
     for name in ("getPosition", "getPosition3D"):
-        found[name] = tuple(mine + scale * (theirs - mine) for mine, theirs in zip(own[name], values[name], strict=True))
+        result[name] = tuple(mine + scale * (other - mine) for mine, other in zip(own[name], values[name], strict=True))
     if values["getRoadID"] == own["getRoadID"]:
-        found["getLanePosition"] = own["getLanePosition"] + scale * (values["getLanePosition"] - own["getLanePosition"])
-    return found
+        result["getLanePosition"] = own["getLanePosition"] + scale * (values["getLanePosition"] - own["getLanePosition"])
+    return result
 
 
 def _between(looks: deque[Look], age: float) -> Look:
-    """What was seen so many steps ago, linear between two of them; before the first one nothing was different."""
+    """The observation `age` steps ago, interpolated linearly between two steps; before the first step the first one holds."""
     whole, part = divmod(age, 1)
     newest = len(looks) - 1
     after, before = looks[max(newest - int(whole), 0)], looks[max(newest - int(whole) - 1, 0)]

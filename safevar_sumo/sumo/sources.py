@@ -1,4 +1,4 @@
-"""Which options a network's folder may set: none that writes a file, opens a socket, draws at random or reads from elsewhere."""
+"""The files and options of a network's folder: no option may write files, open sockets, use random numbers or read other folders."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SIMULATING = re.compile(
     r"net-file|route-files|gui-settings-file|begin|step-length|step-method\.ballistic|lateral-resolution|seed|max-depart-delay"
     r"|(collision|intermodal-collision|pedestrian|default|time-to-teleport|emergencydecel)(\.[a-z-]+)+|time-to-teleport"
     r"|ignore-junction-blocker|ignore-accidents|no-internal-links|lanechange\.duration|no-warnings|no-step-log|verbose")
-"""SUMO's: they say how vehicles and persons move, or which of the folder's own files are read."""
+"""Legal options of SUMO: how vehicles and persons move, or which of the folder's files SUMO reads."""
 BUILDING = re.compile(
     r"precision|simple-projection|proj\.(scale|rotate|utm|dhdn|inverse|dhdnutm)|speed-in-kmh|flatten|lefthand|flip-y-axis|join-lanes"
     r"|max-join-ids|dismiss-vclasses|construction-date|numerical-ids|plain\.extend-edge-shape|no-internal-links|no-left-connections"
@@ -28,13 +28,13 @@ BUILDING = re.compile(
     r"|keep-nodes-unregulated(\.[a-z-]+)?|walkingareas|(geometry|offset|roundabouts|opposites|fringe|speed|edges|default|tls|ramps"
     r"|keep-edges|remove-edges|keep-lanes|junctions|internal-junctions|check-lane-foes|sidewalks|crossings|walkingareas|bikelanes"
     r"|railway|osm|opendrive)(\.[a-zA-Z-]+)+(?<!file)(?<!output)")
-"""Netconvert's: they say what becomes of the sources."""
+"""Legal options of netconvert: how it builds the network from the sources."""
 SOURCES = ("sumo-net-file", "osm-files", "opendrive-files", "node-files", "edge-files", "connection-files", "type-files",
            "tllogic-files", "polygon-files")
-"""Netconvert's, with the names of files that a network is built from."""
-TELLING = re.compile(r"output-file|verbose|print-options|no-warnings|aggregate-warnings|xml-validation(\.net)?|write-license|write-metadata"
+"""Options of netconvert with names of source files."""
+IGNORED = re.compile(r"output-file|verbose|print-options|no-warnings|aggregate-warnings|xml-validation(\.net)?|write-license|write-metadata"
                      r"|log\.(timestamps|processid)|human-readable-time")
-"""Netconvert's that change nothing of what is built; the network is written where the tool wants it."""
+"""Options of netconvert that do not affect the network and are ignored; the output file is set by this tool."""
 TRAFFIC = "traffic.rou.xml"
 
 
@@ -44,7 +44,7 @@ def options_of(file: Path) -> dict[str, str]:
     Raises
     ------
     InputError
-        If it is no such configuration, or says one thing twice.
+        If the file is no such configuration, or sets an option twice.
     """
     try:
         root = ElementTree.fromstring(file.read_bytes())
@@ -62,7 +62,7 @@ def options_of(file: Path) -> dict[str, str]:
 
 
 def check_options(file: Path) -> None:
-    """Refuse a configuration of SUMO with an option that is not on the list.
+    """Refuse a configuration of SUMO with an illegal option.
 
     Raises
     ------
@@ -81,12 +81,12 @@ def check_options(file: Path) -> None:
 
 
 def recipe_of(file: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, str], str]:
-    """Sources by netconvert's option, the options that shape what is built, and the name of the network that the recipe writes.
+    """Source files by netconvert's option, the options that shape the network, and the name of the network that the recipe writes.
 
     Raises
     ------
     InputError
-        Naming the file and an option that a recipe may not set.
+        Naming the file and the illegal option.
     """
     sources, options = dict[str, tuple[str, ...]](), dict[str, str]()
     given = options_of(file)
@@ -95,44 +95,44 @@ def recipe_of(file: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, str], s
             sources[name] = own_files(file, name, value)
         elif BUILDING.fullmatch(name):
             options[name] = value
-        elif not TELLING.fullmatch(name):
+        elif not IGNORED.fullmatch(name):
             raise InputError(file, f"sets netconvert's option {name!r}", f"options that shape the network, such as junctions.*, tls.* and "
                              f"no-turnarounds, and its sources: {', '.join(SOURCES)}")
     return sources, options, given.get("output-file", "")
 
 
 def own_files(file: Path, name: str, value: str) -> tuple[str, ...]:
-    """The files beside a configuration that an option of it names.
+    """The files named by an option, which are in the folder of the configuration.
 
     Raises
     ------
     InputError
-        If it names one that is not beside it.
+        If a file is in another folder or missing.
     """
-    files = tuple(one.strip() for one in value.split(",") if one.strip())
-    for one in files:
-        if Path(one).name != one or "\\" in one:
-            raise InputError(file, f"{name} = {one!r} is in another folder", "the name of a file beside it")
-        if name in SOURCES and not (file.parent / one).is_file():
-            raise InputError(file, f"{name}: {one} is missing", "a file beside it")
+    files = tuple(part.strip() for part in value.split(",") if part.strip())
+    for named in files:
+        if Path(named).name != named or "\\" in named:
+            raise InputError(file, f"{name} = {named!r} is in another folder", "the name of a file in the same folder")
+        if name in SOURCES and not (file.parent / named).is_file():
+            raise InputError(file, f"{name}: {named} is missing", "a file in the same folder")
     return files
 
 
 OPTIONS = "scenario.sumocfg"
 BUILT = ".net.xml"
 PLAIN = {"node-files": "nod", "edge-files": "edg", "connection-files": "con", "type-files": "typ", "tllogic-files": "tll"}
-"""Netconvert's options and how their files are called."""
+"""Endings of the files of netconvert's options."""
 REQUIRED = ("network.nod.xml", "network.edg.xml", "network.con.xml", TRAFFIC, OPTIONS)
 LEGAL = f"a folder with {', '.join(REQUIRED)}; or with a {BUILT}, {TRAFFIC} and {OPTIONS}"
 PRECISION = {"precision": "4"}
-"""Digits of coordinates, where no recipe says how many."""
+"""Digits of coordinates unless a recipe sets them."""
 
 
 class Sources(NamedTuple):
-    """A network's folder, and which of its files count.
+    """A network's folder, and the files in it that are used.
 
-    Either `built` names the network, or netconvert builds it from `plain`, files by its options, as `options` say;
-    `recipe` names the file that says so, and `builds` the network that it writes.
+    Either `built` names the network, or netconvert builds it with `options` from `plain`, files by netconvert's options;
+    `recipe` names the file with these options, and `builds` the network that it writes.
     """
 
     place: Path
@@ -144,17 +144,17 @@ class Sources(NamedTuple):
 
     @property
     def roads(self) -> tuple[str, ...]:
-        """The files that the network itself is made of."""
+        """The source files of the network itself."""
         named = (self.built, *(name for _, names in self.plain for name in names), self.recipe)
         return tuple(name for name in named if name)
 
     @property
     def files(self) -> tuple[str, ...]:
-        """All files that count."""
+        """All files that are used."""
         return (*self.roads, TRAFFIC, OPTIONS)
 
     def contents(self, *names: str) -> tuple[bytes, ...]:
-        """What is in some of its files."""
+        """Contents of some of the files."""
         return tuple((self.place / name).read_bytes() for name in names)
 
 
@@ -164,13 +164,13 @@ def sources_of(network: str) -> Sources:
     Raises
     ------
     InputError
-        If there is no such network, a file is missing, or it is not clear which files count.
+        If there is no such network, a file is missing, or it is unclear which files to use.
     """
     place = NETWORKS / network if is_shipped(network) else Path(network)
     if is_network(place):
         sources = _in_folder(place, _listing(place)) if place.is_dir() else Sources(place.parent, built=place.name)
         if "," in str(sources.place.absolute()):
-            raise InputError(sources.place, "has a comma in its path, where SUMO takes the next file to begin", "a folder without")
+            raise InputError(sources.place, "has a comma in its path, at which SUMO splits file names", "a path without commas")
         for name in (TRAFFIC, OPTIONS):
             if not (sources.place / name).is_file():
                 raise InputError(sources.place, f"{name} is missing", LEGAL)
@@ -181,27 +181,27 @@ def sources_of(network: str) -> Sources:
 
 
 def is_shipped(network: str) -> bool:
-    """Whether it is the name of one of `sumo_nets/`."""
+    """Whether this is the name of a network in `sumo_nets/`."""
     return network not in ("", ".", "..") and Path(network).name == network and is_network(NETWORKS / network)
 
 
 def is_network(place: Path) -> bool:
-    """Whether a path may be that of a network."""
+    """Whether a path may be that of a network: a folder or a built network."""
     try:
         return place.is_dir() or (place.name.endswith(BUILT) and place.is_file())
-    except OSError:  # a name that is too long, say
+    except OSError:  # such as a name that is too long
         return False
 
 
 def _listing(place: Path) -> tuple[tuple[str, int, int], ...]:
-    """Names, times of change and sizes of what lies in a folder."""
+    """Names, modification times and sizes of the files in a folder."""
     with os.scandir(place) as entries:
         return tuple(sorted((entry.name, entry.stat().st_mtime_ns, entry.stat().st_size) for entry in entries if entry.is_file()))
 
 
 @lru_cache(maxsize=256)
 def _in_folder(place: Path, listing: tuple[tuple[str, int, int], ...]) -> Sources:
-    """The sources in a folder; looked at again when its `listing` changes."""
+    """The sources in a folder; read again when its `listing` changes."""
     plain, named = _plain(place), _named(place)
     if plain is not None and (not plain.builds or named in ("", plain.builds) or not (place / named).is_file()):
         sources = plain
@@ -212,13 +212,13 @@ def _in_folder(place: Path, listing: tuple[tuple[str, int, int], ...]) -> Source
     for ending in PLAIN.values():
         for file in sorted(place.glob(f"*.{ending}.xml")):
             if file.name not in sources.roads:
-                what = f"{sources.recipe} does not name it" if sources.recipe else f"the network is made of {', '.join(sources.roads)}"
-                raise InputError(file, f"is not used: {what}", "every source used, named by a network.netccfg; or no file that is not")
+                reason = f"{sources.recipe} does not name it" if sources.recipe else f"the network is made of {', '.join(sources.roads)}"
+                raise InputError(file, f"is not used: {reason}", "sources that a network.netccfg names; or a folder without unused files")
     return sources
 
 
 def _plain(place: Path) -> Sources | None:
-    """The plain sources, as a recipe or their names have it."""
+    """The plain sources, given by a recipe or by their names; None if there are none."""
     recipes = sorted(place.glob("*.netccfg"))
     if len(recipes) > 1:
         raise InputError(place, f"has {' and '.join(file.name for file in recipes)}", "one recipe")
@@ -239,7 +239,7 @@ def _plain(place: Path) -> Sources | None:
 
 
 def _named(place: Path) -> str:
-    """The network that the folder's configuration names."""
+    """The network that the folder's configuration names; "" if none."""
     return options_of(place / OPTIONS).get("net-file", "") if (place / OPTIONS).is_file() else ""
 
 
@@ -249,5 +249,5 @@ def _only(place: Path) -> str:
     if not networks:
         raise InputError(place, f"{REQUIRED[0]} is missing", LEGAL)
     if len(networks) > 1:
-        raise InputError(place, f"has {' and '.join(networks)}", f"one network, or net-file in {OPTIONS} that says which")
+        raise InputError(place, f"has {' and '.join(networks)}", f"one network, or net-file in {OPTIONS} that names one")
     return networks[0]

@@ -1,4 +1,4 @@
-"""A scenario's network with the lanes and traffic that its parameters make: a folder like those of `sumo_nets/`, in the user's cache."""
+"""A scenario's network with the lanes and traffic of its parameters: a folder like those in `sumo_nets/`, in the user's cache."""
 
 from __future__ import annotations
 
@@ -22,33 +22,33 @@ from safevar_sumo.sumo.sources import OPTIONS, TRAFFIC, Sources, options_of, sou
 
 
 class Staged(NamedTuple):
-    """The folder of a network with a scenario's traffic; a digest of all that is in it."""
+    """The folder of a network with a scenario's traffic, and a digest of its content."""
 
     folder: str
     fingerprint: str
 
 
 def staged(scenario: Scenario) -> Staged:
-    """The scenario's network, with its lanes and its traffic as the scenario's parameters have them.
+    """The scenario's network, with lanes and traffic changed by the scenario's parameters.
 
     Raises
     ------
     InputError
-        If the parameters are impossible, or what they change is not in the traffic file.
+        If the parameters are impossible, or change an element that the traffic file lacks.
     """
     return all_staged([scenario])[0]
 
 
 def all_staged(scenarios: Sequence[Scenario]) -> list[Staged]:
-    """The networks of several scenarios; every network's files are read once. Raises as `staged`."""
+    """The networks of several scenarios; each network's files are read once. Raises the errors of `staged`."""
     fingerprints = {name: network_fingerprint(name) for name in {scenario.network for scenario in scenarios}}
-    staging: Any = {True: _staged.__wrapped__, False: _staged}  # what a scenario from outside changes may change
+    staging: Any = {True: _staged.__wrapped__, False: _staged}  # the changes of a scenario from outside may vary
     return [staging[isinstance(scenario, GuardedScenario)](scenario, fingerprints[scenario.network]) for scenario in scenarios]
 
 
 @lru_cache(maxsize=10_000)
 def _staged(scenario: Any, fingerprint: str) -> Staged:
-    """`fingerprint` stands for the contents of the network's files."""
+    """The staged network; `fingerprint` represents the contents of the network's files in the cache key."""
     folder = scenario.network
     lanes, actors = (getattr(scenario, name, None) for name in ("lanes", "actors"))
     if lanes is not None and (changes := lanes(_BuiltRoads(folder))):
@@ -87,28 +87,28 @@ def _shapes(network: Path, content: bytes) -> dict[str, Lane]:
 def _with_lanes(sources: Sources, built: Path, changes: Actors) -> Path:
     """A copy of a network as it was built, with changes to its lanes."""
     files = {ROADS: ElementTree.tostring(_changed(built, changes)), **_files(sources, TRAFFIC, OPTIONS)}
-    return _kept(sources.place.name, tuple(files.items()))
+    return _stored(sources.place.name, tuple(files.items()))
 
 
 def _with_traffic(sources: Sources, changes: Actors) -> Path:
     """A copy of a network with changes to its traffic."""
     files = _files(sources, *sources.files) | {TRAFFIC: ElementTree.tostring(_changed(sources.place / TRAFFIC, changes))}
-    return _kept(sources.place.name, tuple(files.items())) / sources.built
+    return _stored(sources.place.name, tuple(files.items())) / sources.built
 
 
 def _files(sources: Sources, *names: str) -> dict[str, bytes]:
-    """The contents of some of a network's files, and of what sumo-gui shows."""
-    shown = options_of(sources.place / OPTIONS).get("gui-settings-file", "")
-    return {name: (sources.place / name).read_bytes() for name in (*names, shown) if (sources.place / name).is_file()}
+    """Contents of some of a network's files, and of its sumo-gui settings."""
+    gui_settings = options_of(sources.place / OPTIONS).get("gui-settings-file", "")
+    return {name: (sources.place / name).read_bytes() for name in (*names, gui_settings) if (sources.place / name).is_file()}
 
 
 def _changed(file: Path, changes: Actors) -> ElementTree.Element:
     root = parsed(file)
     for path, attributes in changes.items():
-        found = root.findall(path)
-        if not found:
+        elements = root.findall(path)
+        if not elements:
             raise InputError(file, f"has no {path}")
-        for element in found:
+        for element in elements:
             if attributes is None:
                 root.remove(element)
             else:
@@ -117,7 +117,7 @@ def _changed(file: Path, changes: Actors) -> ElementTree.Element:
 
 
 @lru_cache(maxsize=1000)
-def _kept(name: str, files: tuple[tuple[str, bytes], ...]) -> Path:
+def _stored(name: str, files: tuple[tuple[str, bytes], ...]) -> Path:
     digest = hashlib.sha256(repr(files).encode()).hexdigest()
     target = platformdirs.user_cache_path("safevar_sumo") / "staged" / digest[:16] / (name or "network")
     if not target.is_dir():

@@ -1,4 +1,4 @@
-"""A study assembled: its models looked up by name and given their parameters."""
+"""Assembles a study: looks up its models by name and creates them with their parameters."""
 
 from __future__ import annotations
 
@@ -44,13 +44,14 @@ from safevar_sumo.vehicles import (
     region_of,
 )
 
-TAKEN = ("algorithm", "run", "evaluation", "outcome", "handle", "collision", "collision_speed", "setting", "f_safe", "f_diff", "f_num_diff")
-"""Columns of results that no characteristic and no metric may be called."""
+RESERVED = (
+    "algorithm", "run", "evaluation", "outcome", "handle", "collision", "collision_speed", "setting", "f_safe", "f_diff", "f_num_diff")
+"""Names of result columns, which no characteristic and no metric may have."""
 OBJECTIVES = "search.objectives"
 
 
 class Measuring(NamedTuple):
-    """The metrics and further measures of change by their columns, the objectives, and what of it comes from outside."""
+    """Metrics and further measures of change by column, the objectives, and the members that come from outside."""
 
     metrics: Mapping[str, Metric]
     changes: Mapping[str, Change]
@@ -64,14 +65,14 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     Raises
     ------
     InputError
-        If there is no such record, it is wrong, or its name is taken.
+        If a record does not exist or is invalid, or its name is taken.
     """
     metrics, members = {**METRICS, **({RATING_POINTS.name: RATING_POINTS} if is_rated(study) else {})}, list[Member]()
     known = dict(metrics)
-    changes = {name: change for name, change in CHANGES.items() if name not in TAKEN}
+    changes = {name: change for name, change in CHANGES.items() if name not in RESERVED}
     by_name: dict[str, Metric | Change] = {}
 
-    def taken_in(name: str, key: str) -> Metric | Change:
+    def add(name: str, key: str) -> Metric | Change:
         if name in by_name:
             return by_name[name]
         own = {**known, **FURTHER, **({**CHANGES, **BY_OBJECTIVE} if key == OBJECTIVES else {})}
@@ -83,8 +84,8 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
         members.append(member)
         foreign = isinstance(member.what, Change) and key == OBJECTIVES
         record = foreign_change(member.what, member.guard) if foreign else foreign_metric(member.what, member.guard)
-        if record.name in (*TAKEN, *metrics, *FURTHER, *changes, *study.vehicle.characteristics):
-            raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a name of its own")
+        if record.name in (*RESERVED, *metrics, *FURTHER, *changes, *study.vehicle.characteristics):
+            raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a unique name")
         if isinstance(record, Change):
             changes[record.name] = record
         else:
@@ -93,9 +94,9 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
         return record
 
     for name in study.metrics.also:
-        taken_in(name, "metrics.also")
+        add(name, "metrics.also")
     names = [BY_OBJECTIVE[name].name if name in BY_OBJECTIVE else name for name in study.search.objectives]
-    objectives = [_objective(taken_in(name, OBJECTIVES)) for name in names]
+    objectives = [_objective(add(name, OBJECTIVES)) for name in names]
     _refuse_twice(objectives, lookup.source)
     scoring = Scoring(metrics=tuple(metric.facts for metric in metrics.values()), objectives=tuple(objectives))
     return Measuring(metrics, changes, scoring, tuple(members))
@@ -114,11 +115,11 @@ def _refuse_twice(objectives: Iterable[Objective], source: str) -> None:
 
 
 STEP = "a function step(traci, vehicle_id), or a class with that method"
-"""What a controller written for TraCI is."""
+"""Legal forms of a controller written for TraCI."""
 
 
 class Models(NamedTuple):
-    """A study's models with their parameters, and how they were found."""
+    """A study's models with their parameters, and the members that they come from."""
 
     vehicle: Vehicle
     ads: Ads
@@ -129,10 +130,10 @@ class Models(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class System:
-    """What a simulation is made of.
+    """The parts of a simulation.
 
-    `step_length` [s] is None where the network's own counts; `rater` rates what happens in the matrix of a protocol; `metrics` are
-    thresholds, `measuring` is what is computed with them; `members` are how everything was found.
+    `step_length` [s] is None if the network's own step applies; `rater` rates results in the matrix of a protocol; `metrics` are
+    thresholds, `measuring` the metrics computed with them; `members` are the sources of all models and metrics.
     """
 
     characteristics: CharacteristicSet
@@ -151,50 +152,50 @@ class System:
 
     @property
     def points(self) -> tuple[Point, ...]:
-        """Where a setting is simulated: the matrix, or the study's one scenario."""
+        """Points at which a setting is simulated: the matrix, or the study's one scenario."""
         return self.matrix or (Point(self.scenario, self.weather),)
 
     def at(self, point: Point) -> System:
-        """The same at one point alone."""
+        """The system reduced to one point."""
         return replace(self, scenario=point.scenario, weather=point.weather, matrix=(), rater=None)
 
     def check_feasible(self, settings: FloatArray, source: object, *, filtered: bool, switch: str = "beyond=True") -> None:
-        """Refuse settings, shape (M, n), that violate a constraint of the study; raises as `FeasibleRegion.check`."""
+        """Refuse settings, shape (M, n), that violate a constraint of the study; raises the errors of `FeasibleRegion.check`."""
         self.region.check(self.characteristics.filter(settings) if filtered else settings, source, otherwise=f", or any with {switch}")
 
     @property
     def remarks(self) -> list[str]:
-        """What of the networks and the weathers is not used, or does nothing."""
+        """Remarks on parts of networks and weathers that are not used or have no effect."""
         in_traci = isinstance(self.ads, TraciController)
         fmus = [remark for model in (self.vehicle, self.ads) for remark in getattr(model, "remarks", ())]
         networks = dict.fromkeys(point.scenario.network for point in self.points)
         remarks = [remark for network in networks for remark in network_remarks(network, self.nominal.max_speed, sumo_drives=in_traci)]
         remarks += fmus
         hazy = {point.weather.name: point.weather.visibility for point in self.points if point.weather.visibility != 1}
-        if in_traci and not self._sees_a_limited_way():
-            remarks += [f"weather {name!r}: visibility = {value:g} does nothing: the vehicle has no sensor range, and a controller written "
-                      "for TraCI sees as far" for name, value in hazy.items()]
+        if in_traci and not self._has_limited_range():
+            remarks += [f"weather {name!r}: visibility = {value:g} has no effect: the vehicle has no sensor range, so a controller written "
+                      "for TraCI sees everything" for name, value in hazy.items()]
         if not any(getattr(self.ads, name, 0.0) for name in REACTIONS):
-            remarks += [f"weather {name!r} changes nothing: its road and its sight are those of clear weather, and nothing under "
-                      "[ads.parameters] says that the ADS reacts later in it"
-                      for name in dict.fromkeys(point.weather.name for point in self.points if _as_clear(point.weather))]
+            remarks += [f"weather {name!r} has no effect: its road and its visibility are those of clear weather, and no key of "
+                      "[ads.parameters] delays the ADS in it"
+                      for name in dict.fromkeys(point.weather.name for point in self.points if _equals_clear(point.weather))]
         return remarks
 
-    def _sees_a_limited_way(self) -> bool:
+    def _has_limited_range(self) -> bool:
         sensors = getattr(self.vehicle, "sensors", None)
         original = dict(zip(self.characteristics.names, self.characteristics.original[:, np.newaxis], strict=True))
         own = None if sensors is None else sensors(self.vehicle.prepare(original, 1.0, 0.1))
         return own is not None and bool(np.isfinite(own.reach).all())
 
 
-def _as_clear(weather: Weather) -> bool:
-    """Whether a weather is clear but for its name and light."""
+def _equals_clear(weather: Weather) -> bool:
+    """Whether a weather equals clear weather in all but its name."""
     clear = WEATHERS["clear"]
     return weather.name != clear.name and weather.light == clear.light and msgspec.structs.replace(weather, name=clear.name) == clear
 
 
 def assemble(study: Study, source: str = "") -> System:
-    """Look the study's models up and give them their parameters; `source` is how errors call the study.
+    """Look up the study's models and create them with their parameters; `source` is the name of the study in errors.
 
     Raises
     ------
@@ -224,7 +225,7 @@ def _assembled(study: Study, source: str) -> System:
         ends = np.stack([characteristics.original, characteristics.lower, characteristics.upper])
         models.vehicle.refuse_unknown_sensors(dict(zip(characteristics.names, np.ascontiguousarray(ends.T), strict=True)))
     if models.members[0].guard is not None:
-        nominal.tables()  # what is wrong with a vehicle from outside shows here, whoever drives it
+        nominal.tables()  # raises errors of a vehicle from outside here, whichever ADS drives it
     return System(
         characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
         metrics=study.metrics, nominal=nominal, members=(*models.members, *measuring.members, *region.members),
@@ -233,8 +234,8 @@ def _assembled(study: Study, source: str) -> System:
 
 
 def models_of(study: Study, source: str) -> Models:
-    """The study's models with their parameters; raises as `assemble`."""
-    lookup, limit = Lookup(source, study.origin.places), min(study.search.time_limit / 2, LONGEST)  # before a pool gives the batch up
+    """The study's models with their parameters; raises the errors of `assemble`."""
+    lookup, limit = Lookup(source, study.origin.places), min(study.search.time_limit / 2, LONGEST)  # below the time limit of a batch
     vehicle, ads, scenario = _vehicle(study.vehicle, lookup, limit), _ads(study.ads, lookup, limit), _scenario(study.scenario, lookup)
     return Models(vehicle[0], ads[0], scenario[0], weather_of(study.weather, source), (vehicle[1], ads[1], scenario[1]))
 
@@ -251,7 +252,7 @@ def _traci(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
             check_parameters(what, (None, None), parameters, name, "ads.parameters", lookup.source)
 
         def controller_of(what: Any) -> Any:
-            """A controller for one vehicle, from what the module that it has for itself says."""
+            """A controller for one vehicle, from its own instance of the module."""
             if not inspect.isclass(what):
                 return partial(what, **parameters)
             return instance_of(member._replace(what=what), parameters, name, "ads.parameters", lookup.source)
@@ -263,18 +264,18 @@ def _traci(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
 
 
 def _matrix(study: Study, source: str) -> tuple[Point, ...]:
-    """The points of a study's matrix, each by a name of its own."""
+    """The points of a study's matrix; raises an error unless their names are unique."""
     points = [] if study.matrix is None else [point for test in study.matrix.tests for point in _points_of(test, study, source)]
-    named = Counter(point.name for point in points)
-    for name, number in named.items():
+    counts = Counter(point.name for point in points)
+    for name, number in counts.items():
         if number > 1:
-            raise InputError(source, f"matrix.tests: {number} points are {name!r}", "a name of its own for each test, and values once")
+            raise InputError(source, f"matrix.tests: {number} points are {name!r}", "unique names of tests, and each value once")
     return tuple(points)
 
 
 def _points_of(test: MatrixTest, study: Study, source: str) -> Iterator[Point]:
-    same = test.model in ("", study.scenario.model)
-    base = {**(study.scenario.parameters if same else {}), **test.parameters}
+    same_model = test.model in ("", study.scenario.model)
+    base = {**(study.scenario.parameters if same_model else {}), **test.parameters}
     lookup = Lookup(f"{source}: test {test.name!r}", study.origin.places)
     weathers: list[str | Weather] = list(test.weathers) or [study.weather]
     for values in product(*test.over.values()):
@@ -288,13 +289,13 @@ def _points_of(test: MatrixTest, study: Study, source: str) -> Iterator[Point]:
 
 
 def _with_network(scenario: Any, places: Sequence[str]) -> Any:
-    """The scenario on the folder beside the study, if it names one that lies there and is none of ours.
+    """The scenario with its network's folder beside the study, if there is such a folder and the name is not that of a shipped network.
 
-    One with sources comes first: beside a results directory a study's results have its name, as its network may.
+    A folder with sources comes first: a results directory beside the study may have the same name.
     """
     folder = scenario.network
-    there = [path for place in places if is_network(path := Path(place, folder))]
-    network = str(next((path for path in there if path.is_file() or any(path.glob("*.xml"))), there[0] if there else folder))
+    paths = [path for place in places if is_network(path := Path(place, folder))]
+    network = str(next((path for path in paths if path.is_file() or any(path.glob("*.xml"))), paths[0] if paths else folder))
     if network == folder or is_shipped(folder):
         return scenario
     if isinstance(scenario, msgspec.Struct):
@@ -303,16 +304,16 @@ def _with_network(scenario: Any, places: Sequence[str]) -> Any:
     return scenario
 
 
-def _check_units(study: Study, vehicle: Vehicle, ours: bool, source: str) -> None:
+def _check_units(study: Study, vehicle: Vehicle, is_shipped_model: bool, source: str) -> None:
     given, known = study.vehicle.characteristics, vehicle.UNITS
     for name in given:
-        if name in TAKEN:
-            raise InputError(source, f"vehicle.characteristics.{name}: the name is a column of results", f"none of {', '.join(TAKEN)}")
+        if name in RESERVED:
+            raise InputError(source, f"vehicle.characteristics.{name}: the name is a column of results", f"none of {', '.join(RESERVED)}")
         if name not in known:
             raise unknown(source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", name, known)
         if given[name].unit != known[name]:
             raise InputError(source, f"vehicle.characteristics.{name}.unit = {given[name].unit!r}", repr(known[name]))
-        if ours and given[name].lower <= 0:
+        if is_shipped_model and given[name].lower <= 0:
             raise InputError(source, f"vehicle.characteristics.{name}.lower = {given[name].lower}", "a value above 0")
     for name in known:
         if name not in given:
@@ -354,7 +355,7 @@ def _ads(choice: ModelTable, lookup: Lookup, limit: float) -> tuple[Ads, Member]
     name = f"ads.model = {choice.model!r}"
     parameters = lookup.with_paths(member, choice.parameters, "ads.parameters")
     make = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
-    driver = make()  # of a ScalarAds too: what is wrong with its parameters shows here
+    driver = make()  # for a ScalarAds, too, so that wrong parameters raise their errors here
     if issubclass(member.what, ScalarAds):
         return PerVehicle(make, member.guard or Guard(lookup.source, name)), member
     return (driver if member.guard is None else GuardedAds(driver, member.guard)), member

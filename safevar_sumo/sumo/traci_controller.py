@@ -1,8 +1,8 @@
-"""A controller that was written for SUMO: it reads the running simulation through TraCI's functions, and what it commands is a wish.
+"""A controller that was written for SUMO: it reads the running simulation and commands the vehicle through TraCI's functions.
 
-Its `step(traci, vehicle_id)` sees its own copy of the network under the traffic file's ids, and others as the vehicle's sensors
-tell of them. What it asks of the vehicle's type is answered with the original's. A speed or an acceleration that it commands goes
-through pedals to the plant.
+Its `step(traci, vehicle_id)` sees its own copy of the network under the traffic file's ids, and other actors through the vehicle's
+sensors. Queries of the vehicle's type return the original vehicle's values. Commanded speeds and accelerations are converted to pedals
+of the vehicle model.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from safevar_sumo.vehicles import SumoType
 
 
 class TraciController:
-    """Drives every vehicle with a controller of its own, a function `step(traci, vehicle_id)` or a class with `start` and `step`.
+    """Drives every vehicle with its own controller, a function `step(traci, vehicle_id)` or a class with `start` and `step`.
 
     Parameters
     ----------
     modules
-        Makes the user's modules once more for one vehicle, so that nothing which they keep passes from one to another.
+        Creates separate instances of the user's modules for each vehicle, so that vehicles share no module state.
     controller_of
-        The controller, of what those modules call it.
+        Creates the controller from the object that the study names in those modules.
     """
 
     def __init__(self, modules: Callable[[], OwnModules], controller_of: Callable[[Any], Any], guard: Guard) -> None:
@@ -50,7 +50,7 @@ class TraciController:
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         trimmed = trim(memory.nominal, seen) if memory.trimmed is None else memory.trimmed
         wanted = np.zeros(len(memory.drivers))
-        if memory.trimmed is not None:  # the first look around was at the start
+        if memory.trimmed is not None:  # the first observation was made at the start
             memory.sensing.look()
         with importable():
             for i, driver in enumerate(memory.drivers):
@@ -60,7 +60,7 @@ class TraciController:
 
 
 class _Memory(NamedTuple):
-    """The original vehicle, what the vehicles sense, a driver for each vehicle, and the pedals' trim of the first look."""
+    """The original vehicle, the vehicles' sensing, a driver for each vehicle, and the trim at the first observation."""
 
     nominal: Nominal
     sensing: Sensing
@@ -69,7 +69,7 @@ class _Memory(NamedTuple):
 
 
 class _Driver:
-    """The controller of one vehicle, with modules of its own."""
+    """The controller of one vehicle, with its own instances of the modules."""
 
     def __init__(self, view: TraciView, modules: OwnModules, controller_of: Callable[[Any], Any], guard: Guard) -> None:
         self.view, self._modules, self._guard = view, modules, guard
@@ -81,7 +81,7 @@ class _Driver:
             self._call("start", self._controller.start)
 
     def step(self, time: float, speed: float) -> float:
-        """The acceleration that the vehicle is to have [m/s^2]."""
+        """The commanded acceleration [m/s^2]."""
         self.view.time = time
         self._call("step", self._step)
         return self.view.wish.acceleration(speed, time, self.view.speed_of_sumo(speed))
@@ -89,5 +89,5 @@ class _Driver:
     def _call(self, method: str, function: Callable[..., Any]) -> None:
         with self._modules.inside(), driving(self.view, self._subscriptions):
             self._guard.call(method, function, traci_module(), VUT)
-        if self.view.refused is not None:  # and the controller went on, as if nothing were wrong
+        if self.view.refused is not None:  # the controller caught the error and continued
             raise self._guard.failed(method, self.view.refused)

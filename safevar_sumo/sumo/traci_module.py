@@ -1,4 +1,4 @@
-"""TraCI as controllers import it: `import traci`, in whatever module, talks for the vehicle that is being driven; and subscriptions."""
+"""TraCI as controllers import it: `import traci` in any module refers to the vehicle that is being driven; and subscriptions."""
 
 from __future__ import annotations
 
@@ -23,86 +23,86 @@ VARIABLES: Mapping[str, str] = {
     "VAR_MAXSPEED": "getMaxSpeed", "VAR_ACCEL": "getAccel", "VAR_DECEL": "getDecel", "VAR_TAU": "getTau", "VAR_ROUTE_ID": "getRouteID",
     "VAR_WAITING_TIME": "getWaitingTime", "VAR_TIME": "getTime", "VAR_DELTA_T": "getDeltaT",
 }
-"""TraCI's variables that can be subscribed to, and the functions that tell the same."""
+"""TraCI's variables for subscriptions, and the functions that return the same values."""
 AROUND = {"CMD_GET_VEHICLE_VARIABLE": "vehicle", "CMD_GET_PERSON_VARIABLE": "person"}
 DEFAULT = ("VAR_ROAD_ID", "VAR_LANEPOSITION")
 
 
 class Subscriptions:
-    """What a controller subscribes to; results are what those functions tell that stand for the variables, through the sensors."""
+    """Subscriptions of a controller; their results are those of the functions for the variables, through the sensors."""
 
     def __init__(self, view: TraciView) -> None:
         self._view = view
-        self._of: dict[tuple[str, str], dict[int, tuple[Any, ...]]] = {}
+        self._subscribed: dict[tuple[str, str], dict[int, tuple[Any, ...]]] = {}
         self._around: dict[tuple[str, str], tuple[str, float, dict[int, tuple[Any, ...]]]] = {}
 
     def call(self, domain: str, name: str, arguments: tuple[Any, ...], named: Mapping[str, Any]) -> Any:
-        """A function of a domain that subscribes, or tells what was subscribed to."""
+        """Call a domain's function that subscribes, or returns results of subscriptions."""
         if name.startswith("get"):
-            every, context = name.startswith("getAll"), "Context" in name
-            found = self._contexts(domain) if context else self._results(domain)
+            all_results, context = name.startswith("getAll"), "Context" in name
+            results = self._contexts(domain) if context else self._results(domain)
             key = "" if domain == "simulation" else str(next(iter((*arguments, *named.values())), ""))
-            return found if every else found.get(key, {})
+            return results if all_results else results.get(key, {})
         functions: dict[str, Callable[..., None]] = {
             "subscribe": self._subscribe, "subscribeLeader": self._subscribe_to_leader, "unsubscribe": self._unsubscribe,
             "subscribeContext": self._subscribe_around, "unsubscribeContext": self._unsubscribe_around}
         if name not in functions:
-            raise InputError(f"traci.{domain}.{name}", "is not for a controller", "subscribe, subscribeContext, and a choice of one's own")
-        given = positional(domain, name, arguments, named)
-        functions[name](domain, *(("", *given) if domain == "simulation" else given))
+            raise InputError(f"traci.{domain}.{name}", "is not for a controller", "subscribe, subscribeContext, and your own selection")
+        ordered = positional(domain, name, arguments, named)
+        functions[name](domain, *(("", *ordered) if domain == "simulation" else ordered))
         return None
 
-    def _subscribe(self, domain: str, one: str, variables: Any = None, begin: float = 0, end: float = 0, parameters: Any = None) -> None:
-        self._of[domain, one] = _variables(domain, variables, parameters)
+    def _subscribe(self, domain: str, actor: str, variables: Any = None, begin: float = 0, end: float = 0, parameters: Any = None) -> None:
+        self._subscribed[domain, actor] = _variables(domain, variables, parameters)
 
-    def _subscribe_to_leader(self, domain: str, one: str, dist: float = 0.0, begin: float = 0, end: float = 0) -> None:
-        self._of[domain, one] = {_constant("VAR_LEADER"): (dist,)}
+    def _subscribe_to_leader(self, domain: str, actor: str, dist: float = 0.0, begin: float = 0, end: float = 0) -> None:
+        self._subscribed[domain, actor] = {_constant("VAR_LEADER"): (dist,)}
 
-    def _subscribe_around(self, domain: str, one: str, around: int, dist: float, variables: Any = None, begin: float = 0, end: float = 0,
+    def _subscribe_around(self, domain: str, actor: str, around: int, dist: float, variables: Any = None, begin: float = 0, end: float = 0,
                           parameters: Any = None) -> None:
         kinds = {_constant(name): kind for name, kind in AROUND.items()}
         if domain != "vehicle" or around not in kinds:
-            raise InputError(f"traci.{domain}.subscribeContext", f"around {one!r}, domain = {around!r}",
+            raise InputError(f"traci.{domain}.subscribeContext", f"around {actor!r}, domain = {around!r}",
                              f"vehicles or persons around a vehicle: {', '.join(AROUND)}")
-        self._around[domain, one] = kinds[around], dist, _variables(kinds[around], variables, parameters)
+        self._around[domain, actor] = kinds[around], dist, _variables(kinds[around], variables, parameters)
 
-    def _unsubscribe(self, domain: str, one: str = "") -> None:
-        self._of.pop((domain, one), None)
+    def _unsubscribe(self, domain: str, actor: str = "") -> None:
+        self._subscribed.pop((domain, actor), None)
 
-    def _unsubscribe_around(self, domain: str, one: str, around: int = 0, dist: float = 0.0) -> None:
-        self._around.pop((domain, one), None)
+    def _unsubscribe_around(self, domain: str, actor: str, around: int = 0, dist: float = 0.0) -> None:
+        self._around.pop((domain, actor), None)
 
     def _results(self, domain: str) -> dict[str, dict[int, Any]]:
         present = self._view.call(domain, "getIDList", (), {}) if domain in AROUND.values() else None
-        return {one: self._values(domain, one, variables) for (kind, one), variables in self._of.items()
-                if kind == domain and (present is None or one in present)}
+        return {actor: self._values(domain, actor, variables) for (kind, actor), variables in self._subscribed.items()
+                if kind == domain and (present is None or actor in present)}
 
     def _contexts(self, domain: str) -> dict[str, dict[str, dict[int, Any]]]:
-        found = {}
-        for (of, one), (kind, dist, variables) in self._around.items():
-            if of == domain and one in self._view.call(of, "getIDList", (), {}):
-                found[one] = {other: self._values(kind, other, variables) for other in self._view.call(kind, "getIDList", (), {})
-                              if self._distance(of, one, kind, other) <= dist}
-        return found
+        results = {}
+        for (of, actor), (kind, dist, variables) in self._around.items():
+            if of == domain and actor in self._view.call(of, "getIDList", (), {}):
+                results[actor] = {other: self._values(kind, other, variables) for other in self._view.call(kind, "getIDList", (), {})
+                              if self._distance(of, actor, kind, other) <= dist}
+        return results
 
-    def _distance(self, of: str, one: str, kind: str, other: str) -> float:
-        here, there = (self._view.call(domain, "getPosition", (name,), {}) for domain, name in ((of, one), (kind, other)))
-        return float(((here[0] - there[0]) ** 2 + (here[1] - there[1]) ** 2) ** 0.5)
+    def _distance(self, of: str, actor: str, kind: str, other: str) -> float:
+        first, second = (self._view.call(domain, "getPosition", (name,), {}) for domain, name in ((of, actor), (kind, other)))
+        return float(((first[0] - second[0]) ** 2 + (first[1] - second[1]) ** 2) ** 0.5)
 
-    def _values(self, domain: str, one: str, variables: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
+    def _values(self, domain: str, actor: str, variables: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
         functions = {_constant(name): function for name, function in VARIABLES.items()}
-        return {variable: self._view.call(domain, functions[variable], (*((one,) if one else ()), *more), {})
+        return {variable: self._view.call(domain, functions[variable], (*((actor,) if actor else ()), *more), {})
                 for variable, more in variables.items()}
 
 
 def _variables(domain: str, given: Any, parameters: Any) -> dict[int, tuple[Any, ...]]:
-    """What is asked of the functions that stand for variables."""
+    """Further arguments of the functions for variables, by variable."""
     known = {_constant(name): name for name in VARIABLES}
     default = ("VAR_TIME",) if domain == "simulation" else DEFAULT
     chosen = [*map(_constant, default)] if given is None else list(given)
-    for one in chosen:
-        if one not in known:
-            raise InputError(f"traci.{domain}.subscribe", f"variable {one!r}", f"traci.constants.{', '.join(VARIABLES)}")
+    for variable in chosen:
+        if variable not in known:
+            raise InputError(f"traci.{domain}.subscribe", f"variable {variable!r}", f"traci.constants.{', '.join(VARIABLES)}")
     more = {variable: value[1:] if isinstance(value, tuple) else (value,) for variable, value in (parameters or {}).items()}
     return {variable: more.get(variable, ()) for variable in chosen}
 
@@ -112,12 +112,12 @@ def _constant(name: str) -> int:
 
 
 _driven: list[tuple[TraciView, Subscriptions]] = []
-"""For whom TraCI is asked at the moment, innermost last."""
+"""Vehicles for which TraCI is called at the moment, innermost last."""
 
 
 @contextmanager
 def driving(view: TraciView, subscriptions: Subscriptions) -> Iterator[None]:
-    """Within, TraCI speaks for this vehicle."""
+    """Context in which TraCI refers to this vehicle."""
     _driven.append((view, subscriptions))
     try:
         yield
@@ -127,7 +127,7 @@ def driving(view: TraciView, subscriptions: Subscriptions) -> Iterator[None]:
 
 @contextmanager
 def importable() -> Iterator[None]:
-    """Within, `import traci` and `import libsumo` give TraCI as controllers have it."""
+    """Context in which `import traci` and `import libsumo` import TraCI as controllers have it."""
     real_traci()
     before = {name: sys.modules.get(name) for name in ("traci", "libsumo")}
     sys.modules.update({name: traci_module(name) for name in before})
@@ -148,7 +148,7 @@ def traci_module(name: str = "traci") -> ModuleType:
 
 
 class _Module(ModuleType):
-    """Stands for traci or libsumo: constants and classes are theirs, functions are those of the vehicle that is driven."""
+    """A substitute for traci or libsumo: constants and classes are the original ones, functions are those of the driven vehicle."""
 
     def __init__(self, real: ModuleType) -> None:
         super().__init__(real.__name__, real.__doc__)
@@ -184,7 +184,7 @@ def _function(domain: str, name: str) -> Callable[..., Any]:
                              "calls within start and step, not where a module is imported")
         view, subscriptions = _driven[-1]
         if domain and "subscri" in name.lower():
-            with view.noting():
+            with view.translated_errors():
                 return subscriptions.call(domain, name, arguments, named)
         return view.call(domain, name, arguments, named)
 

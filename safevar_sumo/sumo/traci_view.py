@@ -1,4 +1,4 @@
-"""TraCI as one controller has it: one copy of the network, the traffic file's ids, others as the vehicle's sensors tell of them."""
+"""TraCI for one controller: one copy of the network, ids of the traffic file, other actors through the vehicle's sensors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from safevar_sumo.sumo.world import SumoWorld
 WISHES: Mapping[str, tuple[str, ...]] = {
     "setSpeed": ("speed",), "slowDown": ("speed", "duration"), "setAcceleration": ("acceleration", "duration"), "setAccel": ("accel",),
     "setDecel": ("decel",), "setMaxSpeed": ("speed",), "setSpeedMode": ("mode",)}
-"""What a controller may command, and the numbers that go with it."""
+"""Commands of a controller, and their numeric arguments."""
 ELSE = "a controller reads and commands in its step"
 BACK = -1.0
 """The speed and the speed mode that give control back to SUMO's own driver."""
@@ -35,7 +35,7 @@ STARTS = ("start", "init", "connect", "load", "close", "switch", "switchConnecti
 """Functions that advance, begin or end simulations."""
 KNOWN = re.compile("get(Length|Width|Height|MinGap|VehicleClass|ShapeClass|TypeID|Color|(Emergency|Apparent)?Decel|Accel|MaxSpeed"
                    "|Tau|Mass)")
-"""Functions that tell of others what one sees at once, or knows of their kind."""
+"""Functions about other actors whose values are visible at once or known from the type of actor."""
 BLIND: Mapping[str, re.Pattern[str]] = {
     "vehicle": re.compile("getFollower|get(Left|Right)(Followers|Leaders)|getNeighbors|getJunctionFoes|.*LaneChange.*|couldChangeLane"
                           "|getLoadedIDList|getTeleportingIDList|getTaxiFleet|getSpeedWithoutTraCI"),
@@ -44,14 +44,14 @@ BLIND: Mapping[str, re.Pattern[str]] = {
     "trafficlight": re.compile("get(Blocking|Rival|Priority|Served).*"),
 }
 BLIND_ROADS = re.compile("getLastStep.*|getWaitingTime|getTraveltime|getPendingVehicles|get.*(Emission|Consumption)")
-"""Functions that tell of others what no sensor of the vehicle does."""
+"""Functions about other actors whose values no sensor of the vehicle measures."""
 SENSIBLE = "getLeader, getIDList, and positions, speeds, angles and lanes of vehicles and persons: these pass the sensors"
 INVALID = -1073741824
-"""SUMO's value of what somebody who is not on the road does not have."""
+"""SUMO's value for a property of an actor that is not on the road."""
 
 
 class Wish:
-    """What a controller has commanded, and what acceleration comes of it, as SUMO's speed modes have it."""
+    """Commands of a controller, and the acceleration that they result in under SUMO's speed modes."""
 
     SAFE_SPEED, OWN_ACCELERATION, OWN_DECELERATION, USUAL_MODE, LARGEST_MODE = 1, 2, 4, 31, 127
 
@@ -62,12 +62,12 @@ class Wish:
         self._until, self._change = -1.0, 0.0
 
     def command(self, name: str, time: float, speed: float, values: tuple[Any, ...]) -> None:
-        """Take in a command of the vehicle domain.
+        """Process a command of the vehicle domain.
 
         Raises
         ------
         InputError
-            Naming a number that means nothing.
+            Naming an illegal number.
         """
         numbers = [self._number(name, what, value) for what, value in zip(WISHES[name], values, strict=True)]
         if name == "setSpeed":
@@ -97,12 +97,12 @@ class Wish:
             raise InputError(f"traci.vehicle.{name}", f"{what} = {value!r}", legal + back)
         return number
 
-    def acceleration(self, speed: float, time: float, sumos: float) -> float:
-        """Acceleration to ask the plant for [m/s^2], with the speed that SUMO's own driver would have next."""
-        wished = speed + self._change * self._step if time < self._until else sumos if self._speed is None else self._speed
+    def acceleration(self, speed: float, time: float, sumo_speed: float) -> float:
+        """Acceleration to command [m/s^2]; `sumo_speed` is the next speed of SUMO's own driver [m/s]."""
+        wanted = speed + self._change * self._step if time < self._until else sumo_speed if self._speed is None else self._speed
         if self._mode & self.SAFE_SPEED:
-            wished = min(wished, max(sumos, speed - self._decel * self._step) if wished > sumos else wished)
-        change = (min(wished, self._fastest) - speed) / self._step
+            wanted = min(wanted, max(sumo_speed, speed - self._decel * self._step) if wanted > sumo_speed else wanted)
+        change = (min(wanted, self._fastest) - speed) / self._step
         change = min(change, self._accel) if self._mode & self.OWN_ACCELERATION else change
         return max(change, -self._decel) if self._mode & self.OWN_DECELERATION else change
 
@@ -115,40 +115,40 @@ class TraciView:
         self._vut = copied_id(copy, VUT)
         self.wish, self.time = Wish(nominal, step), 0.0
         self.refused: InputError | None = None
-        """What the controller was refused last, even if it went on."""
+        """The last error that was raised to the controller, even if the controller caught it."""
 
     @property
     def on_the_road(self) -> bool:
-        """Whether the vehicle is still there."""
+        """Whether the vehicle is still on the road."""
         return not self._world.has_left(self._vut)
 
     def speed_of_sumo(self, speed: float) -> float:
-        """Speed that SUMO's own driver, with the original's type, would have in the next step [m/s]: for the road and the leader."""
+        """Speed that SUMO's own driver, with the original vehicle's type, would choose next for road and leader [m/s]."""
         vehicle, vut, seen = self._world.api.vehicle, self._vut, self._sensing.seen(self._copy)
         free = min(speed + vehicle.getAccel(vut) * self._world.step_length, vehicle.getAllowedSpeed(vut))
         if seen.leader is None:
             return float(free)
         name, gap = seen.leader
-        inner = copied_id(self._copy, name)
-        leaders = seen.vehicle[name]["getSpeed"]
-        return float(min(free, vehicle.getFollowSpeed(vut, speed, gap, leaders, vehicle.getDecel(inner), inner)))
+        leader = copied_id(self._copy, name)
+        leader_speed = seen.vehicle[name]["getSpeed"]
+        return float(min(free, vehicle.getFollowSpeed(vut, speed, gap, leader_speed, vehicle.getDecel(leader), leader)))
 
     def call(self, domain: str, name: str, arguments: tuple[Any, ...], named: Mapping[str, Any]) -> Any:
-        """One of TraCI's functions on this copy; `domain` is "" for one of the module itself.
+        """Call a TraCI function on this copy; `domain` is "" for functions of the module itself.
 
         Raises
         ------
         InputError
-            If it is not for a controller.
+            If controllers must not call the function.
         TraCIException
-            If SUMO refuses it.
+            If SUMO refuses the call.
         """
-        with self.noting():
+        with self.translated_errors():
             return self._called(domain, name, positional(domain, name, arguments, named))
 
     @contextmanager
-    def noting(self) -> Iterator[None]:
-        """Within, refusals are kept, and SUMO's errors name nobody's inner id."""
+    def translated_errors(self) -> Iterator[None]:
+        """Context that stores errors for the controller, and replaces ids of copies in SUMO's errors by those of the traffic file."""
         api = self._world.api
         try:
             yield
@@ -170,9 +170,9 @@ class TraciView:
             return getattr(self._world.api, name)(*arguments)
         blind = BLIND_ROADS if domain in ("edge", "lane") else BLIND.get(domain)
         if domain in SENSED:
-            found = self._of_somebody(domain, name, arguments)
-            if found is not NotImplemented:
-                return found
+            value = self._sensed(domain, name, arguments)
+            if value is not NotImplemented:
+                return value
         elif domain in ("edge", "lane") and name in ("getLastStepVehicleIDs", "getLastStepVehicleNumber", "getLastStepPersonIDs"):
             return self._on_road(domain, name, arguments[0])
         elif domain == "simulation" and name in ("getTime", "getCurrentTime"):
@@ -180,24 +180,25 @@ class TraciView:
         elif domain == "simulation" and name == "getMinExpectedNumber":
             return sum(len(self._ids(kind)) for kind in SENSED)
         if blind is not None and blind.fullmatch(name):
-            raise InputError(called, "tells of others what no sensor of the vehicle does", SENSIBLE)
+            raise InputError(called, "returns values of other actors that no sensor of the vehicle measures", SENSIBLE)
         if name == "getIDCount":
-            return len(self._ours(getattr(self._world.api, domain).getIDList()))
+            return len(self._translated(getattr(self._world.api, domain).getIDList()))
         return self._passed_on(domain, name, arguments)
 
     def _command(self, domain: str, name: str, called: str, arguments: tuple[Any, ...]) -> Any:
         if domain != "vehicle" or name not in (*WISHES, *SHOWN):
             raise InputError(called, f"is not for a controller of {VUT!r}", f"of traci.vehicle {', '.join(WISHES)}")
         if not arguments or arguments[0] != VUT:
-            given = repr(arguments[0]) if arguments else "nothing"
-            raise InputError(called, f"vehID = {given} is not the vehicle under test", f"{VUT!r}: a controller commands no other vehicle")
+            vehicle_id = repr(arguments[0]) if arguments else "nothing"
+            raise InputError(called, f"vehID = {vehicle_id} is not the vehicle under test",
+                             f"{VUT!r}: a controller commands no other vehicle")
         if name in SHOWN:
             return self._passed_on(domain, name, arguments)
         speed = float(self._world.api.vehicle.getSpeed(self._vut))
         return self.wish.command(name, self.time, speed, arguments[1:])
 
-    def _of_somebody(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
-        """What the sensors tell; NotImplemented where they have nothing to do with it."""
+    def _sensed(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
+        """The value of an actor as sensed; NotImplemented if the function does not depend on sensors."""
         if name in ("getIDList", "getIDCount"):
             ids = self._ids(domain)
             return ids if name == "getIDList" else len(ids)
@@ -207,31 +208,31 @@ class TraciView:
         if not arguments or KNOWN.fullmatch(name):
             return NotImplemented
         if name not in SENSED[domain]:
-            raise InputError(called, f"of {arguments[0]!r} tells what no sensor of the vehicle does", SENSIBLE)
+            raise InputError(called, f"returns a value of {arguments[0]!r} that no sensor of the vehicle measures", SENSIBLE)
         if arguments[0] in others:
-            return self._ours(others[arguments[0]][name])
+            return self._translated(others[arguments[0]][name])
         return _invalid(self._passed_on(domain, name, arguments))
 
     def _ids(self, domain: str) -> tuple[str, ...]:
         return (*((VUT,) if domain == "vehicle" else ()), *self._sensing.seen(self._copy).others(domain))
 
     def _leader(self, dist: float = 100.0) -> tuple[str, float] | None:
-        """Who is ahead and how far beyond the own minGap; no farther than `dist` [m], or, if that is 0, than the vehicle needs to stop."""
+        """The leader and the gap to it beyond the own minGap, up to `dist` [m] or, if `dist` is 0, up to the stopping distance."""
         speed = float(self._world.api.vehicle.getSpeed(self._vut))
         leader = self._sensing.seen(self._copy).leader
         return leader if leader and leader[1] <= (dist or speed**2 / (2 * self._decel)) else None
 
     def _on_road(self, domain: str, name: str, road: str) -> Any:
-        """Who is on a lane or edge, as far as the sensors tell."""
+        """Actors on a lane or edge, as sensed."""
         seen, function = self._sensing.seen(self._copy), "getLaneID" if domain == "lane" else "getRoadID"
-        people = seen.person if name == "getLastStepPersonIDs" else {VUT: seen.own, **seen.vehicle}
-        found = tuple(one for one, values in people.items() if values.get(function) == copied_id(self._copy, road))
-        return len(found) if name == "getLastStepVehicleNumber" else found
+        actors = seen.person if name == "getLastStepPersonIDs" else {VUT: seen.own, **seen.vehicle}
+        names = tuple(actor for actor, values in actors.items() if values.get(function) == copied_id(self._copy, road))
+        return len(names) if name == "getLastStepVehicleNumber" else names
 
     def _passed_on(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
-        """What SUMO itself answers."""
+        """The value from SUMO itself."""
         function = getattr(getattr(self._world.api, domain), name)
-        return self._ours(function(*(self._inner(one) for one in arguments)))
+        return self._translated(function(*(self._inner(argument) for argument in arguments)))
 
     def _inner(self, value: Any) -> Any:
         seen = self._sensing.seen(self._copy)
@@ -239,8 +240,8 @@ class TraciView:
             return copied_id(self._copy, value)
         return type(value)(map(self._inner, value)) if type(value) in (list, tuple) else value
 
-    def _ours(self, value: Any) -> Any:
-        """A result under the traffic file's ids, without what belongs to other copies."""
+    def _translated(self, value: Any) -> Any:
+        """A result with the traffic file's ids, without elements of other copies."""
         if isinstance(value, str):
             for mark in ("", ":", "!"):
                 if value.startswith(f"{mark}{self._copy}."):
@@ -250,12 +251,12 @@ class TraciView:
         if value is None or isinstance(value, bool | int | float | bytes):
             return value
         if isinstance(value, tuple | list):
-            ours = [self._ours(one) for one in value if not self._foreign(one)]
-            return type(value)(*ours) if hasattr(value, "_fields") else type(value)(ours)
+            elements = [self._translated(element) for element in value if not self._foreign(element)]
+            return type(value)(*elements) if hasattr(value, "_fields") else type(value)(elements)
         if isinstance(value, Mapping):
-            return {self._ours(key): self._ours(one) for key, one in value.items() if not self._foreign(key)}
+            return {self._translated(key): self._translated(element) for key, element in value.items() if not self._foreign(key)}
         names = [name for name in dir(value) if not name.startswith("_") and name not in ("this", "thisown")]
-        return SimpleNamespace(**{name: self._ours(getattr(value, name)) for name in names if not callable(getattr(value, name))})
+        return SimpleNamespace(**{name: self._translated(getattr(value, name)) for name in names if not callable(getattr(value, name))})
 
     def _foreign(self, value: Any) -> bool:
         if not isinstance(value, str):
@@ -265,25 +266,25 @@ class TraciView:
 
 
 def _invalid(value: Any) -> Any:
-    """What SUMO says of the same kind of value where there is none."""
+    """SUMO's invalid value of the same type."""
     if isinstance(value, tuple):
         return tuple(map(_invalid, value))
     return "" if isinstance(value, str) else type(value)(INVALID)
 
 
 def traci_exception() -> type[Exception]:
-    """The exception that controllers are to catch, whichever SUMO simulates."""
+    """The exception that controllers catch, with every engine."""
     return real_traci().exceptions.TraCIException  # type: ignore[no-any-return]
 
 
 @cache
 def real_traci() -> Any:
-    """The module itself, not what stands for it while controllers run; to be called before they do."""
+    """The original module, not its substitute for controllers; first called before controllers run."""
     return engine_api(Engine.TRACI)
 
 
 def positional(domain: str, name: str, arguments: tuple[Any, ...], named: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Arguments in the order in which TraCI has them."""
+    """Positional arguments in the order of TraCI's function."""
     signature = _signature(domain, name)
     if signature is None or not (named or name in WISHES):
         return arguments

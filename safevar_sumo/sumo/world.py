@@ -1,4 +1,4 @@
-"""N copies of a network under simulation, and what is asked of SUMO about the actors on them."""
+"""N copies of a network in a running simulation, and queries about their actors."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import Sensors, SumoType
 
 SURE_BRAKES = 9.0
-"""SUMO puts nobody onto the road who might not stop before what is ahead; there everybody brakes so hard at least [m/s^2]."""
+"""Deceleration of all vehicles at their insertion [m/s^2]: SUMO inserts no vehicle that could not stop before an obstacle ahead."""
 FASTEST = 200.0
-"""A vehicle in a scene that is recorded may depart as fast as this [m/s]."""
+"""Highest speed at which a vehicle may depart in a recorded scene [m/s]."""
 # Speed mode: SUMO obeys every speed that is set and yields to nobody on a junction (TraCI "set speed mode", bit 5).
 OBEY = 32
 # Lane change mode: none at all (TraCI "set lane change mode").
@@ -28,7 +28,7 @@ KEEP_LANE = 0
 
 
 class Body(NamedTuple):
-    """A vehicle or a person as a rectangle: its middle and direction, a unit vector, shape (2,); m, m, m/s. Or M of them, in columns."""
+    """A vehicle or person as a rectangle: middle [m] and direction, a unit vector, shape (2,); m, m, m/s. Or M bodies in columns."""
 
     middle: FloatArray
     along: FloatArray
@@ -38,17 +38,17 @@ class Body(NamedTuple):
 
     @classmethod
     def behind(cls, front: FloatArray, along: FloatArray, length: float, width: float, speed: Any) -> Body:
-        """From the middle of its front."""
+        """The body with the middle of its front at `front`."""
         return cls(front - along * (length / 2), along, length, width, speed)
 
     @classmethod
     def columns(cls, bodies: Sequence[Body]) -> Body:
-        """M bodies, their positions and directions of shape (M, 2), all else of shape (M,)."""
+        """M bodies in columns: positions and directions of shape (M, 2), the others of shape (M,)."""
         return cls._make(np.array(column) for column in zip(*bodies, strict=True))
 
 
 class SumoWorld:
-    """N copies of a network under simulation; made by `open_world`. Shapes: (N,) or (N, 2)."""
+    """N copies of a network in a running simulation; created by `open_world`. Shapes: (N,) or (N, 2)."""
 
     def __init__(self, api: Any, n: int, *, watched: bool = False) -> None:
         self._api, self.n = api, n
@@ -58,18 +58,18 @@ class SumoWorld:
         """Speeds and positions of vehicles under test that have left the road."""
         self._speeds_now: FloatArray | None = None
         self._struck: dict[int, str] = {}
-        """By copy, whom the vehicles under test were reported to collide with last."""
+        """By copy, the id of the actor in the vehicle under test's last collision."""
         self._ids: dict[str, list[str]] = {}
         self._positions: dict[str, FloatArray] = {}
         self._copy_of = {name: copy for copy, name in enumerate(self.ids(VUT))}
         self._driving, self._rows = dict(self._copy_of), np.arange(len(self._copy_of))
         """Copies whose vehicle under test is on the road."""
-        self._told = np.full(len(self._rows), np.nan)
-        """Speeds that the vehicles under test were last told to reach."""
+        self._commanded = np.full(len(self._rows), np.nan)
+        """Last speeds commanded to the vehicles under test [m/s]."""
         self.step_length: float = api.simulation.getDeltaT()
         self._pause = self.step_length if watched else 0.0
         self.sensors = Sensors.perfect(n)
-        """Through which the ADSs see it that read it themselves, weather included."""
+        """Sensors of ADSs that read the world themselves, including the weather."""
 
     def ids(self, name: str) -> list[str]:
         """The ids of an actor in its copies."""
@@ -78,7 +78,7 @@ class SumoWorld:
         return self._ids[name]
 
     def set_types(self, types: SumoType) -> None:
-        """Make the vehicles under test the SUMO vehicle types that their settings say."""
+        """Set the SUMO vehicle types of the vehicles under test."""
         vehicletype = self._api.vehicletype
         columns = (values.tolist() for values in (types.mass, types.accel, types.max_speed, types.tau))
         for name, mass, accel, max_speed, tau in zip(self.ids(VUT), *columns, strict=True):
@@ -89,24 +89,24 @@ class SumoWorld:
         self.set_decelerations(types.decel)
 
     def let_depart(self) -> None:
-        """Make the vehicles under test such that SUMO puts them onto the road at any speed."""
+        """Set types of the vehicles under test with which SUMO inserts them at any speed."""
         for name in self.ids(VUT):
             self._api.vehicletype.setMaxSpeed(name, FASTEST)
         self.set_decelerations(np.full(self.n, SURE_BRAKES))
 
     def set_decelerations(self, decel: FloatArray) -> None:
-        """What their brakes can do at the most, in an emergency too [m/s^2]."""
+        """Set the largest decelerations of the vehicles under test, also in emergencies [m/s^2]."""
         for name, value in zip(self.ids(VUT), decel.tolist(), strict=True):
             self._api.vehicletype.setDecel(name, value)
             self._api.vehicletype.setEmergencyDecel(name, value)
 
     def depart(self) -> None:
-        """Insert everybody, and take the vehicles under test into our hands.
+        """Insert all actors, and take control of the vehicles under test.
 
         Raises
         ------
         SimulationError
-            If a vehicle under test found no place.
+            If SUMO cannot insert a vehicle under test.
         """
         global _present
         _present = self
@@ -121,10 +121,10 @@ class SumoWorld:
     def advance(self, speeds: FloatArray) -> None:
         """One simulation step in which the vehicles under test reach `speeds` [m/s]."""
         set_speed, names = self._set_speed, self.ids(VUT)
-        changed = self._rows[(speeds != self._told)[self._rows]]
+        changed = self._rows[(speeds != self._commanded)[self._rows]]
         for copy, speed in zip(changed.tolist(), speeds[changed].tolist(), strict=True):
             set_speed(names[copy], speed)
-        self._told = speeds
+        self._commanded = speeds
         self._api.simulationStep()
         self._positions.clear()
         self._speeds_now = None
@@ -134,20 +134,20 @@ class SumoWorld:
     def collisions(self, open_: BoolArray) -> dict[int, float]:
         """Copies of open runs whose vehicle under test collides in this step, and its speed [m/s].
 
-        Of two vehicles on a junction SUMO calls the collider who would have to yield (`MSLane::detectCollisions`): either may be ours.
+        On a junction SUMO calls the vehicle that must yield the collider (`MSLane::detectCollisions`): either may be under test.
         """
         self._struck, speeds = {}, dict[int, float]()
-        for one in self._api.simulation.getCollisions():
-            pairs = [(one.collider, one.colliderSpeed, one.victim)]
-            if one.type == "junction":
-                pairs.append((one.victim, one.victimSpeed, one.collider))
+        for collision in self._api.simulation.getCollisions():
+            pairs = [(collision.collider, collision.colliderSpeed, collision.victim)]
+            if collision.type == "junction":
+                pairs.append((collision.victim, collision.victimSpeed, collision.collider))
             for name, speed, other in pairs:
                 if (copy := self._copy_of.get(name)) is not None and open_[copy]:
                     speeds[copy], self._struck[copy] = speed, other
         return speeds
 
     def bodies(self, copies: Sequence[int]) -> tuple[Body, Body]:
-        """Vehicles under test that collide in this step, and whom they collide with; in columns."""
+        """Vehicles under test that collide in this step, and the bodies that they collide with; in columns."""
         return (Body.columns([self._body_of(self.ids(VUT)[copy]) for copy in copies]),
                 Body.columns([self._body_of(self._struck[copy]) for copy in copies]))
 
@@ -157,7 +157,7 @@ class SumoWorld:
                            kind.getWidth(name), kind.getSpeed(name))
 
     def leave(self, copies: Sequence[int]) -> None:
-        """Take vehicles under test off the road whose runs are over: they are told to be as they were, and cost nothing."""
+        """Remove vehicles under test whose runs are over: their last state is kept, and SUMO no longer simulates them."""
         if not copies:
             return
         self._last_speeds[copies], self._last_positions[copies] = self.speeds()[copies], self.vehicle_positions(VUT)[copies]
@@ -167,20 +167,20 @@ class SumoWorld:
         self._rows = np.array([*self._driving.values()], dtype=np.intp)
 
     def speeds(self) -> FloatArray:
-        """Speeds of the vehicles under test as SUMO has them in this step [m/s]; whoever asks again gets the same array."""
+        """Speeds of the vehicles under test in this step [m/s]; repeated calls return the same array."""
         if self._speeds_now is None:
             self._speeds_now = self._last_speeds.copy()
             self._speeds_now[self._rows] = [*map(self._get_speed, self._driving)]
         return self._speeds_now
 
     def vehicle_positions(self, actor: str) -> FloatArray:
-        return self._looked_up(actor, self._vehicle_position)
+        return self._positions_of(actor, self._vehicle_position)
 
     def person_positions(self, actor: str) -> FloatArray:
-        return self._looked_up(actor, self._person_position)
+        return self._positions_of(actor, self._person_position)
 
-    def _looked_up(self, actor: str, position: Callable[[str], tuple[float, float]]) -> FloatArray:
-        """Positions in this step; whoever asks again gets the same array."""
+    def _positions_of(self, actor: str, position: Callable[[str], tuple[float, float]]) -> FloatArray:
+        """Positions in this step; repeated calls return the same array."""
         if actor not in self._positions:
             names = self._driving if actor == VUT else self.ids(actor)
             positions = np.fromiter(chain.from_iterable(map(position, names)), float, 2 * len(names)).reshape(-1, 2)
@@ -192,7 +192,7 @@ class SumoWorld:
 
     @property
     def lookup_errors(self) -> tuple[type[Exception], ...]:
-        """What is raised when somebody asks for an actor or a lane that there is not."""
+        """Errors raised by queries for actors or lanes that do not exist."""
         return (self._api.TraCIException,)
 
     @property
@@ -205,18 +205,18 @@ class SumoWorld:
         return name not in self._driving
 
     def names(self) -> frozenset[str]:
-        """What vehicles, persons, roads and types are called in the originals of the copies."""
+        """Names of vehicles, persons, roads and types in the original network."""
         api = self._api
         kinds = (api.vehicle, api.person, api.edge, api.lane, api.route, api.vehicletype, api.junction)
         return frozenset(name.removeprefix(":").partition(".")[2] for kind in kinds for name in kind.getIDList())
 
     def whereabouts(self) -> dict[str, tuple[float, float, float]]:
-        """Where everybody is who is on the road, by id: front bumper or person [m], heading clockwise from north [degrees]."""
+        """Positions of all actors on the road by id: front bumper or person [m], heading clockwise from north [degrees]."""
         kinds = (self._api.vehicle, self._api.person)
         return {name: (*kind.getPosition(name), kind.getAngle(name)) for kind in kinds for name in kind.getIDList()}
 
     def measures(self, name: str) -> tuple[bool, float, float]:
-        """Whether the one of this id is a person, and its length and width [m]."""
+        """Whether an actor is a person, and its length and width [m]."""
         is_person = name in self._api.person.getIDList()
         kind = self._api.person if is_person else self._api.vehicle
         return is_person, kind.getLength(name), kind.getWidth(name)
@@ -258,36 +258,36 @@ class SumoWorld:
 
 
 def begin(scenario: Scenario, world: Any) -> Any:
-    """What a scenario remembers of a world before the first step.
+    """Start a scenario in a world before the first step; returns the scenario's memory.
 
     Raises
     ------
     InputError
-        If the network does not have what the scenario looks for.
+        If the network lacks an actor or lane of the scenario.
     """
     try:
         return scenario.begin(world)
     except world.lookup_errors as error:
-        raise InputError("scenario.parameters.network", f"the scenario does not find what it looks for: {str(error).strip()}",
+        raise InputError("scenario.parameters.network", f"the network lacks an element of the scenario: {str(error).strip()}",
                          "a network and traffic with the ids that the scenario names") from None
 
 
 _present: SumoWorld | None = None
-"""The world that is being driven in this process: SUMO is one a process, too."""
+"""The world that is being simulated in this process; SUMO allows one per process, too."""
 
 
 def present_world() -> SumoWorld:
-    """The world that is being driven."""
+    """The world that is being simulated."""
     assert _present is not None
     return _present
 
 
 def direction_of(angle: float) -> FloatArray:
-    """Unit vector of SUMO's angle: degrees clockwise from north."""
+    """Unit vector of a SUMO angle [degrees clockwise from north]."""
     return np.array([math.sin(math.radians(angle)), math.cos(math.radians(angle))])
 
 
 def _direct(api: Any, domain: str, name: str) -> Callable[..., Any]:
-    """A function of SUMO's without libsumo's Python wrapper, which costs as much as the call; traci has none."""
+    """A function of libsumo without its Python wrapper, which costs as much as the call; a function of traci as it is."""
     compiled = getattr(api, "_libsumo", None)
     return getattr(getattr(api, domain), name) if compiled is None else getattr(compiled, f"{domain}_{name}")  # type: ignore[no-any-return]

@@ -155,9 +155,9 @@ BAD = {
     "random driving": ('<vType id="r" speedDev="0"/><trip id="t" type="r" from="oncoming" depart="0"/>', "sigma = SUMO default 0.5"),
     "a random model": ('<vType id="r" speedDev="0" carFollowModel="EIDM"/><trip id="t" type="r" from="oncoming" depart="0"/>', "'EIDM'"),
     "a device": ('<vType id="r"><param key="has.ssm.device" value="true"/></vType>', "param 'has.ssm.device' gives a device"),
-    "no such edge": ('<trip id="t" type="car" from="nowhere" depart="0"/>', "trip 't': from = 'nowhere' is not there"),
-    "no such type": ('<trip id="t" type="lorry" from="oncoming" depart="0"/>', "trip 't': type = 'lorry' is not there"),
-    "no such route": ('<vehicle id="v" type="car" route="r" depart="0"/>', "vehicle 'v': route = 'r' is not there"),
+    "no such edge": ('<trip id="t" type="car" from="nowhere" depart="0"/>', "trip 't': from = 'nowhere' does not exist"),
+    "no such type": ('<trip id="t" type="lorry" from="oncoming" depart="0"/>', "trip 't': type = 'lorry' does not exist"),
+    "no such route": ('<vehicle id="v" type="car" route="r" depart="0"/>', "vehicle 'v': route = 'r' does not exist"),
     "an id twice": ('<trip id="vut" type="car" from="oncoming" depart="0"/>', "trip has the id 'vut'"),
     "the tested type for others": (
         '<trip id="t" type="vut" from="oncoming" depart="0"/>', "type = 'vut', which changes with every setting"),

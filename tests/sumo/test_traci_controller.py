@@ -176,7 +176,7 @@ REFUSED = [
     ("traci.vehicle.setDecel(v, decel=-1)", "traci.vehicle.setDecel: decel = -1"),
     ("traci.vehicle.setAcceleration(v, float('-inf'), 1)", "traci.vehicle.setAcceleration: acceleration = -inf"),
     ("traci.vehicle.setSpeedMode(v, 1.5)", "traci.vehicle.setSpeedMode: mode = 1.5"),
-    ("traci.vehicle.getNeighbors(v, 1)", "traci.vehicle.getNeighbors: tells of others what no sensor of the vehicle does"),
+    ("traci.vehicle.getNeighbors(v, 1)", "traci.vehicle.getNeighbors: returns values of other actors that no sensor"),
     ("traci.vehicle.moveTo(v, 'road_0', 50)", "traci.vehicle.moveTo: is not for a controller of 'vut'"),
 ]
 
