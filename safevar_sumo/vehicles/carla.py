@@ -334,17 +334,18 @@ def _follows(commanded: FloatArray, pedal: FloatArray, rates: tuple[FloatArray, 
 
 def _shift(p: _Prepared, s: CarlaState, throttle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Automatic gearbox: gear, target gear, time since a shift. During a shift, including the first out of neutral, the gear is neutral."""
-    relative, since_shift = s.engine_speed / p.engine_limit, s.since_shift + p.step
-    if not (np.count_nonzero(s.gear <= NEUTRAL) or np.count_nonzero(relative > p.shift_up)
-            or np.count_nonzero((s.gear > FIRST) & (relative < p.shift_down))):
-        return s.gear, s.target_gear, since_shift  # the usual case: no vehicle is shifting or about to shift
-    settled, target = s.gear == s.target_gear, s.target_gear
-    automatic = settled & (s.since_shift >= p.shift_latency)
-    sets_off = settled & (s.gear <= NEUTRAL) & (throttle > p.nothing)
-    up = sets_off | automatic & (relative > p.shift_up) & (s.gear > NEUTRAL) & (s.gear < TOP)
-    down = automatic & (relative < p.shift_down) & (s.gear > FIRST)
-    switches = up | down
-    if np.count_nonzero(switches):
+    target, since_shift, relative = s.target_gear, s.since_shift + p.step, s.engine_speed / p.engine_limit
+    neutral, ready = s.gear <= NEUTRAL, s.since_shift >= p.shift_latency
+    any_neutral = np.count_nonzero(neutral)
+    # In most steps no vehicle can shift; numpy's calls for those that could are spared.
+    sets_off = neutral & (s.gear == target) & (throttle > p.nothing) if any_neutral else neutral
+    automatic = ready & ((relative > p.shift_up) | (relative < p.shift_down)) if np.count_nonzero(ready) else ready
+    if np.count_nonzero(sets_off) or np.count_nonzero(automatic):
+        up = sets_off | automatic & (relative > p.shift_up) & (s.gear > NEUTRAL) & (s.gear < TOP)
+        down = automatic & (relative < p.shift_down) & (s.gear > FIRST)
         target = target + up - down
-        since_shift[switches] = NEUTRAL
-    return np.where((target == s.gear) | (since_shift >= p.shift_ends), target, NEUTRAL), target, since_shift
+        since_shift[up | down] = NEUTRAL
+    elif not any_neutral:
+        return s.gear, target, since_shift
+    gear = np.where((target == s.gear) | (since_shift >= p.shift_ends), target, NEUTRAL)
+    return gear if np.count_nonzero(gear != s.gear) else s.gear, target, since_shift
