@@ -1,8 +1,8 @@
-"""A study carried out: many runs at once, their batches computed elsewhere, their journals kept.
+"""Carries out a study: many runs at once, with a journal for each, on a pool of workers.
 
-A search is a generator that knows nothing of this. A run answers it from its journal and its memory, asks for what is
-new, journals the answers and sends them in: so a resumed run is a replayed one. What all runs ask for is gathered into
-batches for a pool: a lost worker costs a batch, and no result depends on who computed what with whom.
+A search is a generator that knows nothing of this. Its run answers requests from its journal and memory, has new settings
+evaluated, journals their evaluations and sends them in: a resumed run is a replayed one. New settings of all runs are gathered
+into batches for a pool: a lost worker costs a batch, and no result depends on the worker or the other settings in a batch.
 """
 
 from safevar_sumo.campaign.campaign import Campaign, run_campaign

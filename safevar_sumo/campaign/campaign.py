@@ -29,15 +29,15 @@ from safevar_sumo.workers.isolation import check_code
 from safevar_sumo.workers.retrying import RetryingPool
 
 JOURNALS_AT_ONCE = 8
-"""Journals that wait for the disk together: each append is synced before its run goes on."""
+"""Number of journals written at the same time: each append is synced to the disk before its run goes on."""
 
 
 class Campaign(NamedTuple):
-    """What runs of a study found: the original vehicle's evaluation and the solutions of every finished run.
+    """Results of a study's runs: the original vehicle's evaluation and the solutions of every finished run.
 
-    `failures` are settings that could not be simulated; `busy` runs are in the hands of another process; `scoring` is what
-    was measured and minimised; `collisions` counts the different settings of each finished run that collided, `invalid_tests` those
-    that left the tolerance of a test's speed.
+    `failures` are settings that could not be simulated; another process works on `busy` runs; `scoring` holds the metrics and
+    objectives; `collisions` counts the distinct settings of each finished run that collided, `invalid_tests` those that left the
+    tolerance of a test's speed.
     """
 
     original: Evaluations
@@ -51,20 +51,20 @@ class Campaign(NamedTuple):
 
 def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory, pool: Pool, observer: Observer,
                  batch: int | None = None, *, engine: Engine = Engine.LIBSUMO, retry_failed: bool = False) -> Campaign:
-    """Carry out runs of a study, or finish what of them is unfinished.
+    """Carry out runs of a study, or resume unfinished ones.
 
     Parameters
     ----------
     keys
-        Which runs.
+        The runs.
     results
-        Where their journals are kept.
+        The directory of their journals.
     pool
         Computes batches.
     batch
-        Settings per batch at the most, gathered from several runs.
+        Maximum number of settings per batch, gathered from several runs.
     engine
-        Who moves the vehicles; what moves in a recorded scene is verified in SUMO before a run counts as finished.
+        What moves the vehicles; results from recorded scenes are verified in SUMO before a run counts as finished.
     retry_failed
         Whether settings that could not be simulated before are tried again.
 
@@ -74,8 +74,8 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
         If a journal cannot be written or the study itself is at fault.
     """
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
-    persistent, work = RetryingPool(pool, study, results.note), packed(study, results.inputs, engine=engine)
-    original = _original(study, work, characteristics, results, persistent, observer)
+    retrying, work = RetryingPool(pool, study, results.note), packed(study, results.inputs, engine=engine)
+    original = _original(study, work, characteristics, results, retrying, observer)
     if not original.valid[0]:
         raise InputError(study.source, "the original vehicle leaves the tolerance of a test's speed before the ADS acts "
                          "(invalid-test): nothing can be compared with it", "tests whose speed the vehicle can hold")
@@ -87,17 +87,17 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
     campaign = Campaign(original, {}, [], [], {}, {}, results.scoring)
     waiting, runs = deque(keys), set[Run]()
 
-    def begun(key: RunKey) -> Search:
+    def begin_search(key: RunKey) -> Search:
         return search_of(key, study, problem, results.note)
 
-    batcher = Batcher(persistent, work, batch or LARGEST_WORLD)
-    verification = Verification(study, results, persistent, begun, engine, observer)
+    batcher = Batcher(retrying, work, batch or LARGEST_WORLD)
+    verification = Verification(study, results, retrying, begin_search, engine, observer)
 
-    def go_on(run: Run) -> None:
-        """Let a run go as far as it can, then ask for what it misses."""
+    def advance(run: Run) -> None:
+        """Advance a run as far as its known evaluations allow, then queue its missing settings."""
         if not run.advance():
-            batcher.ask(run, run.missing)
-        elif run.finished or not verification.ask(run):
+            batcher.add(run, run.missing)
+        elif run.finished or not verification.begin(run):
             finish(run)
 
     def finish(run: Run) -> None:
@@ -118,8 +118,8 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
                 except JournalBusy:
                     campaign.busy.append(key)
                     continue
-                runs.add(run := Run(key, begun(key), journal, observer, study.search.evaluations, retry=retry_failed))
-                go_on(run)
+                runs.add(run := Run(key, begin_search(key), journal, observer, study.search.evaluations, retry=retry_failed))
+                advance(run)
             batcher.send()
             verification.send()
             for future in first_of([*batcher.under_way, *verification.under_way]):
@@ -128,9 +128,9 @@ def run_campaign(study: Study, keys: Iterable[RunKey], results: ResultsDirectory
                         finish(run)
                     continue
                 shares = list(batcher.take(future))
-                for (run, _), is_whole in zip(shares, journalling.map(_take, shares), strict=True):
-                    if is_whole:
-                        go_on(run)
+                for (run, _), is_complete in zip(shares, journalling.map(_take, shares), strict=True):
+                    if is_complete:
+                        advance(run)
     finally:
         journalling.shutdown()
         for run in runs:
@@ -146,7 +146,7 @@ def _take(share: tuple[Run, Evaluations]) -> bool:
 
 def _original(study: Study, work: bytes, characteristics: CharacteristicSet, results: ResultsDirectory, pool: RetryingPool,
               observer: Observer) -> Evaluations:
-    """The original vehicle's evaluation, simulated once; where it fails, or models mix settings up, the study is at fault."""
+    """The original vehicle's evaluation, simulated once; raises if that fails, or if models mix settings up."""
     def simulated() -> Evaluations:
         return result_of(pool.submit(work, characteristics.original[np.newaxis], must_succeed=True))
 

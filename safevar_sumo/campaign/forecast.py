@@ -1,4 +1,4 @@
-"""What a campaign would take, measured by a short probe."""
+"""Estimate of a campaign's cost, measured by a short probe."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from safevar_sumo.workers.interrupts import result_of
 from safevar_sumo.workers.retrying import RetryingPool
 
 PROBE_BATCHES = 4
-"""Batches on every worker that a forecast is measured with."""
+"""Number of batches per worker in the measurement."""
 NUMBERS_BESIDE_METRICS = 4
 """A journal keeps f_diff, f_num_diff, the collision's speed and a position and outcome with the metrics of a setting."""
 
 
 class Forecast(NamedTuple):
-    """Evaluations, evaluations per second, seconds and bytes that a campaign takes at the most."""
+    """Largest number of evaluations, evaluations per second, and largest numbers of seconds and bytes of a campaign."""
 
     evaluations: int
     rate: float
@@ -32,20 +32,20 @@ class Forecast(NamedTuple):
 
 
 def forecast(study: Study, runs: int, pool: Pool, batch: int = LARGEST_WORLD, engine: Engine = Engine.LIBSUMO) -> Forecast:
-    """What carrying out `runs` runs takes at the most, after a short probe of the pool that will do it."""
+    """The largest cost of `runs` runs, estimated by a short probe of the pool that will carry them out."""
     characteristics, size = CharacteristicSet.of(study.vehicle.characteristics), min(batch, max(runs, 1) * study.search.population)
-    persistent, work, rng = RetryingPool(pool, study), packed(study, engine=engine), np.random.default_rng(study.search.seed)
+    retrying, work, rng = RetryingPool(pool, study), packed(study, engine=engine), np.random.default_rng(study.search.seed)
 
     def probe(number: int) -> float:
         """Seconds that `number` batches on every worker take."""
         start = time.perf_counter()
         drawn = [characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (size, len(characteristics))))
                  for _ in range(number * pool.workers)]
-        for future in [persistent.submit(work, settings) for settings in drawn]:
+        for future in [retrying.submit(work, settings) for settings in drawn]:
             result_of(future)
         return time.perf_counter() - start
 
-    result_of(persistent.submit(work, characteristics.original[np.newaxis], must_succeed=True))
+    result_of(retrying.submit(work, characteristics.original[np.newaxis], must_succeed=True))
     probe(1)  # starts the workers and builds the network
     rate = PROBE_BATCHES * pool.workers * size / probe(PROBE_BATCHES)
     evaluations = runs * study.search.evaluations

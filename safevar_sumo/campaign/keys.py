@@ -40,7 +40,7 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     source, search = study.source, study.search
     name, key = search.labels.get(label, label), f"search.{label}"
     if len(search.labels) < len(set(search.algorithms)):
-        raise InputError(source, f"search.algorithms = {search.algorithms}: two have one name", "algorithms of different names")
+        raise InputError(source, f"search.algorithms = {search.algorithms}: two have the same name", "algorithms with different names")
     for stray in search.parameters:
         if stray not in ALGORITHMS and stray not in search.labels:
             legal = [*SearchTable.__struct_fields__, *ALGORITHMS, *search.labels]
@@ -72,7 +72,7 @@ def search_of(key: RunKey, study: Study, problem: Problem, note: Callable[[Files
     """The search of a run; calls `note` after every step with the files that an algorithm from outside has read."""
     own, rng, ended = _packages(study), run_generator(study, key), False
     search: Search | None = None
-    answer: Any = None  # what begins a generator
+    answer: Any = None  # starts a generator
     while True:
         with noted_reading() as reading:
             try:
@@ -88,7 +88,7 @@ def search_of(key: RunKey, study: Study, problem: Problem, note: Callable[[Files
 
 
 def _packages(study: Study) -> list[str]:
-    """Top modules of the algorithms from outside."""
+    """Top-level packages of the algorithms from outside."""
     return [name.partition(":")[0].partition(".")[0] for name in study.search.algorithms if ":" in name]
 
 

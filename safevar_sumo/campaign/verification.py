@@ -1,4 +1,4 @@
-"""Parts of a run done once more: in SUMO itself what was driven in a recorded scene, and alone what other people's code had a part in."""
+"""Re-simulates parts of a run: in SUMO itself if it drove in recorded scenes, and alone if other people's code took part in it."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from safevar_sumo.workers.identity import networks_of
 from safevar_sumo.workers.isolation import refuse_difference, refuse_unlike_sumo
 from safevar_sumo.workers.retrying import RetryingPool, reproducing
 
-LEGAL = ("what a run asks for depends on its problem, its evaluations and `rng` alone: nothing kept in a class or a module between runs, "
-         "no clock, no random numbers of its own")
+LEGAL = ("requests that depend only on the run's problem, evaluations and `rng`: nothing kept in a class or a module between runs, no "
+         "clock, no random numbers of its own")
 
 
 class Verification:
-    """Runs that have ended, and settings of theirs under way: alone and with other people's models loaded afresh, then in SUMO."""
+    """Ended runs whose settings are simulated again: first alone with other people's models loaded afresh, then in SUMO."""
 
-    def __init__(self, study: Study, results: ResultsDirectory, pool: RetryingPool, begun: Callable[[RunKey], Search],
+    def __init__(self, study: Study, results: ResultsDirectory, pool: RetryingPool, begin_search: Callable[[RunKey], Search],
                  engine: Engine, observer: Observer) -> None:
-        self._study, self._pool, self._begun, self._observer = study, pool, begun, observer
+        self._study, self._pool, self._begin_search, self._observer = study, pool, begin_search, observer
         self._alone = packed(study, results.inputs, engine=engine, afresh=True) if foreign_names(study) else b""
         self._is_recorded = engine is Engine.RECORDED
         self._driven = driven_in_sumo(study, assemble(study).weather)
@@ -41,33 +41,33 @@ class Verification:
         self._in_sumo = Batcher(pool, packed(self._driven, inputs, engine=Engine.LIBSUMO), LARGEST_WORLD)
         self._leaks: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}
         self._unverified: dict[Run, tuple[Evaluations, int]] = {}
-        """What runs hold of settings that are driven in SUMO, and how many of them have not come back."""
+        """By run: the evaluations that SUMO verifies, and the number of those still missing from SUMO."""
 
     @property
     def under_way(self) -> list[Future[Evaluations]]:
-        """What is being computed."""
+        """Batches that are being computed."""
         return [*self._leaks, *self._in_sumo.under_way]
 
     def send(self) -> None:
-        """Have SUMO drive what pays now."""
+        """Send the batches for SUMO that pay now."""
         self._in_sumo.send()
 
-    def ask(self, run: Run) -> bool:
-        """Have settings of a run simulated once more; whether there are any to verify.
+    def begin(self, run: Run) -> bool:
+        """Begin to verify a run; returns whether there are settings to verify.
 
         Raises
         ------
         ForeignError
-            If it is the last run of an algorithm from outside, and the same run, alone and loaded afresh, asks for other settings.
+            If it is the last run of an algorithm from outside, and its repetition, alone and loaded afresh, requests other settings.
         """
         self._refuse_unrepeatable(run)
         rng = run_generator(self._study, run.key._replace(algorithm=f"recheck {run.key.algorithm}"))
         for known in run.samples(rng) if self._alone else ():
             self._leaks[self._pool.submit(self._alone, known.settings)] = run, known
-        return self._is_alone(run) or self._ask_sumo(run)
+        return self._awaits_leaks(run) or self._begin_in_sumo(run)
 
-    def _ask_sumo(self, run: Run) -> bool:
-        """Have settings of a run driven in SUMO, once nothing leaks between them; whether there are any."""
+    def _begin_in_sumo(self, run: Run) -> bool:
+        """Begin to verify a run in SUMO, once nothing leaks between its settings; returns whether there are any to verify."""
         rng = run_generator(self._study, run.key._replace(algorithm=f"verify {run.key.algorithm}"))
         known = run.solutions_and_others(rng) if self._is_recorded else None
         if not known:
@@ -75,52 +75,53 @@ class Verification:
         if self._driven is not self._study:  # SUMO drives settings in a few of a rating's cells
             known = evaluate(assemble(self._driven), known.settings)
         self._unverified[run] = known, len(known)
-        self._in_sumo.ask(run, known.settings)
+        self._in_sumo.add(run, known.settings)
         return True
 
-    def _is_alone(self, run: Run) -> bool:
+    def _awaits_leaks(self, run: Run) -> bool:
+        """Whether settings of a run are still being simulated alone."""
         return any(run is other for other, _ in self._leaks.values())
 
-    def _is_verified(self, run: Run, in_sumo: Evaluations) -> bool:
-        """Hold what has come back from SUMO against what a run holds of it; whether that was all."""
-        known, left = self._unverified.pop(run)
+    def _verify(self, run: Run, in_sumo: Evaluations) -> bool:
+        """Compare evaluations from SUMO with a run's; returns whether these were the last ones."""
+        known, missing = self._unverified.pop(run)
         rows = {row.tobytes(): i for i, row in enumerate(known.settings)}
         refuse_unlike_sumo(self._study, known.take([rows[row.tobytes()] for row in in_sumo.settings]), in_sumo)
         failed = np.flatnonzero(in_sumo.failed).tolist()
         if failed:
             self._observer.warned(f"run {run.key}: {len(failed)} of {len(known)} settings could not be verified in SUMO: "
                                   f"{in_sumo.reason(failed[0])}")
-        if left > len(in_sumo):
-            self._unverified[run] = known, left - len(in_sumo)
+        if missing > len(in_sumo):
+            self._unverified[run] = known, missing - len(in_sumo)
         return run not in self._unverified
 
     def _refuse_unrepeatable(self, run: Run) -> None:
         name = self._from_outside(run.key)
         if name and run.key.run == self._study.search.runs - 1:
             forget_foreign()
-            if not run.is_repeated_by(self._begun(run.key)):
+            if not run.is_repeated_by(self._begin_search(run.key)):
                 raise self._unrepeatable(name, run.key)
 
     def _from_outside(self, key: RunKey) -> str:
-        """What the study calls the algorithm of a run; "" for one of ours."""
+        """The name of a run's algorithm in the study if it comes from outside, else ""."""
         name = self._study.search.labels.get(key.algorithm, "")
         return name if ":" in name else ""
 
     def _unrepeatable(self, name: str, key: RunKey) -> ForeignError:
-        problem = f"search.algorithms: {name!r} asks for other settings when run {key.run} is repeated alone"
+        problem = f"search.algorithms: {name!r} requests other settings when run {key.run} is repeated alone"
         return ForeignError(f"study {self._study.name!r}", problem, LEGAL)
 
     def take(self, done: Future[Evaluations]) -> list[Run]:
-        """The runs of settings of which those were the last ones.
+        """Compare a computed batch; returns the runs that are verified with it.
 
         Raises
         ------
         InputError
-            If a setting's result is another one alone, or in SUMO.
+            If a setting's result differs alone, or in SUMO.
         """
         if done in self._in_sumo.under_way:
-            return [run for run, in_sumo in self._in_sumo.take(done) if self._is_verified(run, in_sumo)]
+            return [run for run, in_sumo in self._in_sumo.take(done) if self._verify(run, in_sumo)]
         run, known = self._leaks.pop(done)
         reproduction = reproducing(self._study, known.settings[0])
         refuse_difference(self._study, {f"in run {run.key}": known, "alone": done.result()}, reproduction)
-        return [] if self._is_alone(run) or self._ask_sumo(run) else [run]
+        return [] if self._awaits_leaks(run) or self._begin_in_sumo(run) else [run]

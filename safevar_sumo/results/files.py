@@ -18,7 +18,7 @@ def make_directory(path: Path) -> None:
     Raises
     ------
     InputError
-        If it cannot be written.
+        If the directory cannot be written.
     """
     try:
         make_durable(path)
@@ -42,7 +42,7 @@ def write_whole(path: Path, text: str) -> None:
     Raises
     ------
     SafevarError
-        If it cannot be written.
+        If the file cannot be written.
     """
     temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp"
     try:

@@ -40,9 +40,9 @@ def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations
     Parameters
     ----------
     path
-        Made if it does not exist; solutions of other algorithms from an earlier import of the same study stay.
+        The directory, made if it does not exist; solutions of other algorithms from an earlier import of the same study stay.
     solutions
-        By algorithm.
+        Solutions by algorithm.
     original
         The original vehicle's metrics, by name; None keeps those of an earlier import.
     files
@@ -61,8 +61,8 @@ def write_imported(path: Path, study: Study, solutions: Mapping[str, Evaluations
     frame = solutions_frame(names, [((name, 0), evaluations) for name, evaluations in solutions.items()]).drop(columns="run")
     if earlier:
         refuse_edited_table(path / SOLUTIONS, earlier, "the file as it was, or another directory")
-        there = read_imported(path, names)
-        frame = pd.concat([there[~there["algorithm"].isin(list(solutions))], frame], ignore_index=True)
+        present = read_imported(path, names)
+        frame = pd.concat([present[~present["algorithm"].isin(list(solutions))], frame], ignore_index=True)
         frame = frame.sort_values(["algorithm", "f_safe", "f_diff", "f_num_diff", *names], kind="stable", ignore_index=True)
     text = frame.to_csv(index=False, lineterminator="\n")
     manifest: dict[str, Any] = {
@@ -107,7 +107,7 @@ def read_imported(path: Path, characteristics: tuple[str, ...]) -> pd.DataFrame:
         raise InputError(file, f"cannot be read: {error.strerror or error}", "what the command import has written") from None
     except (KeyError, ValueError) as error:
         raise InputError(file, f"is damaged: {str(error).splitlines()[0]}", "what the command import has written") from None
-    always = [name for name in numbers if name not in METRICS]
-    if not np.isfinite(table[always].to_numpy()).all():
-        raise InputError(file, f"is damaged: no number in one of the columns {', '.join(always)}", "what the command import has written")
+    required = [name for name in numbers if name not in METRICS]
+    if not np.isfinite(table[required].to_numpy()).all():
+        raise InputError(file, f"is damaged: no number in one of the columns {', '.join(required)}", "what the command import has written")
     return table.astype({"f_num_diff": int})

@@ -66,7 +66,7 @@ class Result(msgspec.Struct, frozen=True, tag="result", omit_defaults=True):
 
 
 class Retry(msgspec.Struct, frozen=True, tag="retry"):
-    """From here on failed evaluations do not count; evaluations after the first of them are spare."""
+    """Discards the failed evaluations so far; evaluations after the first failed one become spare."""
 
 
 Frame = Owner | Batch | Result | Retry
@@ -159,8 +159,8 @@ def content_of(frames: list[Frame]) -> Content:
 def _without_failures(positions: list[int], evaluations: Evaluations) -> tuple[list[int], Evaluations]:
     """Positions and evaluations of a run that simulates its failed settings again."""
     simulated = ~evaluations.failed
-    first = min((position for position, fine in zip(positions, simulated, strict=True) if not fine), default=max(positions) + 1)
-    kept = [position if position < first else SPARE for position, fine in zip(positions, simulated, strict=True) if fine]
+    first = min((position for position, valid in zip(positions, simulated, strict=True) if not valid), default=max(positions) + 1)
+    kept = [position if position < first else SPARE for position, valid in zip(positions, simulated, strict=True) if valid]
     return kept, evaluations.take(simulated)
 
 
@@ -247,7 +247,7 @@ class Journal:
         self.content = content_of(read_frames(self._file.read(), self.path)[0])
 
     def close(self) -> None:
-        """Give the lock back."""
+        """Release the lock."""
         self._file.close()
 
     def _read(self, owner: Owner) -> Content:
@@ -283,7 +283,7 @@ class Journal:
             raise SafevarError(f"{self.path}: cannot be written: {error.strerror}; what was written before stays valid") from None
 
     def _undo(self, start: int) -> None:
-        """Cut a half-written frame off again; where that fails too, the next reader does it."""
+        """Cut a half-written frame off again; if that fails too, the next reader does it."""
         try:
             self._cut_at(start)
         except OSError:
@@ -317,7 +317,7 @@ def owner_of(path: Path) -> str | None:
 
 
 def _frames_of(path: Path) -> tuple[list[Frame], int]:
-    """The frames of a journal, and how many bytes of a torn tail follow."""
+    """The frames of a journal, and the number of bytes of a torn tail after them."""
     try:
         refuse_other_than_file(path)
         data = path.read_bytes()

@@ -47,10 +47,10 @@ class StoredResults(NamedTuple):
     manifest
         The study as run, versions, seed, the original vehicle's evaluation.
     evaluations
-        One row per simulated setting of every run, in the order in which the run asked for it first; columns of
-        `safevar_sumo.results.evaluations_frame`, and `evaluation`, its place in that order from 0.
+        One row per simulated setting of every run, in the order of the run's first requests; columns of
+        `safevar_sumo.results.evaluations_frame`, and `evaluation`, the place in that order from 0.
     solutions
-        One row per solution of every finished run; the same columns but `evaluation`. Imported ones belong to no run.
+        One row per solution of every finished run; the same columns except `evaluation`. Imported solutions belong to no run.
     finished
         Algorithm and number of every finished run.
     failures
@@ -65,7 +65,7 @@ class StoredResults(NamedTuple):
 
 
 class RunStatus(NamedTuple):
-    """Progress of one run: its different settings simulated, how many of them collided or failed, and its least safety degree.
+    """Progress of one run: numbers of distinct settings simulated, of collisions and failures among them, and the lowest safety degree.
 
     `state` is waiting, begun or finished; `best` is in m, or -m/s, None before the first simulation.
     """
@@ -83,7 +83,7 @@ class Status(NamedTuple):
     """Progress of a study.
 
     `budget` is the largest number of evaluations of a run, `points` are (f_safe, f_diff, f_num_diff) of all settings so far, shape
-    (M, 3), `remarks` what is wrong with the directory.
+    (M, 3), `remarks` tell what is wrong with the directory.
     """
 
     study: str
@@ -128,7 +128,7 @@ def _search_of(place: Path, manifest: Mapping[str, Any]) -> _Search:
         runs = [(name, run) for name in dict.fromkeys(map(label_of, search["algorithms"])) for run in range(search["runs"])]
         return _Search(runs, int(search["evaluations"]), tuple(manifest["study"]["vehicle"]["characteristics"]))
     except (KeyError, TypeError, ValueError):
-        raise InputError(place / MANIFEST, "tells of no characteristics or of no search", "what the command study has written") from None
+        raise InputError(place / MANIFEST, "has no characteristics or no search", "what the command study has written") from None
 
 
 def _journals(place: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str, int]]) -> Iterator[tuple[str, int, Content | None]]:
@@ -140,12 +140,12 @@ def _journals(place: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str
 
 
 def load(directory: str | Path) -> StoredResults:
-    """Read a results directory, finished or not: the runs and evaluations that its manifest's study asks for; warns of torn runs.
+    """Read the runs and evaluations of a results directory's study, which may be unfinished; warns of torn runs.
 
     Raises
     ------
     InputError
-        If it is none, or a file in it is damaged, was edited or belongs to another study.
+        If the directory holds no results, or a file in it is damaged, was edited or belongs to another study.
     """
     place = Path(directory)
     manifest = read_manifest(place)
@@ -153,25 +153,25 @@ def load(directory: str | Path) -> StoredResults:
     again = "the same import again" if "imported" in manifest else "the same study again, which writes it from the journals"
     refuse_edited_table(place / SOLUTIONS, manifest, f"the file as it was, or {again}")
     if "imported" in manifest:
-        none = evaluations_frame(search.characteristics, []).assign(evaluation=0)
-        return StoredResults(manifest, none, read_imported(place, search.characteristics))
-    everything, solved, positions, failures = [], [], [], []
+        no_evaluations = evaluations_frame(search.characteristics, []).assign(evaluation=0)
+        return StoredResults(manifest, no_evaluations, read_imported(place, search.characteristics))
+    evaluated, solved, positions, failures = [], [], [], []
     for algorithm, run, content in _journals(place, manifest, search.runs):
         if content is not None and content.torn and content.result(search.budget) is None:
             journal = place / RUNS / f"{algorithm}-{run:02d}.journal"
-            warn(f"{journal}: the last {content.torn} bytes are torn, so the run is left out; the same study again simulates what "
-                 "they held")
+            warn(f"{journal}: the last {content.torn} bytes are torn, so the run is left out; running the same study again "
+                 "simulates what they held")
         if content is None or content.evaluations is None:
             continue
-        asked = sorted((position, row) for row, position in enumerate(content.positions) if 0 <= position < search.budget)
-        evaluations = content.evaluations.take([row for _, row in asked])
-        everything.append(((algorithm, run), evaluations))
-        positions += [position for position, _ in asked]
-        failures += [Failure(algorithm, run, asked[row][0], evaluations.reason(row)) for row in np.flatnonzero(evaluations.failed).tolist()]
+        order = sorted((position, row) for row, position in enumerate(content.positions) if 0 <= position < search.budget)
+        evaluations = content.evaluations.take([row for _, row in order])
+        evaluated.append(((algorithm, run), evaluations))
+        positions += [position for position, _ in order]
+        failures += [Failure(algorithm, run, order[row][0], evaluations.reason(row)) for row in np.flatnonzero(evaluations.failed).tolist()]
         result = content.result(search.budget)
         if result is not None:
             solved.append(((algorithm, run), content.by_position(result.positions)))
-    frame = evaluations_frame(search.characteristics, everything)
+    frame = evaluations_frame(search.characteristics, evaluated)
     frame.insert(2, "evaluation", positions)
     return StoredResults(manifest, frame, solutions_frame(search.characteristics, solved), tuple(key for key, _ in solved), tuple(failures))
 

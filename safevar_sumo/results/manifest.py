@@ -1,4 +1,4 @@
-"""The manifest of a results directory: what its results depend on, digests of its files, and how another study differs."""
+"""The manifest of a results directory: inputs of its results, digests of its files, and differences from another study."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PLACES, LATER = "places.json", "read-*.json"
 FORMAT = 3
 READABLE = (2, FORMAT)
 RESULTS = 2
-"""Number of the package's results, raised whenever they change (enforced by tests/golden)."""
+"""Version number of the package's results, raised whenever they change (enforced by tests/golden)."""
 VERSIONED = ("safevar_sumo", "libsumo", "eclipse-sumo", "deap", "numpy")
 FREE = ("title", "published", "repeatability", "fit", "calibration", "spread", "model_error", "variation", "correlations")
 """Keys of a study that change no result of a campaign."""
@@ -30,7 +30,7 @@ FREE_OF_SEARCH = ("runs", "algorithms", "evaluations", "time_limit")
 LAYERS = {
     "resolved": "the same study and options", "network": "the network's file as it was", "sources": "the file as it was",
     "results": "that version", "versions": "those versions", "platform": "such a machine"}
-"""What results depend on, and how to get back to it after a change."""
+"""Inputs that results depend on, and the way back to each after a change."""
 OF_FILES = ("network", "sources")
 """Layers that hold digests by file."""
 LAYERS_BEFORE = ("resolved", "network", "sources", "code", "versions", "platform")
@@ -49,7 +49,7 @@ def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
     study
         The study as it is run.
     identity
-        What its results depend on beside its file, by `LAYERS`; see `safevar_sumo.workers.identity.identity_of`.
+        Inputs of its results besides its file, by `LAYERS`; see `safevar_sumo.workers.identity.identity_of`.
     """
     return {
         "format": FORMAT, "study": tables_of(study), "seed": study.search.seed, "resolved": fixed(study), **identity,
@@ -71,7 +71,7 @@ def fixed(study: Study) -> dict[str, Any]:
 
 
 def owner(manifest: Mapping[str, Any]) -> str:
-    """The digest in the journals of a manifest's study."""
+    """The digest that identifies a manifest's study in its journals."""
     if "format" in manifest:
         return _digest({layer: manifest.get(layer) for layer in (LAYERS if manifest["format"] == FORMAT else LAYERS_BEFORE)})
     search = {key: value for key, value in manifest["study"]["search"].items() if key not in ("runs", "algorithms")}
@@ -89,17 +89,17 @@ def difference(stored: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, 
 
 
 def differences_now(stored: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """All differences between what is simulated now and what results were computed with.
+    """All differences between the present inputs of simulations and the inputs of stored results.
 
     Other versions of search libraries, another machine, and versions of this package with the same `RESULTS` change no simulation.
     """
     if stored.get("format") != FORMAT:
         return [f"version {stored['versions'].get('safevar_sumo')} wrote them"]
-    texts = [f"{key} is {there!r} there and {here!r} here" for key, there, here in _pairs(stored["resolved"], new["resolved"])
-             if there is not None]  # whether a key added since changes results is up to `RESULTS`
+    texts = [f"{key} was {before!r} and is {now!r} now" for key, before, now in _pairs(stored["resolved"], new["resolved"])
+             if before is not None]  # whether a key added since changes results is up to `RESULTS`
     texts += [text for layer in (*OF_FILES, "results") for text in _differences(layer, stored.get(layer, {}), new[layer])]
-    there, here = ({name: manifest["versions"].get(name) for name in SIMULATORS} for manifest in (stored, new))
-    return [*texts, *_differences("versions", there, here)]
+    before, now = ({name: manifest["versions"].get(name) for name in SIMULATORS} for manifest in (stored, new))
+    return [*texts, *_differences("versions", before, now)]
 
 
 def extent_of(manifest: Mapping[str, Any]) -> Any:
@@ -122,7 +122,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        If there is none, the file is something else or was edited.
+        If there is no manifest, or its file is something else or was edited.
     """
     file = directory / MANIFEST
     legal = "a directory that the command study has written"
@@ -157,7 +157,7 @@ def digest_of_table(text: str) -> str:
 
 
 def is_edited(file: Path, manifest: Mapping[str, Any]) -> bool:
-    """Whether a table is not the one that was written, as far as the manifest has its digest.
+    """Whether a table differs from the written one; False if the manifest has no digest of it.
 
     Raises
     ------
@@ -174,20 +174,19 @@ def is_edited(file: Path, manifest: Mapping[str, Any]) -> bool:
 
 
 def refuse_edited_table(file: Path, manifest: Mapping[str, Any], way_back: str) -> None:
-    """Refuse a table for which `is_edited` holds; `way_back` says what to do about it."""
+    """Refuse a table for which `is_edited` holds; `way_back` tells the user what to do about it."""
     if is_edited(file, manifest):
         raise InputError(file, "was edited: it does not hold what was computed", way_back)
 
 
 def _differences(layer: str, stored: Any, new: Any) -> Iterator[str]:
     """All differences between a layer of two manifests, in words."""
-    for key, there, here in _pairs(stored, new):
+    for key, before, now in _pairs(stored, new):
         if layer in OF_FILES:
-            what = "is not there any more" if here is None else "was not there" if there is None else "has changed"
-            yield f"{key} {what} since"
+            yield f"{key} {'no longer exists' if now is None else 'is new' if before is None else 'has changed since'}"
         else:
-            what = f"version of {key}" if layer == "versions" else key or "the number of the package's results"
-            yield f"{what} is {there!r} there and {here!r} here"
+            name = f"version of {key}" if layer == "versions" else key or "the number of the package's results"
+            yield f"{name} was {before!r} and is {now!r} now"
 
 
 def _pairs(stored: Any, new: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
@@ -227,19 +226,19 @@ def comparable_inputs(stored: Mapping[str, Any], now: Mapping[str, str], later: 
                   ) -> tuple[dict[str, Any], Files]:
     """A stored manifest and the files that its study reads now, ready to be compared.
 
-    Files that were read later are left out of both, unless they have changed or are gone: those are in both.
+    Files that were read later are omitted from both, unless they have changed or are gone: then both have them.
     """
-    begun, here = dict(stored.get("sources", {})), dict(now)
+    at_start, at_present = dict(stored.get("sources", {})), dict(now)
     for name, digest in later.items():
-        if name not in begun:
-            present = here.pop(name, None) or digest_of(located(name, places))
+        if name not in at_start:
+            present = at_present.pop(name, None) or digest_of(located(name, places))
             if present != digest:
-                begun[name], here[name] = digest, present
-    return {**stored, "sources": begun}, {name: digest for name, digest in here.items() if digest}
+                at_start[name], at_present[name] = digest, present
+    return {**stored, "sources": at_start}, {name: digest for name, digest in at_present.items() if digest}
 
 
-def _digest(what: Any) -> str:
-    return sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+def _digest(value: Any) -> str:
+    return sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
 def _relative(place: str, directory: Path) -> str:

@@ -33,7 +33,7 @@ class SolutionId(NamedTuple):
         Raises
         ------
         InputError
-            If it is none.
+            If the text is no handle.
         """
         algorithm, _, rest = text.partition(":")
         run, _, row = rest.partition(":")
@@ -53,7 +53,7 @@ def handles(solutions: pd.DataFrame) -> list[SolutionId]:
 
 
 def position_of(solutions: pd.DataFrame, handle: SolutionId, source: object = "solution") -> int:
-    """The place of a handle's solution among the rows of the frame.
+    """The row of a handle's solution in the frame.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def chosen_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str, source: 
     Raises
     ------
     InputError
-        If there is none.
+        If there is no such solution.
     """
     named = solutions.assign(handle=list(map(str, handles(solutions))))
     candidates = named if choice == "most_severe" else named[unsafe.rows(named)]

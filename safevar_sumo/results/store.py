@@ -50,7 +50,7 @@ class ResultsDirectory:
     Parameters
     ----------
     path
-        Made if it does not exist.
+        The directory, made if it does not exist.
     study
         The study as it is run.
     identity
@@ -87,8 +87,8 @@ class ResultsDirectory:
             If a file has changed since it was first read.
         """
         for name, digest in files.items():
-            there = self._known.get(name) or read_later(self.path).get(name, digest)
-            if there != digest:
+            recorded = self._known.get(name) or read_later(self.path).get(name, digest)
+            if recorded != digest:
                 raise InputError(name, "is not the file that this study began with: it was changed meanwhile",
                                  "the file as it was, and the same command; or another --out")
             if name not in self._known:
@@ -125,9 +125,9 @@ class ResultsDirectory:
 
     def _refuse_another_study(self) -> None:
         if not (self.path / MANIFEST).exists():
-            foreign = sorted(name for path in self.path.iterdir() if (name := path.name) not in (RUNS, SOLUTIONS) and name[0] != ".")
-            if foreign and not (self.path / RUNS).exists():  # if there are journals, their owner decides whose directory this is
-                raise InputError("out", f"{self.path} holds other things: {foreign[0]}", "an empty directory, or one of this study")
+            others = sorted(name for path in self.path.iterdir() if (name := path.name) not in (RUNS, SOLUTIONS) and name[0] != ".")
+            if others and not (self.path / RUNS).exists():  # if there are journals, their owner decides whose directory this is
+                raise InputError("out", f"{self.path} holds other files: {others[0]}", "an empty directory, or one of this study")
             return
         stored, later = read_manifest(self.path), read_later(self.path)
         if "imported" not in stored and later:
@@ -141,9 +141,9 @@ class ResultsDirectory:
     def _refuse_another_owner(self, path: Path) -> None:
         """Wait until the process that holds a journal has written its owner; refuse another study."""
         end = time.monotonic() + SECONDS_TO_CLAIM
-        while (theirs := owner_of(path)) is None and time.monotonic() < end:
+        while (its_owner := owner_of(path)) is None and time.monotonic() < end:
             time.sleep(SECONDS_TO_CLAIM / 1000)
-        if theirs != owner(self.manifest):
+        if its_owner != owner(self.manifest):
             raise InputError(self.path, "is in use by another study that is running now", "another --out")
 
     def _remove(self, path: Path) -> None:

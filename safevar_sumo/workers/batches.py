@@ -23,21 +23,21 @@ from safevar_sumo.workers.isolation import check_code, refuse_unlike_sumo
 from safevar_sumo.workers.retrying import RetryingPool
 
 SHARES = 4
-"""Batches for each worker, so that none waits long for another."""
+"""Number of batches per worker, so that no worker waits long for another."""
 LEAST_BATCH = 100
 """Least number of settings of a batch: a smaller one costs as much."""
 VERIFIED = 50
-"""Settings of a study that are driven in SUMO, too, over as many calls as it takes; as many evaluations of each run."""
+"""Number of settings of a study, over all calls, that are also driven in SUMO; as many evaluations of each run are."""
 _batches: dict[bytes, tuple[int, bool]] = {}
-"""What `batches_of` says of a packed study."""
+"""Results of `batches_of` by packed study."""
 _verified: dict[bytes, int] = {}
-"""How many settings of a packed study were driven in SUMO, too, with the same results."""
+"""Number of settings of a packed study that were also driven in SUMO, with the same results."""
 _read: dict[tuple[bytes, str], Files] = {}
 """Files that models have read in this process, by packed study and working directory."""
 
 
 def batches_of(study: Study) -> tuple[int, bool]:
-    """How many settings a batch pays to have, and whether they are driven in a recorded scene."""
+    """The most economical number of settings in a batch, and whether they are driven in a recorded scene."""
     system = assemble(study, study.source)
     return settings_per_batch(system, Engine.RECORDED), not reason_for_sumo(system)
 
@@ -45,42 +45,42 @@ def batches_of(study: Study) -> tuple[int, bool]:
 def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[[int], None] = lambda number: None) -> Evaluations:
     """Evaluate many filtered settings, shape (M, n), row by row; equal rows are simulated once.
 
-    Code from outside is first checked (`check_code`), and a sample of what is driven in a recorded
-    scene is driven in SUMO too. `done` is called with the number of settings of every batch that is finished.
+    Code from outside is first checked (`check_code`), and a sample of the settings that are driven in a recorded
+    scene is driven in SUMO too. `done` is called with the number of settings of every finished batch.
     """
-    persistent, work = RetryingPool(pool, study), packed(study, inputs := inputs_of(study, pool))
-    for remark in check_code(study, inputs, persistent):
+    retrying, work = RetryingPool(pool, study), packed(study, inputs := inputs_of(study, pool))
+    for remark in check_code(study, inputs, retrying):
         warn(remark)
     unique, row_of = np.unique(settings, axis=0, return_inverse=True)
     if work not in _batches:
         _batches[work] = batches_of(study)
-    most, recorded = _batches[work]
-    size = min(most, max(math.ceil(len(unique) / (SHARES * pool.workers)), LEAST_BATCH))
+    economical, recorded = _batches[work]
+    size = min(economical, max(math.ceil(len(unique) / (SHARES * pool.workers)), LEAST_BATCH))
     starts = range(0, len(unique), size)
-    futures = {persistent.submit(work, unique[start:start + size]): start for start in starts}
+    futures = {retrying.submit(work, unique[start:start + size]): start for start in starts}
     verified = np.linspace(0, len(unique) - 1, min(VERIFIED - _verified.get(work, 0), len(unique))).astype(int)
     in_sumo = in_scenes = None
     if recorded and len(verified):
         driven = driven_in_sumo(study, assemble(study).weather)
-        there = inputs if driven is study else inputs_of(driven, pool)
-        in_sumo = persistent.submit(packed(driven, there, engine=Engine.LIBSUMO), unique[verified])
+        driven_inputs = inputs if driven is study else inputs_of(driven, pool)
+        in_sumo = retrying.submit(packed(driven, driven_inputs, engine=Engine.LIBSUMO), unique[verified])
         if driven is not study:
-            in_scenes = persistent.submit(packed(driven, there), unique[verified])
+            in_scenes = retrying.submit(packed(driven, driven_inputs), unique[verified])
     parts: dict[int, Evaluations] = {}
     while len(parts) < len(futures):
         for future in first_of([future for future, start in futures.items() if start not in parts]):
             parts[futures[future]] = future.result()
             done(len(parts[futures[future]]))
-    found = Evaluations.concatenate([parts[start] for start in starts])
+    evaluations = Evaluations.concatenate([parts[start] for start in starts])
     if in_sumo is not None:
-        known = found.take(verified) if in_scenes is None else result_of(in_scenes)
+        known = evaluations.take(verified) if in_scenes is None else result_of(in_scenes)
         refuse_unlike_sumo(study, known.take(~known.failed), result_of(in_sumo).take(~known.failed))
         _verified[work] = _verified.get(work, 0) + len(verified)
-    return found.take(row_of.ravel())
+    return evaluations.take(row_of.ravel())
 
 
 def inputs_of(study: Study, pool: Pool) -> Inputs:
-    """Digests of the files that every worker must have alike, by layer and name; raises as `sources_of`."""
+    """Digests of the files that must be the same on every worker, by layer and name; raises as `sources_of`."""
     return {"network": networks_of(assemble(study)), "sources": sources_of(study, pool)}
 
 

@@ -40,9 +40,9 @@ def cluster_pool(address: str, time_limit: float) -> Iterator[ClusterPool]:
     Parameters
     ----------
     address
-        Of the scheduler.
+        Address of the scheduler.
     time_limit
-        The worker of a batch that takes longer is stopped [s].
+        Time limit of a batch [s]; a worker that takes longer is stopped.
 
     Raises
     ------

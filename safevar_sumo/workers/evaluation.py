@@ -1,4 +1,4 @@
-"""Evaluating a batch is a pure function that any process of any machine may run; here is the function and the seam."""
+"""Evaluation of a batch, a pure function that any process of any machine may run, and the protocol of the pools that run it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.workers.identity import Inputs, networks_of
 
 SHARED = ("network", "sources")
-"""Layers of a study's identity that every worker must have alike."""
+"""Layers of a study's identity that must be the same on every worker."""
 
 
 class WorkerLostError(SafevarError):
@@ -29,24 +29,24 @@ class WorkerLostError(SafevarError):
 
 
 class PoolLostError(SafevarError):
-    """Nothing can be computed any more: whatever is tried again will fail again."""
+    """The pool can compute nothing any more: every further attempt would fail, too."""
 
 
 class Pool(Protocol):
-    """Computes batches somewhere; futures fail with `WorkerLostError`, `PoolLostError` or what the batch itself raised."""
+    """Computes batches somewhere; futures fail with `WorkerLostError`, `PoolLostError` or the batch's own error."""
 
     @property
     def workers(self) -> int:
-        """How many batches are computed at the same time."""
+        """Number of batches that are computed at the same time."""
 
     def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
         """Evaluate filtered settings, shape (k, n), of a packed study."""
 
 
 class _Work(msgspec.Struct, frozen=True):
-    """A study as it travels to a worker, the digests of the files that it is to be computed with, and how.
+    """A study packed for a worker, with the digests of the files that it depends on, and the way to evaluate its settings.
 
-    With `check` the code from outside that it names is checked instead.
+    With `check` the worker checks the study's code from outside instead.
     """
 
     study: Study
@@ -57,8 +57,8 @@ class _Work(msgspec.Struct, frozen=True):
     cells: tuple[int, int] | None = None
 
 
-class _How(msgspec.Struct, frozen=True):
-    """What of that is to be known before models are loaded."""
+class _Mode(msgspec.Struct, frozen=True):
+    """The fields of `_Work` that are read before models are loaded."""
 
     afresh: bool
     check: bool
@@ -67,21 +67,21 @@ class _How(msgspec.Struct, frozen=True):
 
 def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Engine = Engine.RECORDED, afresh: bool = False,
            check: bool = False, cells: tuple[int, int] | None = None) -> bytes:
-    """A study as it travels to a worker.
+    """A study packed for a worker.
 
     Parameters
     ----------
     inputs
-        Layers of the study's identity by name: workers that have other files compute nothing, and tell which files other
-        people's code reads that are not among the `sources`. By default the networks as they are now.
+        Layers of the study's identity by name: a worker with other files computes nothing, and reports the files that other
+        people's code reads and `sources` lacks. By default the networks as they are now.
     engine
-        Who moves the vehicles.
+        What moves the vehicles.
     afresh
-        By models that are loaded anew, with nothing in their modules and classes that earlier batches left there.
+        Whether models are loaded anew, without anything that earlier batches left in their modules and classes.
     check
-        A batch checks the code from outside; its `reasons` are remarks on that.
+        Whether a batch checks the code from outside instead; its `reasons` are remarks on that code.
     cells
-        (k, n): of a rated study what settings do in the k-th of n parts of the cells, instead of what they are worth in all.
+        (k, n): for a rated study, results in the k-th of n parts of the cells, instead of points for all cells.
     """
     if inputs is None:
         inputs = {"network": networks_of(assemble(study))}
@@ -90,43 +90,43 @@ def packed(study: Study, inputs: Mapping[str, Any] | None = None, *, engine: Eng
 
 
 def evaluate_batch(work: bytes, settings: FloatArray) -> Evaluations:
-    """What a worker does: (study, settings) -> evaluations.
+    """The function that a worker runs: (study, settings) -> evaluations.
 
     Raises
     ------
     InputError
         If the study's files are not those that the campaign began with.
     """
-    how = msgspec.msgpack.decode(work, type=_How)
-    if how.check:
+    mode = msgspec.msgpack.decode(work, type=_Mode)
+    if mode.check:
         from safevar_sumo.conformance import refuse_defects  # it loads the searches, which a simulation does not need
 
         remarks = refuse_defects(msgspec.msgpack.decode(work, type=_Work).study)
         return replace(Evaluations.none(settings.shape[1], METRICS), reasons={remark.encode(): remark for remark in remarks})
-    if how.afresh:
+    if mode.afresh:
         forget_foreign()
         assembled = _assembled.__wrapped__
     else:
         assembled = _assembled
     with noted_reading() as reading:
-        cells = how.cells
-        this, system = assembled(work if cells is None else _in_all_cells(work))
-        _refuse_changes(this.inputs, system)
-        evaluations = evaluate(system, settings, this.engine) if cells is None else in_cells(system, settings, cells, this.engine)
-    _refuse_changes(this.inputs, system)
-    return replace(evaluations, files=_unknown(this, digests(reading.files(foreign_packages(this.study)), this.study.origin.places)))
+        cells = mode.cells
+        task, system = assembled(work if cells is None else _in_all_cells(work))
+        _refuse_changes(task.inputs, system)
+        evaluations = evaluate(system, settings, task.engine) if cells is None else in_cells(system, settings, cells, task.engine)
+    _refuse_changes(task.inputs, system)
+    return replace(evaluations, files=_unknown(task, digests(reading.files(foreign_packages(task.study)), task.study.origin.places)))
 
 
 def _in_all_cells(work: bytes) -> bytes:
-    """The same for all cells: parts of them share a system."""
+    """The same work for all cells, so that the parts of the cells share a system."""
     return msgspec.msgpack.encode(msgspec.structs.replace(msgspec.msgpack.decode(work, type=_Work), cells=None))
 
 
 @lru_cache(maxsize=4)
 def _assembled(work: bytes) -> tuple[_Work, System]:
-    """What is to be computed, and the system that the study names; code that is loaded stays, whatever becomes of its files."""
-    this = msgspec.msgpack.decode(work, type=_Work)
-    return this, assemble(this.study)
+    """The unpacked work, and the system that its study names; loaded code stays, even if its files change."""
+    task = msgspec.msgpack.decode(work, type=_Work)
+    return task, assemble(task.study)
 
 
 def _refuse_changes(expected: Inputs, system: System) -> None:
@@ -134,9 +134,9 @@ def _refuse_changes(expected: Inputs, system: System) -> None:
         _refuse(changes(expected["network"], networks_of(system)))
 
 
-def _unknown(this: _Work, files: Files) -> Files:
-    """Of the files that were read those that the study did not begin with; others that it did not begin with so are refused."""
-    known = this.inputs.get("sources", {})
+def _unknown(task: _Work, files: Files) -> Files:
+    """The files that the study did not begin with; refuses files that have changed since it began."""
+    known = task.inputs.get("sources", {})
     _refuse([name for name, digest in files.items() if known.get(name, digest) != digest])
     return {name: digest for name, digest in files.items() if name not in known}
 

@@ -1,4 +1,4 @@
-"""The identity of a study: what its results depend on beside its file."""
+"""The identity of a study: the inputs of its results besides its file."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from safevar_sumo.sumo.system import System
 Inputs = dict[str, dict[str, str]]
 """Digests of files, by layer and name."""
 EXPONENTS = (1 / 21, 1 / 20, -21.0, 21.0)
-"""Of the powers that NSGA-II's operators take (distribution index 20)."""
+"""Exponents of the powers that NSGA-II's operators compute (distribution index 20)."""
 POWERS = 2000
 
 
 def identity_of(study: Study, system: System, sources: Mapping[str, str] = MappingProxyType({})) -> dict[str, Any]:
-    """The layers of a manifest beside the study: plain values, the same in every process and for every worker.
+    """The layers of a manifest besides the study: plain values, the same in every process and for every worker.
 
     `resolved` are the study's tables with models' defaults and the weather's numbers, `network` and `sources` digests by file,
     `results` the number of the package's results, `platform` the properties of the machine on which the last bit of a result may depend.

@@ -16,13 +16,13 @@ from contextlib import contextmanager
 from safevar_sumo.records import Evaluations
 
 SECONDS_BETWEEN_LOOKS = 0.2
-"""How long Ctrl-C may go unnoticed at the most."""
+"""Longest time for which Ctrl-C goes unnoticed [s]."""
 _pressed = threading.Event()
 
 
 @contextmanager
 def interrupts_noted() -> Iterator[None]:
-    """Within, Ctrl-C is raised by `first_of` and `result_of` alone; what nobody has waited for is raised at the end."""
+    """Within the context only `first_of` and `result_of` raise Ctrl-C; one that is still pending is raised at the end."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -36,7 +36,7 @@ def interrupts_noted() -> Iterator[None]:
 
 
 def first_of(futures: Iterable[Future[Evaluations]]) -> set[Future[Evaluations]]:
-    """The futures that are done, as soon as there is one, or none if there are no futures."""
+    """Wait until a future is done, and return all that are; an empty set if there are no futures."""
     while True:
         done, not_done = wait(futures, timeout=SECONDS_BETWEEN_LOOKS, return_when=FIRST_COMPLETED)
         _raise_if_pressed()
@@ -57,7 +57,7 @@ def _raise_if_pressed() -> None:
 
 
 def leave_interrupts_to_the_caller() -> None:
-    """Ctrl-C reaches all processes of a terminal: block it in this thread, whose processes then never see it, however young."""
+    """Block Ctrl-C, which reaches all processes of a terminal, in this thread: processes that it starts then never see it."""
     if sys.platform == "win32":  # there are no signal masks: a process ignores interrupts once it serves
         return
     from multiprocessing import resource_tracker

@@ -1,4 +1,4 @@
-"""Checks of code from outside, that it keeps settings apart, and that a recorded scene gives the results of SUMO."""
+"""Checks that code from outside keeps settings apart, and that recorded scenes give the same results as SUMO."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from safevar_sumo.workers.identity import Inputs
 from safevar_sumo.workers.interrupts import result_of
 from safevar_sumo.workers.retrying import RetryingPool
 
-LEGAL = ("what happens to vehicle i depends on vehicle i alone: nothing kept in a class, a module or the model itself from one call or "
+LEGAL = ("results of a vehicle that depend on this vehicle alone: nothing kept in a class, a module or the model itself from one call or "
          "setting to another, no mean or sum over the batch, nothing random")
 
 ROUNDING = 1e-9
@@ -30,7 +30,7 @@ _passed: set[str] = set()
 
 
 def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> list[str]:
-    """Check the code from outside that a study names, in a worker; what has passed with the same files is not checked again.
+    """Check the code from outside that a study names, in a worker; code that has passed with the same files is not checked again.
 
     Returns remarks that do not make results wrong.
 
@@ -56,7 +56,7 @@ def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> list[str]:
 
 
 def refuse_difference(study: Study, ways: dict[str, Evaluations], again: str = "") -> None:
-    """Refuse two different evaluations of a setting, by how it was simulated; `again` is a command that repeats one of them.
+    """Refuse evaluations of a setting, by the way in which it was simulated, that differ; the command `again` repeats one of them.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def refuse_difference(study: Study, ways: dict[str, Evaluations], again: str = "
 
 
 def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations) -> None:
-    """Refuse settings with different results in a recorded scene and in SUMO itself; what SUMO could not simulate tells nothing.
+    """Refuse settings with different results in a recorded scene and in SUMO itself; settings that SUMO could not simulate are skipped.
 
     Raises
     ------
@@ -91,11 +91,11 @@ def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations
                              "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or --engine sumo")
 
 
-def _alike(one: Evaluations, other: Evaluations, most: float) -> BoolArray:
-    """Settings whose outcome is the same and whose numbers differ by no more than `most`, shape (N,)."""
+def _alike(one: Evaluations, other: Evaluations, tolerance: float) -> BoolArray:
+    """Whether settings have the same outcome and numbers that differ by at most `tolerance`, shape (N,)."""
     alike = one.outcome == other.outcome
     for here, there in ((one.collision_speed, other.collision_speed), *((one.metrics[name], other.metrics[name]) for name in one.metrics)):
-        alike &= np.isclose(here, there, rtol=0, atol=most, equal_nan=True)
+        alike &= np.isclose(here, there, rtol=0, atol=tolerance, equal_nan=True)
     return np.asarray(alike)
 
 

@@ -24,7 +24,7 @@ from safevar_sumo.workers.interrupts import interrupts_noted, leave_interrupts_t
 START_LIMIT = 120.0
 """How long a worker process may take until it is ready for its first batch [s]."""
 STARTS = 5
-"""How many workers in a row may die before they are ready; no batch is to blame for that."""
+"""Number of workers in a row that may die before they are ready; no batch is to blame for that."""
 _starting = threading.Lock()
 
 
@@ -35,14 +35,14 @@ def available_cores() -> int:
 
 @contextmanager
 def local_pool(jobs: int, time_limit: float) -> Iterator[LocalPool]:
-    """Worker processes, started when they are needed first. They end with the block.
+    """A pool of worker processes, started when they are first needed; they end with the block.
 
     Parameters
     ----------
     jobs
-        How many worker processes.
+        Number of worker processes.
     time_limit
-        A batch that takes longer is stopped [s].
+        Time limit of a batch [s]; a worker that takes longer is stopped.
     """
     with interrupts_noted():
         pool = LocalPool(jobs, time_limit)
@@ -132,22 +132,22 @@ class _Worker:
         return self._process.is_alive()
 
     def wait_until_ready(self) -> None:
-        """Raises WorkerLostError if that never comes."""
+        """Wait for the process's first message; raises WorkerLostError if it never comes."""
         self._receive(START_LIMIT, "start")
 
     def compute(self, study: bytes, settings: FloatArray, time_limit: float) -> Evaluations:
         """Compute a batch; raises its error, or WorkerLostError."""
-        with suppress(OSError):  # a dead worker is told by the answer that does not come
+        with suppress(OSError):  # a dead worker shows when its answer does not come
             self._pipe.send((study, settings))
         answer = self._receive(time_limit, "simulation")
         if isinstance(answer, Exception):
             raise answer
         return answer  # type: ignore[no-any-return]
 
-    def _receive(self, time_limit: float, what: str) -> Any:
+    def _receive(self, time_limit: float, activity: str) -> Any:
         ready = connection.wait([self._pipe, self._process.sentinel], time_limit)
         if not ready:
-            raise WorkerLostError(f"the {what} took longer than {time_limit:g} s")
+            raise WorkerLostError(f"the {activity} took longer than {time_limit:g} s")
         with suppress(EOFError, OSError):
             if self._pipe in ready:
                 return self._pipe.recv()
@@ -173,7 +173,7 @@ def _without_main() -> Iterator[None]:
 
 
 def _serve(pipe: connection.Connection[Any, Any], folders: list[str]) -> None:
-    """What a worker process does: answer batches until the other end of the pipe is closed."""
+    """The main function of a worker process: answer batches until the other end of the pipe is closed."""
     inherit_reachable(folders)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_the_caller, daemon=True).start()
@@ -197,7 +197,7 @@ def _answer(study: bytes, settings: FloatArray) -> Evaluations | Exception:
 
 
 def _end_with_the_caller() -> None:
-    """A worker that hangs in a simulation would outlive a killed caller."""
+    """End this process with its caller: a worker that hangs in a simulation would outlive a killed one."""
     caller = multiprocessing.parent_process()
     assert caller is not None
     caller.join()

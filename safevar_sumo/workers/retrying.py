@@ -1,7 +1,7 @@
 """A pool that retries a failed batch: as a whole, then in ever smaller parts, then without the setting that fails alone.
 
 A setting that repeatedly fails alone in SUMO, while the original vehicle can be simulated, gets the outcome `simulator-error`. Faults of
-the environment (disk, network files, memory) and of a user's own code end the study; the same command later goes on from there.
+the environment (disk, network files, memory) and of a user's own code end the study; the same command later resumes it.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ class RetryingPool:
     pool
         Computes batches.
     study
-        What is computed.
+        The study of the settings.
     note
-        Called with files that code from outside reads and that the study did not begin with; may refuse them.
+        Called with files that code from outside reads and that were not known when the study began; may refuse them.
     """
 
     def __init__(self, pool: Pool, study: Study, note: Callable[[Mapping[str, str]], None] = lambda files: None) -> None:
@@ -52,7 +52,7 @@ class RetryingPool:
 
     @property
     def workers(self) -> int:
-        """How many batches are computed at the same time."""
+        """Number of batches that are computed at the same time."""
         return self._pool.workers
 
     def submit(self, study: bytes, settings: FloatArray, *, must_succeed: bool = False) -> Future[Evaluations]:
@@ -180,7 +180,7 @@ class RetryingPool:
 
     def _blamed(self, error: WorkerLostError) -> ForeignError:
         """The error for a worker that repeatedly ends or hangs while it runs a user's code."""
-        problem = f"{error}, again and again, with {' and '.join(self._foreign)} in it; a process that is gone cannot tell file and line"
+        problem = f"{error}, again and again, with {' and '.join(self._foreign)} in it; a dead process cannot report file and line"
         return ForeignError(f"study {self._study.name!r}", problem)
 
     def _with_command(self, error: ForeignError, setting: FloatArray) -> ForeignError:

@@ -61,12 +61,12 @@ def test_a_run_in_the_hands_of_another_process_is_not_started_twice(whole: Path)
 
 def test_results_of_another_version_or_seed_are_refused_and_left_alone(copied: Path) -> None:
     before = {path: path.read_bytes() for path in copied.rglob("*.*")}
-    assert "search.seed is 1 there and 9 here" in study("--out", "out", "--seed", "9", expect=2)
+    assert "search.seed was 1 and is 9 now" in study("--out", "out", "--seed", "9", expect=2)
     assert {path: path.read_bytes() for path in copied.rglob("*.*")} == before
     manifest = json.loads((copied / "manifest.json").read_text())
     manifest["versions"]["libsumo"] = "1.20.0"
     write_manifest(copied, manifest)
-    assert "version of libsumo is '1.20.0' there and '1.28.0' here" in study("--out", "out", expect=2)
+    assert "version of libsumo was '1.20.0' and is '1.28.0' now" in study("--out", "out", expect=2)
     (copied / "manifest.json").unlink()
     (copied / "runs" / "original.journal").unlink()
     Path("small.toml").write_text(STUDY + "seed = 2\n")

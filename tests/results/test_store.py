@@ -102,7 +102,7 @@ def test_results_of_another_study_are_not_overwritten(tmp_path: Path, study: Stu
     written(tmp_path, study)
     ResultsDirectory(tmp_path, study)
     ResultsDirectory(tmp_path, with_search(study, runs=7))
-    with pytest.raises(InputError, match=r"search\.seed is 1 there and 2 here"):
+    with pytest.raises(InputError, match=r"search\.seed was 1 and is 2 now"):
         ResultsDirectory(tmp_path, with_search(study, seed=2))
     with pytest.raises(InputError, match="holds results of another study"):
         ResultsDirectory(tmp_path, load_study("native"))
@@ -114,7 +114,7 @@ def test_the_file_that_has_changed_is_named_and_the_two_ways_on(tmp_path: Path, 
         ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc", "my_map.py": "012"}})
     assert "my_map.py has changed since" in str(caught.value)
     assert caught.value.legal == "another --out, or the file as it was"
-    with pytest.raises(InputError, match=r"my_map\.py is not there any more"):
+    with pytest.raises(InputError, match=r"my_map\.py no longer exists"):
         ResultsDirectory(tmp_path, study, {"sources": {"my_ads.py": "abc"}})
 
 
@@ -130,13 +130,13 @@ def test_what_changes_no_result_locks_nobody_out(tmp_path: Path, study: Study) -
 def test_a_whole_number_is_not_the_same_as_one_with_a_point(tmp_path: Path, study: Study) -> None:
     one, other = (msgspec.structs.replace(study, ads=ModelTable(model="my_ads:Mine", parameters={"margin": margin})) for margin in (2, 2.0))
     ResultsDirectory(tmp_path, one).begin(evaluations(2.5))
-    with pytest.raises(InputError, match=r"ads\.parameters\.margin is 2 there and 2\.0 here"):
+    with pytest.raises(InputError, match=r"ads\.parameters\.margin was 2 and is 2\.0 now"):
         ResultsDirectory(tmp_path, other)
 
 
 def test_a_folder_that_holds_other_things_is_refused(tmp_path: Path, study: Study) -> None:
     (tmp_path / "thesis.tex").write_text("")
-    with pytest.raises(InputError, match=r"holds other things: thesis\.tex"):
+    with pytest.raises(InputError, match=r"holds other files: thesis\.tex"):
         ResultsDirectory(tmp_path, study)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["thesis.tex"]
 
@@ -181,7 +181,7 @@ def test_what_is_simulated_now_hangs_on_files_and_the_number_of_results_not_on_k
     stored = {"format": FORMAT, "resolved": {"a": 1}, "network": {}, "sources": {"x.py": "0"}, "results": 1, "versions": {"numpy": "1"}}
     assert differences_now(stored, {**stored, "resolved": {"a": 1, "b": False}, "versions": {"numpy": "2"}}) == []
     assert differences_now(stored, {**stored, "resolved": {"a": 2}, "sources": {}, "results": 2}) == [
-        "a is 1 there and 2 here", "x.py is not there any more since", "the number of the package's results is 1 there and 2 here"]
+        "a was 1 and is 2 now", "x.py no longer exists", "the number of the package's results was 1 and is 2 now"]
 
 
 FRAME = pd.DataFrame({

@@ -1,4 +1,4 @@
-"""Pictures of algorithms beside each other: critical differences, and what part of the objectives their runs attain."""
+"""Figures that compare algorithms: critical differences, and the part of the objective space that their runs attain."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROW = 0.34
 
 
 def critical_differences(case: Case) -> Figure:
-    """Mean ranks of the algorithms by each quality indicator; bars join those that Nemenyi's test does not tell apart.
+    """Mean ranks of the algorithms by each quality indicator; bars join ranks that Nemenyi's test does not distinguish.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def cliques(mean: FloatArray, difference: float) -> list[tuple[int, int]]:
 
 
 def attainment_surfaces(case: Case) -> Figure:
-    """What one run, half of the runs and all runs of each algorithm attain of the first two objectives.
+    """The values of the first two objectives that one run, half of the runs and all runs of each algorithm attain.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def attainment_surfaces(case: Case) -> Figure:
 
 
 def _stairs(points: FloatArray, ends: FloatArray) -> FloatArray:
-    """The border of what is no better than one of the points, from and to the worst values; shape (K, 2)."""
+    """The border of the region that the points dominate, from and to the worst values; shape (K, 2)."""
     order = points[np.argsort(points[:, 0], kind="stable")]
     if np.sign(ends[0] - np.mean(order[:, 0])) < 0:
         order = order[::-1]

@@ -1,4 +1,4 @@
-"""RQ2 for any set of algorithms: every pair, ranks over runs (Friedman), and which region of the objective space the runs attain."""
+"""RQ2 for any set of algorithms: every pair, ranks over runs (Friedman), and the region of the objective space that the runs attain."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from safevar_sumo.records import FloatArray
 PAIR_COLUMNS = ["setting", "algorithm", "other", "metric", "p_value", "p_holm", "effect_size", "magnitude", "n1", "n2", "method"]
 RANK_COLUMNS = ["setting", "metric", "algorithm", "mean_rank", "median", "runs", "statistic", "p_value", "p_holm", "critical_difference"]
 ATTAINED = (50.0, 100.0)
-"""Percentages of the runs whose attainment surfaces are found, beside that of a single run."""
+"""Percentages of the runs whose attainment surfaces are computed, in addition to a single run's."""
 
 
 def pairs(case: Case) -> pd.DataFrame:
     """Every pair of algorithms, run against run: indicators and metrics' run means, Mann-Whitney U.
 
-    Columns: `PAIR_COLUMNS`. `effect_size` is A12, turned so that a higher one means that `algorithm` is better than `other`. `p_holm` is
-    `p_value` corrected by Holm's method for all pairs and metrics of this setting. What is undefined is None.
+    Columns: `PAIR_COLUMNS`. `effect_size` is A12, turned so that higher values mean that `algorithm` is better than `other`. `p_holm` is
+    `p_value` corrected by Holm's method for all pairs and metrics of this setting. Undefined values are None.
 
     Raises
     ------
     Unanswerable
-        If there are no runs, or those of one algorithm alone.
+        If there are no runs, or runs of only one algorithm.
     """
     samples, rows = _samples(case, 2), list[dict[str, Any]]()
     for first, second in combinations(case.algorithms, 2):
@@ -48,9 +48,9 @@ def pairs(case: Case) -> pd.DataFrame:
 def ranks(case: Case) -> pd.DataFrame:
     """Mean ranks of the algorithms over runs, metric by metric, with Friedman's test.
 
-    Runs of the same number form a block; a block in which an algorithm has no value is left out. Columns: `RANK_COLUMNS`. Rank 1 is the
+    Runs with the same number form a block; a block in which an algorithm has no value is left out. Columns: `RANK_COLUMNS`. Rank 1 is the
     best, `runs` counts blocks, `statistic` and `p_value` are Friedman's, `p_holm` is corrected for all metrics of this setting. Mean
-    ranks that differ by less than `critical_difference` are not told apart (Nemenyi's test at 0.01; Demsar 2006).
+    ranks that differ by less than `critical_difference` are not distinguished (Nemenyi's test at 0.01; Demsar 2006).
 
     Raises
     ------
@@ -74,7 +74,7 @@ def ranks(case: Case) -> pd.DataFrame:
 
 
 def critical_difference(algorithms: int, runs: int, alpha: float = ALPHA) -> float:
-    """By how much two mean ranks must differ (Nemenyi 1963): q sqrt(k (k + 1) / (6 N)), q the studentised range over sqrt(2)."""
+    """Least difference of two distinct mean ranks (Nemenyi 1963): q sqrt(k (k + 1) / (6 N)), q the studentised range over sqrt(2)."""
     q = float(scipy.stats.studentized_range.ppf(1 - alpha, algorithms, np.inf)) / np.sqrt(2)
     return float(q * np.sqrt(algorithms * (algorithms + 1) / (6 * runs)))
 
@@ -82,8 +82,8 @@ def critical_difference(algorithms: int, runs: int, alpha: float = ALPHA) -> flo
 def attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
     """Empirical attainment surfaces of the first two objectives, by algorithm and percentage of its runs.
 
-    Points, shape (K, 2), in the objectives' units, sorted by the first objective; that share of the runs found a setting at least as good
-    as the point (Fonseca, Guerreiro, Lopez-Ibanez, Paquete 2011).
+    Points, shape (K, 2), in the objectives' units, sorted by the first objective; the percentage of the runs found settings at least as
+    good as each point (Fonseca, Guerreiro, Lopez-Ibanez, Paquete 2011).
 
     Raises
     ------
@@ -111,7 +111,7 @@ def attainment(case: Case) -> dict[str, dict[float, FloatArray]]:
 def _samples(case: Case, fewest: int) -> Mapping[str, tuple[bool, dict[str, pd.Series[float]]]]:
     """For each indicator and metric: whether more is better, and per algorithm a series of its values over the runs."""
     if not case.has_runs:
-        case.runs_of(next(iter(case.algorithms), ""))  # says why there is no answer
+        case.runs_of(next(iter(case.algorithms), ""))  # raises with the reason
     if len(case.algorithms) < fewest:
         raise Unanswerable(case.name, f"has finished runs of {len(case.algorithms)} algorithms ({', '.join(case.algorithms) or 'none'})",
                            f"results of {fewest} algorithms or more")
@@ -128,7 +128,7 @@ def _samples(case: Case, fewest: int) -> Mapping[str, tuple[bool, dict[str, pd.S
 
 
 def _friedman(values: FloatArray) -> tuple[float | None, float | None]:
-    """Friedman's statistic and p-value of blocks, shape (N, k); 0 and 1 where nothing differs, None where there are too few blocks."""
+    """Friedman's statistic and p-value of blocks, shape (N, k); 0 and 1 if nothing differs, None for too few blocks."""
     if len(values) < 2:
         return None, None
     if np.all(values == values[:, :1]):

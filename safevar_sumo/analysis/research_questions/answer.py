@@ -47,7 +47,7 @@ QUESTIONS = (*FRAMES_OF_ONE_CASE, WEATHER)
 
 
 class Answer(NamedTuple):
-    """The answer to a question: a tidy frame over all cases (empty if no case holds an answer), notes on the frame, and its metrics."""
+    """The answer to a question: a tidy frame over all cases (empty if no case has an answer), notes on the frame, and its metrics."""
 
     name: str
     frame: pd.DataFrame
@@ -56,12 +56,12 @@ class Answer(NamedTuple):
 
 
 def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
-    """Ask one question, or all of them.
+    """Answer one question, or all of them.
 
     Raises
     ------
     InputError
-        If there is no such question, or no case holds an answer.
+        If there is no such question, or no case has an answer.
     """
     if question is not None and question not in QUESTIONS:
         raise unknown("question", f"there is no question {question!r}", question, QUESTIONS)
@@ -108,11 +108,11 @@ def _notes(question: str, case: Case) -> list[str]:
             rows = counted(case.solutions, metric)
             undefined = int(rows[metric.name].isna().sum())
             if undefined:
-                notes.append(f"{case.name}: {metric.name} is undefined in {undefined} of {len(rows)} solutions, which are left out of it.")
+                notes.append(f"{case.name}: {metric.name} is undefined in {undefined} of {len(rows)} solutions and omits them.")
     if question == "rq1":
-        lacking = [name for name, value in case.original.items() if pd.isna(value)]
-        if lacking:
-            notes.append(f"{case.name}: the original vehicle's {', '.join(lacking)} is undefined, nothing is compared with it.")
+        undefined_metrics = [name for name, value in case.original.items() if pd.isna(value)]
+        if undefined_metrics:
+            notes.append(f"{case.name}: the original vehicle's {', '.join(undefined_metrics)} is undefined; nothing is compared with it.")
     if question in ("rq1-runs", "rq2-runs"):
         notes.append(f"{case.name}: {difference_line(case)}")
     if question == "rq2" and not case.has_runs:

@@ -27,7 +27,7 @@ ALGORITHM_TITLES = {
 
 
 class Unanswerable(InputError):
-    """These results do not hold what a question asks for."""
+    """The results lack the data for a question."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +74,7 @@ class Case:
 
     @property
     def unsafe(self) -> Unsafe:
-        """What is unsafe among the solutions where nobody states a criterion."""
+        """The default criterion for unsafe solutions."""
         return Unsafe.default(self.original, self.solutions["outcome"])
 
     @property
@@ -89,7 +89,7 @@ class Case:
         Raises
         ------
         Unanswerable
-            If it has no finished run.
+            If the algorithm has no finished run.
         """
         if algorithm not in self.algorithms:
             present = ", ".join(self.algorithms) or "no algorithm"
@@ -138,7 +138,7 @@ def values(solutions: pd.DataFrame, metric: MetricFacts) -> FloatArray:
 
 
 def collided(solutions: pd.DataFrame) -> pd.Series[bool]:
-    """Which solutions are collisions."""
+    """Whether solutions are collisions."""
     return solutions["outcome"] == str(Outcome.COLLISION)
 
 
@@ -148,7 +148,7 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
     Raises
     ------
     InputError
-        If one is no results directory, is damaged or is given twice.
+        If a directory holds no results, is damaged or is given twice.
     """
     places = [Path(directory) for directory in directories]
     twice = [place for place, number in Counter(place.resolve() for place in places).items() if number > 1]
@@ -163,7 +163,7 @@ def _loaded(place: Path) -> Case:
     try:
         return load_case(place)
     except (TypeError, ValueError, KeyError, ArithmeticError) as error:
-        raise InputError(place, f"is damaged: {first_line(error)}", "a directory as the command study has left it") from error
+        raise InputError(place, f"is damaged: {first_line(error)}", "an unchanged directory of the command study") from error
 
 
 def load_case(directory: Path) -> Case:

@@ -1,6 +1,6 @@
-"""RQ3 and the discussion: how many, which and how large changes make the vehicle unsafe, collisions, combinations, sun against rain.
+"""RQ3 and the discussion: number, kind and size of changes that make the vehicle unsafe, collisions, combinations, sun against rain.
 
-Functions of a case raise `Unanswerable` as `critical` does; those over runs also where solutions belong to no run.
+Functions of a case raise `Unanswerable` as `critical` does; functions over runs also raise it if solutions belong to no run.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from safevar_sumo.study import SAFETY_DEGREE
 
 ANY = "any"
 COMBINED = 4
-"""How many characteristics are changed in the combinations that are counted."""
+"""Number of changed characteristics in the combinations that are counted."""
 SHOWN = 3
-"""How many of the most frequent combinations are shown."""
+"""Number of the most frequent combinations that are shown."""
 
 
 def critical(case: Case) -> pd.DataFrame:
@@ -45,13 +45,13 @@ def changes(case: Case, solutions: pd.DataFrame) -> FloatArray:
 
 
 def by_number(case: Case, changed: FloatArray) -> dict[str, BoolArray]:
-    """Which solutions have j characteristics changed, for j = "1".."n" and "any"."""
+    """Whether solutions have j characteristics changed, for j = "1".."n" and "any"."""
     number = np.count_nonzero(changed, axis=1)
     return {**{str(j): number == j for j in range(1, len(case.characteristics) + 1)}, ANY: np.ones(len(changed), dtype=bool)}
 
 
 def rq31(case: Case) -> pd.DataFrame:
-    """How many critical solutions of each run have exactly j characteristics changed; columns setting, run, j, count."""
+    """Number of critical solutions of each run with exactly j characteristics changed; columns setting, run, j, count."""
     solutions, runs = critical(case), case.runs_of(NSGA2)
     number, run_of = np.count_nonzero(changes(case, solutions), axis=1), solutions["run"].to_numpy()
     rows = [(case.name, run, str(j), int(np.count_nonzero((run_of == run) & (number == j))))
@@ -60,10 +60,10 @@ def rq31(case: Case) -> pd.DataFrame:
 
 
 def rq32(case: Case) -> pd.DataFrame:
-    """In which share of the critical solutions with j changed each characteristic is changed.
+    """Share of the critical solutions with j characteristics changed in which each characteristic is changed.
 
-    Columns setting, characteristic, j ("1".."n", "any"), percent (None without such a solution), rank (by `any`, of
-    j = "any" alone; ties share the better rank and the next one is skipped).
+    Columns setting, characteristic, j ("1".."n", "any"), percent (None without such a solution), rank (only for
+    j = "any"; ties share the better rank and the next one is skipped).
     """
     changed = changes(case, critical(case))
     times = np.count_nonzero(changed, axis=0)
@@ -77,10 +77,10 @@ def rq32(case: Case) -> pd.DataFrame:
 
 
 def rq33(case: Case) -> pd.DataFrame:
-    """How large the changes are, increases and decreases apart, in the critical solutions with j changed.
+    """Size of the changes, increases and decreases apart, in the critical solutions with j characteristics changed.
 
     Columns setting, characteristic, direction, j ("1".."n", "any"), pc (mean of |v - v''| / v, a fraction), delta (mean
-    signed change in the characteristic's unit), n (over how many changes); pc and delta are None where n is 0.
+    signed change in the characteristic's unit), n (number of changes); pc and delta are None where n is 0.
     """
     changed = changes(case, critical(case))
     rows = []
@@ -96,7 +96,7 @@ def rq33(case: Case) -> pd.DataFrame:
 
 
 def rq33_safety(case: Case) -> pd.DataFrame:
-    """Effect of the critical solutions with j changed on safety: the footer of RQ3.3's table.
+    """Effect of the critical solutions with j characteristics changed on safety: the footer of RQ3.3's table.
 
     Columns setting, quantity, j, value, percent (of the original's value), n; value is None where n is 0. Quantities:
     avgSD_mD, mean reduction of the distance, without collisions [m]; avgSD_cS, mean speed of the collisions [m/s], no
@@ -113,17 +113,17 @@ def rq33_safety(case: Case) -> pd.DataFrame:
         "TIT": (np.where(crash, np.nan, tit - original["tit"]), original["tit"]),
         "aveDece": (original["ave_dece"] - dece, original["ave_dece"])}
     rows = []
-    for quantity, (difference, whole) in quantities.items():
+    for quantity, (difference, reference) in quantities.items():
         for j, chosen in by_number(case, changes(case, solutions)).items():
             counted = difference[chosen & ~np.isnan(difference)]
             mean = float(np.mean(counted)) if counted.size else None
-            percent = None if mean is None or np.isnan(whole) or whole == 0 else 100 * mean / abs(whole)
+            percent = None if mean is None or np.isnan(reference) or reference == 0 else 100 * mean / abs(reference)
             rows.append((case.name, quantity, j, mean, percent, counted.size))
     return pd.DataFrame(rows, columns=["setting", "quantity", "j", "value", "percent", "n"], dtype=object)
 
 
 def collisions(case: Case) -> pd.DataFrame:
-    """Per algorithm how many of its solutions are collisions; columns setting, algorithm, solutions, collisions, share [fraction].
+    """Number of collisions among each algorithm's solutions; columns setting, algorithm, solutions, collisions, share [fraction].
 
     Raises
     ------
@@ -158,7 +158,7 @@ def combinations(case: Case) -> pd.DataFrame:
 
 
 def weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
-    """Settings that differ in the weather alone, and in how the ADS reacts in it: the clearer one first (by friction, sight, delays).
+    """Pairs of cases that differ only in the weather and the ADS's reaction to it, the clearer first (by friction, sight, delays).
 
     Raises
     ------
@@ -176,9 +176,9 @@ def weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
 def weather(clear: Case, wet: Case) -> pd.DataFrame:
     """One weather against another, characteristic by characteristic, over the critical solutions.
 
-    Columns setting, other, characteristic, percent and percent_other (in which share of the critical solutions it is
-    changed), difference (the other's minus the first's), rank and rank_other, and for increase and decrease the mean
-    signed change in its unit: increase, increase_other, decrease, decrease_other.
+    Columns setting, other, characteristic, percent and percent_other (share of the critical solutions in which it is
+    changed), difference (the other's minus the first's), rank and rank_other, and the mean signed change in its unit:
+    increase, increase_other, decrease, decrease_other.
     """
     sides = []
     for case in (clear, wet):

@@ -1,4 +1,4 @@
-"""Two samples compared: Mann-Whitney U, and how large the difference is (method section 7)."""
+"""Comparison of two samples: Mann-Whitney U, and the size of the difference (method section 7)."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from safevar_sumo.metrics import MetricFacts
 from safevar_sumo.records import FloatArray
 
 ALPHA = 0.01
-"""Below it a p-value is called significant."""
+"""A p-value below this level is significant."""
 EXACT_UP_TO = 8
-"""Without ties, p is exact if a sample is no larger; else it is the normal approximation."""
+"""Without ties, p is exact if one sample is at most this large; else it is the normal approximation."""
 EXACT = "Mann-Whitney U, two-sided, exact"
 ASYMPTOTIC = "Mann-Whitney U, two-sided, normal approximation with corrections for ties and continuity"
 MAGNITUDES = ((0.714, "large"), (0.638, "medium"), (0.556, "small"))
@@ -28,7 +28,7 @@ NOTABLE = ("medium", "large")
 
 
 class TwoSampleTest(NamedTuple):
-    """Two samples X and Y compared; None where one of them is empty.
+    """Comparison of two samples X and Y; None where a sample is empty.
 
     `effect_size` is Vargha-Delaney's A12 = P(X > Y) + 0.5 P(X = Y), `n1` and `n2` the samples' sizes.
     """
@@ -62,7 +62,7 @@ def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
 
 
 def magnitude(effect_size: float) -> str:
-    """How large an effect size is, by Kitchenham's intervals."""
+    """The magnitude of an effect size, by Kitchenham's intervals."""
     distance = round(max(effect_size, 1 - effect_size), 12)
     return next((name for least, name in MAGNITUDES if distance >= least), "negligible")
 
@@ -73,8 +73,8 @@ RQ1_COLUMNS = ["setting", "algorithm", "metric", "p_value", "effect_size", "magn
 def rq1(case: Case) -> pd.DataFrame:
     """Every algorithm's solutions against the original's value, repeated to the sample's size, metric by metric.
 
-    Columns: `RQ1_COLUMNS`. `effect_size` is A12, turned so that a smaller one means that the algorithm's solutions are
-    more unsafe; `mean` is the mean over the algorithm's solutions, `original` the original vehicle's value. What is undefined is None.
+    Columns: `RQ1_COLUMNS`. `effect_size` is A12, turned so that smaller values mean that the algorithm's solutions are
+    more unsafe; `mean` is the mean over the algorithm's solutions, `original` the original vehicle's value. Undefined values are None.
 
     Raises
     ------
@@ -117,8 +117,8 @@ RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "effect_size", "magni
 def rq2(case: Case) -> pd.DataFrame:
     """NSGA-II against every other algorithm: its runs' indicators, then its pooled solutions' metrics.
 
-    Columns: `RQ2_COLUMNS`. `effect_size` is A12, turned so that a higher one means that NSGA-II is better: a better front,
-    more unsafe solutions. `n1` counts NSGA-II's values, `n2` the baseline's. What is undefined is None, as are the
+    Columns: `RQ2_COLUMNS`. `effect_size` is A12, turned so that higher values mean that NSGA-II is better: a better front,
+    more unsafe solutions. `n1` counts NSGA-II's values, `n2` the baseline's. Undefined values are None, as are the
     indicators of imported solutions, which belong to no run.
 
     Raises

@@ -1,4 +1,4 @@
-"""Figures of results: a function for each, which takes a case, or all cases, and returns a matplotlib figure."""
+"""Figures of results: each function takes one case, or all cases, and returns a matplotlib figure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's colours, which colour-blind readers can tell apart; each has its own marker and line style, too."""
+"""Okabe and Ito's colours, which colour-blind readers can distinguish; each also has its own marker and line style."""
 MARKERS, DASHES = ("o", "X", "^", "s", "D", "v"), ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)))
 INCREASE, DECREASE = COLOURS[1], COLOURS[0]
 OBJECTIVE_TITLES = {"f_safe": "f_safe: safety degree [m, -m/s]", "f_diff": "f_diff: largest change [fraction of the original]",
@@ -34,12 +34,12 @@ BINS = 24
 
 
 def number_of_changes(cases: Sequence[Case]) -> Figure:
-    """RQ3.1: how many critical solutions of a run have j characteristics changed, as box plots over the runs; a panel per case.
+    """RQ3.1: number of critical solutions of a run with j characteristics changed, as box plots over the runs; a panel per case.
 
     Raises
     ------
     Unanswerable
-        As `rq31`, for the first case that holds no answer.
+        As `rq31`, for the first case that has no answer.
     """
     import seaborn as sns
 
@@ -110,7 +110,7 @@ def sizes_of_changes(case: Case) -> Figure:
 
 
 def pareto_fronts(case: Case) -> Figure:
-    """The non-dominated solutions of each algorithm, from all its runs together, for every pair of objectives.
+    """The non-dominated solutions of all runs of each algorithm together, for every pair of objectives.
 
     Each panel also shows the original vehicle; solutions on the dashed line or left of it are collisions.
 

@@ -1,4 +1,4 @@
-"""Every picture of results by name, drawn for all cases that it can be drawn for."""
+"""All figures of results by name, drawn for every case that has the data."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 FORMATS = ("png", "pdf", "svg")
 LEAST_RANKED = 3
-"""Ranks are drawn for at least so many algorithms; for two, the test of the pair says all."""
+"""Minimum number of algorithms for a figure of ranks; for two, the test of the pair says all."""
 FIGURES_OF_ALL_CASES: Mapping[str, Callable[[Sequence[Case]], Figure]] = {"rq3.1-number-of-changes": number_of_changes}
 FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
     "rq3.2-changed-characteristics": changed_characteristics,
@@ -36,7 +36,7 @@ FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
 
 
 def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
-    """Every figure of the cases by name, and why some are not there; with several cases, a case's figures begin with its name.
+    """Every figure of the cases by name, and the reasons for missing ones; with several cases, a figure's name begins with its case's.
 
     Raises
     ------
@@ -46,10 +46,10 @@ def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
     figures, refused = {}, []
     alone = len(cases) == 1
     for name, of_all in FIGURES_OF_ALL_CASES.items():
-        able, unable = _able(cases)
-        refused += unable
-        if able:
-            figures[name] = of_all(able)
+        answerable, errors = _answerable(cases)
+        refused += errors
+        if answerable:
+            figures[name] = of_all(answerable)
     for case in cases:
         for name, draw_figure in FIGURES_OF_ONE_CASE.items():
             if draw_figure is critical_differences and len(case.algorithms) < LEAST_RANKED:
@@ -63,20 +63,20 @@ def draw(cases: Sequence[Case]) -> tuple[dict[str, Figure], list[str]]:
     return figures, list(dict.fromkeys(f"{error.source}: {error.problem}" for error in refused))
 
 
-def _able(cases: Sequence[Case]) -> tuple[list[Case], list[Unanswerable]]:
-    """The cases that RQ3.1 can be asked of, and why the others cannot."""
-    able, refused = [], []
+def _answerable(cases: Sequence[Case]) -> tuple[list[Case], list[Unanswerable]]:
+    """The cases that have an answer to RQ3.1, and the errors of the others."""
+    answerable, errors = [], []
     for case in cases:
         try:
             rq31(case)
-            able.append(case)
+            answerable.append(case)
         except Unanswerable as error:
-            refused.append(error)
-    return able, refused
+            errors.append(error)
+    return answerable, errors
 
 
 def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Path], list[str]]:
-    """Draw every figure into a file; returns the files, and why some figures are not there.
+    """Draw every figure into a file; returns the files, and the reasons for missing figures.
 
     Raises
     ------
@@ -94,5 +94,5 @@ def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Pa
 
 
 def _file_name(name: str) -> str:
-    """A case's name without what file systems dislike."""
-    return "".join(sign if sign.isalnum() or sign in "._-" else "-" for sign in name).strip("-")
+    """A case's name without characters that file systems may refuse."""
+    return "".join(character if character.isalnum() or character in "._-" else "-" for character in name).strip("-")

@@ -1,4 +1,4 @@
-"""How good a run's front is: IGD on the objectives as they are, IGD+ and hypervolume on normalised ones (method section 7)."""
+"""Quality of a run's front: IGD on the objectives as they are, IGD+ and hypervolume on normalised ones (method section 7)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def titles_of(metrics: Iterable[MetricFacts]) -> dict[str, str]:
 
 
 def nondominated(points: FloatArray) -> FloatArray:
-    """The non-dominated points, each once; minimisation, shape (M, m)."""
+    """The distinct non-dominated points for minimisation, shape (M, m)."""
     return np.asarray(moocore.filter_dominated(_checked(points, "the set of points")))
 
 
@@ -36,7 +36,7 @@ def igd(front: FloatArray, reference: FloatArray) -> float:
 
 
 def igd_plus(front: FloatArray, reference: FloatArray) -> float:
-    """IGD with distances to which only those objectives contribute in which `front` is worse."""
+    """IGD with distances that count only the objectives in which `front` is worse."""
     return float(moocore.igd_plus(_checked(front, "the front"), ref=_checked(reference, "the reference front")))
 
 

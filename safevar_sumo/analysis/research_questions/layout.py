@@ -67,7 +67,7 @@ Layouts = Mapping[str, Callable[[Answer], list[Table]]]
 
 
 def lay_out(answer: Answer, layouts: Layouts | None = None) -> list[Table]:
-    """The tables of an answer; for an empty answer a table that says why."""
+    """The tables of an answer; for an empty answer a table with the reason."""
     if answer.frame.empty:
         return [Table(TITLES[answer.name], (), [], 0, (), answer.notes)]
     tables = (layouts or LAYOUTS)[answer.name](answer)
@@ -79,8 +79,7 @@ def pivoted(title: str, frame: pd.DataFrame, labels: Sequence[str], cells: Calla
     """A row for each combination of `labels`, and a block of cells for each value of the column `over`.
 
     Each block has one column per head, below the value of `over` as a spanning heading; without `heads` a block is one column, headed by
-    that value.
-    `names` are titles for the values of labels.
+    that value. `names` are titles for the values of labels.
     """
     blocks = list(dict.fromkeys(frame[over]))
     keys = list(zip(*(frame[label] for label in labels), strict=True))
@@ -103,7 +102,7 @@ def units_note(metrics: Iterable[MetricFacts]) -> str:
 
 
 def non_collision_note(metrics: Iterable[MetricFacts]) -> str:
-    """Which metrics are taken over which solutions."""
+    """A note on the solutions that each metric is taken over."""
     titles: dict[bool, list[str]] = {False: [], True: []}
     for metric in metrics:
         titles[metric.over_collisions].append(metric.title)
@@ -203,7 +202,7 @@ def _rq2_ranks(answer: Answer) -> list[Table]:
         heads = ("metric", *(names.get(name, name) for name in algorithms), "critical difference", "p", "p Holm", "runs")
         tables.append(Table(f"{TITLES['rq2-ranks']}: {case}", heads, rows, 1, notes=(
             "p: Friedman's test; runs with the same number form a block. Holm's correction is for all metrics of a setting.",
-            f"Mean ranks that differ by less than the critical difference are not told apart (Nemenyi, {ALPHA:g}).",
+            f"Mean ranks that differ by less than the critical difference are not distinguished (Nemenyi, {ALPHA:g}).",
             non_collision_note(answer.metrics))))
     return tables
 

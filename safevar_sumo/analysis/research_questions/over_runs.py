@@ -25,15 +25,15 @@ RQ2_COLUMNS = ["setting", "baseline", "metric", "p_value", "p_holm", "effect_siz
 EXACT_SIGNED = "Wilcoxon signed-rank, two-sided, exact"
 ASYMPTOTIC_SIGNED = "Wilcoxon signed-rank, two-sided, normal approximation with correction for continuity"
 EXACT_UP_TO = 50
-"""Without ties, the signed-rank test is exact for up to that many runs."""
+"""Without ties, the signed-rank test is exact for up to this many runs."""
 
 
 def rq1_runs(case: Case) -> pd.DataFrame:
     """Every algorithm's run means against the original's value, metric by metric: Wilcoxon's signed-rank test.
 
-    Columns: `RQ1_COLUMNS`. `effect_size` is the share of runs whose mean is greater than the original's value, plus half of those that
-    are equal (A12 against one value), turned so that a smaller one means more unsafe runs. `mean` is the mean of the run means.
-    `p_holm` is `p_value` corrected by Holm's method for all tests of RQ1 and RQ2 of this setting. What is undefined is None.
+    Columns: `RQ1_COLUMNS`. `effect_size` is the share of runs whose mean is greater than the original's value, plus half the share of
+    equal ones (A12 against one value), turned so that smaller values mean more unsafe runs. `mean` is the mean of the run means.
+    `p_holm` is `p_value` corrected by Holm's method for all tests of RQ1 and RQ2 of this setting. Undefined values are None.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def rq2_runs(case: Case) -> pd.DataFrame:
     """
     frame = _corrected(case)[1]
     if frame is None:
-        rq2(case)  # says why there is no answer
+        rq2(case)  # raises with the reason
         raise Unanswerable(case.name, "has no runs to compare", "results of nsga2 and another algorithm")
     return frame
 
@@ -88,7 +88,7 @@ def signed_rank(sample: FloatArray, value: float) -> TwoSampleTest:
 
 
 def fewest_runs(question: str) -> int:
-    """Least number of runs with which a test of this question can be significant before any correction."""
+    """Smallest number of runs with which a test of this question can be significant before any correction."""
     return next(n for n in range(1, 100) if 2 / (2**n if question == "RQ1" else math.comb(2 * n, n)) < ALPHA)
 
 
@@ -123,13 +123,13 @@ def difference_line(case: Case) -> str:
 def summary_lines(case: Case) -> list[str]:
     """Lines on RQ1 and RQ2 for the end of a study: effect sizes over runs, an asterisk for significant ones, and `difference_line`.
 
-    If there are too few runs for a significant difference, the line says so.
+    A line says so if there are too few runs for a significant difference.
     """
     titles = titles_of(case.scoring.metrics)
     lines, any_testable = [], False
-    for question, ask, group_column, meaning in SUMMARISED:
+    for question, frame_of, group_column, meaning in SUMMARISED:
         try:
-            frame = ask(case)
+            frame = frame_of(case)
         except Unanswerable as error:
             lines.append(f"{question}: {error.problem}.")
             continue

@@ -24,12 +24,12 @@ _LATEX = {
     "\N{MIDDLE DOT}": r"\textperiodcentered{}", MINUS: r"\textminus{}"}
 """LaTeX code for LaTeX's special characters, and for some characters that occur in units."""
 _LAST_PLAIN = "\N{LATIN SMALL LETTER Z WITH CARON}"
-"""Up to here, LaTeX's T1 fonts have nearly every letter."""
+"""LaTeX's T1 fonts have nearly every letter up to this one."""
 LATEX_NEEDS = r"% In the preamble: \usepackage[T1]{fontenc} \usepackage{textcomp} \usepackage{booktabs} \usepackage{graphicx}"
 
 
 def text(answers: Sequence[Answer], layouts: Layouts = LAYOUTS) -> str:
-    """For a terminal: columns aligned, bold cells with an asterisk."""
+    """Text for a terminal: aligned columns, bold cells with an asterisk."""
     return "\n".join(_text(table) for answer in answers for table in lay_out(answer, layouts))
 
 
@@ -83,8 +83,8 @@ def _text(table: Table) -> str:
     heads = tuple(f"{head} " if i >= table.labels else head for i, head in enumerate(table.heads))
     widths = [max(len(cell) for cell in column) for column in zip(heads, *rows, strict=True)]
     for (span, number), start in zip(table.spans, _starts(table), strict=True):
-        lacking = len(span) - (sum(widths[start:start + number]) + 2 * (number - 1))
-        widths[start] += max(lacking, 0)
+        missing = len(span) - (sum(widths[start:start + number]) + 2 * (number - 1))
+        widths[start] += max(missing, 0)
     lines = [table.title, ""]
     if table.spans:
         blocks = [" " * (sum(widths[:table.labels]) + 2 * (table.labels - 1))]
@@ -117,7 +117,7 @@ def _markdown(table: Table) -> str:
 
 
 def _escaped_for_markdown(plain: str) -> str:
-    """Plain text as Markdown, with Markdown's own signs escaped."""
+    """Plain text as Markdown, with Markdown's special characters escaped."""
     return re.sub(r"([\\`*_|<>\[\]~^#$])", r"\\\1", plain.replace("\n", " "))
 
 
@@ -144,17 +144,18 @@ def _tabular(table: Table) -> list[str]:
 
 
 def escaped_for_latex(plain: str) -> str:
-    """Plain text as LaTeX; a character that its fonts may lack becomes its code point."""
+    """Plain text as LaTeX; a character that LaTeX's fonts may lack becomes its code point."""
     powers = re.split(r"\^(-?\d+)", re.sub(r"(?<![\w)^-])-(?=\.?\d)", MINUS, " ".join(plain.split())))
     text = "".join(rf"\textsuperscript{{{''.join(map(_letter, part.replace('-', MINUS)))}}}" if i % 2 else "".join(map(_letter, part))
                     for i, part in enumerate(powers))
     return text.replace("--", "-{}-")
 
 
-def _letter(sign: str) -> str:
-    if sign in _LATEX:
-        return _LATEX[sign]
-    return sign if sign.isascii() or (sign.isalpha() and sign <= _LAST_PLAIN) else f"U+{ord(sign):04X}"
+def _letter(character: str) -> str:
+    if character in _LATEX:
+        return _LATEX[character]
+    is_plain = character.isascii() or (character.isalpha() and character <= _LAST_PLAIN)
+    return character if is_plain else f"U+{ord(character):04X}"
 
 
 def _starts(table: Table) -> list[int]:
