@@ -26,17 +26,17 @@ def report(*results: Results | str | Path, out: str | Path | None = None, only: 
     results
         Results, or their directories.
     out
-        File that the page is written to, if any.
+        File to write the page to, if any.
     only
         Names of `SECTIONS`, such as "verdict"; all of them by default.
     point
-        Name of a point of a matrix, to be asked about alone; the research questions are about whole studies and left out.
+        Name of a point of the study's matrix to report on alone, without the research questions, which are about whole studies.
     jobs
-        Worker processes for what is to be simulated, by default one for each core.
+        Worker processes for simulations, by default one for each core.
     progress
-        True for a bar on the terminal, or a function called with the stage, how much of it is done, and how much there is.
+        True for a bar on the terminal, or a function called with the stage, the amount done, and the total amount.
     as_it_is_now
-        Simulate with what is there now where results were computed with something else; the page says so.
+        If results were computed with other files or versions, simulate with the present ones; the page says so.
 
     Returns
     -------
@@ -46,7 +46,7 @@ def report(*results: Results | str | Path, out: str | Path | None = None, only: 
     Warns
     -----
     UserWarning
-        Of solutions that, simulated again, are not what the results say; with `as_it_is_now` of what has changed.
+        If a solution, simulated again, differs from the results; with `as_it_is_now`, for everything that has changed.
 
     Raises
     ------
@@ -54,8 +54,8 @@ def report(*results: Results | str | Path, out: str | Path | None = None, only: 
         If a directory holds no results, there is no such section or point, or the file cannot be written.
     """
     directories = [item.directory if isinstance(item, Results) else item for item in results]
-    with shown(progress) as tell:
-        page = make_report(directories, only, jobs, tell, point=point, as_it_is_now=as_it_is_now)
+    with shown(progress) as show:
+        page = make_report(directories, only, jobs, show, point=point, as_it_is_now=as_it_is_now)
     if out is not None:
         write_whole(Path(out), page)
     return page

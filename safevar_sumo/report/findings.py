@@ -14,139 +14,140 @@ from safevar_sumo.analysis.opinion.compute import Cause, opinions_of, second_sys
 from safevar_sumo.analysis.research_questions.indicators import nondominated
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import differences, number, raised, spaced
-from safevar_sumo.report.input import ReportInput, stored
+from safevar_sumo.report.input import ReportInput, stored_answer
 from safevar_sumo.report.svg import Bar, rows
 from safevar_sumo.results import SolutionId, chosen_handle
 
 Failures = list[dict[str, Any]]
-"""What `explain --json` prints."""
+"""The failures of `explain --json`, with their explanations."""
 CAUSES = 6
-"""Minimal causes that a report shows, at the most."""
+"""Maximum number of minimal causes in a report."""
 REPLAYS = 10
-"""Solutions that a report shows, at the most; explained ones come on top."""
+"""Maximum number of solutions with a replay in a report, unless explained failures are more."""
 FIRST = ("fewest", "smallest", "most_severe")
 """Choices that are shown first."""
 OBJECTIVES = ["f_safe", "f_diff", "f_num_diff"]
 
 
-def explanations(material: ReportInput, jobs: int | None, progress: Progress) -> Failures:
-    """The failures that matter, explained; computed once for these results."""
-    return list(stored(material, "explain", lambda: explain(
-        material.case, material.options["explain"], jobs=jobs, progress=progress).to_dict()))
+def explanations(data: ReportInput, jobs: int | None, progress: Progress) -> Failures:
+    """The failures that matter with their explanations, computed once for these results."""
+    return list(stored_answer(data, "explain", lambda: explain(
+        data.case, data.options["explain"], jobs=jobs, progress=progress).to_dict()))
 
 
-def necessity_chart(explained: Failures, material: ReportInput) -> Markup | None:
-    """How often each characteristic is changed in a failure, and how often it is needed."""
-    shares: dict[str, dict[str, Any]] = next((one["summary"] for one in explained if "summary" in one), {})
+def necessity_chart(failures: Failures, data: ReportInput) -> Markup | None:
+    """A chart of how often failures change each characteristic, and how often they need the change."""
+    shares: dict[str, dict[str, Any]] = next((one["summary"] for one in failures if "summary" in one), {})
     names = [name for name in shares.get("necessary", {}) if shares["changed"].get(name)]
     if not names:
         return None
     ordered = sorted(names, key=lambda name: (-shares["necessary"][name], -shares["changed"][name], name))
-    pieces = [[Bar(0, shares["changed"][name], "weak", f"{name}: changed in {shares['changed'][name]:.0%} of the failures"),
-               Bar(0, shares["necessary"][name], "hit", f"{name}: needed in {shares['necessary'][name]:.0%} of the failures")]
-              for name in ordered]
+    bars = [[Bar(0, shares["changed"][name], "weak", f"{name}: changed in {shares['changed'][name]:.0%} of the failures"),
+             Bar(0, shares["necessary"][name], "hit", f"{name}: needed in {shares['necessary'][name]:.0%} of the failures")]
+            for name in ordered]
     ends = [("", f"needed {shares['necessary'][name]:.0%}{_interval(*shares['necessary_interval'][name])}, "
                  f"changed {shares['changed'][name]:.0%}") for name in ordered]
-    description = f"{material.case.name}: how often a characteristic is needed for a failure, beside how often it is changed"
-    return rows(description, ordered, pieces, [None] * len(ordered), ends)
+    description = f"{data.case.name}: how often a characteristic is needed for a failure, beside how often it is changed"
+    return rows(description, ordered, bars, [None] * len(ordered), ends)
 
 
 def _interval(low: float, high: float) -> str:
-    """A sample's 95 % interval; nothing where all failures were analysed."""
+    """A sample's 95 % interval; empty if all failures were analysed."""
     return f" ({low:.0%} to {high:.0%})" if low < high else ""
 
 
-def causes(explained: Failures, material: ReportInput) -> list[dict[str, Any]]:
-    """The distinct minimal causes, the one of the fewest and smallest changes first, each with its replay at the boundary."""
+def causes(failures: Failures, data: ReportInput) -> list[dict[str, Any]]:
+    """The distinct minimal causes with replays, in the order of the number and size of their changes."""
     distinct: dict[tuple[str, ...], dict[str, Any]] = {}
-    for failure in explained:
-        for cause in _with_changes(failure):
+    for failure in failures:
+        for cause in _causes_of(failure):
             key = tuple(cause["changes"])
-            if key not in distinct or _size(material, cause) < _size(material, distinct[key]["cause"]):
+            if key not in distinct or _size(data, cause) < _size(data, distinct[key]["cause"]):
                 distinct[key] = {"cause": cause, "because": raised(failure["because"]), "robustness": failure["robustness"],
                                  "handle": handle_of(failure)}
-    ordered = sorted(distinct.values(), key=lambda one: _size(material, one["cause"]))[:CAUSES]
+    ordered = sorted(distinct.values(), key=lambda entry: _size(data, entry["cause"]))[:CAUSES]
     if ordered:
-        material.again([material.setting_with(one["cause"]["changes"]) for one in ordered])
-    opinions = _opinions(material, ordered) if ordered and not no_opinion(material) else [None] * len(ordered)
-    return [{**_shown(material, place, one), "opinion": opinions[place - 1]} for place, one in enumerate(ordered, 1)]
+        data.simulate_again([data.setting_with(entry["cause"]["changes"]) for entry in ordered])
+    opinions = _opinions(data, ordered) if ordered and not no_opinion(data) else [None] * len(ordered)
+    return [{**_cause(data, number, entry), "opinion": opinions[number - 1]} for number, entry in enumerate(ordered, 1)]
 
 
-def no_opinion(material: ReportInput) -> str:
+def no_opinion(data: ReportInput) -> str:
     """Why there is no second opinion on causes, in a sentence; empty if there is one."""
     try:
-        second_system(material.case.study)
+        second_system(data.case.study)
     except InputError as error:
         return f"No second opinion on these causes: {error.problem}; expected: {error.legal}."
     return ""
 
 
-def _opinions(material: ReportInput, ordered: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What the second vehicle model says of each cause; computed once for these results."""
-    causes = [Cause(one["handle"] or None, one["cause"]["changes"], one["cause"]["fraction"]) for one in ordered]
-    return list(stored(material, "opinion", lambda: opinions_of(material.case.study, causes, material.case.unsafe).to_dict()))
+def _opinions(data: ReportInput, ordered: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The second vehicle model's opinion on each cause, computed once for these results."""
+    causes = [Cause(entry["handle"] or None, entry["cause"]["changes"], entry["cause"]["fraction"]) for entry in ordered]
+    return list(stored_answer(data, "opinion", lambda: opinions_of(data.case.study, causes, data.case.unsafe).to_dict()))
 
 
-def _with_changes(failure: dict[str, Any]) -> list[dict[str, Any]]:
-    """The minimal causes of a failure; none where the original vehicle itself is unsafe, which no change causes."""
+def _causes_of(failure: dict[str, Any]) -> list[dict[str, Any]]:
+    """The minimal causes of a failure; none if the original vehicle itself is unsafe."""
     return [cause for cause in failure.get("minimal_causes", []) if cause["changes"]]
 
 
 def handle_of(failure: dict[str, Any]) -> str:
-    """The handle of an explained failure, nothing if it did not come from a solution."""
+    """The handle of an explained failure; empty if it is no solution."""
     return "" if failure["algorithm"] is None else f"{failure['algorithm']}:{failure['run']}:{failure['index']}"
 
 
-def _size(material: ReportInput, cause: dict[str, Any]) -> tuple[int, float]:
-    setting = material.setting_with(cause["boundary"])
-    return len(cause["changes"]), float(material.case.characteristics.largest_change(setting[np.newaxis])[0])
+def _size(data: ReportInput, cause: dict[str, Any]) -> tuple[int, float]:
+    setting = data.setting_with(cause["boundary"])
+    return len(cause["changes"]), float(data.case.characteristics.largest_change(setting[np.newaxis])[0])
 
 
-def _shown(material: ReportInput, place: int, one: dict[str, Any]) -> dict[str, Any]:
-    cause = one["cause"]
-    setting = material.setting_with(cause["changes"])
-    members = {member.name: member for member in material.case.characteristics}
+def _cause(data: ReportInput, place: int, entry: dict[str, Any]) -> dict[str, Any]:
+    """A cause for the template; `place` is its number, from 1."""
+    cause = entry["cause"]
+    setting = data.setting_with(cause["changes"])
+    members = {member.name: member for member in data.case.characteristics}
     table = [{"name": name, "short": members[name].short_name, "words": members[name].words,
-              **{what: f"{number(one)}{spaced(members[name].unit)}" for what, one in (
+              **{column: f"{number(shown)}{spaced(members[name].unit)}" for column, shown in (
                   ("original", members[name].original), ("value", value), ("boundary", cause["boundary"][name]))}}
              for name, value in cause["changes"].items()]
-    comparison = material.compared(setting)
-    return {"title": f"Cause {place}: {', '.join(cause['changes'])}", "anchor": material.anchor("cause", place), "rows": table,
-            "end": comparison.verdict(comparison.rows[-1]), "because": one["because"], "robustness": one["robustness"],
-            "borderline": one["robustness"] is not None and is_borderline(one["robustness"]),
-            "handle": one["handle"], "where": material.where(setting),
-            "whole": material.anchor("replay", one["handle"]),
-            "fraction": cause["fraction"], "below": cause["end"], "replay": material.replay(setting)}
+    comparison = data.compared(setting)
+    return {"title": f"Cause {place}: {', '.join(cause['changes'])}", "anchor": data.anchor("cause", place), "rows": table,
+            "end": comparison.verdict(comparison.rows[-1]), "because": entry["because"], "robustness": entry["robustness"],
+            "borderline": entry["robustness"] is not None and is_borderline(entry["robustness"]),
+            "handle": entry["handle"], "where": data.where(setting),
+            "whole": data.anchor("replay", entry["handle"]),
+            "fraction": cause["fraction"], "below": cause["end"], "replay": data.replay(setting)}
 
 
-def replays(material: ReportInput, explained: Failures | None) -> list[dict[str, Any]]:
+def replays(data: ReportInput, failures: Failures | None) -> list[dict[str, Any]]:
     """The solutions with a replay: the choices of `FIRST`, explained ones, and non-dominated unsafe ones."""
-    shown, chosen = [], _chosen(material, explained)
-    if material.system is not None and chosen:
-        material.again([material.setting_of(SolutionId.parse(handle)) for handle in chosen])
+    entries, chosen = [], _chosen(data, failures)
+    if data.system is not None and chosen:
+        data.simulate_again([data.setting_of(SolutionId.parse(handle)) for handle in chosen])
     for place, handle in enumerate(chosen):
-        row, setting = material.solutions[handle], material.setting_of(SolutionId.parse(handle))
-        one = {"handle": handle, "anchor": material.anchor("replay", handle), "f_safe": row["f_safe"], "f_diff": row["f_diff"],
-               "f_num_diff": row["f_num_diff"], "outcome": row["outcome"], "open": place == 0 and not explained,
-               "differences": [], "where": None, "changes": material.changes(setting)}
-        shown.append(one if material.system is None else {
-            **one, "replay": material.replay(setting), "where": material.where(setting),
-            "differences": differences(material.again([setting])[0].evaluation, row)})
-    return sorted(shown, key=lambda one: (one["f_safe"], one["handle"]))
+        row, setting = data.solutions[handle], data.setting_of(SolutionId.parse(handle))
+        entry = {"handle": handle, "anchor": data.anchor("replay", handle), "f_safe": row["f_safe"], "f_diff": row["f_diff"],
+                 "f_num_diff": row["f_num_diff"], "outcome": row["outcome"], "open": place == 0 and not failures,
+                 "differences": [], "where": None, "changes": data.changes(setting)}
+        entries.append(entry if data.system is None else {
+            **entry, "replay": data.replay(setting), "where": data.where(setting),
+            "differences": differences(data.simulate_again([setting])[0].evaluation, row)})
+    return sorted(entries, key=lambda entry: (entry["f_safe"], entry["handle"]))
 
 
-def _chosen(material: ReportInput, explained: Failures | None) -> list[str]:
-    """Their handles, each once."""
-    solutions, criterion = material.case.solutions, material.case.unsafe
+def _chosen(data: ReportInput, failures: Failures | None) -> list[str]:
+    """Handles of the solutions with a replay, each once."""
+    solutions, criterion = data.case.solutions, data.case.unsafe
     if solutions.empty:
         return []
     unsafe = criterion.rows(solutions).tolist()
     choices = FIRST if any(unsafe) else FIRST[-1:]
-    chosen = [str(chosen_handle(solutions, criterion, choice, material.place)) for choice in choices]
-    chosen += [handle_of(failure) for failure in explained or [] if failure.get("algorithm") is not None]
-    best = best_of([row for row, is_unsafe in zip(material.solutions.values(), unsafe, strict=True) if is_unsafe])
-    chosen += [best[place]["handle"] for place in evenly(len(best), REPLAYS)]
-    return list(dict.fromkeys(chosen))[:max(REPLAYS, len(choices) + len(explained or []))]
+    chosen = [str(chosen_handle(solutions, criterion, choice, data.directory)) for choice in choices]
+    chosen += [handle_of(failure) for failure in failures or [] if failure.get("algorithm") is not None]
+    best = best_of([row for row, is_unsafe in zip(data.solutions.values(), unsafe, strict=True) if is_unsafe])
+    chosen += [best[index]["handle"] for index in evenly_spaced(len(best), REPLAYS)]
+    return list(dict.fromkeys(chosen))[:max(REPLAYS, len(choices) + len(failures or []))]
 
 
 def best_of(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -159,6 +160,6 @@ def best_of(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return list(by_point.values())
 
 
-def evenly(number: int, most: int) -> list[int]:
-    """At most `most` of `number` places, evenly spaced."""
-    return sorted({round(place) for place in np.linspace(0, number - 1, min(number, most)).tolist()})
+def evenly_spaced(number: int, most: int) -> list[int]:
+    """At most `most` evenly spaced indices of `number` items."""
+    return sorted({round(index) for index in np.linspace(0, number - 1, min(number, most)).tolist()})

@@ -48,11 +48,11 @@ def failing_places(matrix: Sequence[Point], failing: Collection[str]) -> dict[st
     matrix
         All points.
     failing
-        Names of those that fail.
+        Names of the failing points.
 
     Returns
     -------
-    A sentence `summary`, column `heads`, and `rows` of a name and a cell for each head; a cell is empty where nothing is tested.
+    A sentence `summary`, column `heads`, and `rows` of a name and a cell for each head; a cell without a test is empty.
     """
     places = [(point.name in failing, dict(point.place)) for point in matrix]
     speeds = sorted({place[SPEED] for _, place in places if SPEED in place})
@@ -73,11 +73,11 @@ def failing_places(matrix: Sequence[Point], failing: Collection[str]) -> dict[st
 
 
 SAMPLES = 4000
-"""Samples of the report's risk and rules."""
+"""Number of samples for the report's risk and rules."""
 
 
-class Again(NamedTuple):
-    """A setting simulated once more: its evaluation now, and the points of a matrix at which it is unsafe."""
+class Resimulation(NamedTuple):
+    """A recorded setting simulated again: its evaluation now, and the points of the matrix at which it is unsafe."""
 
     evaluation: Evaluations
     points: tuple[str, ...]
@@ -87,25 +87,25 @@ class Again(NamedTuple):
 class ReportInput:
     """One study of a report.
 
-    `place` is its results directory as it was given, `number` its place among the studies, from 1. `system` is None where the study
-    cannot be simulated here, and `lacking` says why. `point` is the point of the matrix that the whole case then belongs to; empty for
-    the whole study. `changed` lists the differences between what is simulated for the page and what the results were computed with.
+    `directory` holds its results, `number` counts the studies from 1. `system` is None if the study cannot be simulated here; `problem`
+    says why. `point` is the only point of the matrix that the page is about, empty for the whole study. `changed` lists the files and
+    versions that have changed since the results were computed.
     """
 
     number: int
-    place: Path
+    directory: Path
     case: Case
     manifest: Mapping[str, Any]
     system: System | None
-    lacking: str = ""
+    problem: str = ""
     point: str = ""
     changed: Sequence[str] = ()
     _compared: dict[bytes, Comparison] = field(default_factory=dict)
-    _again: dict[bytes, Again] = field(default_factory=dict)
+    _simulated_again: dict[bytes, Resimulation] = field(default_factory=dict)
 
     @cached_property
     def solutions(self) -> dict[str, dict[str, Any]]:
-        """Every solution's row by its handle, which it holds too."""
+        """The rows of the solutions by their handles; each row holds its handle too."""
         named = zip(handles(self.case.solutions), self.case.solutions.to_dict("records"), strict=True)
         return {str(handle): {**{str(name): value for name, value in row.items()}, "handle": str(handle)} for handle, row in named}
 
@@ -115,45 +115,45 @@ class ReportInput:
         return np.array([row[name] for name in self.case.characteristics.names], dtype=float)
 
     def setting_with(self, changes: Mapping[str, float]) -> FloatArray:
-        """The original setting with some values in place of its own, shape (n,)."""
+        """The original setting with some values changed, shape (n,)."""
         setting = self.case.characteristics.original.copy()
         for name, value in changes.items():
             setting[self.case.characteristics.names.index(name)] = value
         return setting
 
     def changes(self, setting: FloatArray) -> list[dict[str, str]]:
-        """What differs from the original: a text with both values, and what the characteristic is, where the study says so."""
+        """The changes from the original: a text with both values, and the description of the characteristic, if there is one."""
         members = [member for member, value in zip(self.case.characteristics, setting.tolist(), strict=True) if value != member.original]
         texts = changes_in_words(self.case.characteristics, setting)
         return [{"text": text, "short": member.short_name, "words": member.words} for member, text in zip(members, texts, strict=True)]
 
     def compared(self, setting: FloatArray) -> Comparison:
-        """A setting simulated beside the original vehicle, once."""
+        """The comparison of a setting with the original vehicle, simulated once."""
         assert self.system is not None
         key = setting.tobytes()
         if key not in self._compared:
             self._compared[key] = compare_setting(self.case.study, self.system, setting)
         return self._compared[key]
 
-    def again(self, settings: Sequence[FloatArray]) -> list[Again]:
-        """Settings simulated once more, all in one go, each once; nothing is to come out otherwise than it is recorded."""
+    def simulate_again(self, settings: Sequence[FloatArray]) -> list[Resimulation]:
+        """Simulate recorded settings again, all in one batch, each once; the page warns where results differ."""
         assert self.system is not None
-        new = {setting.tobytes(): setting for setting in settings if setting.tobytes() not in self._again}
+        new = {setting.tobytes(): setting for setting in settings if setting.tobytes() not in self._simulated_again}
         if new:
             at_points = at_every_point(self.system, np.stack(list(new.values())))
             evaluations, points = aggregated(at_points), points_of(self.system, at_points, self.case.unsafe)
             for row, key in enumerate(new):
-                self._again[key] = Again(evaluations.take([row]), points[row])
-        return [self._again[setting.tobytes()] for setting in settings]
+                self._simulated_again[key] = Resimulation(evaluations.take([row]), points[row])
+        return [self._simulated_again[setting.tobytes()] for setting in settings]
 
     @cached_property
     def options(self) -> dict[str, Any]:
-        """With which options each question is asked for the page: smaller samples than the commands' own, one criterion for all."""
+        """The options of every question for the page: smaller samples than the commands' defaults, one criterion for all."""
         unsafe = None if self.case.solutions.empty else str(self.case.unsafe)
-        asked: tuple[Options, ...] = (
+        all_options: tuple[Options, ...] = (
             ExplainOptions(unsafe=unsafe, limit=12_000), OpinionOptions(unsafe=unsafe), ToleranceOptions(unsafe=unsafe),
             RiskOptions(unsafe=unsafe, samples=SAMPLES), RulesOptions(unsafe=unsafe, samples=SAMPLES))
-        return {one.question: one for one in asked}
+        return {options.question: options for options in all_options}
 
     @property
     def original_fails(self) -> bool:
@@ -161,106 +161,107 @@ class ReportInput:
         return self.case.original[SAFETY_DEGREE] < 0
 
     def where(self, setting: FloatArray) -> dict[str, Any] | None:
-        """At which points of a matrix a setting fails; None of a study without one, and where one point is asked about."""
+        """The points of the matrix at which a setting fails; None without a matrix, or if the page is about one point."""
         if self.system is None or not self.system.matrix or self.point:
             return None
-        return failing_places(self.system.matrix, self.again([setting])[0].points)
+        return failing_places(self.system.matrix, self.simulate_again([setting])[0].points)
 
     def replay(self, setting: FloatArray) -> dict[str, Any]:
         """A setting's animation, as the template `player` takes it."""
         return player_data(scene_of(self.compared(setting)))
 
     def anchor(self, *parts: object) -> str:
-        """A name for a place in the page that belongs to this study."""
+        """The anchor of a part of the page that belongs to this study."""
         words = "-".join(str(part) for part in ("study", self.number, *parts))
-        return "".join(sign if sign.isascii() and sign.isalnum() else "-" for sign in words)
+        return "".join(letter if letter.isascii() and letter.isalnum() else "-" for letter in words)
 
 
-def gather(directories: Iterable[str | Path], point: str | None = None, *, as_it_is_now: bool = False) -> list[ReportInput]:
-    """Read results directories, or what their solutions are at one point of a matrix, where they are simulated once more.
+def read_inputs(directories: Iterable[str | Path], point: str | None = None, *, as_it_is_now: bool = False) -> list[ReportInput]:
+    """Read results directories; with `point`, their solutions are simulated again at this point of the matrix.
 
     Raises
     ------
     InputError
-        If one is no results directory, is damaged or is given twice, a study has no such point, or something that the results were
-        computed with has changed since and `as_it_is_now` does not allow that.
+        If a directory holds no results, is damaged or is given twice, a study has no such point, or files or versions have changed
+        since the results were computed and `as_it_is_now` is false.
     """
-    places = [Path(directory) for directory in directories]
+    paths = [Path(directory) for directory in directories]
     inputs = []
-    for number, (place, case) in enumerate(zip(places, load_cases(places), strict=True), 1):
-        system, lacking, changed = None, "", list[str]()
+    for number, (path, case) in enumerate(zip(paths, load_cases(paths), strict=True), 1):
+        system, problem, changed = None, "", list[str]()
         try:
-            system = assemble(case.study, str(place))
+            system = assemble(case.study, str(path))
         except InputError as error:
-            lacking = f"What this study is about cannot be simulated here: {error.source}: {error.problem}."
-            warn(f"{place}: {lacking}")
+            problem = f"This study cannot be simulated here: {error.source}: {error.problem}."
+            warn(f"{path}: {problem}")
         else:
-            changed = changes_since(place, case, as_it_is_now=as_it_is_now)
+            changed = changes_since(path, case, as_it_is_now=as_it_is_now)
         if point is not None:
             case = _at_point(case, point)
-            system = assemble(case.study, str(place))
-        inputs.append(ReportInput(number=number, place=place, case=case, manifest=read_manifest(place), system=system, lacking=lacking,
+            system = assemble(case.study, str(path))
+        inputs.append(ReportInput(number=number, directory=path, case=case, manifest=read_manifest(path), system=system, problem=problem,
                               point=point or "", changed=changed))
     return inputs
 
 
 def _at_point(case: Case, point: str) -> Case:
-    """A case with its solutions and its original as they are at one point of the study's matrix."""
+    """A case whose solutions and original are simulated again at one point of the study's matrix."""
     study = study_at(case.study, point, "--point")
     system = assemble(study)
     settings = np.concatenate([case.characteristics.original[np.newaxis], case.solutions[list(case.characteristics.names)].to_numpy(float)])
     now = evaluate(system, settings)
     measured = {"f_safe": now.f_safe, **now.metrics, "outcome": now.outcome}
     scoring = system.measuring.scoring
-    solutions = case.solutions.drop(columns=[one.name for one in case.scoring.metrics if one.name not in now.metrics])
-    return replace(case, study=study, scoring=scoring, original={one.name: float(now.metrics[one.name][0]) for one in scoring.metrics},
+    solutions = case.solutions.drop(columns=[metric.name for metric in case.scoring.metrics if metric.name not in now.metrics])
+    original = {metric.name: float(now.metrics[metric.name][0]) for metric in scoring.metrics}
+    return replace(case, study=study, scoring=scoring, original=original,
                    solutions=solutions.assign(**{name: values[1:] for name, values in measured.items()}))
 
 
 FOLDER = "answers"
-"""Of a results directory."""
+"""Folder of stored answers in a results directory."""
 
 
-def stored(material: ReportInput, name: str, compute: Callable[[], Any]) -> Any:
-    """The result of `compute` as plain values; read from the results directory if the same was computed before.
+def stored_answer(data: ReportInput, name: str, compute: Callable[[], Any]) -> Any:
+    """The result of `compute` as plain values, read from the results directory if it was computed before.
 
-    Nothing is stored where the directory cannot be written, or the code that computes an answer has no identity.
+    The result is not stored if the directory cannot be written, or if the code that computes it has no identity.
     """
-    if material.changed or ("imported" in material.manifest and foreign_names(material.case.study)):
+    if data.changed or ("imported" in data.manifest and foreign_names(data.case.study)):
         return json.loads(json.dumps(compute(), allow_nan=False))
-    at = f"-{material.anchor(material.point)}" if material.point else ""
-    file, identity = material.place / FOLDER / f"{name}{at}.json", _identity(material, name)
+    suffix = f"-{data.anchor(data.point)}" if data.point else ""
+    file, identity = data.directory / FOLDER / f"{name}{suffix}.json", _identity(data, name)
     try:
         refuse_other_than_file(file)
-        kept = json.loads(file.read_text(encoding="utf-8"))
-        if kept["identity"] == identity:
-            return kept["value"]
+        content = json.loads(file.read_text(encoding="utf-8"))
+        if content["identity"] == identity:
+            return content["value"]
     except (OSError, ValueError, KeyError, TypeError):
-        pass  # never computed, or not by us: it is computed now
+        pass  # never computed, or not by this package: compute it now
     text = json.dumps({"identity": identity, "value": compute()}, indent=1, allow_nan=False) + "\n"
     try:
         file.parent.mkdir(exist_ok=True)
         write_whole(file, text)
     except (OSError, SafevarError):
-        pass  # a report from results on a read-only disk is a report all the same
+        pass  # results on a read-only disk get their report too
     return json.loads(text)["value"]
 
 
-def _identity(material: ReportInput, name: str) -> str:
+def _identity(data: ReportInput, name: str) -> str:
     """Digest of all that an answer depends on: the results, the options, the package's code."""
     digest = sha256(_package().encode())
-    for kept in (MANIFEST, SOLUTIONS):
-        file = material.place / kept
+    for name_of_file in (MANIFEST, SOLUTIONS):
+        file = data.directory / name_of_file
         content = file.read_bytes() if file.is_file() else b""
         digest.update(len(content).to_bytes(8, "big") + content)
-    parts = [material.case.finished, material.point, material.options.get(name, material.case.study.spread)]
+    parts = [data.case.finished, data.point, data.options.get(name, data.case.study.spread)]
     digest.update(repr(parts).encode())
     return digest.hexdigest()
 
 
 @cache
 def _package() -> str:
-    """Identity of all of the package's code: an answer depends on more of it than results do."""
+    """Identity of all of the package's code, for answers depend on more of the code than results do."""
     files = sorted(PACKAGE.rglob("*.py"))
     return repr([version("safevar_sumo"), RESULTS, [(file.relative_to(PACKAGE).as_posix(), sha256(file.read_bytes()).hexdigest())
                                                     for file in files]])

@@ -1,4 +1,4 @@
-"""How far characteristics may go, how likely a failure is, and in which region failures lie."""
+"""The sections on tolerances, on the probability of a failure, and on the regions of failures."""
 
 from __future__ import annotations
 
@@ -13,81 +13,81 @@ from safevar_sumo.analysis.rules.compute import find_rules, rule_in_words
 from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.replay.comparison import number, raised, spaced
-from safevar_sumo.report.input import ReportInput, stored
+from safevar_sumo.report.input import ReportInput, stored_answer
 from safevar_sumo.report.svg import Bar, rows
 from safevar_sumo.vehicles import Characteristic
 
 Section = dict[str, Any]
 
 
-def tolerance(material: ReportInput, jobs: int | None, progress: Progress) -> Section:
+def tolerance(data: ReportInput, jobs: int | None, progress: Progress) -> Section:
     """Every characteristic's safe interval alone, as bars over its domain, and the factor for all together."""
     def compute() -> Section:
-        tolerances = find_tolerances(material.case.study, material.options["tolerance"], jobs=jobs, progress=progress)
+        tolerances = find_tolerances(data.case.study, data.options["tolerance"], jobs=jobs, progress=progress)
         return {**tolerances.to_dict(), "verdict": tolerances.verdict}
 
-    result = stored(material, "tolerance", compute)
-    return {"verdict": result["verdict"], "unsafe": result["unsafe"], "joint": result["joint"], "chart": _bars(material, result["alone"])}
+    result = stored_answer(data, "tolerance", compute)
+    return {"verdict": result["verdict"], "unsafe": result["unsafe"], "joint": result["joint"], "chart": _bars(data, result["alone"])}
 
 
-def risk(material: ReportInput, jobs: int | None, progress: Progress) -> Section:
-    """The probability of a failure with its interval, and what decides, as bars."""
+def risk(data: ReportInput, jobs: int | None, progress: Progress) -> Section:
+    """The probability of a failure with its interval, and the characteristics that decide it, as bars."""
     def compute() -> Section:
-        return estimate_risk(material.case.study, material.options["risk"], jobs=jobs, progress=progress).to_dict()
+        return estimate_risk(data.case.study, data.options["risk"], jobs=jobs, progress=progress).to_dict()
 
-    result = stored(material, "risk", compute)
-    study = material.case.study
+    result = stored_answer(data, "risk", compute)
+    study = data.case.study
     fleet = {} if not study.variation else {
         "fleet": {"vehicles": FLEET, "probability": fleet_probability(result["probability"], FLEET)}}
     return {**result, **fleet, "of_domain": not study.variation, "correlated": bool(study.correlations),
-            "chart": _sensitivity(material, result["sensitivity"])}
+            "chart": _sensitivity(data, result["sensitivity"])}
 
 
-def rules(material: ReportInput, jobs: int | None, progress: Progress) -> Section:
+def rules(data: ReportInput, jobs: int | None, progress: Progress) -> Section:
     """Rules in words, with density and coverage on vehicles that were not used to find them."""
     def compute() -> Section:
-        regions = find_rules(material.case.study, material.options["rules"], jobs=jobs, progress=progress)
-        sure = [rule for rule in regions.rules if rule.is_denser_than(regions.unsafe_share)]
-        words = [raised(rule_in_words(rule, material.case.characteristics, regions.unsafe)) for rule in sure]
-        dropped = number_of(len(regions.rules) - len(sure), "rule")
-        remark = regions.remark if len(sure) == len(regions.rules) else (
-            f"Left out: {dropped} that so few vehicles do not tell from chance; the command rules looks at more.")
+        regions = find_rules(data.case.study, data.options["rules"], jobs=jobs, progress=progress)
+        significant = [rule for rule in regions.rules if rule.is_denser_than(regions.unsafe_share)]
+        words = [raised(rule_in_words(rule, data.case.characteristics, regions.unsafe)) for rule in significant]
+        dropped = number_of(len(regions.rules) - len(significant), "rule")
+        remark = regions.remark if len(significant) == len(regions.rules) else (
+            f"Left out: {dropped} that may be chance with so few vehicles; the command rules simulates more.")
         return {"words": words, "samples": regions.samples, "share": regions.unsafe_share, "remark": remark, "unsafe": str(regions.unsafe)}
 
-    result: Section = stored(material, "rules", compute)
+    result: Section = stored_answer(data, "rules", compute)
     return result
 
 
 INDICES = {"first_order": "alone", "total": "with others"}
-"""What the Sobol indices are called beside a bar."""
+"""Names of the Sobol indices beside a bar."""
 LIMITS: Mapping[str, Callable[[ReportInput, int | None, Progress], Section]] = {"tolerance": tolerance, "risk": risk, "rules": rules}
 """The sections about the whole domain, by name."""
 
 
-def _bars(material: ReportInput, alone: list[Section]) -> Markup:
-    members = {member.name: member for member in material.case.characteristics}
-    names, pieces, marks, ends = [], [], [], []
-    for one in alone:
-        member = members[one["characteristic"]]
-        safe, unsafe = one["safe"], one["unsafe"]
-        bars = [] if safe is None else [_bar(member, safe, "safe")]
+def _bars(data: ReportInput, alone: list[Section]) -> Markup:
+    members = {member.name: member for member in data.case.characteristics}
+    names, bars, marks, ends = [], [], [], []
+    for scan in alone:
+        member = members[scan["characteristic"]]
+        safe, unsafe = scan["safe"], scan["unsafe"]
+        safe_bars = [] if safe is None else [_bar(member, safe, "safe")]
         names.append(member.name)
-        pieces.append([*bars, *(_bar(member, interval, "unsafe") for interval in unsafe),
-                       *(_bar(member, interval, "weak", "could not be simulated") for interval in one["not_simulated"])])
-        marks.append(_share(member, member.original))
+        bars.append([*safe_bars, *(_bar(member, interval, "unsafe") for interval in unsafe),
+                     *(_bar(member, interval, "weak", "could not be simulated") for interval in scan["not_simulated"])])
+        marks.append(_place(member, member.original))
         ends.append((f"{number(member.lower)}{spaced(member.unit)}", f"{number(member.upper)}{spaced(member.unit)}"))
-    description = f"{material.case.name}: where each characteristic alone is safe and where it is unsafe; a mark at the original"
-    return rows(description, names, pieces, marks, ends)
+    description = f"{data.case.name}: where each characteristic alone is safe and where it is unsafe; a mark at the original"
+    return rows(description, names, bars, marks, ends)
 
 
 def _bar(member: Characteristic, interval: Sequence[float], look: str, state: str = "") -> Bar:
     low, high = interval
     words = f"{member.name} from {number(low)} to {number(high)}{spaced(member.unit)}: {state or look}"
-    return Bar(_share(member, low), _share(member, high), look, words)
+    return Bar(_place(member, low), _place(member, high), look, words)
 
 
-def _part(name: str, share: float, look: str, how: str) -> Bar:
-    return Bar(0, min(max(share, 0.0), 1.0), look, f"{name}: {share:.0%} {how}")
+def _index_bar(name: str, index: float, look: str, kind: str) -> Bar:
+    return Bar(0, min(max(index, 0.0), 1.0), look, f"{name}: {index:.0%} {kind}")
 
 
 def _percent(share: float | None, interval: Sequence[float | None]) -> str:
@@ -99,18 +99,19 @@ def _percent(share: float | None, interval: Sequence[float | None]) -> str:
     return f"{100 * (round(share, 2) + 0.0):.0f} %{error}"
 
 
-def _share(member: Characteristic, value: float) -> float:
+def _place(member: Characteristic, value: float) -> float:
+    """The place of a value in its domain, from 0 to 1."""
     return (value - member.lower) / (member.upper - member.lower)
 
 
-def _sensitivity(material: ReportInput, sensitivity: list[Section]) -> Markup | None:
+def _sensitivity(data: ReportInput, sensitivity: list[Section]) -> Markup | None:
     defined = [one for one in sensitivity if one["total"] is not None]
     ordered = sorted(defined, key=lambda one: (-one["total"], one["characteristic"]))
     if not ordered:
         return None
-    pieces = [[_part(one["characteristic"], one["total"], "weak", "together with others"),
-               _part(one["characteristic"], one["first_order"] or 0.0, "safe", "alone")] for one in ordered]
-    return rows(f"{material.case.name}: share of the safety degree's variance that each characteristic decides",
-                [one["characteristic"] for one in ordered], pieces, [None] * len(ordered),
+    bars = [[_index_bar(one["characteristic"], one["total"], "weak", "together with others"),
+             _index_bar(one["characteristic"], one["first_order"] or 0.0, "safe", "alone")] for one in ordered]
+    return rows(f"{data.case.name}: share of the safety degree's variance that each characteristic explains",
+                [one["characteristic"] for one in ordered], bars, [None] * len(ordered),
                 [("", ", ".join(f"{words} {_percent(one[index], one[f'{index}_interval'])}" for index, words in INDICES.items()))
                  for one in ordered])

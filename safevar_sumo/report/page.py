@@ -1,4 +1,4 @@
-"""The page: its sections, the research questions in it, the commands that make its numbers again, and the template."""
+"""The page: its sections, its research questions, the commands that reproduce its numbers, and the template."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from safevar_sumo.errors import InputError, did_you_mean, warn
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.replay.comparison import raised
 from safevar_sumo.replay.page import environment, player_parts
-from safevar_sumo.report.findings import best_of, causes, evenly, explanations, necessity_chart, no_opinion, replays
-from safevar_sumo.report.input import ReportInput, gather
+from safevar_sumo.report.findings import best_of, causes, evenly_spaced, explanations, necessity_chart, no_opinion, replays
+from safevar_sumo.report.input import ReportInput, read_inputs
 from safevar_sumo.report.limits import LIMITS
 from safevar_sumo.report.rated import rated_study_page
 from safevar_sumo.report.svg import Dot, scatter
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DIGITS = re.compile(r"(\d\.\d\d)\d+")
-"""A number in a picture, with more digits than can be seen."""
+"""A number in a picture with more digits than anybody can see."""
 DOTS = 150
-"""Points of a scatter chart, at the most."""
+"""Maximum number of points in a scatter chart."""
 TEXT = {"svg.fonttype": "none", "svg.hashsalt": "safevar_sumo", "font.family": ["sans-serif"]}
 
 
@@ -60,15 +60,15 @@ def _plain(table: Table) -> dict[str, Any]:
 
 
 def figures(cases: Sequence[Case]) -> list[dict[str, str]]:
-    """Every figure as a picture that stands in the page."""
+    """Every figure as a picture embedded in the page."""
     try:
         drawn, _ = draw(cases)
     except Unanswerable:
         return []
-    return [{"name": name, "alt": _words(figure), "source": _inline(figure)} for name, figure in drawn.items()]
+    return [{"name": name, "alt": _alt_text(figure), "source": _inline(figure)} for name, figure in drawn.items()]
 
 
-def _words(figure: Figure) -> str:
+def _alt_text(figure: Figure) -> str:
     axis = figure.axes[0]
     return f"{figure.get_suptitle()}: {axis.get_ylabel() or 'values'} over {axis.get_xlabel() or 'characteristics'}".replace("\n", " ")
 
@@ -83,49 +83,49 @@ def _inline(figure: Figure) -> str:
     return "data:image/svg+xml," + quote(picture, safe=" =:/;,()'!?@&+$*")
 
 
-def front(material: ReportInput, shown: Sequence[str]) -> Markup:
-    """A chart of the non-dominated solutions by largest change and safety degree; replayed ones are links to their replays."""
-    rows = [row for row in material.solutions.values() if not np.isnan([row["f_safe"], row["f_diff"]]).any()]
+def front(data: ReportInput, replayed: Sequence[str]) -> Markup:
+    """A chart of the non-dominated solutions by largest change and safety degree, with links to the replays of `replayed` handles."""
+    rows = [row for row in data.solutions.values() if not np.isnan([row["f_safe"], row["f_diff"]]).any()]
     best = best_of(rows)
-    kept = [best[place] for place in evenly(len(best), DOTS)] + [row for row in rows if row["handle"] in shown]
-    dots = {row["handle"]: _dot(material, row, row["handle"] in shown) for row in kept}
-    return scatter(f"{material.case.name}: safety degree over the largest change of the solutions that no other beats",
+    chosen = [best[index] for index in evenly_spaced(len(best), DOTS)] + [row for row in rows if row["handle"] in replayed]
+    dots = {row["handle"]: _dot(data, row, row["handle"] in replayed) for row in chosen}
+    return scatter(f"{data.case.name}: safety degree over the largest change of the solutions that no other beats",
                    list(dots.values()), "largest change [% of the original]", "safety degree [m, or -m/s]", 0.0, "collision below")
 
 
-def _dot(material: ReportInput, row: dict[Any, Any], is_shown: bool) -> Dot:
+def _dot(data: ReportInput, row: dict[Any, Any], is_replayed: bool) -> Dot:
     words = (f"{row['handle']}: {row['outcome']}, safety degree {row['f_safe']:.2f}, largest change {row['f_diff']:.0%}, "
              f"{row['f_num_diff']} changed")
     look = "hit" if row["outcome"] == "collision" else "miss"
-    return Dot(100 * row["f_diff"], row["f_safe"], words, look, material.anchor("replay", row["handle"]) if is_shown else "")
+    return Dot(100 * row["f_diff"], row["f_safe"], words, look, data.anchor("replay", row["handle"]) if is_replayed else "")
 
 
-def reproduce(materials: Sequence[ReportInput], parts: Sequence[str]) -> list[dict[str, str]]:
-    """Commands that make the numbers of this page again."""
-    places = " ".join(shlex.quote(str(material.place)) for material in materials)
+def reproduce(inputs: Sequence[ReportInput], parts: Sequence[str]) -> list[dict[str, str]]:
+    """Commands that reproduce the numbers of this page."""
+    places = " ".join(shlex.quote(str(data.directory)) for data in inputs)
     commands = []
-    for material in materials:
-        place, study = shlex.quote(str(material.place)), material.case.study
-        now = " --as-it-is-now" if material.changed else ""
-        if material.case.has_runs:
-            commands.append({"what": f"The study {study.name}, as its manifest.json records it whole, into another directory",
-                             "command": _again(study, f"{material.place}-again", material.place)})
-        asked = [*parts, *(["opinion"] if "explain" in parts and material.system is not None and not no_opinion(material) else [])]
-        commands += [{"what": f"The part {part}", "command": material.options[part].command_line(str(material.place), material.point) + now}
-                     for part in asked]
-        if material.point:
+    for data in inputs:
+        place, study = shlex.quote(str(data.directory)), data.case.study
+        now = " --as-it-is-now" if data.changed else ""
+        if data.case.has_runs:
+            commands.append({"what": f"The study {study.name}, as its manifest.json records it, into another directory",
+                             "command": _rerun_command(study, f"{data.directory}-again", data.directory)})
+        questions = [*parts, *(["opinion"] if "explain" in parts and data.system is not None and not no_opinion(data) else [])]
+        commands += [{"what": f"The part {part}", "command": data.options[part].command_line(str(data.directory), data.point) + now}
+                     for part in questions]
+        if data.point:
             continue
         commands.append({"what": "A replay, with figure and animation",
                          "command": f"{RUN} simulate {place} --most-severe --plot it.png --animate it.html{now}"})
-    if any(material.point for material in materials):
+    if any(data.point for data in inputs):
         return commands
     commands.append({"what": "The tables of RQ1 to RQ3", "command": f"{RUN} tables {places}"})
     commands.append({"what": "The figures", "command": f"{RUN} figures {places} --out figures"})
     return commands
 
 
-def _again(study: Study, out: str, place: Path) -> str:
-    """The command that runs a study again: for a shipped study with other options `study`, else a call with the recorded study."""
+def _rerun_command(study: Study, out: str, place: Path) -> str:
+    """The command that runs a study again: `study` with options for a shipped study, else a call with the recorded study."""
     search = study.search
     if study.name in study_names():
         options = {name: getattr(search, name) for name in ("seed", "runs", "evaluations", "algorithms")}
@@ -149,11 +149,11 @@ SECTIONS = {
     "trust": "What was not tested, and how far to trust it",
     "reproduce": "How to reproduce every number",
 }
-"""The sections of a report by the names that `--only` takes, in their order."""
+"""The sections of a report in their order, by the names that `--only` accepts."""
 
 
 PARTS = {"causes": "explain", **{name: name for name in LIMITS}}
-"""Sections that take simulations, and the commands that make them alone."""
+"""Sections that need simulations, each with the command that computes it alone."""
 
 
 def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), jobs: int | None = None, progress: Progress = silent,
@@ -167,59 +167,58 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
         if "questions" in only:
             raise InputError("only", "the research questions are about whole studies", "sections other than questions with --point")
         wanted = [name for name in wanted if name != "questions"]
-    materials = gather(directories, point, as_it_is_now=as_it_is_now)
-    for material in materials:
-        for change in material.changed:
-            warn(f"{material.place}: {change}")
-    are_rated = [is_rated(material.case.study) and point is None for material in materials]
+    inputs = read_inputs(directories, point, as_it_is_now=as_it_is_now)
+    for data in inputs:
+        for change in data.changed:
+            warn(f"{data.directory}: {change}")
+    are_rated = [is_rated(data.case.study) and point is None for data in inputs]
     if any(are_rated):
         if not all(are_rated):
             raise InputError("directories", "some hold results of rated studies, others do not", "a report for each kind")
         return environment(WEB).get_template("rated.html.j2").render(
-            title=f"Euro NCAP rating: {', '.join(material.case.name for material in materials)}", css=_part("report.css"),
-            studies=[rated_study_page(material, jobs, progress) for material in materials]) + "\n"
-    studies = [_study(material, wanted, jobs, progress) for material in materials]
+            title=f"Euro NCAP rating: {', '.join(data.case.name for data in inputs)}", css=_web_file("report.css"),
+            studies=[rated_study_page(data, jobs, progress) for data in inputs]) + "\n"
+    studies = [_study(data, wanted, jobs, progress) for data in inputs]
     progress("tables and figures", 0, 1)
-    cases = [material.case for material in materials]
-    asked = "questions" in wanted
+    cases = [data.case for data in inputs]
+    with_questions = "questions" in wanted
     page = environment(WEB).get_template("report.html.j2").render(
         title=f"Safety report: {', '.join(case.name for case in cases)}", sections={name: SECTIONS[name] for name in wanted},
         studies=studies,
-        tables=tables(cases) if asked else [], figures=figures(cases) if asked else [],
-        commands=reproduce(materials, [PARTS[name] for name in PARTS if name in wanted]) if "reproduce" in wanted else [],
-        takes_simulations=list(PARTS), player=player_parts(), css=_part("report.css"), js=_part("report.js"))
+        tables=tables(cases) if with_questions else [], figures=figures(cases) if with_questions else [],
+        commands=reproduce(inputs, [PARTS[name] for name in PARTS if name in wanted]) if "reproduce" in wanted else [],
+        takes_simulations=list(PARTS), player=player_parts(), css=_web_file("report.css"), js=_web_file("report.js"))
     progress("tables and figures", 1, 1)
     return page + "\n"
 
 
-def _study(material: ReportInput, wanted: Sequence[str], jobs: int | None, show: Progress) -> Mapping[str, Any]:
+def _study(data: ReportInput, wanted: Sequence[str], jobs: int | None, show: Progress) -> Mapping[str, Any]:
     """The data of one study for every wanted section."""
     def progress(stage: str, done: int, total: int) -> None:
-        show(f"{material.case.name}: {stage}", done, total)
+        show(f"{data.case.name}: {stage}", done, total)
 
-    explained = explanations(material, jobs, progress) if "causes" in wanted and material.system is not None else None
-    limits = {name: make(material, jobs, progress) for name, make in LIMITS.items()
-              if name in wanted and material.system is not None}
+    failures = explanations(data, jobs, progress) if "causes" in wanted and data.system is not None else None
+    limits = {name: make(data, jobs, progress) for name, make in LIMITS.items()
+              if name in wanted and data.system is not None}
     progress("replays", 0, 1)
-    shown = replays(material, explained) if "causes" in wanted else []
+    replayed = replays(data, failures) if "causes" in wanted else []
     sections: dict[str, Callable[[], Any]] = {
-        "tested": lambda: tested(material),
-        "verdict": lambda: verdict(material, explained, limits.get("tolerance")),
-        "causes": lambda: causes(explained or [], material),
-        "no_opinion": lambda: "" if material.system is None else no_opinion(material),
-        "necessity": lambda: necessity_chart(explained or [], material),
-        "trust": lambda: trust(material, explained)}
-    otherwise = [one["handle"] for one in shown if one.get("differences")]
-    if otherwise:
-        warn(f"{material.place}: {', '.join(otherwise)}: simulated again not what the results say; other versions or code than "
-             "those of the study?")
-    return {"name": material.case.name, "title": material.case.study.title, "anchor": material.anchor(), "replays": shown,
-            "otherwise": otherwise,
-            "lacking": material.lacking, "changed": material.changed, "original_fails": material.original_fails,
-            "front": front(material, [one["handle"] for one in shown]) if shown else None,
+        "tested": lambda: tested(data),
+        "verdict": lambda: verdict(data, failures, limits.get("tolerance")),
+        "causes": lambda: causes(failures or [], data),
+        "no_opinion": lambda: "" if data.system is None else no_opinion(data),
+        "necessity": lambda: necessity_chart(failures or [], data),
+        "trust": lambda: trust(data, failures)}
+    different = [solution["handle"] for solution in replayed if solution.get("differences")]
+    if different:
+        warn(f"{data.directory}: simulated again with different results: {', '.join(different)}; other versions or code than in the study?")
+    return {"name": data.case.name, "title": data.case.study.title, "anchor": data.anchor(), "replays": replayed,
+            "different": different,
+            "problem": data.problem, "changed": data.changed, "original_fails": data.original_fails,
+            "front": front(data, [solution["handle"] for solution in replayed]) if replayed else None,
             **limits, **{name: make() for name, make in sections.items()
                          if name in wanted or (name in ("necessity", "no_opinion") and "causes" in wanted)}}
 
 
-def _part(name: str) -> Markup:
+def _web_file(name: str) -> Markup:
     return Markup((WEB / name).read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""The page about results of a rated study: matrices of the original beside a worn vehicle, and the points that are lost by test."""
+"""The page about results of a rated study: matrices of the original beside those of a worn vehicle, and the points lost by test."""
 
 from __future__ import annotations
 
@@ -19,34 +19,35 @@ from safevar_sumo.results import chosen_handle, position_of
 from safevar_sumo.vehicles import CharacteristicSet
 
 CHOICE = "fewest"
-"""Which solution stands beside the original: the one that loses a point with the fewest changes."""
+"""The solution beside the original: it loses a point with the fewest changes."""
 
 
-def rated_study_page(material: ReportInput, jobs: int | None, progress: Progress) -> dict[str, Any]:
-    """What the page says of one study; its vehicles are simulated in all cells."""
-    case, variants, handle = material.case, dict[str, np.ndarray](), None
+def rated_study_page(data: ReportInput, jobs: int | None, progress: Progress) -> dict[str, Any]:
+    """The data of one study for the page; its vehicles are simulated in all cells."""
+    case, variants, handle = data.case, dict[str, np.ndarray](), None
     if case.unsafe.rows(case.solutions).any():
-        handle = chosen_handle(case.solutions, case.unsafe, CHOICE, material.place)
+        handle = chosen_handle(case.solutions, case.unsafe, CHOICE, data.directory)
         row = case.solutions.iloc[position_of(case.solutions, handle)]
         names = CharacteristicSet.of(case.study.vehicle.characteristics).names
         variants[str(handle)] = row[list(names)].to_numpy(dtype=float)
     rating = rate(case.study, variants, jobs=jobs, progress=progress)
-    asked = RatingOptions(solution=None if handle is None else str(handle)).command_line(str(material.place))
+    rating_command = RatingOptions(solution=None if handle is None else str(handle)).command_line(str(data.directory))
     return {"title": case.study.title, "sentence": verdict(rating), "notes": remarks(rating), "points": _points(rating),
             "lost": [(test_in_words(test), f"{lost:.2f}") for test, lost in lost_by_test(rating)], "turned": turned_in_words(rating),
-            "picture": picture(rating), "names": [one.name for one in rating.variants], "open": not_simulated(rating),
-            "commands": [asked, ask("tolerance", str(material.place)), ask("explain", str(material.place))]}
+            "picture": picture(rating), "names": [variant.name for variant in rating.variants], "open": not_simulated(rating),
+            "commands": [rating_command, ask("tolerance", str(data.directory)), ask("explain", str(data.directory))]}
 
 
 def _points(rating: Rating) -> Sequence[tuple[str, Sequence[str], str]]:
-    """Test, points of every vehicle, and what there is to earn."""
+    """Rows of a test, the points of every vehicle, and the points to earn."""
     rows = [(tests[0].block.name, [f"{test.total:.2f}" for test in tests], f"{sum(tests[0].block.points):g}")
-            for tests in zip(*(one.tests for one in rating.variants), strict=True)]
-    return [*rows, ("all", [f"{one.points:.2f}" for one in rating.variants], f"{sum(sum(b.points) for b in rating.protocol.blocks):g}")]
+            for tests in zip(*(variant.tests for variant in rating.variants), strict=True)]
+    possible = sum(sum(block.points) for block in rating.protocol.blocks)
+    return [*rows, ("all", [f"{variant.points:.2f}" for variant in rating.variants], f"{possible:g}")]
 
 
 def picture(rating: Rating) -> Markup:
-    """The matrices as SVG that stands in the page; the same rating gives the same bytes."""
+    """The matrices as SVG to embed in the page; the same rating gives the same bytes."""
     import matplotlib
 
     file = io.StringIO()

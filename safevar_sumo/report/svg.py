@@ -1,4 +1,4 @@
-"""Charts as SVG that stands in the page: values show where one points, without a script."""
+"""Charts as SVG to embed in the page: values show under the pointer, without a script."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ WIDTH = 720
 ROW = 26
 """Height of a bar's row."""
 LABEL = 170
-"""Room for the names at the left."""
+"""Width of the names on the left."""
 RIGHT = 24
 
 
@@ -34,11 +34,11 @@ class Bar(NamedTuple):
     title: str
 
 
-def rows(description: str, names: Sequence[str], pieces: Sequence[Sequence[Bar]], marks: Sequence[float | None],
+def rows(description: str, names: Sequence[str], bars_of_rows: Sequence[Sequence[Bar]], marks: Sequence[float | None],
          ends: Sequence[tuple[str, str]]) -> Markup:
-    """Rows of bars with a mark each; `description` is the chart in words, `ends` what stands at a row's left and right end."""
+    """Rows of bars with a mark each; `description` is the chart in words, `ends` the texts at a row's left and right end."""
     parts, inside = [], WIDTH - LABEL - RIGHT
-    for i, (name, bars, mark, (left, right)) in enumerate(zip(names, pieces, marks, ends, strict=True)):
+    for i, (name, bars, mark, (left, right)) in enumerate(zip(names, bars_of_rows, marks, ends, strict=True)):
         y = i * ROW * 1.6
         parts.append(_text(LABEL - 8, y + 17, name, "name"))
         parts.append(f'<rect class="track" x="{LABEL}" y="{y + 4:.1f}" width="{inside}" height="{ROW - 8}" rx="3"/>')
@@ -54,7 +54,7 @@ def rows(description: str, names: Sequence[str], pieces: Sequence[Sequence[Bar]]
 
 
 def scatter(description: str, dots: Sequence[Dot], x_title: str, y_title: str, line: float | None, line_title: str) -> Markup:
-    """Points in a plane, with a level line; y points up."""
+    """A scatter chart with a level line; y points up."""
     height, left, bottom = 330, 62, 44
     xs, ys = [dot.x for dot in dots], [dot.y for dot in dots] + ([] if line is None else [line])
     x_scale, y_scale = _ticks(min([0.0, *xs]), max(xs)), _ticks(min(ys), max([0.0, *ys]))
@@ -81,7 +81,7 @@ def scatter(description: str, dots: Sequence[Dot], x_title: str, y_title: str, l
 
 
 def _svg(description: str, height: float, parts: Sequence[str], role: str = "img") -> Markup:
-    """A chart of these parts, all of them escaped already."""
+    """A chart of these parts, which must be escaped already."""
     return Markup(f'<svg class="chart" role="{role}" viewBox="0 0 {WIDTH} {height:.0f}" aria-label="{escape(description)}">\n'
                   + "\n".join(parts) + "\n</svg>")
 
@@ -95,4 +95,4 @@ def _ticks(low: float, high: float) -> list[float]:
     from matplotlib.ticker import MaxNLocator
 
     ticks = MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high if high > low else low + 1)
-    return [round(float(one), 10) for one in ticks]
+    return [round(float(tick), 10) for tick in ticks]

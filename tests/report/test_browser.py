@@ -27,7 +27,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.replay.animation import animate
 from safevar_sumo.replay.comparison import compare_setting
-from safevar_sumo.report import input as material
+from safevar_sumo.report import input as report_input
 from safevar_sumo.report import make_report
 from safevar_sumo.sumo.system import assemble
 
@@ -45,7 +45,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
 def report(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("page") / "report.html"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(material, "SAMPLES", 256)
+        patch.setattr(report_input, "SAMPLES", 256)
         file.write_text(make_report([slippery]), encoding="utf-8")
     return file
 

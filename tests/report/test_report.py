@@ -24,11 +24,11 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import changes_in_words
 from safevar_sumo.report import SECTIONS, findings, make_report
-from safevar_sumo.report import input as material
+from safevar_sumo.report import input as report_input
 from safevar_sumo.report import verdict as what
-from safevar_sumo.report.input import AVOIDED, failing_places, stored
+from safevar_sumo.report.input import AVOIDED, failing_places, stored_answer
 from safevar_sumo.report.limits import LIMITS, _percent
-from safevar_sumo.report.page import PARTS, gather
+from safevar_sumo.report.page import PARTS, read_inputs
 from safevar_sumo.report.svg import Dot, scatter
 from safevar_sumo.report.verdict import verdict
 from safevar_sumo.results import SolutionId
@@ -78,7 +78,7 @@ class Outline(HTMLParser):
 
 @pytest.fixture
 def few_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(material, "SAMPLES", 400)
+    monkeypatch.setattr(report_input, "SAMPLES", 400)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def page(slippery: Path, explained: Explained) -> str:
     friction = list(study.vehicle.characteristics).index("tireFric")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(findings, "explain", lambda *_, **__: explained)
-        patch.setattr(material, "SAMPLES", 400)
+        patch.setattr(report_input, "SAMPLES", 400)
         patch.setattr(local, "LocalPool", lambda *_: Plant(study, lambda rows: rows[:, friction] < 1.5))
         return make_report([slippery], jobs=1)
 
@@ -149,9 +149,9 @@ def test_bars_are_where_their_values_lie_in_the_domain(page: str) -> None:
 def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderline(
         slippery: Path, tmp_path: Path, explained: Explained) -> None:
     """The values beside it are those of its solution: no number is another one further down."""
-    (material,) = gather([shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))])
+    (data,) = read_inputs([shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))])
     fewest, robust = explained.to_dict()[:1] * 2
-    failing = [row for row in material.solutions.values() if row["outcome"] == "collision"]
+    failing = [row for row in data.solutions.values() if row["outcome"] == "collision"]
     fewest = fewest | {"reasons": ["fewest changes"], "robustness": 0.79}
     robust = robust | {"reasons": ["smallest robust"], "robustness": 0.81}
     for record, row in zip((fewest, robust), failing, strict=False):
@@ -159,26 +159,26 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
         record |= {"algorithm": algorithm, "run": int(run), "index": int(index)}
     summary = {"summary": {"preventable": {"competent_driver": 0.14, "full_braking": 0.1, "nobody": 0.76, "looked_at": 40,
                                            "interval_competent_driver": [0.05, 0.29]}}}
-    result = verdict(material, [fewest, robust, summary], {"joint": {"factor": 0.42, "samples": 1024}})
+    result = verdict(data, [fewest, robust, summary], {"joint": {"factor": 0.42, "samples": 1024}})
     assert [(one["title"], one["borderline"]) for one in result["findings"]] == [
         ("Smallest robust failure", False), ("Fewest changes", True)]
     first = result["findings"][0]
-    setting = material.setting_of(SolutionId.parse(first["handle"]))
-    assert [one["text"] for one in first["changes"]] == changes_in_words(material.case.characteristics, setting)
+    setting = data.setting_of(SolutionId.parse(first["handle"]))
+    assert [one["text"] for one in first["changes"]] == changes_in_words(data.case.characteristics, setting)
     number, needed = len(first["changes"]), len(robust["minimal_causes"][0]["changes"])
     assert 0 < needed < number, "or the next line tells nothing"
     assert result["headline"].startswith(f"{number} changes lead to a collision that is robust ({needed} of them suffice")
     robust["minimal_causes"] = [{"changes": {one["text"]: 1.0 for one in first["changes"]}}]
-    every = verdict(material, [fewest, robust, summary], None)["headline"]
+    every = verdict(data, [fewest, robust, summary], None)["headline"]
     assert every.startswith(f"{number} changes suffice for a collision that is robust: the vehicle collides")
     assert [one["value"] for one in result["figures"][2:]] == ["14% of the collisions", "42.0% of the way"]
     assert result["figures"][0]["value"].startswith(f"{len(first['changes'])} changes")
 
 
 def test_every_replay_that_is_linked_is_there_and_hits_as_recorded(page: str, slippery: Path) -> None:
-    (material,) = gather([slippery])
+    (data,) = read_inputs([slippery])
     players = re.findall(r'<details class="replay" id="(.*?)".*?<script type="application/json">(.*?)</script>', page, re.DOTALL)
-    by_anchor = {material.anchor("replay", handle): row for handle, row in material.solutions.items()}
+    by_anchor = {data.anchor("replay", handle): row for handle, row in data.solutions.items()}
     assert len(players) >= 3
     for anchor, data in players:
         changed = json.loads(data)["drives"][1]
@@ -204,25 +204,25 @@ def test_a_kept_answer_belongs_to_its_options_and_to_the_code_that_computed_it(
     computed: list[str] = []
 
     def ask(why: str) -> None:
-        stored(gather([place])[0], "risk", lambda: computed.append(why))
+        stored_answer(read_inputs([place])[0], "risk", lambda: computed.append(why))
 
     for why in ("first", "again"):
         ask(why)
     file = place / "answers/risk.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), "identity": "of something else"}))
     ask("other results")
-    monkeypatch.setattr(material, "SAMPLES", 33)
+    monkeypatch.setattr(report_input, "SAMPLES", 33)
     ask("another sample size")
-    monkeypatch.setattr(material, "_package", lambda: "edited since")
+    monkeypatch.setattr(report_input, "_package", lambda: "edited since")
     ask("other code")
     assert computed == ["first", "other results", "another sample size", "other code"]
 
 
 def test_what_is_not_as_the_results_say_any_more_is_told(page: str, slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Somebody's driving system was edited since: here another one drives."""
-    assert "not what the results say" not in page
-    monkeypatch.setattr(material, "assemble", lambda *study: replace(assemble(*study), ads=FullBraking()))
-    with pytest.warns(UserWarning, match="simulated again not what the results say"):
+    assert "differs from the results" not in page
+    monkeypatch.setattr(report_input, "assemble", lambda *study: replace(assemble(*study), ads=FullBraking()))
+    with pytest.warns(UserWarning, match="simulated again with different results: "):
         other = make_report([slippery], only=["verdict", "causes"], jobs=1)
     assert re.search(r"the outcome is collision there and \w+ here", other)
     assert Outline(other).open == []
@@ -315,9 +315,9 @@ def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path:
     manifest = json.loads((slippery / "manifest.json").read_text())
     manifest["study"]["scenario"]["parameters"] = {"network": "/nowhere/gone"}
     write_manifest(tmp_path / "copy", manifest)
-    with pytest.warns(UserWarning, match="copy: What this study is about cannot be simulated here: .*gone"):
+    with pytest.warns(UserWarning, match="copy: This study cannot be simulated here: .*gone"):
         page = make_report([tmp_path / "copy"], only=["tested", "verdict", *PARTS, "trust", "reproduce"], jobs=1)
-    result = re.findall(r"slippery: What this study is about cannot be simulated here: .*gone", page)
+    result = re.findall(r"slippery: This study cannot be simulated here: .*gone", page)
     assert len(result) == 1 + len(LIMITS), "each section that would take simulations says so"
     assert '<details class="replay"' in page
 
@@ -338,15 +338,15 @@ def test_of_an_original_that_collides_no_change_is_called_the_cause(
 
 
 def test_what_comes_from_outside_is_called_by_its_name_once(slippery: Path) -> None:
-    (material,) = gather([slippery])
+    (data,) = read_inputs([slippery])
     scenario = SimpleNamespace()
-    study = msgspec.structs.replace(material.case.study, ads=msgspec.structs.replace(material.case.study.ads, model="my_controller:Pilot"))
-    points = [Point(scenario, material.case.weather)]  # type: ignore[arg-type]
-    others: Any = SimpleNamespace(case=dataclasses.replace(material.case, study=study), manifest=material.manifest, lacking="", point="",
+    study = msgspec.structs.replace(data.case.study, ads=msgspec.structs.replace(data.case.study.ads, model="my_controller:Pilot"))
+    points = [Point(scenario, data.case.weather)]  # type: ignore[arg-type]
+    others: Any = SimpleNamespace(case=dataclasses.replace(data.case, study=study), manifest=data.manifest, problem="", point="",
                                   system=SimpleNamespace(points=points, matrix=(), vehicle=None))
     result = what.tested(others)
-    assert "Driving system: my_controller:Pilot. Scenario: pedestrian_crossing (" in result["who"]
-    assert "NSGA-II (1 run)" in result["how"]
+    assert "Driving system: my_controller:Pilot. Scenario: pedestrian_crossing (" in result["subject"]
+    assert "NSGA-II (1 run)" in result["search"]
     assert not result["tags"]
 
 

@@ -19,15 +19,15 @@ import safevar_sumo
 from safevar_sumo.cli import study as command
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.report import input as material
+from safevar_sumo.report import input as report_input
 from safevar_sumo.report import make_report
-from safevar_sumo.report.page import gather, reproduce
+from safevar_sumo.report.page import read_inputs, reproduce
 from safevar_sumo.study import Study, load_study
 from tests.in_process import searched
 
 
 def first_command(study: Study) -> list[str]:
-    one: Any = SimpleNamespace(place=Path("its results"), point="", changed=(), case=SimpleNamespace(study=study, has_runs=True))
+    one: Any = SimpleNamespace(directory=Path("its results"), point="", changed=(), case=SimpleNamespace(study=study, has_runs=True))
     return shlex.split(reproduce([one], [])[0]["command"])
 
 
@@ -58,7 +58,7 @@ def test_any_other_study_is_carried_out_from_what_its_results_record(
 def test_every_printed_command_gives_the_numbers_of_the_page(
         slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Made from what its own printed commands print, the page is the same to the last byte; the tables' numbers are those of `tables`."""
-    monkeypatch.setattr(material, "SAMPLES", 300)
+    monkeypatch.setattr(report_input, "SAMPLES", 300)
     place = tmp_path / "results"
     shutil.copytree(slippery, place, ignore=shutil.ignore_patterns("answers"))
     page = make_report([place], jobs=2)
@@ -107,7 +107,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_all_of_it_is_of_the_point(results: Path) -> None:
-    (whole,), (there,) = gather([results]), gather([results], DAY)
+    (whole,), (there,) = read_inputs([results]), read_inputs([results], DAY)
     assert [point.name for point in whole.system.points] == [DAY, RAIN]  # type: ignore[union-attr]
     assert [point.name for point in there.system.points] == [DAY]  # type: ignore[union-attr]
     assert (there.case.solutions["f_safe"] >= whole.case.solutions["f_safe"]).all(), "elsewhere is the worst"
@@ -115,7 +115,7 @@ def test_all_of_it_is_of_the_point(results: Path) -> None:
     page = make_report([results], ["tested", "verdict", "reproduce"], jobs=1, point=DAY)
     worst = there.case.solutions["f_safe"].min()
     assert (f"collides at {-worst:.1f} m/s" if worst < 0 else f"with {worst:.2f} m to spare") in page
-    assert f"at the point {DAY} of its matrix alone" in page
+    assert f"only at the point {DAY} of its matrix" in page
 
 
 def test_its_commands_ask_about_the_point_and_a_wrong_one_is_refused(results: Path) -> None:
