@@ -58,10 +58,12 @@ class CampaignProgress:
         print_text(self._console, f"warning: {message}")
 
     def _show(self) -> None:
+        if self._quiet:
+            return
         tally = self._tally
         self._bar.update(self._task, completed=tally.done, total=tally.total, summary=tally.text(self._text_width))
         now = time.monotonic()
-        if not self._console.is_terminal and not self._quiet and now - self._last_line >= SECONDS_BETWEEN_LINES:
+        if not self._console.is_terminal and now - self._last_line >= SECONDS_BETWEEN_LINES:
             self._last_line = now
             print_text(self._console, f"{self._name}: {tally.text()}")
 

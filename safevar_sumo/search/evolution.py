@@ -29,7 +29,11 @@ MISSES = 50
 @cache
 def fitness_of(objectives: int) -> type[Any]:
     """The class of a fitness with a number of objectives, all minimised."""
-    return type("Fitness", (base.Fitness,), {"weights": (-1.0,) * objectives})
+    def set_values(self: base.Fitness, values: tuple[float, ...] = ()) -> None:
+        if values:  # DEAP's own constructor also checks the type of the weights, which takes longer than all the rest
+            self.values = values
+
+    return type("Fitness", (base.Fitness,), {"weights": (-1.0,) * objectives, "__init__": set_values})
 
 
 class Individual(list[float]):
@@ -187,10 +191,15 @@ def stand_by_crowding(individuals: Sequence[Individual]) -> list[list[Individual
     """The fronts of individuals; sets their `standing` to their rank, from 0, and minus their crowding distance."""
     ranked = fronts(individuals)
     for rank, front in enumerate(ranked):
-        tools.emo.assignCrowdingDist(front)
-        for individual in front:
-            individual.standing = rank, -individual.fitness.crowding_dist
+        stand_in_front(front, rank)
     return ranked
+
+
+def stand_in_front(front: Sequence[Individual], rank: int) -> None:
+    """Set the `standing` of a front's individuals to its rank, from 0, and minus their crowding distance."""
+    tools.emo.assignCrowdingDist(front)
+    for individual in front:
+        individual.standing = rank, -individual.fitness.crowding_dist
 
 
 def tournament(population: list[Individual], size: int = 2) -> Individual:

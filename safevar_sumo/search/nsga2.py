@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from safevar_sumo.search.base import Problem, Search
-from safevar_sumo.search.evolution import Individual, Operators, Variation, initial_population, result_of, simulated, stand_by_crowding
+from safevar_sumo.search.evolution import Individual, Operators, Variation, fronts, initial_population, result_of, simulated, stand_in_front
 
 
 class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -30,7 +30,8 @@ def survivors(individuals: list[Individual], number: int) -> list[Individual]:
     """The best `number` by rank, then by crowding distance; DEAP's `selNSGA2`, sorted by compiled code."""
     ordered = sorted(individuals, key=lambda individual: individual.fitness.wvalues, reverse=True)
     best: list[Individual] = []
-    for front in stand_by_crowding(ordered):
+    for rank, front in enumerate(fronts(ordered)):
+        stand_in_front(front, rank)
         best += sorted(front, key=lambda individual: individual.standing)
         if len(best) >= number:
             break
