@@ -24,25 +24,25 @@ STEP_DECIMALS = 6
 
 
 class Late(NamedTuple):
-    """A delay line: the delay as whole steps and a part of a step, and the past values, oldest first."""
+    """A delay line: the delay as `steps` and a `fraction` of a step, and the past values, oldest first."""
 
-    whole: int
-    part: float
+    steps: int
+    fraction: float
     past: tuple[FloatArray, ...] = ()
 
     @classmethod
     def by(cls, delay: float, step: float) -> Late:
         """The delay line for a delay [s] at a time step [s]."""
-        whole, part = divmod(round(delay / step, STEP_DECIMALS), 1)
-        return cls(int(whole), part)
+        steps, fraction = divmod(round(delay / step, STEP_DECIMALS), 1)
+        return cls(int(steps), fraction)
 
     def shown(self, now: FloatArray) -> tuple[FloatArray, Late]:
         """The values of a delay ago, linear between two steps, and the next state; before the first step the first values hold."""
-        past = (*(self.past[1:] or (now,) * (self.whole + 1)), now)
+        past = (*(self.past[1:] or (now,) * (self.steps + 1)), now)
         before, after = past[0], past[1]
-        if self.part:
+        if self.fraction:
             with np.errstate(invalid="ignore"):  # a value that appears or vanishes in between keeps its old value
-                between = after + (before - after) * self.part
+                between = after + (before - after) * self.fraction
             after = between if np.count_nonzero(finite := np.isfinite(between)) == finite.size else np.where(finite, between, before)
         return after, self._replace(past=past)
 

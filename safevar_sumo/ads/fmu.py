@@ -68,9 +68,9 @@ class FmuAds:
         if not input_ports.keys() & OBSERVED.keys():
             raise InputError(source, "ads.inputs: no observed quantity", f"some of {', '.join(OBSERVED)}")
         self._inputs, self._outputs = tuple(input_ports), tuple(output_ports)
-        taken = [port.variable.name for port in input_ports.values()]
+        mapped_names = [port.variable.name for port in input_ports.values()]
         self._instances = Instances(description, [*input_ports.values()], [*output_ports.values()],
-                                    list(fixed_of(description, parameters, taken, source, "ads.parameters")), limit)
+                                    list(fixed_of(description, parameters, mapped_names, source, "ads.parameters")), limit)
         self.most_vehicles = self._instances.most_vehicles
         if "warns" in output_ports:
             self.warns = self._warns

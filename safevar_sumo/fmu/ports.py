@@ -78,13 +78,13 @@ def ports_of(description: Description, named: Mapping[str, str], units: Mapping[
     return ports
 
 
-def fixed_of(description: Description, values: Mapping[str, Any], taken: Collection[str], source: str,
+def fixed_of(description: Description, values: Mapping[str, Any], mapped_names: Collection[str], source: str,
              key: str) -> Iterator[tuple[Variable, Any]]:
     """Parameters of an FMU that a study sets, with their values in the FMU's units; raises the errors of `ports_of`."""
     for name, value in values.items():
         variable = description.variable(name, ("parameter", "structuralParameter"), source, key, (*NUMBERS, "String"))
         if type(value) not in PYTHON_TYPES.get(variable.type, (int,)):
             raise InputError(source, f"{key}.{name} = {value!r}", f"a value of type {variable.type}")
-        if name in taken:
+        if name in mapped_names:
             raise InputError(source, f"{key}.{name}: another key of the study sets the same parameter", "each parameter once")
         yield variable, value

@@ -136,7 +136,7 @@ def _text(element: ElementTree.Element, ids: Ids) -> str:
 
 
 def _marked(element: ElementTree.Element, ids: Ids) -> ElementTree.Element:
-    attributes = {name: " ".join(copied_id(_COPY, one) for one in value.split()) if name in ids.get(element.tag, ()) else value
+    attributes = {name: " ".join(copied_id(_COPY, id_) for id_ in value.split()) if name in ids.get(element.tag, ()) else value
                   for name, value in element.attrib.items()}
     result = ElementTree.Element(element.tag, attributes)
     result.text, result.tail = element.text, element.tail

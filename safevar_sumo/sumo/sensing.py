@@ -64,7 +64,7 @@ class Sensing:
         if copy not in self._seen:
             looks, age = self._looks[copy], self._age[copy]
             late = _between(looks, age) if age > 0 else self._look(copy)
-            self._seen[copy] = self._within_reach(late, copy)
+            self._seen[copy] = self._within_range(late, copy)
         return self._seen[copy]
 
     def _look(self, copy: int) -> Look:
@@ -90,7 +90,7 @@ class Sensing:
                     names[copy][kind].append(name)
         return names
 
-    def _within_reach(self, look: Look, copy: int) -> Look:
+    def _within_range(self, look: Look, copy: int) -> Look:
         """The observation without actors beyond the range, and with distances scaled as the sensors measure them."""
         reach, scale = float(self._sensors.reach[copy]), float(self._sensors.scale[copy])
         if not look.own or (reach == math.inf and scale == 1):
@@ -136,26 +136,26 @@ def _scaled(values: Values, own: Values, scale: float) -> Values:
 
 def _between(looks: deque[Look], age: float) -> Look:
     """The observation `age` steps ago, interpolated linearly between two steps; before the first step the first one holds."""
-    whole, part = divmod(age, 1)
+    steps, fraction = divmod(age, 1)
     newest = len(looks) - 1
-    after, before = looks[max(newest - int(whole), 0)], looks[max(newest - int(whole) - 1, 0)]
-    if not part or after is before or not after.own:
+    after, before = looks[max(newest - int(steps), 0)], looks[max(newest - int(steps) - 1, 0)]
+    if not fraction or after is before or not after.own:
         return after
-    others = {kind: {name: _mixed(after.others(kind).get(name, values), values, part) for name, values in before.others(kind).items()}
-              for kind in SENSED}
+    others = {kind: {name: _interpolated(after.others(kind).get(name, values), values, fraction)
+                     for name, values in before.others(kind).items()} for kind in SENSED}
     same = after.leader and before.leader and after.leader[0] == before.leader[0]
-    leader = (before.leader[0], _linear(after.leader[1], before.leader[1], part)) if same else before.leader  # type: ignore[index]
-    return Look(_mixed(after.own, before.own, part), others["vehicle"], others["person"], leader)
+    leader = (before.leader[0], _linear(after.leader[1], before.leader[1], fraction)) if same else before.leader  # type: ignore[index]
+    return Look(_interpolated(after.own, before.own, fraction), others["vehicle"], others["person"], leader)
 
 
-def _mixed(after: Values, before: Values, part: float) -> Values:
+def _interpolated(after: Values, before: Values, fraction: float) -> Values:
     steady = STEADY if after["getLaneID"] == before["getLaneID"] else (*STEADY, "getLanePosition", "getLateralLanePosition")
-    return {name: old if name in steady else _linear(after[name], old, part) for name, old in before.items()}
+    return {name: old if name in steady else _linear(after[name], old, fraction) for name, old in before.items()}
 
 
-def _linear(after: Any, before: Any, part: float) -> Any:
+def _linear(after: Any, before: Any, fraction: float) -> Any:
     if isinstance(before, float):
-        return after + (before - after) * part
+        return after + (before - after) * fraction
     if isinstance(before, tuple):
-        return tuple(_linear(new, old, part) for new, old in zip(after, before, strict=True))
+        return tuple(_linear(new, old, fraction) for new, old in zip(after, before, strict=True))
     return before

@@ -69,15 +69,15 @@ def check_options(file: Path) -> None:
     InputError
         Naming the file and the option.
     """
-    given = options_of(file)
-    for name in given:
+    options = options_of(file)
+    for name in options:
         if not SIMULATING.fullmatch(name):
             raise InputError(file, f"sets SUMO's option {name!r}", "options that write no file, open no socket and draw nothing at random, "
                              "such as step-length, collision.* and pedestrian.*")
     for name in ("net-file", "gui-settings-file"):
-        own_files(file, name, given.get(name, ""))
-    if given.get("route-files", TRAFFIC) != TRAFFIC:
-        raise InputError(file, f"route-files = {given['route-files']!r}", f"{TRAFFIC}, all traffic in one file")
+        own_files(file, name, options.get(name, ""))
+    if options.get("route-files", TRAFFIC) != TRAFFIC:
+        raise InputError(file, f"route-files = {options['route-files']!r}", f"{TRAFFIC}, all traffic in one file")
 
 
 def recipe_of(file: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, str], str]:
@@ -89,8 +89,8 @@ def recipe_of(file: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, str], s
         Naming the file and the illegal option.
     """
     sources, options = dict[str, tuple[str, ...]](), dict[str, str]()
-    given = options_of(file)
-    for name, value in given.items():
+    configured = options_of(file)
+    for name, value in configured.items():
         if name in SOURCES:
             sources[name] = own_files(file, name, value)
         elif BUILDING.fullmatch(name):
@@ -98,7 +98,7 @@ def recipe_of(file: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, str], s
         elif not IGNORED.fullmatch(name):
             raise InputError(file, f"sets netconvert's option {name!r}", f"options that shape the network, such as junctions.*, tls.* and "
                              f"no-turnarounds, and its sources: {', '.join(SOURCES)}")
-    return sources, options, given.get("output-file", "")
+    return sources, options, configured.get("output-file", "")
 
 
 def own_files(file: Path, name: str, value: str) -> tuple[str, ...]:

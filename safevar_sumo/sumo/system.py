@@ -68,14 +68,14 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
         If a record does not exist or is invalid, or its name is taken.
     """
     metrics, members = {**METRICS, **({RATING_POINTS.name: RATING_POINTS} if is_rated(study) else {})}, list[Member]()
-    known = dict(metrics)
+    default_metrics = dict(metrics)
     changes = {name: change for name, change in CHANGES.items() if name not in RESERVED}
     by_name: dict[str, Metric | Change] = {}
 
     def add(name: str, key: str) -> Metric | Change:
         if name in by_name:
             return by_name[name]
-        own = {**known, **FURTHER, **({**CHANGES, **BY_OBJECTIVE} if key == OBJECTIVES else {})}
+        own = {**default_metrics, **FURTHER, **({**CHANGES, **BY_OBJECTIVE} if key == OBJECTIVES else {})}
         member = lookup.find(own, name, key)
         if member.guard is None:
             if name in FURTHER:
@@ -305,19 +305,19 @@ def _with_network(scenario: Any, places: Sequence[str]) -> Any:
 
 
 def _check_units(study: Study, vehicle: Vehicle, is_shipped_model: bool, source: str) -> None:
-    given, known = study.vehicle.characteristics, vehicle.UNITS
-    for name in given:
+    table, units = study.vehicle.characteristics, vehicle.UNITS
+    for name in table:
         if name in RESERVED:
             raise InputError(source, f"vehicle.characteristics.{name}: the name is a column of results", f"none of {', '.join(RESERVED)}")
-        if name not in known:
-            raise unknown(source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", name, known)
-        if given[name].unit != known[name]:
-            raise InputError(source, f"vehicle.characteristics.{name}.unit = {given[name].unit!r}", repr(known[name]))
-        if is_shipped_model and given[name].lower <= 0:
-            raise InputError(source, f"vehicle.characteristics.{name}.lower = {given[name].lower}", "a value above 0")
-    for name in known:
-        if name not in given:
-            raise InputError(source, f"vehicle.characteristics.{name} is missing", f"all of {', '.join(known)}")
+        if name not in units:
+            raise unknown(source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", name, units)
+        if table[name].unit != units[name]:
+            raise InputError(source, f"vehicle.characteristics.{name}.unit = {table[name].unit!r}", repr(units[name]))
+        if is_shipped_model and table[name].lower <= 0:
+            raise InputError(source, f"vehicle.characteristics.{name}.lower = {table[name].lower}", "a value above 0")
+    for name in units:
+        if name not in table:
+            raise InputError(source, f"vehicle.characteristics.{name} is missing", f"all of {', '.join(units)}")
 
 
 def _vehicle(choice: VehicleTable, lookup: Lookup, limit: float) -> tuple[Vehicle, Member]:

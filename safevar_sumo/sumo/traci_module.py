@@ -95,16 +95,16 @@ class Subscriptions:
                 for variable, more in variables.items()}
 
 
-def _variables(domain: str, given: Any, parameters: Any) -> dict[int, tuple[Any, ...]]:
+def _variables(domain: str, requested: Any, parameters: Any) -> dict[int, tuple[Any, ...]]:
     """Further arguments of the functions for variables, by variable."""
     known = {_constant(name): name for name in VARIABLES}
     default = ("VAR_TIME",) if domain == "simulation" else DEFAULT
-    chosen = [*map(_constant, default)] if given is None else list(given)
+    chosen = [*map(_constant, default)] if requested is None else list(requested)
     for variable in chosen:
         if variable not in known:
             raise InputError(f"traci.{domain}.subscribe", f"variable {variable!r}", f"traci.constants.{', '.join(VARIABLES)}")
-    more = {variable: value[1:] if isinstance(value, tuple) else (value,) for variable, value in (parameters or {}).items()}
-    return {variable: more.get(variable, ()) for variable in chosen}
+    arguments = {variable: value[1:] if isinstance(value, tuple) else (value,) for variable, value in (parameters or {}).items()}
+    return {variable: arguments.get(variable, ()) for variable in chosen}
 
 
 def _constant(name: str) -> int:

@@ -133,10 +133,10 @@ class FmuVehicle:
 
     def _units(self, description: Description, name: str, unit: str, wanted: str, key: str) -> tuple[Unit, Unit]:
         """The units of a characteristic that sets a quantity, and of the quantity."""
-        given = description.units.get(unit) or USUAL.get(unit)
-        if given is None or not given.fits(SI[wanted]):
+        defined = description.units.get(unit) or USUAL.get(unit)
+        if defined is None or not defined.fits(SI[wanted]):
             raise InputError(self._guard.source, f"{key} = {name!r}: the unit of that characteristic is {unit!r}", f"a unit of {wanted}")
-        return given, SI[wanted]
+        return defined, SI[wanted]
 
     def prepare(self, characteristics: Characteristics, road_friction: float | FloatArray, step: float, slope: Slope = LEVEL,
                 wet: bool | BoolArray = False) -> _Prepared:
