@@ -71,14 +71,14 @@ def first_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
-def unknown(source: object, problem: str, given: object, names: Iterable[str], otherwise: str = "") -> InputError:
+def unknown(source: object, problem: str, name: object, names: Iterable[str], otherwise: str = "") -> InputError:
     """The error for an unknown name: it suggests the nearest known name and lists all of them.
 
     Parameters
     ----------
     source, problem
         As in `InputError`.
-    given
+    name
         The name that the user gave.
     names
         The known names.
@@ -86,13 +86,13 @@ def unknown(source: object, problem: str, given: object, names: Iterable[str], o
         What is accepted besides the names.
     """
     options = list(names)
-    return InputError(source, f"{problem}{did_you_mean(given, options)}", f"{one_of(options)}{otherwise}")
+    return InputError(source, f"{problem}{did_you_mean(name, options)}", f"{one_of(options)}{otherwise}")
 
 
-def did_you_mean(given: object, names: Iterable[str]) -> str:
+def did_you_mean(name: object, names: Iterable[str]) -> str:
     """`; did you mean 'rain'?` with the nearest name, upper and lower case ignored; empty if no name is near."""
-    by_lower = {name.lower(): name for name in names}
-    near = get_close_matches(str(given).lower(), by_lower, n=1)
+    by_lower = {known.lower(): known for known in names}
+    near = get_close_matches(str(name).lower(), by_lower, n=1)
     return f"; did you mean {by_lower[near[0]]!r}?" if near else ""
 
 

@@ -130,7 +130,7 @@ def open_pool(study: Study, jobs: int | None = None, cluster: str | None = None)
 
 
 def _observer(progress: bool | Progress | Observer, study: Study, keys: list[RunKey]) -> AbstractContextManager[Observer]:
-    """The observer that `progress` stands for."""
+    """The observer for a value of `progress`."""
     if progress is True:
         return CampaignProgress(Console(stderr=True), study, keys, quiet=False)
     if progress is False:

@@ -42,7 +42,7 @@ from safevar_sumo.reference import (
 from safevar_sumo.reference.effects import LEAST as LEAST_EFFECT
 from safevar_sumo.reference.effects import SHARE as EFFECT_SHARE
 from safevar_sumo.reference.profiles import plot_profiles
-from safevar_sumo.reference.replication import Nearness, nearness, paired, replication
+from safevar_sumo.reference.replication import Nearness, nearness, pair_cases, replication
 from safevar_sumo.results import write_imported, write_whole
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, load_study, study_names, write_study
 from safevar_sumo.sumo.system import assemble
@@ -209,10 +209,10 @@ def _owner(word: str, studies: Sequence[Study]) -> tuple[int, Path]:
 @click.option("--safe-fuzzer", type=click.Path(path_type=Path), metavar="FILE.csv", help="Solutions of SafeFuzzer.")
 @click.option("--original", metavar="sd=2.7,tet=1.2,tit=0.44,ave_dece=5.97",
               help="The original vehicle's metrics.  [default: those published for STUDY]")
-def import_command(study: str, out: Path, original: str | None, **given: Path | None) -> None:
+def import_command(study: str, out: Path, original: str | None, **paths: Path | None) -> None:
     """Import published CSV solutions of STUDY as a results directory, or add another algorithm's solutions to it."""
     chosen = load_study(study)
-    files = {algorithm: path for algorithm, path in given.items() if path is not None}
+    files = {algorithm: path for algorithm, path in paths.items() if path is not None}
     if not files:
         raise InputError("import", "no file is given", "at least one of --nsga2, --rs, --safe-fuzzer")
     adds = original is None and (out / "manifest.json").exists()
@@ -275,7 +275,7 @@ def replicate(directories: tuple[str, ...], published: tuple[str, ...], out: Pat
     for directory in published:
         if Path(directory).resolve() in [Path(other).resolve() for other in directories]:
             raise InputError("--published", f"{directory} is given as results too", "results that the command import has written")
-    pairs = paired(load_cases(directories), load_cases(published))
+    pairs = pair_cases(load_cases(directories), load_cases(published))
     page = replication(pairs, _nearness(pairs.here, references))
     if out is None:
         click.echo(page, nl=False)

@@ -234,12 +234,12 @@ def _print_setting(console: Console, simulation: Simulation) -> None:
 
 
 def _compared_with_original(simulation: Simulation) -> str:
-    here, there = simulation.metrics[SAFETY_DEGREE], simulation.original.metrics[SAFETY_DEGREE]
-    if np.isnan(here) or np.isnan(there):
+    degree, original = simulation.metrics[SAFETY_DEGREE], simulation.original.metrics[SAFETY_DEGREE]
+    if np.isnan(degree) or np.isnan(original):
         return "whether that is less safe cannot be decided"
-    if here == there:
+    if degree == original:
         return "as safe as the original"
-    return f"{'less safe' if here < there else 'safer'} than the original, SD {here:.2f} against {there:.2f}"
+    return f"{'less safe' if degree < original else 'safer'} than the original, SD {degree:.2f} against {original:.2f}"
 
 
 def print_sweep(console: Console, study: Study, names: Sequence[str], original: Evaluations, variants: Evaluations) -> None:

@@ -168,7 +168,7 @@ def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[
     if staged or not from_scratch:
         searches.append(search.begin(trial.shares(start), NEAR, fit.seed + 1))
     search.race(searches)
-    assert search.best is not None, "there is a trial at least"
+    assert search.best is not None, "there is at least one trial"
     reached, results = [one.lowest for one in searches if one.lowest < np.inf], []
     profiles = Profiles.of(free, trial, search, trial.shares(search.best))
     for k, best in enumerate(search.best):
@@ -205,7 +205,7 @@ def _by_stages(subjects: Sequence[Subject], free: Sequence[Free], used: Sequence
             trial = _Trial(parameters, [_Fitted(studies[k], data, pool) for k, data in zip(indices, thinned, strict=True)])
             search = Search(trial, fit.population, trials, partial(_done_with_some, done, studies, indices))
             search.race(search.from_random_places(_first_of_key(parameters), fit.starts, fit.screened, fit.width, rng))
-            assert search.best is not None, "there is a trial at least"
+            assert search.best is not None, "there is at least one trial"
             studies, trials_left = _replaced(studies, indices, search.best), trials_left - trials
             values = [(one, value_of(studies[0], one.key)) for one in free if 0 in one.studies]
             studies = tuple(with_values(study, {one.key: value for one, value in values if k in one.studies})

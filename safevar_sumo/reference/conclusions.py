@@ -15,7 +15,7 @@ from safevar_sumo.analysis.research_questions.comparisons import ALPHA, magnitud
 from safevar_sumo.errors import InputError
 from safevar_sumo.reference.validation import rank_correlation
 
-HERE, THERE = "here", "published"
+HERE, PUBLISHED = "here", "published"
 KEYS: Mapping[str, Sequence[str]] = {
     "rq1": ("setting", "algorithm", "metric"), "rq2": ("setting", "baseline", "metric"), "rq3.1": ("setting", "j"),
     "rq3.2": ("setting", "characteristic", "j"), "rq3.3": ("setting", "characteristic", "direction", "j"),
@@ -29,12 +29,12 @@ class Pairs(NamedTuple):
     """Cases of the same studies on both sides, and names of studies that only one side has."""
 
     here: list[Case]
-    there: list[Case]
+    published: list[Case]
     only_here: list[str]
-    only_there: list[str]
+    only_published: list[str]
 
 
-class Beside(NamedTuple):
+class ComparedTable(NamedTuple):
     """A table of both sides: key columns, then two columns for each quantity; and notes."""
 
     name: str
@@ -43,7 +43,7 @@ class Beside(NamedTuple):
     notes: list[str]
 
 
-def paired(here: Sequence[Case], there: Sequence[Case]) -> Pairs:
+def pair_cases(here: Sequence[Case], published: Sequence[Case]) -> Pairs:
     """Match cases by their studies' names.
 
     Raises
@@ -51,7 +51,7 @@ def paired(here: Sequence[Case], there: Sequence[Case]) -> Pairs:
     InputError
         If a side has two results of one study, or no study is on both.
     """
-    sides = [_by_study(here, "directories"), _by_study(there, "published")]
+    sides = [_by_study(here, "directories"), _by_study(published, "published")]
     common = [name for name in sides[0] if name in sides[1]]
     if not common:
         raise InputError("published", f"has {', '.join(sides[1])} and none of {', '.join(sides[0])}",
@@ -59,7 +59,7 @@ def paired(here: Sequence[Case], there: Sequence[Case]) -> Pairs:
     for name in common:
         one, other = (side[name].characteristics for side in sides)
         if one.names != other.names or not np.array_equal(one.original, other.original):
-            raise InputError("published", f"{name} has another vehicle there", "results of the same study")
+            raise InputError("published", f"{name} has another vehicle in the published results", "results of the same study")
     cases = [[side[name] for name in common] for side in sides]
     alone = [[name for name in side if name not in common] for side in sides]
     return Pairs(cases[0], cases[1], alone[0], alone[1])
@@ -74,23 +74,23 @@ def _by_study(cases: Sequence[Case], flag: str) -> dict[str, Case]:
     return by_study
 
 
-def tables_beside(pairs: Pairs) -> list[Beside]:
+def compared_tables(pairs: Pairs) -> list[ComparedTable]:
     """Every table of the research questions with both sides."""
-    sides = [{one.name: one for one in answer(cases)} for cases in (pairs.here, pairs.there)]
+    sides = [{one.name: one for one in answer(cases)} for cases in (pairs.here, pairs.published)]
     tables = []
     for name, keys in KEYS.items():
         answers = [side.get(name, Answer(name, pd.DataFrame(), ())) for side in sides]  # a table that is missing has no footer
         frames = [_shares(cases) for cases in pairs[:2]] if name == "rq3.1" else [one.frame for one in answers]
-        notes = [f"{side}: {note}" for side, one in zip((HERE, THERE), answers, strict=True) for note in one.notes]
+        notes = [f"{side}: {note}" for side, one in zip((HERE, PUBLISHED), answers, strict=True) for note in one.notes]
         frames = [_with_ranks(frame) for frame in frames]
         if any(frame.empty for frame in frames):
-            empty = [side for side, frame in zip((HERE, THERE), frames, strict=True) if frame.empty]
-            tables.append(Beside(name, pd.DataFrame(), [], [*notes, f"No table: nothing to show {' and '.join(empty)}."]))
+            empty = [side for side, frame in zip((HERE, PUBLISHED), frames, strict=True) if frame.empty]
+            tables.append(ComparedTable(name, pd.DataFrame(), [], [*notes, f"No table: nothing to show {' and '.join(empty)}."]))
             continue
         quantities = [str(column) for column in frames[0] if column not in (*keys, *NOT_COMPARED) and column in frames[1]]
         both = frames[0][[*keys, *quantities]].merge(frames[1][[*keys, *quantities]], on=list(keys), how="outer", sort=False,
-                                                     suffixes=(f" {HERE}", f" {THERE}"))
-        tables.append(Beside(name, both, quantities, notes))
+                                                     suffixes=(f" {HERE}", f" {PUBLISHED}"))
+        tables.append(ComparedTable(name, both, quantities, notes))
     return tables
 
 
@@ -146,7 +146,7 @@ class Conclusion(NamedTuple):
     why: str
 
 
-def conclusions(tables: Sequence[Beside]) -> list[Conclusion]:
+def conclusions(tables: Sequence[ComparedTable]) -> list[Conclusion]:
     """All published conclusions, in the order of the questions."""
     return [one for table in tables if not table.frame.empty for one in READERS[table.name](table.frame)]
 
@@ -155,15 +155,15 @@ def _tests(question: str, subject_column: str, directions: str) -> Any:
     def read(frame: pd.DataFrame) -> Iterator[Conclusion]:
         for row in frame.to_dict("records"):
             (effect, p), (published, published_p) = (
-                (_number(row[f"effect_size {side}"]), _number(row[f"p_value {side}"])) for side in (HERE, THERE))
+                (_number(row[f"effect_size {side}"]), _number(row[f"p_value {side}"])) for side in (HERE, PUBLISHED))
             subject = f"{ALGORITHM_TITLES.get(row[subject_column], row[subject_column])}, {row['metric']}"
             if effect is None or published is None or p is None or published_p is None:
-                yield Conclusion(question, row["setting"], subject, OPEN, f"no test {HERE if effect is None else THERE}")
+                yield Conclusion(question, row["setting"], subject, OPEN, f"no test {HERE if effect is None else PUBLISHED}")
                 continue
             words = f"{subject}: {_difference(published, published_p, directions)}"
             yield Conclusion(question, row["setting"], words, grade(effect, p, published, published_p),
                              f"effect size {effect:.2f} here ({row[f'magnitude {HERE}']}, p {p:.2g}), {published:.2f} published "
-                             f"({row[f'magnitude {THERE}']}, p {published_p:.2g})")
+                             f"({row[f'magnitude {PUBLISHED}']}, p {published_p:.2g})")
     return read
 
 
@@ -186,7 +186,7 @@ def _difference(effect: float, p: float, directions: str) -> str:
 
 def _numbers(frame: pd.DataFrame) -> Iterator[Conclusion]:
     for setting, rows in frame.groupby("setting", sort=False):
-        sides = [rows[f"percent {side}"].fillna(0).to_numpy(dtype=float) for side in (HERE, THERE)]
+        sides = [rows[f"percent {side}"].fillna(0).to_numpy(dtype=float) for side in (HERE, PUBLISHED)]
         if not all(side.sum() for side in sides):
             continue
         number = rows["j"].astype(int).to_numpy()
@@ -198,23 +198,23 @@ def _numbers(frame: pd.DataFrame) -> Iterator[Conclusion]:
 
 def _orders(frame: pd.DataFrame) -> Iterator[Conclusion]:
     for setting, rows in frame[frame["j"] == "any"].groupby("setting", sort=False):
-        both = rows.dropna(subset=[f"percent {HERE}", f"percent {THERE}"])
+        both = rows.dropna(subset=[f"percent {HERE}", f"percent {PUBLISHED}"])
         if both.empty:
             continue
-        first = both.sort_values(f"percent {THERE}", ascending=False, kind="stable")["characteristic"].head(3)
+        first = both.sort_values(f"percent {PUBLISHED}", ascending=False, kind="stable")["characteristic"].head(3)
         first_here = both.sort_values(f"percent {HERE}", ascending=False, kind="stable")["characteristic"].head(3)
         yield _by_rank("RQ3.2", str(setting), f"changed most often: {', '.join(first)}", both, "percent", f"; here {', '.join(first_here)}")
 
 
 def _weather(frame: pd.DataFrame) -> Iterator[Conclusion]:
     for (setting, other), rows in frame.groupby(["setting", "other"], sort=False):
-        both = rows.dropna(subset=[f"difference {HERE}", f"difference {THERE}"])
+        both = rows.dropna(subset=[f"difference {HERE}", f"difference {PUBLISHED}"])
         yield _by_rank("weather", f"{setting}, {other}", "how much more often each characteristic is changed in the worse weather",
                        both, "difference", "")
 
 
 def _by_rank(question: str, setting: str, words: str, both: pd.DataFrame, column: str, more: str) -> Conclusion:
-    rho = rank_correlation(*(both[f"{column} {side}"].to_numpy(dtype=float) for side in (HERE, THERE)))
+    rho = rank_correlation(*(both[f"{column} {side}"].to_numpy(dtype=float) for side in (HERE, PUBLISHED)))
     verdict = OPEN if rho is None else HOLDS if rho >= CLOSE else DIRECTION if rho >= ALIKE else DIFFERS
     return Conclusion(question, setting, words, verdict, ("no rank correlation" if rho is None else f"rank correlation {rho:.2f}") + more)
 
@@ -222,12 +222,12 @@ def _by_rank(question: str, setting: str, words: str, both: pd.DataFrame, column
 def _directions(frame: pd.DataFrame) -> Iterator[Conclusion]:
     for setting, rows in frame[frame["j"] == "any"].groupby("setting", sort=False):
         leaning = {}
-        for side in (HERE, THERE):
+        for side in (HERE, PUBLISHED):
             counts = rows.pivot_table(index="characteristic", columns="direction", values=f"n {side}", aggfunc="sum", sort=False)
             both = (counts["increase"] + counts["decrease"]).replace(0, np.nan)
             leaning[side] = ((counts["increase"] - counts["decrease"]) / both).astype(float)
-        clear = leaning[THERE].abs() >= LEANING
-        same = np.sign(leaning[HERE][clear]) == np.sign(leaning[THERE][clear])
+        clear = leaning[PUBLISHED].abs() >= LEANING
+        same = np.sign(leaning[HERE][clear]) == np.sign(leaning[PUBLISHED][clear])
         if not len(same):
             continue
         share = float(same.mean())
@@ -241,30 +241,31 @@ def _ratios(question: str, subject_column: str, value: str, words: str) -> Any:
     def read(frame: pd.DataFrame) -> Iterator[Conclusion]:
         rows = frame[frame["j"] == "any"] if "j" in frame else frame
         for row in rows.to_dict("records"):
-            here, there = (_number(row[f"{value} {side}"]) for side in (HERE, THERE))
+            here, published = (_number(row[f"{value} {side}"]) for side in (HERE, PUBLISHED))
             subject = f"{ALGORITHM_TITLES.get(row[subject_column], row[subject_column])}: {words}"
-            if here is None or there is None:
-                missing = " and ".join(side for side, number in ((HERE, here), (THERE, there)) if number is None)
+            if here is None or published is None:
+                missing = " and ".join(side for side, number in ((HERE, here), (PUBLISHED, published)) if number is None)
                 yield Conclusion(question, row["setting"], subject, OPEN, f"no value {missing}")
                 continue
-            yield Conclusion(question, row["setting"], subject, _ratio(here, there), f"{here:.3g} here, {there:.3g} published")
+            yield Conclusion(question, row["setting"], subject, _ratio(here, published), f"{here:.3g} here, {published:.3g} published")
     return read
 
 
-def _ratio(here: float, there: float) -> str:
-    if here == there or (here * there > 0 and 1 / FACTOR <= here / there <= FACTOR):
+def _ratio(here: float, published: float) -> str:
+    if here == published or (here * published > 0 and 1 / FACTOR <= here / published <= FACTOR):
         return HOLDS
-    return DIRECTION if here * there > 0 else DIFFERS
+    return DIRECTION if here * published > 0 else DIFFERS
 
 
 def _combinations(frame: pd.DataFrame) -> Iterator[Conclusion]:
     for setting, rows in frame.groupby("setting", sort=False):
-        here, there = (rows.sort_values("place")[f"characteristics {side}"].dropna().tolist() for side in (HERE, THERE))
-        if not here or not there:
+        here, published = (rows.sort_values("place")[f"characteristics {side}"].dropna().tolist() for side in (HERE, PUBLISHED))
+        if not here or not published:
             continue
-        shared = len(set(here[0].split(", ")) & set(there[0].split(", ")))
-        verdict = HOLDS if here[0] == there[0] else DIRECTION if there[0] in here or here[0] in there or shared >= 3 else DIFFERS
-        yield Conclusion("combinations", str(setting), f"the four most often changed together: {there[0]}", verdict,
+        shared = len(set(here[0].split(", ")) & set(published[0].split(", ")))
+        similar = published[0] in here or here[0] in published or shared >= 3
+        verdict = HOLDS if here[0] == published[0] else DIRECTION if similar else DIFFERS
+        yield Conclusion("combinations", str(setting), f"the four most often changed together: {published[0]}", verdict,
                          f"here {here[0]}; {shared} of four the same")
 
 

@@ -100,17 +100,17 @@ def covered_by_spread(data: ReferenceData, study: Study) -> Coverage:
     """
     evaluations = evaluations_of_sets(study, data.settings)
     lower, upper = band_of(study, evaluations)
-    there = data.metrics[SAFETY_DEGREE]
-    outside = _outside(there, lower, upper)
-    held_back = np.arange(len(there)) % study.fit.hold_out == study.fit.hold_out - 1
-    chosen = held_back if held_back.any() else np.ones(len(there), dtype=bool)
-    return Coverage(len(evaluations), len(there), float(np.mean(outside == 0)), float(np.mean(outside[chosen] == 0)),
+    published = data.metrics[SAFETY_DEGREE]
+    outside = _outside(published, lower, upper)
+    held_back = np.arange(len(published)) % study.fit.hold_out == study.fit.hold_out - 1
+    chosen = held_back if held_back.any() else np.ones(len(published), dtype=bool)
+    return Coverage(len(evaluations), len(published), float(np.mean(outside == 0)), float(np.mean(outside[chosen] == 0)),
                     float(np.median(upper - lower)), float(np.quantile(outside[chosen], BAND)))
 
 
-def _outside(there: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
+def _outside(values: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
     """Distance of values from a band; zero inside it."""
-    return np.asarray(np.maximum(np.maximum(lower - there, there - upper), 0.0))
+    return np.asarray(np.maximum(np.maximum(lower - values, values - upper), 0.0))
 
 
 def error_beyond_spread(study: Study, references: Mapping[str, ReferenceData]) -> float:
@@ -121,11 +121,11 @@ def error_beyond_spread(study: Study, references: Mapping[str, ReferenceData]) -
     bare = msgspec.structs.replace(study, model_error={})
     scores, weights = [], []
     for data in references.values():
-        distances, there = distance(study, data.settings), data.metrics[SAFETY_DEGREE]
-        used = (distances > 0) & np.isfinite(there)
+        distances, published = distance(study, data.settings), data.metrics[SAFETY_DEGREE]
+        used = (distances > 0) & np.isfinite(published)
         if used.any():
             lower, upper = band_of(bare, evaluations_of_sets(bare, data.settings[used]))
-            scores.append(_outside(there[used], lower, upper) / distances[used])
+            scores.append(_outside(published[used], lower, upper) / distances[used])
             weights.append(np.full(len(scores[-1]), 1 / len(scores[-1])))
     if not scores:
         return 0.0

@@ -18,14 +18,14 @@ from safevar_sumo.reference.conclusions import (
     HERE,
     HOLDS,
     OPEN,
+    PUBLISHED,
     RULES,
-    THERE,
-    Beside,
+    ComparedTable,
     Conclusion,
     Pairs,
+    compared_tables,
     conclusions,
-    paired,
-    tables_beside,
+    pair_cases,
 )
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.study import SAFETY_DEGREE
@@ -37,7 +37,7 @@ class Nearness(NamedTuple):
     """Solutions of one algorithm and the published rows nearest to each.
 
     Distances are Euclidean in widths of the domains, medians over the five nearest: `distance` from solutions to
-    published rows, `distance_there` between published rows. Safety degrees are means [m, -m/s]; `also_collide` is the share of
+    published rows, `distance_published` between published rows. Safety degrees are means [m, -m/s]; `also_collide` is the share of
     collisions among the rows next to solutions that collide.
     """
 
@@ -45,9 +45,9 @@ class Nearness(NamedTuple):
     algorithm: str
     solutions: int
     distance: float
-    distance_there: float
+    distance_published: float
     safety_here: float
-    safety_there: float
+    safety_published: float
     collisions: int
     also_collide: float | None
 
@@ -88,7 +88,7 @@ NOT_COMPARED = "; RQ2, RQ3 and the weathers need them and are not compared"
 
 def replication(pairs: Pairs, near: Sequence[Nearness]) -> str:
     """The page, as Markdown."""
-    tables = tables_beside(pairs)
+    tables = compared_tables(pairs)
     verdicts = conclusions(tables)
     parts = [_head(pairs, verdicts), _conclusions(verdicts)]
     if near:
@@ -100,14 +100,14 @@ def _head(pairs: Pairs, verdicts: Sequence[Conclusion]) -> str:
     counts = Counter(one.verdict for one in verdicts)
     summary = ", ".join(f"{counts[verdict]} {words}" for verdict, words in COUNTED.items())
     lines = ["# Does the published study replicate?", "", f"Of {len(verdicts)} conclusions: {summary}.", ""]
-    for here, there in zip(pairs.here, pairs.there, strict=True):
-        sizes = f"{_solutions(here.solutions)} here, {_solutions(there.solutions)} published"
+    for here, published in zip(pairs.here, pairs.published, strict=True):
+        sizes = f"{_solutions(here.solutions)} here, {_solutions(published.solutions)} published"
         lines.append(f"- {here.study.title} ({here.study.name}): {sizes}.")
     lines += [f"- {name}: results here, none published given." for name in pairs.only_here]
-    lines += [f"- {name}: published results given, none here." for name in pairs.only_there]
-    for here, there in zip(pairs.here, pairs.there, strict=True):
+    lines += [f"- {name}: published results given, none here." for name in pairs.only_published]
+    for here, published in zip(pairs.here, pairs.published, strict=True):
         lines += [f"- {here.study.name}: no solutions of {name} {side}{NOT_COMPARED if name == NSGA2 else ''}."
-                  for side, one, other in ((THERE, here, there), (HERE, there, here))
+                  for side, one, other in ((PUBLISHED, here, published), (HERE, published, here))
                   for name in one.algorithms if name not in other.algorithms]
     lines += [f"- {note}" for case in pairs.here for note in case.remarks]
     return "\n".join([*lines, ""])
@@ -125,30 +125,30 @@ def _conclusions(verdicts: Sequence[Conclusion]) -> str:
 
 
 def _nearest_rows(near: Sequence[Nearness]) -> str:
-    rows = [(one.setting, one.algorithm, one.solutions, one.distance, one.distance_there, one.safety_here, one.safety_there,
+    rows = [(one.setting, one.algorithm, one.solutions, one.distance, one.distance_published, one.safety_here, one.safety_published,
              one.collisions, None if one.also_collide is None else 100 * one.also_collide) for one in near]
     heads = ("setting", "algorithm", "solutions", "distance to published rows", "distance among published rows", "mean SD here",
-             "mean SD there", "collisions here", "published rows next to them that collide [%]")
+             "mean SD published", "collisions here", "published rows next to them that collide [%]")
     return "\n".join([
         "## Does the search exploit the model?", "",
         f"Each solution beside its {NEIGHBOURS} nearest published rows; distances are medians, in widths of the domains. If the search "
         "found holes in the model, the published rows next to its solutions would be as safe as others.", "", _markdown(heads, rows), ""])
 
 
-def _side_by_side(table: Beside) -> str:
+def _side_by_side(table: ComparedTable) -> str:
     lines = [f"### {TITLES[table.name]}", ""]
     if not table.frame.empty:
         keys = [column for column in table.frame if column not in _pairs(table.quantities)]
-        heads = [*map(str, keys), *(f"{name} {HERE} / {THERE}" for name in table.quantities)]
+        heads = [*map(str, keys), *(f"{name} {HERE} / {PUBLISHED}" for name in table.quantities)]
         rows = [(*(row[key] for key in keys),
-                 *(" / ".join(_cell(row[f"{name} {side}"]) for side in (HERE, THERE)) for name in table.quantities))
+                 *(" / ".join(_cell(row[f"{name} {side}"]) for side in (HERE, PUBLISHED)) for name in table.quantities))
                 for row in table.frame.to_dict("records")]
         lines += [_markdown(heads, rows), ""]
     return "\n".join([*lines, *(f"{note}  " for note in table.notes), ""])
 
 
 def _pairs(quantities: Iterable[str]) -> set[str]:
-    return {f"{name} {side}" for name in quantities for side in (HERE, THERE)}
+    return {f"{name} {side}" for name in quantities for side in (HERE, PUBLISHED)}
 
 
 def _markdown(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -162,4 +162,4 @@ def _cell(value: object) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value).replace("|", r"\|").replace("\n", " ")
 
 
-__all__ = ["paired", "replication"]
+__all__ = ["pair_cases", "replication"]

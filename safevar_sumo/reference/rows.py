@@ -176,23 +176,23 @@ def evaluations_of(data: ReferenceData, characteristics: CharacteristicSet) -> E
         f_diff=characteristics.largest_change(data.settings), f_num_diff=characteristics.number_changed(data.settings))
 
 
-def original_metrics(given: str | None, published: Mapping[str, float]) -> dict[str, float | None]:
+def original_metrics(text: str | None, published: Mapping[str, float]) -> dict[str, float | None]:
     """The original vehicle's metrics, as given (sd=2.7,tet=1.2,...) or else as published; None where neither has a value.
 
     Raises
     ------
     InputError
-        If `given` has another form, or neither has a safety degree.
+        If `text` has another form, or neither has a safety degree.
     """
     original: dict[str, float | None] = {name: published.get(name) for name in METRICS}
-    for part in given.split(",") if given is not None else ():
-        name, _, text = (word.strip() for word in part.partition("="))
+    for part in text.split(",") if text is not None else ():
+        name, _, number = (word.strip() for word in part.partition("="))
         try:
-            value = float(text)
+            value = float(number)
         except ValueError:
             value = np.nan
         if name not in SHORT or not np.isfinite(value):
-            raise InputError("original", f"{part!r} in {given!r}", ORIGINAL_FORM)
+            raise InputError("original", f"{part!r} in {text!r}", ORIGINAL_FORM)
         original[SHORT[name]] = value
     if original[SAFETY_DEGREE] is None:
         raise InputError("original", "the study has no published values of the original vehicle", ORIGINAL_FORM)

@@ -127,7 +127,7 @@ def _is_duplicate(comparison: Comparison, name: str, row: int) -> bool:
 
 
 def _view(bodies: tuple[FlatBody, ...], length: int) -> View:
-    """The whole road or, in a long scene, the part that a camera shows that follows the vehicles."""
+    """The whole road or, in a long scene, the view of a camera that follows the vehicles."""
     low = min(float(np.nanmin(body.x)) - body.length for body in bodies) - MARGIN / 2
     high = max(float(np.nanmax(body.x)) + (0 if body.is_vut else body.length) for body in bodies) + MARGIN
     sides = [side for body in bodies for side in (np.nanmin(body.y) - body.width / 2, np.nanmax(body.y) + body.width / 2)]

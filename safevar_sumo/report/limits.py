@@ -64,10 +64,10 @@ LIMITS: Mapping[str, Callable[[ReportInput, int | None, Progress], Section]] = {
 """The sections about the whole domain, by name."""
 
 
-def _bars(data: ReportInput, alone: list[Section]) -> Markup:
+def _bars(data: ReportInput, scans: list[Section]) -> Markup:
     members = {member.name: member for member in data.case.characteristics}
     names, bars, marks, ends = [], [], [], []
-    for scan in alone:
+    for scan in scans:
         member = members[scan["characteristic"]]
         safe, unsafe = scan["safe"], scan["unsafe"]
         safe_bars = [] if safe is None else [_bar(member, safe, "safe")]

@@ -17,7 +17,7 @@ from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.reference import Agreement, keep_totals, quoted, validation
-from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, conclusions, grade, paired, tables_beside
+from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, compared_tables, conclusions, grade, pair_cases
 from safevar_sumo.reference.validation import rank_correlation
 from safevar_sumo.report.verdict import agreement_with_published
 from safevar_sumo.study import load_study
@@ -61,7 +61,7 @@ def sides(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def verdicts_of(sides: Path, here: str, there: str) -> dict[tuple[str, str], str]:
-    tables = tables_beside(paired(load_cases([sides / here]), load_cases([sides / there])))
+    tables = compared_tables(pair_cases(load_cases([sides / here]), load_cases([sides / there])))
     return {(one.question, one.words.split(":")[0]): one.verdict for one in conclusions(tables)}
 
 
