@@ -21,7 +21,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Member
 
 ADVICE: Mapping[str, str] = {
-    "contract": "return what the base class documents: see `safevar_sumo/{room}` and the tutorials",
+    "contract": "return what the base class documents: see `safevar_sumo/{base}` and the tutorials",
     "units": "give the study's table and UNITS the same names and units",
     "determinism": "draw nothing at random (an algorithm: from `rng` alone) and ask no clock",
     "state": "keep what a vehicle remembers in the memory that is handed on, or in the instance of that vehicle: nothing in a class, a "
@@ -34,14 +34,14 @@ ADVICE: Mapping[str, str] = {
     "speed": "compute all vehicles at once with arrays; load files in `__init__`",
     "picklable": "give functions a name at the top of the module; open files, sockets and locks in `start`, not in `__init__`",
 }
-"""How to mend what a check finds."""
+"""Advice on the findings of every check."""
 REFUSED = ("contract", "units", "determinism", "state", "batch", "inputs", "finite")
 """Checks whose failure makes results wrong, so that a study does not begin. The failure of another check is a warning."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """A check that is not passed: where, what was expected, what came, and how to mend it."""
+    """A failed check: the line at fault, the expected and the actual result, and advice."""
 
     check: str
     file: str
@@ -56,7 +56,7 @@ class Finding:
 
 @dataclass(kw_only=True)
 class Report:
-    """The findings on a subject; `key` is how a study names it, `remarks` are on what was assumed, `speed` is in words."""
+    """The findings on a subject; `key` is its key and name in a study, `remarks` state assumptions, `speed` is a sentence."""
 
     subject: str
     kind: str
@@ -77,10 +77,10 @@ class Report:
 
 
 class TakesTooLong(BaseException):
-    """Raised inside an author's code that does not come back; no `except Exception` swallows it."""
+    """Raised inside an author's code that does not return; no `except Exception` swallows it."""
 
 
-def crowd() -> float:
+def load_factor() -> float:
     """Processes per core that want to run, at least 1: the factor by which everything takes longer."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 1.0
     return max(1.0, load / (os.cpu_count() or 1))
@@ -88,7 +88,7 @@ def crowd() -> float:
 
 @contextmanager
 def time_limit(seconds: float) -> Iterator[None]:
-    """Raise `TakesTooLong` in what takes longer, on a free machine; without effect outside the main thread and on Windows."""
+    """Raise `TakesTooLong` in a block that would take longer on an idle machine; no effect outside the main thread and on Windows."""
     if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
         yield
         return
@@ -97,7 +97,7 @@ def time_limit(seconds: float) -> Iterator[None]:
         raise TakesTooLong
 
     before = signal.signal(signal.SIGALRM, ring)
-    signal.setitimer(signal.ITIMER_REAL, seconds * crowd())
+    signal.setitimer(signal.ITIMER_REAL, seconds * load_factor())
     try:
         yield
     finally:
@@ -106,12 +106,12 @@ def time_limit(seconds: float) -> Iterator[None]:
 
 
 class Source:
-    """An author's code: where it stands, and what returned last.
+    """An author's code: its file, and the line that returned last.
 
     Parameters
     ----------
     member
-        How the subject was found; of a metric or objective its function counts.
+        The subject; a metric or objective is represented by its function.
     """
 
     def __init__(self, member: Member) -> None:
@@ -129,7 +129,7 @@ class Source:
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """Within, remember the last line of the author's that returned."""
+        """A context that remembers the last line of the author's code that returned."""
         before = sys.getprofile()
         sys.setprofile(self._note)
         try:
@@ -150,7 +150,7 @@ class Source:
         return self._mine[code]
 
     def of_error(self, error: BaseException) -> tuple[str, int]:
-        """Innermost line of the author's that an exception passed through; else of what returned last."""
+        """The innermost line of the author's code that an exception passed through; else the line that returned last."""
         if self._is_fmu:
             return self.definition()
         one: BaseException | None = error
@@ -170,7 +170,7 @@ class Source:
         return self._last or self.definition()
 
     def definition(self, *methods: str) -> tuple[str, int]:
-        """Line of the first of these methods that there is, else of the subject itself; an FMU shows no lines."""
+        """The line of the first of these methods that exists, else of the subject itself; line 1 of an FMU."""
         if self._is_fmu:
             return self.file, 1
         for name in methods:
@@ -189,7 +189,7 @@ class Source:
         return next(((self.file, number) for number, line in enumerate(text, 1) if re.search(pattern, line)), None)
 
     def suspect(self, check: str) -> tuple[str, int] | None:
-        """The line of the file that looks like the cause of a difference; None where nothing does."""
+        """The line of the file that looks like the cause of a difference; None if no line does."""
         if self._is_fmu:
             return None
         try:
@@ -216,7 +216,7 @@ MUTATORS = ("append", "add", "update", "setdefault", "extend", "insert", "pop", 
 
 
 def _part_of(tree: ast.Module, name: str) -> ast.Module:
-    """Of a module what a class or function of that name uses: classes and functions that it names, and all assignments."""
+    """The parts of a module that a class or function of that name uses: classes and functions that it names, and all assignments."""
     defined = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
     used, waiting = set[str](), [name]
     while waiting:
@@ -235,24 +235,24 @@ def _functions(tree: ast.AST) -> Iterator[ast.FunctionDef]:
 
 
 def _calls(function: ast.FunctionDef) -> Iterator[tuple[str, int]]:
-    """What is called, and the line."""
+    """The name and the line of every call."""
     yield from ((ast.unparse(node.func), node.lineno) for node in ast.walk(function) if isinstance(node, ast.Call))
 
 
 def _random_lines(tree: ast.AST) -> Iterator[int]:
-    """Calls of random numbers and clocks; `rng.something` is what an algorithm is given."""
+    """Lines that call random numbers or clocks, except the `rng` of an algorithm."""
     yield from (line for function in _functions(tree) for name, line in _calls(function)
                 if RANDOM.search(name) and not name.startswith(("rng.", "problem.", "self.rng.")))
 
 
 def _batch_lines(tree: ast.AST) -> Iterator[int]:
-    """Reductions over vehicles, and what depends on how many there are."""
+    """Lines that reduce over vehicles, or depend on the number of vehicles."""
     yield from (line for function in _functions(tree) if function.name != "__init__" for name, line in _calls(function)
                 if name.rpartition(".")[2] in OVER_VEHICLES)
 
 
 def _state_lines(tree: ast.AST) -> Iterator[int]:
-    """Assignments to classes and modules, and to models outside of what begins a run."""
+    """Lines that assign to classes or modules, or to models in methods that do not begin a run."""
     classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
     owners = {one.name for one in classes} | {"cls", "type(self)", "self.__class__"}
     shared = {target.id for body in (getattr(tree, "body", []), *(one.body for one in classes)) for node in body

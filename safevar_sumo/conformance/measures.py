@@ -108,7 +108,7 @@ class ObjectiveProbe(Probe):
 
 
 class AlgorithmProbe(Probe):
-    """A search of a smooth function; the settings that it asks for stand for the vehicles."""
+    """A search of a smooth function; the settings that it requests take the place of vehicles."""
 
     methods = ("search",)
     number = 1
@@ -137,16 +137,16 @@ class AlgorithmProbe(Probe):
         return GuardedAlgorithm(instance_of(member, parameters, subject.key, f"search.{subject.name}", "check"), guard_of(subject))
 
     def run(self, model: Any, rows: Rows, seed: int = 1) -> Outputs:
-        """All settings that a run asks for, and those that it returns."""
+        """All settings that a run requests, and its solutions."""
         search = model.search(self._problem, np.random.default_rng(seed))
-        asked, answer = list[FloatArray](), None
+        requested, answer = list[FloatArray](), None
         while True:
             try:
                 settings = next(search) if answer is None else search.send(answer)
             except StopIteration as end:
-                return {"settings asked for": np.concatenate(asked)[..., np.newaxis],
+                return {"settings requested": np.concatenate(requested)[..., np.newaxis],
                         "settings returned": end.value.settings[..., np.newaxis]}
-            asked.append(settings)
+            requested.append(settings)
             answer = self._scored(settings)
 
     def again(self, model: Any, rows: Rows) -> Outputs:
@@ -170,11 +170,11 @@ class AlgorithmProbe(Probe):
 
     def reactions(self, model: Any, outputs: Outputs) -> Iterator[Reaction]:
         other = self.run(model, np.arange(1), seed=2)
-        if np.array_equal(outputs["settings asked for"], other["settings asked for"]):
+        if np.array_equal(outputs["settings requested"], other["settings requested"]):
             yield Reaction(("search",), "other settings with other random numbers `rng`", "the same settings in every run")
         if not outputs["settings returned"].size:
             yield Reaction(("search",), "a result: settings that the run was sent evaluations of",
-                           f"nothing, after {len(outputs['settings asked for'])} evaluations")
+                           f"nothing, after {len(outputs['settings requested'])} evaluations")
 
 
 PROBES: Mapping[str, tuple[type[Probe], ...]] = {

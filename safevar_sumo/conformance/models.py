@@ -35,7 +35,7 @@ class _Traffic(NamedTuple):
     obstacle_speed: FloatArray
 
 
-# Speed [m/s], gap [m], lateral offset [m], lateral speed [m/s], obstacle's speed [m/s], and since when it is detected [s].
+# Speed [m/s], gap [m], lateral offset [m], lateral speed [m/s], obstacle's speed [m/s], and the time from which it is detected [s].
 ENCOUNTERS = np.array([
     *((speed, 3.0 * speed, 0.0, 0.0, 0.0, 0.0) for speed in (5.0, 10.0, 15.0, 20.0, 25.0, 8.0)),
     (5.0, 15.0, -4.0, 1.5, 0.0, 0.0), (10.0, 25.0, -6.0, 2.2, 0.0, 0.3),
@@ -43,7 +43,7 @@ ENCOUNTERS = np.array([
     (15.0, 30.0, 0.0, 0.0, 10.0, 0.0), (10.0, 40.0, 0.0, 0.0, -5.0, 0.0), (10.0, 30.0, 10.0, 0.0, 0.0, 0.0),
     (12.0, 30.0, 0.0, 0.0, 0.0, 1.5)])
 COURSE, FREE = slice(0, 6), 8
-"""Encounters on a collision course; and the one that is like the second of them, but without anybody."""
+"""Encounters on a collision course; and the free road that is otherwise like the second of them."""
 
 
 def _traffic() -> _Traffic:
@@ -77,8 +77,8 @@ class AdsProbe(Probe):
         return GuardedAds(system.ads, guard_of(self.subject)) if self.subject.is_ours else system.ads
 
     def run(self, model: Ads, rows: Rows) -> Outputs:
-        n, nothing = len(rows), np.zeros(len(rows))
-        memory, command = model.start(n, self._nominal, STEP), Command(nothing, nothing)
+        n, zeros = len(rows), np.zeros(len(rows))
+        memory, command = model.start(n, self._nominal, STEP), Command(zeros, zeros)
         pedals = np.zeros((2, STEPS, n))
         for step in range(STEPS):
             speed, gap, closing, lateral, lateral_speed, obstacle = (column[step, rows] for column in self._traffic)
@@ -104,7 +104,7 @@ class VehicleProbe(Probe):
 
     methods = ("advance", "sense", "prepare", "at_rest", "sumo_type", "at_speed")
     PHASES = ((1.0, 0.0, 40), (0.3, 0.0, 5), (0.0, 0.0, 5), (0.0, 0.2, 5), (0.5, 0.5, 5), (0.0, 1.0, 30), (0.0, 0.0, 2))
-    """Throttle, brake, and for how many steps."""
+    """Throttle, brake, and number of steps."""
     STEP = 0.1  # s
 
     def __init__(self, subject: Subject) -> None:
@@ -136,13 +136,13 @@ class VehicleProbe(Probe):
     def _drive(self, model: Any, prepared: Any, state: Any, steps: int, throttle: float, brake: float,
                outputs: dict[str, list[np.ndarray]], sample: int = 0) -> Any:
         n = len(state.speed)
-        nothing = np.zeros(n)
+        zeros = np.zeros(n)
         for step in range(sample, sample + steps):
-            gap = 100.0 - step + nothing
-            seen = Observation(step * self.STEP, state.speed, gap, state.speed, nothing + 2 - 0.02 * step, nothing - 0.2, 0.9, nothing,
+            gap = 100.0 - step + zeros
+            seen = Observation(step * self.STEP, state.speed, gap, state.speed, zeros + 2 - 0.02 * step, zeros - 0.2, 0.9, zeros,
                                state.throttle, state.brake)
             sensed, state = model.sense(prepared, state, seen)
-            state = model.advance(prepared, state, Command(nothing + throttle, nothing + brake))
+            state = model.advance(prepared, state, Command(zeros + throttle, zeros + brake))
             for name in ("speed", "throttle", "brake", "gear"):
                 outputs.setdefault(name, []).append(getattr(state, name))
             for name in ("gap", "closing_speed", "lateral"):
@@ -169,7 +169,7 @@ class VehicleProbe(Probe):
 
 
 def _drive_ours(n: int, steps: int) -> None:
-    """Drive n of the simplest vehicle of this package."""
+    """Drive n vehicles of this package's simplest model."""
     values = {"mass": 1500.0, "accel": 3.0, "decel": 8.0, "maxSpeed": 40.0, "tau": 0.1, "sensorRange": 100.0, "reactionTime": 0.1,
               "brakeDelay": 0.1, "brakeGain": 1.0}
     vehicle = SumoVehicle()
@@ -183,7 +183,7 @@ def _drive_ours(n: int, steps: int) -> None:
 
 
 class StudyProbe(Probe):
-    """The subject's study simulated: the original vehicle and corners of the domains."""
+    """Simulations of the subject's study: the original vehicle and corners of the domains."""
 
     methods = ("observe", "encounter", "begin", "step", "drive", "advance")
     number = 5
@@ -208,7 +208,7 @@ class StudyProbe(Probe):
         near = np.isfinite(gap)
         if self.subject.kind == "traci":
             if outputs["outcome"][0] == "never-moved":
-                yield Reaction(("step",), "a wish that moves the vehicle: setSpeed, slowDown, setAcceleration", "the vehicle never moves")
+                yield Reaction(("step",), "a command to move: setSpeed, slowDown or setAcceleration", "the vehicle never moves")
             elif outputs["outcome"][0] == "collision" and not runs.trace.brake.any():
                 yield Reaction(("step",), "a brake pedal above 0 at some time before somebody in its way", "never brakes, and collides")
             return

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.conformance.finding import crowd
+from safevar_sumo.conformance.finding import load_factor
 from safevar_sumo.conformance.subject import Subject
 from safevar_sumo.plugins import Guard, Lookup, forget_foreign
 from safevar_sumo.records import FloatArray
@@ -23,7 +23,7 @@ Rows = npt.NDArray[np.intp]
 Outputs = Mapping[str, np.ndarray]
 """Results by name; the last axis is that of the vehicles."""
 POINTS = 2
-"""Points of a matrix that a study is tried at."""
+"""Number of points of a matrix at which a study is tried."""
 
 
 class Reaction(NamedTuple):
@@ -35,7 +35,7 @@ class Reaction(NamedTuple):
 
 
 class Probe(ABC):
-    """Situations for `number` vehicles. `methods` are those of the subject that are called."""
+    """Situations for `number` vehicles; `methods` are the subject's methods that are called."""
 
     methods: tuple[str, ...] = ()
     number: int
@@ -66,7 +66,7 @@ class Probe(ABC):
         yield from ()
 
     def cost(self, model: Any, seconds: float) -> tuple[float, str]:
-        """Time per vehicle and step [s] of a run that took so long, and a sentence on it."""
+        """Time per vehicle and step [s] of a run that took `seconds`, and a sentence on it."""
         return 0.0, ""
 
 
@@ -83,10 +83,10 @@ def guard_of(subject: Subject) -> Guard:
 
 
 def timed(run: Callable[[], Any]) -> float:
-    """Time that a call takes [s], as it would if nothing else ran on this machine."""
+    """Time that a call would take on an idle machine [s]."""
     start = time.perf_counter()
     run()
-    return (time.perf_counter() - start) / crowd()
+    return (time.perf_counter() - start) / load_factor()
 
 
 def cost_of(mine: float, ours: float, example: str, vehicles: int, steps: int) -> tuple[float, str]:

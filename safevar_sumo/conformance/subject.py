@@ -31,14 +31,14 @@ METHODS: Mapping[str, tuple[str, ...]] = {
     "ads": ("start", "drive"), "vehicle": ("prepare", "sumo_type", "at_rest", "sense", "advance"),
     "scenario": ("begin", "observe", "encounter"), "algorithm": ("search",), "traci": ("step",)}
 KEYS = {"metric": "metrics.also", "objective": "search.objectives", "algorithm": "search.algorithms", "traci": "ads.model"}
-"""Keys of a study that name a kind; of others `KIND.model`."""
-USUAL = {"traci": "native"}
-"""Studies that a kind is tried in where no study names the subject; of others `smoke`."""
+"""Keys of a study that name subjects of a kind; `KIND.model` for the other kinds."""
+DEFAULT_STUDIES = {"traci": "native"}
+"""Studies in which a kind is tried if no study names the subject; `smoke` for the other kinds."""
 MOST_FILES = 50
-"""Study files beside a subject that are looked into."""
+"""Maximum number of study files beside a subject that are read."""
 BY_UNIT = {"kg": (1500.0, 1000.0, 2500.0), "m/s^2": (5.0, 3.0, 8.0), "m/s": (30.0, 20.0, 40.0), "s": (0.1, 0.05, 0.3), "m": (1.0, 0.5, 2.0),
            "Nm": (400.0, 200.0, 600.0), "N": (4000.0, 2000.0, 6000.0)}
-"""Original and domain of a characteristic that no study names, by its unit; of others 0.8 to 1.2 around 1."""
+"""Original and domain of a characteristic that no study names, by its unit; 0.8 to 1.2 around 1 for other units."""
 
 
 class Subject(NamedTuple):
@@ -53,7 +53,7 @@ class Subject(NamedTuple):
 
     @property
     def key(self) -> str:
-        """As errors about a study call it."""
+        """The subject's key and name, as in errors about a study."""
         return f"{KEYS.get(self.kind, f'{self.kind}.model')} = {self.name!r}"
 
     @property
@@ -67,21 +67,21 @@ def subject_of(name: str, study: str | None = None) -> Subject:
     Parameters
     ----------
     name
-        A shipped one's name, or `package.module:Name`.
+        The name of a shipped subject, or `package.module:Name`.
     study
         A study to try it in; by default one beside it that names it, else a shipped one.
 
     Raises
     ------
     InputError
-        If there is nothing of that name, or it is nothing that can be checked.
+        If nothing has that name, or it cannot be checked.
     """
     chosen = None if study is None else load_study(study)
     name = OBJECTIVES[name].name if name in OBJECTIVES else name
     kinds = [kind for kind, members in KINDS.items() if name in members]
     if kinds:
         shipped = chosen or next((one for one in map(load_study, study_names()) if _named(one, kinds[0], name)), load_study("smoke"))
-        return _tried(Subject(name, kinds[0], Member(KINDS[kinds[0]][name]), shipped))
+        return _in_study(Subject(name, kinds[0], Member(KINDS[kinds[0]][name]), shipped))
     if name.endswith(".fmu"):
         return _fmu_of(name, chosen)
     if ":" not in name:
@@ -97,7 +97,7 @@ def subject_of(name: str, study: str | None = None) -> Subject:
         legal = "a class with the methods of an ADS, a vehicle, a scenario, an algorithm or a TraCI controller; a Metric; a Change"
         raise InputError("check", f"{name!r} is {_short(member.what)}, which is nothing that a study can name", legal)
     remarks = (f"tried in {beside[0].origin.called}, which names it",) if beside else ()
-    return _tried(Subject(name, kind, member, study_of or load_study(USUAL.get(kind, "smoke")), {}, remarks))
+    return _in_study(Subject(name, kind, member, study_of or load_study(DEFAULT_STUDIES.get(kind, "smoke")), {}, remarks))
 
 
 def _fmu_of(name: str, chosen: Study | None) -> Subject:
@@ -113,7 +113,7 @@ def _fmu_of(name: str, chosen: Study | None) -> Subject:
 
 
 def subjects_of(study: Study) -> Iterator[Subject]:
-    """Everything that a study names, once."""
+    """Every subject that a study names, each once."""
     lookup = Lookup(study.source, study.origin.places)
     named = {"vehicle": [study.vehicle.model], "traci" if study.ads.kind == "traci" else "ads": [study.ads.model],
              "scenario": [study.scenario.model, *(test.model for test in _tests(study) if test.model)],
@@ -140,7 +140,7 @@ def _fmu(study: Study, kind: str, name: str) -> Subject:
 
 
 def kind_of(what: Any) -> str:
-    """The kind of what a name stands for; "" if it is none of them."""
+    """The kind of an object that a name stands for; "" if it is of no kind."""
     if isinstance(what, Metric | Change):
         return "metric" if isinstance(what, Metric) else "objective"
     if inspect.isclass(what):
@@ -159,7 +159,7 @@ def kind_of(what: Any) -> str:
 
 
 def violation(subject: Subject) -> tuple[str, str]:
-    """Why a subject does not meet its contract, as far as that shows without a call, and what is expected; empty if it does."""
+    """The reason why a subject does not meet its contract, by inspection alone, and the expectation; empty reason if it does."""
     what, kind = subject.member.what, subject.kind
     if kind in ("metric", "objective"):
         record = Metric if kind == "metric" else Change
@@ -193,7 +193,7 @@ def _refused_arguments(function: Callable[..., Any], number: int, more: int) -> 
     return f"has a step that takes ({names}), not (traci, vehicle_id)"
 
 
-def _tried(subject: Subject) -> Subject:
+def _in_study(subject: Subject) -> Subject:
     """The subject in a study that names it, with the parameters of that study, or guessed ones."""
     study, kind, name = subject.study, subject.kind, subject.name
     if _named(study, kind, name):
@@ -261,7 +261,7 @@ def _tests(study: Study) -> list[MatrixTest]:
 
 
 def _named(study: Study, kind: str, name: str) -> bool:
-    """Whether a study names something as that kind."""
+    """Whether a study names a subject of that kind and name."""
     return name in {
         "ads": [study.ads.model] if study.ads.kind != "traci" else [], "traci": [study.ads.model] if study.ads.kind == "traci" else [],
         "vehicle": [study.vehicle.model], "scenario": [study.scenario.model], "metric": study.metrics.also,

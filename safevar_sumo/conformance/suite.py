@@ -25,8 +25,8 @@ LONGEST = 6.0
 SLOWEST = 1e-3
 """Time per vehicle and step above which a subject is slow [s]: a run of 1,000 simulations then takes minutes."""
 ALONE = 2
-"""Vehicles that are tried alone."""
-ROOMS = {"ads": "ads/base.py", "vehicle": "vehicles/base.py", "scenario": "scenarios/base.py", "metric": "metrics/base.py",
+"""Number of vehicles that are tried alone."""
+BASES = {"ads": "ads/base.py", "vehicle": "vehicles/base.py", "scenario": "scenarios/base.py", "metric": "metrics/base.py",
          "objective": "vehicles/characteristics.py", "algorithm": "search/base.py", "traci": "sumo/traci_controller.py"}
 
 
@@ -43,7 +43,7 @@ def check(name: str, study: str | None = None) -> Report:
     Raises
     ------
     InputError
-        If it cannot be loaded.
+        If the subject or the study cannot be loaded.
     """
     start = time.perf_counter()
     if ":" not in name and (name in study_names() or name.endswith(".toml")):
@@ -58,7 +58,7 @@ def check(name: str, study: str | None = None) -> Report:
 
 
 def checks_of(study: Study, *, foreign: bool = False) -> Iterator[Report]:
-    """Check everything that a study names, or what of it is `foreign`; simulate the study once, for one of them. Raises as `checked`."""
+    """Check everything that a study names, or only code from outside (`foreign`); simulate the study only once. Raises as `checked`."""
     subjects = [subject for subject in subjects_of(study) if not (foreign and subject.is_ours)]
     order = ("traci", "scenario", "ads", "vehicle")
     models = sorted((one for one in subjects if one.kind in order), key=lambda one: (one.is_ours, order.index(one.kind)))
@@ -87,12 +87,12 @@ def refuse_defects(study: Study) -> list[str]:
 
 
 def checked(subject: Subject, *, simulated: bool = True) -> Report:
-    """Check one subject; `simulated`: also in simulations of its study.
+    """Check one subject, with `simulated` also in simulations of its study.
 
     Raises
     ------
     InputError
-        If it cannot be tried: its parameters are not those that it takes, or its study cannot be put together.
+        If it cannot be tried: it does not take its parameters, or its study cannot be assembled.
     """
     report = Report(subject=subject.name, kind=subject.kind, key=subject.key, remarks=list(subject.remarks))
     start, suite = time.perf_counter(), _Suite(subject, simulated)
@@ -104,9 +104,9 @@ def checked(subject: Subject, *, simulated: bool = True) -> Report:
 
 ADVICE_ON_FMUS = {
     "determinism": "let the FMU draw nothing at random and ask no clock", "state": "let its reset bring everything back to its start",
-    "batch": "let its instances share nothing", "finite": "limit what the FMU divides by; a max of an input limits gaps to nobody",
+    "batch": "let its instances share nothing", "finite": "limit what the FMU divides by; a max of an input limits infinite gaps",
     "reaction": "look at the table of inputs and outputs, and at units and signs"}
-"""How to mend what a check finds in an FMU, in place of advice on code."""
+"""Advice on findings in an FMU, in place of advice on code."""
 
 
 class _Suite:
@@ -116,7 +116,7 @@ class _Suite:
         self.speed, self._seconds = "", 0.0
 
     def findings(self) -> Iterator[Finding]:
-        """What is wrong with the subject; nothing further is tried on what fails."""
+        """The subject's defects; the first probe with findings is the last one."""
         got, expected = violation(self._subject)
         if got:
             yield self._finding("contract", got, expected, self._source.definition(*_named(got)))
@@ -160,15 +160,15 @@ class _Suite:
                 raise
 
     def _differences(self, probe: Probe, model: Any, outputs: Outputs) -> Iterator[Finding]:
-        """The first way of grouping vehicles in which results are others than all together."""
+        """The first way of grouping vehicles that gives other results than all vehicles together."""
         rows = np.arange(probe.number)
         place = _difference(outputs, probe.run(probe.fresh(), rows), rows)
         if place:
-            yield self._differing("determinism", probe, f"{place} when the same is done once more", "the same, to the bit")
+            yield self._differing("determinism", probe, f"{place} when the run is repeated", "the same, to the bit")
             return
-        again: dict[str, Outputs] = {}
-        self._seconds = timed(lambda: again.update(outputs=probe.again(model, rows)))
-        place = _difference(outputs, again["outputs"], rows)
+        second: dict[str, Outputs] = {}
+        self._seconds = timed(lambda: second.update(outputs=probe.again(model, rows)))
+        place = _difference(outputs, second["outputs"], rows)
         if place:
             yield self._differing("state", probe, f"{place} in a second run", "the same as in the first run, to the bit")
             return
@@ -197,24 +197,24 @@ class _Suite:
                                 self._source.definition(*probe.methods))
 
     def _picklable(self) -> Iterator[Finding]:
-        """What travels to worker processes; a class by its name, an instance by what it holds, a record with its function."""
+        """Pickle the object as for a worker process: a class by its name, an instance by its contents, a record with its function."""
         if self._subject.member.file:
-            return  # it travels as a file
-        what = loaded_again(self._subject)
-        travels: Any = what
-        if isinstance(what, type) and self._subject.kind != "traci":
+            return  # an FMU is sent as a file
+        subject = loaded_again(self._subject)
+        payload: Any = subject
+        if isinstance(subject, type) and self._subject.kind != "traci":
             try:
-                travels = what(**self._subject.parameters)
+                payload = subject(**self._subject.parameters)
             except Exception:
-                travels = what  # an instance is made by what the study gives, which the probes have tried
-        if getattr(travels, "function", None) is not None and self._subject.kind in ("metric", "objective"):
-            travels = travels.function
+                payload = subject  # the probes have tried instances with the study's parameters
+        if getattr(payload, "function", None) is not None and self._subject.kind in ("metric", "objective"):
+            payload = payload.function
         try:
-            pickle.dumps(travels)
+            pickle.dumps(payload)
         except Exception as error:
-            holds = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
-            place = self._source.definition("__init__") if isinstance(what, type) else self._source.definition()
-            yield self._finding("picklable", holds, "what pickle can send to a worker process", place)
+            problem = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+            place = self._source.definition("__init__") if isinstance(subject, type) else self._source.definition()
+            yield self._finding("picklable", problem, "an object that pickle can send to a worker process", place)
 
     def _of_error(self, error: ForeignError) -> Finding:
         """The finding for an error that a guard raised."""
@@ -228,7 +228,7 @@ class _Suite:
         return self._finding(check, text, expected, self._source.of_error(error))
 
     def _finding(self, check: str, got: str, expected: str, place: tuple[str, int]) -> Finding:
-        advice = ADVICE[check].format(room=ROOMS[self._subject.kind])
+        advice = ADVICE[check].format(base=BASES[self._subject.kind])
         if self._subject.member.file:
             advice = ADVICE_ON_FMUS.get(check, "see the tutorial on FMUs")
         elif check == "contract" and self._subject.kind == "ads" and isinstance(self._subject.member.what, type) \
@@ -244,14 +244,14 @@ def _named(problem: str) -> tuple[str, ...]:
 
 
 def _difference(one: Outputs, other: Outputs, rows: Rows) -> str:
-    """The first result that differs, of which vehicle, and both values; "" if all are equal to the bit."""
+    """The first result that differs, its vehicle and both values; "" if all are equal to the bit."""
     for name, values in one.items():
-        again = other[name]
-        if values.shape != again.shape:
-            return f"{name} has shape {again.shape}, not {values.shape},"
-        same = values == again if values.dtype.kind == "U" else (values == again) | (np.isnan(values) & np.isnan(again))
+        others = other[name]
+        if values.shape != others.shape:
+            return f"{name} has shape {others.shape}, not {values.shape},"
+        same = values == others if values.dtype.kind == "U" else (values == others) | (np.isnan(values) & np.isnan(others))
         if not same.all():
             place = tuple(np.argwhere(~same)[0])
-            return f"{name} of vehicle {rows[place[-1]]} is {again[place]} instead of {values[place]}"
+            return f"{name} of vehicle {rows[place[-1]]} is {others[place]} instead of {values[place]}"
     return ""
 

@@ -1,4 +1,4 @@
-"""Files that results depend on: which of them code from outside reads, and their digests by names that hold on every machine.
+"""Files that results depend on: those that code from outside reads, and their digests by names that are the same on every machine.
 
 The interpreter raises an audit event for every file that Python code opens and for every module that is loaded. Compiled code
 raises none: files that a study's parameters name count in any case.
@@ -78,15 +78,15 @@ class _Watch:
     def _note(self, event: str, arguments: tuple[Any, ...]) -> None:
         if not self.inside or event not in ("open", "import", "ctypes.dlopen", "sqlite3.connect"):
             return
-        what = arguments[0]
+        target = arguments[0]
         if event == "import":
-            self.imported.add(what)
+            self.imported.add(target)
             for one in self.readings:
-                one.modules.add(what)
-            what = arguments[1]
-        if not isinstance(what, str | bytes | os.PathLike):
+                one.modules.add(target)
+            target = arguments[1]
+        if not isinstance(target, str | bytes | os.PathLike):
             return
-        path = os.fsdecode(what)
+        path = os.fsdecode(target)
         if event == "sqlite3.connect" and path.startswith("file:"):
             path = unquote(urlsplit(path).path)
         path = os.path.abspath(path)
@@ -118,7 +118,7 @@ def is_foreign(path: str) -> bool:
 
 
 def _source_of(path: str) -> str:
-    """The source of a cached module; other paths as they are."""
+    """The source of a cached module; any other path unchanged."""
     folder, name = os.path.split(path)
     if os.path.basename(folder) == "__pycache__" and name.endswith(".pyc"):
         return os.path.join(os.path.dirname(folder), f"{name.partition('.')[0]}.py")
@@ -135,7 +135,7 @@ def _counts(path: str, own: Sequence[str]) -> bool:
 def digest_of(path: Path | str) -> str:
     """Digest of a file's content; "" for a missing file.
 
-    Of a Python file only the syntax tree without docstrings counts, of others the content without differences in line ends.
+    A Python file counts as its syntax tree without docstrings, any other file as its content without differences in line ends.
     """
     try:
         at = os.stat(path)
@@ -198,7 +198,7 @@ def digests(paths: Iterable[str], places: Sequence[str]) -> Files:
 
 
 def _name_of(path: str, places: Sequence[str], more: int = 0) -> str:
-    """A file's path relative to the first place that holds it; elsewhere its last two parts, and `more`."""
+    """A file's path relative to the first place that holds it; without one, its last two parts, and `more`."""
     for root in (*places, *_roots()):
         if not more and Path(path).is_relative_to(root):
             return Path(path).relative_to(root).as_posix()
@@ -210,9 +210,9 @@ def located(name: str, places: Sequence[str]) -> str:
     return next((str(path) for root in (*places, *_roots()) if (path := Path(root, name)).is_file()), "")
 
 
-def changes(there: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
+def changes(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     """Names of files with different digests."""
-    return [name for name in sorted({*there, *here}) if there.get(name) != here.get(name)]
+    return [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
 
 
 def named_files(value: Any, places: Sequence[str]) -> Iterator[str]:

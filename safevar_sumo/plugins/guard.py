@@ -26,16 +26,16 @@ INFINITE = float("inf")
 
 
 class Contract(NamedTuple):
-    """The members that a class must have, read off the protocol or base class that documents it.
+    """The members that a class must have, taken from the protocol or base class that documents them.
 
     Attributes
     ----------
     title
         What an instance is, such as "an ADS".
     methods, optional
-        The parameters of every method that must be there, and of every method that may be missing.
+        The parameters of every required method, and of every optional one.
     attributes
-        Attributes of an instance beside its methods.
+        Attributes of an instance besides its methods.
     base
         The class that it must derive from, if there is one.
     """
@@ -121,7 +121,7 @@ def read_only_copy(value: Any) -> Any:
 
 @contextmanager
 def guard_process_state(source: str, names: Sequence[str]) -> Iterator[None]:
-    """Restore the working directory, environment variables and numpy's error state after plug-ins of such names; no-op without any."""
+    """Restore the working directory, environment variables and numpy's error state after the plug-ins `names`, if there are any."""
     if not names:
         yield
         return
@@ -146,7 +146,7 @@ class Guard(NamedTuple):
     name
         The plug-in as the study names it, such as `ads.model = 'my_ads:Careful'`.
     folder
-        Folder of its sources; an error names the innermost line in it.
+        Folder of the plug-in's sources; an error names the innermost line in it.
     """
 
     source: str
@@ -154,7 +154,7 @@ class Guard(NamedTuple):
     folder: str = ""
 
     def call(self, method: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        """What the function returns.
+        """Call a function and return its result.
 
         Raises
         ------
@@ -197,7 +197,7 @@ class Guard(NamedTuple):
 
     def numbers(self, method: str, what: str, value: Any, shape: tuple[int, ...], lowest: float = -INFINITE, highest: float = INFINITE,
                 *, above: bool = False, infinite: bool = False, undefined: bool = False) -> FloatArray:
-        """A result as an array of its own, float64.
+        """A result as a new array of float64.
 
         Parameters
         ----------
@@ -212,18 +212,18 @@ class Guard(NamedTuple):
             if highest == INFINITE else f" in {'(' if above else '['}{lowest:g}, {highest:g}]"
         expected = f"numbers{bounds}, {'' if infinite else 'finite, '}shape {shape}"
         numbers = self._array(method, what, value, shape, "biuf", expected).astype(float)
-        good = (numbers > lowest) if above else (numbers >= lowest)
-        good &= numbers <= highest
+        valid = (numbers > lowest) if above else (numbers >= lowest)
+        valid &= numbers <= highest
         if not infinite:
-            good &= np.isfinite(numbers)
+            valid &= np.isfinite(numbers)
         if undefined:
-            good |= np.isnan(numbers)
-        if not good.all():
-            raise self.wrong(method, what, float(numbers[~good][0]), expected)
+            valid |= np.isnan(numbers)
+        if not valid.all():
+            raise self.wrong(method, what, float(numbers[~valid][0]), expected)
         return numbers
 
     def truths(self, method: str, what: str, value: Any, shape: tuple[int, ...]) -> BoolArray:
-        """A result as an array of its own, bool."""
+        """A result as a new array of bool."""
         return self._array(method, what, value, shape, "b", f"truth values, shape {shape}").astype(bool)
 
     def _array(self, method: str, what: str, value: Any, shape: tuple[int, ...], kinds: str, expected: str) -> np.ndarray:

@@ -32,7 +32,7 @@ class Member(NamedTuple):
     """The class or record that a name in a study stands for.
 
     `guard` calls it (None for the package's own), `module` is the name of its module ("" for the package's own), `folder` the folder
-    of that module's top package. An FMU is a `file`, and what simulates it is the package's own.
+    of that module's top package. An FMU is a `file`; the class that simulates it is the package's own.
     """
 
     what: Any
@@ -66,7 +66,7 @@ class Lookup(NamedTuple):
     places: Sequence[str] = ()
 
     def find(self, members: Mapping[str, Any], name: str, key: str) -> Member:
-        """The one of `members` with that name, or what `package.module:Name` stands for.
+        """The member with that name, or the object that `package.module:Name` names.
 
         Raises
         ------
@@ -102,12 +102,12 @@ class Lookup(NamedTuple):
         return member
 
     def with_paths(self, member: Member, parameters: Mapping[str, Any], key: str) -> dict[str, Any]:
-        """Parameters for a member from outside, in which names of files beside the study's file are whole paths.
+        """Parameters for a member from outside, in which names of files beside the study's file are absolute paths.
 
         Raises
         ------
         InputError
-            If a text names a file of the working directory alone: the study would read another file elsewhere.
+            If a text names a file that is only in the working directory: elsewhere the study would read another file.
         """
         if member.guard is None or not self.places:
             return dict(parameters)
@@ -196,7 +196,7 @@ def reachable() -> list[str]:
 
 
 def inherit_reachable(folders: Iterable[str]) -> None:
-    """Tell a process that inherited its path from another process which folders `make_reachable` had added to it."""
+    """Record, in a process that inherited its path from another one, the folders that `make_reachable` had added there."""
     _reachable[:] = folders
 
 
@@ -276,7 +276,7 @@ def instance_of(member: Member, parameters: Mapping[str, Any], name: str, key: s
 
 def check_parameters(function: Callable[..., Any], arguments: tuple[Any, ...], parameters: Mapping[str, Any], name: str, key: str,
                      source: str) -> None:
-    """Refuse parameters that a class or function does not take beside its arguments; raises as `instance_of`."""
+    """Refuse parameters that a class or function does not take besides its arguments; raises as `instance_of`."""
     try:
         inspect.signature(function).bind(*arguments, **parameters)
     except TypeError as error:
@@ -286,7 +286,7 @@ def check_parameters(function: Callable[..., Any], arguments: tuple[Any, ...], p
 
 
 class OwnModules:
-    """A copy of the user's modules for one of many vehicles, so that what they keep in variables is that vehicle's own.
+    """A copy of the user's modules for one of many vehicles, so that each vehicle has its own variables of these modules.
 
     Parameters
     ----------
@@ -308,7 +308,7 @@ class OwnModules:
 
     @contextmanager
     def inside(self) -> Iterator[None]:
-        """Within, an import finds these copies, and loads further ones."""
+        """A context in which an import finds these copies, and loads further ones."""
         shared = self._removed()
         sys.modules.update(self._modules)
         number, writes_bytecode, sys.dont_write_bytecode = len(sys.modules), sys.dont_write_bytecode, True

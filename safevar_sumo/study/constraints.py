@@ -1,4 +1,4 @@
-"""What the characteristics of one vehicle satisfy together: the constraints of a study, and their checks."""
+"""The constraints of a study, which the characteristics of one vehicle satisfy together, and their checks."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ LONGEST = 400
 
 
 class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A quantity of several characteristics that is `at_least` and `at_most` so large.
+    """A quantity of several characteristics with its bounds `at_least` and `at_most`.
 
-    It is either `sum`, the characteristics in their units times these weights, or `function`, a function `package.module:Name` of a
-    mapping from names to arrays of shape (N,) that returns such an array. `unit` is that of the quantity and its bounds: one of the
-    characteristics', or "-". It may be left out where all characteristics of the sum have the same one. `meaning` says what the
-    constraint stands for, with its source.
+    The quantity is either `sum`, the characteristics in their units times these weights, or `function`, a `package.module:Name` of a
+    function from names with arrays of shape (N,) to such an array. `unit` is the unit of the quantity and its bounds: one of the
+    characteristics', or "-"; optional if all characteristics of the sum have the same one. `meaning` explains the constraint, with its
+    source.
     """
 
     sum: dict[str, float] = {}
@@ -55,7 +55,7 @@ class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def constraint_mistakes(source: object, rows: Mapping[str, CharacteristicTable], constraints: Sequence[Constraint]) -> Iterator[InputError]:
-    """Constraints that name what there is not, add different units or bound nothing."""
+    """Constraints that name unknown characteristics, add different units or have no bounds."""
     for number, one in enumerate(constraints):
         key = f"constraints[{number}]"
         if bool(one.sum) == bool(one.function):

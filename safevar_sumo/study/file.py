@@ -36,7 +36,7 @@ def load_study(study: StudyLike, **changes: Any) -> Study:
     Parameters
     ----------
     study
-        Its name, the path of its file, its tables as in a file, or a study to change.
+        The study's name, the path of its file, its tables as in a file, or a study to change.
     changes
         Keys that override the study's, table by table as in a file that extends it:
         `weather="fog"`, `search={"runs": 2}`.
@@ -46,13 +46,13 @@ def load_study(study: StudyLike, **changes: Any) -> Study:
     InputError
         Naming file, key, value and what is expected.
     """
-    given = _given(study)
-    return _checked(_overridden(given, changes, given.source) if changes else given)
+    raw = _raw(study)
+    return _checked(_overridden(raw, changes, raw.source) if changes else raw)
 
 
-def _given(study: StudyLike) -> _Raw:
+def _raw(study: StudyLike) -> _Raw:
     if isinstance(study, Study):
-        return _Raw(study.source, without_nothing(tables_of(study)), study.origin)
+        return _Raw(study.source, without_nulls(tables_of(study)), study.origin)
     if isinstance(study, Mapping):
         return _extended(_Raw("study", dict(study)), Path("."), ())
     return _read(study_path(str(study)), seen=())
@@ -72,7 +72,7 @@ def _checked(raw: _Raw) -> Study:
 
 
 def of_today(tables: dict[str, Any]) -> dict[str, Any]:
-    """A study's tables of any time as they are now: a hesitation, once a weather's, is the driving system's."""
+    """Tables of any earlier version in the present form: `hesitation`, once the weather's, is a parameter of the driving system."""
     weather, ads = tables.get("weather"), tables.get("ads")
     if not (isinstance(weather, dict) and "hesitation" in weather and isinstance(ads, dict)):
         return tables
@@ -84,20 +84,20 @@ def of_today(tables: dict[str, Any]) -> dict[str, Any]:
 
 
 def _with_fmu(raw: _Raw, tables: dict[str, Any]) -> dict[str, Any]:
-    """A study's tables with the rows of characteristics completed by what the vehicle's FMU declares of its parameters."""
+    """A study's tables, with rows of characteristics completed from the parameters that the vehicle's FMU declares."""
     vehicle = tables.get("vehicle")
     if not isinstance(vehicle, dict) or vehicle.get("kind") != "fmu" or not isinstance(model := vehicle.get("model"), str):
         return tables
-    given, fixed = vehicle.get("characteristics", {}), vehicle.get("parameters", {})
-    if not isinstance(given, dict) or not isinstance(fixed, dict) or not all(isinstance(row, dict) for row in given.values()):
+    stated, fixed = vehicle.get("characteristics", {}), vehicle.get("parameters", {})
+    if not isinstance(stated, dict) or not isinstance(fixed, dict) or not all(isinstance(row, dict) for row in stated.values()):
         return tables
-    from safevar_sumo.fmu.description import description_of, file_of  # FMPy is for those who have an FMU
+    from safevar_sumo.fmu.description import description_of, file_of  # only a study with an FMU needs FMPy
 
-    complete = given and all({"unit", "original", "lower", "upper"} <= row.keys() for row in given.values())
+    complete = stated and all({"unit", "original", "lower", "upper"} <= row.keys() for row in stated.values())
     if complete and not file_of(model, raw.origin.places):
         return tables  # results without their FMU can be read
     declared = description_of(model, raw.origin.places, str(raw.source), "vehicle.model")
-    rows = {**declared.rows(fixed), **{name: {**declared.row(name, str(row.get("unit", ""))), **row} for name, row in given.items()}}
+    rows = {**declared.rows(fixed), **{name: {**declared.row(name, str(row.get("unit", ""))), **row} for name, row in stated.items()}}
     return {**tables, "vehicle": {**vehicle, "characteristics": rows}}
 
 
@@ -112,7 +112,7 @@ def _with_algorithms(raw: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read(path: Path, seen: tuple[Path, ...]) -> _Raw:
-    """Read a TOML file and what it `extends`; its own keys override table by table."""
+    """Read a TOML file and the study that it `extends`; its own keys override table by table."""
     if path in seen:
         raise InputError(path, f"extends = {path.stem!r} leads back to this file", "a study that does not extend this one")
     try:
@@ -159,7 +159,7 @@ def _overridden(base: _Raw, over: Mapping[str, Any], source: object) -> _Raw:
         lost = [key for key in OF_ONE_SYSTEM[:2] if key in base.tables and key not in over]
         tables = {**{key: value for key, value in tables.items() if key not in OF_ONE_SYSTEM}, "title": tables.get("name", ""),
                   **{key: over[key] for key in OF_ONE_SYSTEM if key in over}}
-        if "vehicle" in other or "ads" in other:  # they are of their parameters
+        if "vehicle" in other or "ads" in other:  # both are about their parameters
             tables = {key: value for key, value in tables.items() if key in over or key not in ("spread", "model_error")}
         if lost:
             remarks = (*remarks, f"{source}: has another {' and another '.join(other)} than study {base.tables.get('name')!r}, whose "
@@ -190,9 +190,9 @@ def _refines(key: str, old: object, new: object) -> bool:
     return all(new.get(kind, old.get(kind)) == old.get(kind) for kind in ("model", "distribution"))
 
 
-def without_nothing(raw: Any) -> Any:
+def without_nulls(raw: Any) -> Any:
     """Tables without null values, which TOML does not have."""
-    return {key: without_nothing(value) for key, value in raw.items() if value is not None} if isinstance(raw, dict) else raw
+    return {key: without_nulls(value) for key, value in raw.items() if value is not None} if isinstance(raw, dict) else raw
 
 
 def write_study(path: Path, study: Study, comment: str) -> None:
@@ -205,7 +205,7 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     """
     if re.fullmatch(NAME, path.stem):
         study = msgspec.structs.replace(study, name=path.stem)
-    tables = {name: value for name, value in without_nothing(tables_of(study)).items() if value != {}}
+    tables = {name: value for name, value in without_nulls(tables_of(study)).items() if value != {}}
     printable = ("".join(character if character.isprintable() else "?" for character in line) for line in comment.splitlines())
     text = "".join(f"# {line}".rstrip() + "\n" for line in printable) + "\n" + tomli_w.dumps(tables)
     try:
@@ -220,7 +220,7 @@ def check_writable(path: Path, source: str = "out") -> None:
     Raises
     ------
     InputError
-        If it cannot be written.
+        If the file cannot be written.
     """
     try:
         refuse_other_than_file(path, source, streams=True)

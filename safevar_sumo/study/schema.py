@@ -53,8 +53,8 @@ class CharacteristicTable(Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A model by its name, or by `package.module:Name`, and its parameters.
 
-    An ADS of the kind `traci` is a controller written for SUMO's TraCI, one of the kind `fmu` an FMU by its path: `inputs` are its
-    variables by what they are given, `outputs` by what they tell, `step` [s] is its own step, by default the one that it declares.
+    An ADS of the kind `traci` is a controller written for SUMO's TraCI; an ADS of the kind `fmu` is an FMU, named by its path: `inputs`
+    and `outputs` are its variables by the quantity they receive or return, `step` [s] is its own step, by default the declared one.
     """
 
     model: str
@@ -68,9 +68,9 @@ class ModelTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The vehicle under test: its model, the model's parameters, and the characteristics that vary.
 
-    One of the kind `fmu` is an FMU by its path, with `inputs`, `outputs` and `step` as an ADS has them. Its parameters are the
-    characteristics, whose rows need to say only what it does not declare; `sensors` and `sumo_type` are characteristics or numbers,
-    `sumo_type` its variables, too, by what they say of the sensors and of the vehicle.
+    A vehicle of the kind `fmu` is an FMU, named by its path, with `inputs`, `outputs` and `step` as for an ADS. Its parameters are the
+    characteristics, whose rows need to state only what the FMU does not declare. `sensors` and `sumo_type` are characteristics or
+    numbers, by properties of the sensors and of the vehicle; `sumo_type` may also name the FMU's variables.
     """
 
     model: str
@@ -85,11 +85,11 @@ class VehicleTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class Weather(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Weather as data: what it does to the road and to the sensors.
+    """Weather as data: its effects on the road and on the sensors.
 
     `road_friction` and `visibility` are factors on the dry, clear case [-]; on a `wet` road worn treads lose further friction.
-    `recognition_delay` is the additional time in which the sensors make somebody out [s], whatever ADS they serve; how an ADS itself
-    reacts is among its parameters. `light` is a label without an effect of its own.
+    `recognition_delay` is the additional time that the sensors need to recognise a road user [s], for every ADS; an ADS's own reaction
+    is among its parameters. `light` is a label without an effect of its own.
     """
 
     name: str
@@ -141,7 +141,7 @@ def label_of(algorithm: str) -> str:
 
 
 class MatrixTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A test of a matrix: its scenario at every combination of the values in `over`, in every one of the weathers.
+    """A test of a matrix: its scenario at every combination of the values in `over`, in each of the weathers.
 
     `parameters` are added to those of the study's scenario; with another `model` they stand alone. A weather is a name or a table.
     """
@@ -154,7 +154,7 @@ class MatrixTest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class RatingTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a manufacturer states for a rating: `claims` are robustness layers by test that nothing here simulates, such as glare."""
+    """A manufacturer's claims for a rating: by test, robustness layers that cannot be simulated here, such as glare."""
 
     claims: dict[str, list[str]] = {}
 
@@ -173,8 +173,8 @@ class MatrixTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 class FreeParameter(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A parameter to calibrate: its bounds in `unit`, and its meaning.
 
-    Studies that are fitted together share it as far as they give it one value, unless it is a study's `own`. A search takes equal
-    differences for equally far, with `log` equal ratios: rates and other positive quantities whose magnitude is not known.
+    Studies that are fitted together share the parameter if they give it the same value, unless it is a study's `own`. The search
+    measures its distances as differences, with `log` as ratios: for rates and other positive quantities of unknown magnitude.
     """
 
     lower: float
@@ -198,20 +198,20 @@ class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How free parameters are found: what counts for how much, which rows are used, and from where the search starts.
+    """How free parameters are fitted: the weights in the loss, the rows used, and the starts of the search.
 
     The loss is `original` * mean_m(w_m h(miss / (`tolerance` * published))) of the original vehicle, h being x^2 to 1 and 2 x - 1 beyond,
     + mean over the files of sum_m(w_m (`rank` (1 - rho) + mean |error| / unit)) + `effects` * mean_c |difference of the safety degree's
     linear effects over the domain of characteristic c| / unit + `collisions` * share of rows that collide on one side alone. w_m are
     `weights` by metric; a unit is the study's repeatability or, where it is not known, the standard deviation of the data. Studies that
-    are fitted together have the mean of their losses. Of every `hold_out` rows one is used for nothing but to be reported.
-    Sets of parameters whose loss is within the share `alike` of the lowest one fit as well: they become the study's `spread`.
+    are fitted together have the mean of their losses. One of every `hold_out` rows is not used for the fit, only reported.
+    Sets of parameters whose loss is within the share `alike` of the lowest one fit equally well: they become the study's `spread`.
     `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own values and from
-    `starts` random places in the bounds, of which the worse half gives up after every round. With `screened` these are the best of so
-    many random places, but no more than a quarter of the trials is spent on that. A search from a random place is `width` of the bounds
-    wide at first (standard deviation). `seed` is the seed of all that. From scratch, studies that are fitted together are searched in
-    stages: the first one alone, then what the others have of their own, and at last all from there. Stages but the last use one row in
-    `thinning`.
+    `starts` random places in the bounds; the worse half gives up after every round. With `screened`, the random places are the best of
+    that many, but at most a quarter of the trials is spent on that. A search from a random place begins with a standard deviation of
+    `width` of the bounds. `seed` is the seed of all random numbers. From scratch, studies that are fitted together are searched in
+    stages: first the first study alone, then the other studies' own parameters, finally all parameters from there. All stages but the
+    last use one row in `thinning`.
     """
 
     trials: PositiveInt = 1200
@@ -233,22 +233,22 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A whole study as its TOML file gives it; `load_study` reads one.
+    """A complete study, as in its TOML file; `load_study` reads one.
 
-    `matrix` are the scenario points that it is simulated in, if there is more than the one scenario;
-    `rating` is what the user claims for a rating;
+    `matrix` are the scenario points in which it is simulated, if there are several;
+    `rating` are the user's claims for a rating;
     `step_length` is the simulation's time step [s], by default the one of the network's options;
-    `published` are the original vehicle's metrics in the published study, by name, as far as there are any;
-    `repeatability` are standard deviations of repeats of one setting there;
-    `calibration` tells which parameters are free, by their keys in the file, such as `ads.parameters.corridor`, `fit` how they are found,
-    `spread` sets of their values that fit the published data as well, a list for each parameter, the study's own set first;
-    `model_error` by how much the model errs beyond these, by metric, for a vehicle that is a whole domain away from the original;
-    `variation` and `correlations` tell how characteristics vary in the world, by name: uniformly where nothing is said;
-    `constraints` tell what the characteristics of one vehicle satisfy together.
+    `published` are the original vehicle's metrics in the published study, by name, as far as they are known;
+    `repeatability` are standard deviations of repeats of one setting in the published study;
+    `calibration` are the free parameters by their keys in the file, such as `ads.parameters.corridor`, `fit` states how they are fitted,
+    `spread` are sets of their values that fit the published data equally well, a list for each parameter, the study's own set first;
+    `model_error` is the model's further error, by metric, for a vehicle that is a whole domain away from the original;
+    `variation` and `correlations` state how characteristics vary in the world, by name: uniformly by default;
+    `constraints` are conditions that the characteristics of one vehicle satisfy together.
     """
 
-    # A new key that changes no result of a campaign also belongs in FREE of results/manifest.py. Any other one becomes part of the identity
-    # of results: let `fixed` there leave its default out, so that results from before it keep theirs.
+    # A new key that changes no result of a campaign also belongs in FREE of results/manifest.py. Any other new key becomes part of the
+    # identity of results: let `fixed` there omit its default, so that older results keep their identity.
     name: Annotated[str, Meta(pattern=NAME)]
     title: str
     scenario: ModelTable
@@ -273,7 +273,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     @property
     def source(self) -> str:
-        """How errors call it: by its file, or by its name if it has none of its own."""
+        """The study's name in errors: its file, or its own name if it has no file."""
         return self.origin.called or f"study {self.name!r}"
 
 
@@ -282,7 +282,7 @@ def tables_of(study: Study) -> dict[str, Any]:
     tables: dict[str, Any] = msgspec.to_builtins(study)
     del tables["origin"]
     if not study.constraints:
-        del tables["constraints"]  # results of studies from before there were any keep their bytes
+        del tables["constraints"]  # results from before constraints existed keep their bytes
     for name in ("vehicle", "ads", "scenario"):
         if tables[name].get("kind") != "fmu":
             kept = () if name == "vehicle" else ("kind",)
@@ -329,7 +329,7 @@ def fmus_of(study: Study) -> list[tuple[str, str]]:
 
 
 def foreign_packages(study: Study) -> list[str]:
-    """The top modules of that code."""
+    """The top-level packages of a study's code from outside."""
     return sorted({name.partition(":")[0].partition(".")[0] for _, name in _foreign(study)})
 
 

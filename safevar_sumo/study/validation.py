@@ -88,7 +88,7 @@ def mistakes(source: object, raw: Any, kind: Any, where: str = "") -> Iterator[I
 
 @cache
 def _fields(kind: type[Struct]) -> dict[str, msgspec.structs.FieldInfo]:
-    """A record's fields by name; msgspec evaluates their annotations anew each time, which a matrix of a thousand cells feels."""
+    """A record's fields by name; cached, as msgspec evaluates their annotations anew each time."""
     return {field.name: field for field in msgspec.structs.fields(kind)}
 
 
@@ -143,11 +143,11 @@ def _short(value: object) -> str:
 LARGEST = 1e12
 """Largest magnitude of a characteristic, in its unit."""
 DEEPEST = 32
-"""Tables and lists within each other that a study may have; Python gives up at about a thousand."""
+"""Maximum nesting of tables and lists in a study; Python gives up at about a thousand."""
 
 
 def unusable(source: object, value: object, where: str = "", depth: int = 0) -> Iterator[InputError]:
-    """Values anywhere in a study's tables that cannot be used the same way everywhere; `depth` tables and lists are around `value`."""
+    """Unusable values and names anywhere in a study's tables; `value` lies within `depth` tables and lists."""
     if isinstance(value, Mapping | list | tuple) and depth > DEEPEST:
         yield InputError(source, f"{where.partition('.')[0]} is nested too deeply", f"at most {DEEPEST} tables within each other")
     elif isinstance(value, Mapping | list | tuple):
@@ -191,10 +191,10 @@ def implausible(source: object, study: Study) -> Iterator[InputError]:
         yield InputError(source, "spread: its lists differ in length or are empty", "a list for each parameter, all of one length")
     if study.matrix is not None and study.matrix.aggregate == "mean":
         yield InputError(source, "matrix.aggregate = 'mean' would average distances [m] with minus the speeds of collisions [m/s]",
-                         "'worst', the point in which a setting comes off worst")
+                         "'worst', the safety degree at a setting's worst point")
     for name, times in Counter(study.metrics.also).items():
         if times > 1:
-            yield InputError(source, f"metrics.also = {study.metrics.also}: {name!r} stands there {times} times", "each metric once")
+            yield InputError(source, f"metrics.also = {study.metrics.also}: {name!r} is listed {times} times", "each metric once")
     for name, number in study.published.items():
         if number == 0:
             yield InputError(source, f"published.{name} = 0", "a number other than 0")

@@ -109,6 +109,6 @@ def _correlation_mistakes(source: object, names: Sequence[str], correlations: Se
         elif len(pair) == 1:
             yield InputError(source, f"correlations.between = {list(between)}", "two different characteristics")
         elif pair in values:
-            yield InputError(source, f"correlations: {between[0]} and {between[1]} stand twice, "
+            yield InputError(source, f"correlations: {between[0]} and {between[1]} are given twice, "
                              f"with {values[pair]:g} and {correlation.value:g}", "each pair once")
         values.setdefault(pair, correlation.value)

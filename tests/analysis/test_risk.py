@@ -127,8 +127,8 @@ def test_correlations_are_those_of_the_copula() -> None:
     ({"correlations": [{"between": pair, "value": -0.9} for pair in (["mass", "radius"], ["mass", "tireFric"], ["radius", "tireFric"])]},
      "contradict each other"),
     ({"correlations": [{"between": ["mass", "radius"], "value": 0.5}, {"between": ["radius", "mass"], "value": -0.5}]},
-     "radius and mass stand twice, with 0.5 and -0.5"),
-    ({"correlations": [{"between": ["mass", "radius"], "value": 0.5}] * 2}, "stand twice"),
+     "radius and mass are given twice, with 0.5 and -0.5"),
+    ({"correlations": [{"between": ["mass", "radius"], "value": 0.5}] * 2}, "are given twice"),
     ({"variation": {"mass": {"distribution": "normal", "deviation": 1e300}}}, "variation.mass.deviation = 1e+300\nexpected: at most 66000"),
     ({"variation": {"mass": {"distribution": "lognormal", "sigma": 1e300}}}, "variation.mass.sigma")])
 def test_impossible_distributions_are_refused(changes: dict[str, Any], says: str) -> None:

@@ -37,7 +37,7 @@ def checked(mine: Mine, module: str, folder: Path) -> None:
 
 @pytest.mark.parametrize(("module", "message"), [
     (MEAN, "in two halves (|alone|in another order)"), (CLASS, "in a second run"), (SELF, "in a second run"),
-    (RANDOM, "when the same is done once more"), (PLACE, "in another order")], ids=["mean", "class", "self", "random", "place"])
+    (RANDOM, "when the run is repeated"), (PLACE, "in another order")], ids=["mean", "class", "self", "random", "place"])
 def test_an_ads_that_mixes_settings_up_is_refused(module: str, message: str, mine: Mine, folder: Path) -> None:
     with pytest.raises(ForeignError, match=rf"'mine:Mine' (throttle|brake) of vehicle \d+ is .* {message}") as caught:
         checked(mine, module, folder)
@@ -113,7 +113,7 @@ def test_an_algorithm_whose_runs_learn_from_each_other(own: str, shared: bool, m
         return carry_out_runs(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
 
     if shared:
-        with pytest.raises(ForeignError, match=r"'mine:Mine' settings asked for .* in a second run .*mine.py:9"):
+        with pytest.raises(ForeignError, match=r"'mine:Mine' settings requested .* in a second run .*mine.py:9"):
             searched()
     else:
         searched()
@@ -166,7 +166,7 @@ class Mine:
 def test_an_algorithm_that_draws_from_the_clock(mine: Mine, folder: Path, tmp_path: Path) -> None:
     system = mine(CLOCK, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 1\n')
     study = load_study(str(folder / "mine.toml"))
-    with pytest.raises(ForeignError, match=r"'mine:Mine' settings asked for .* when the same is done once more .*mine.py:10"):
+    with pytest.raises(ForeignError, match=r"'mine:Mine' settings requested .* when the run is repeated .*mine.py:10"):
         carry_out_runs(study, system, all_runs(study), tmp_path / "out", Here(), NullObserver(), None)
 
 

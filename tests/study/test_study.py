@@ -103,7 +103,7 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
     ("[vehicle]\ncharacteristics = 3", "vehicle.characteristics = 3\nexpected: a table"),
     ('[ads]\nkind = "fmuu"', "ads.kind = 'fmuu'; did you mean 'fmu'?\nexpected: one of fmu, traci, or no such key"),
     ('[variation.mass]\ndistribution = "norml"', "mass.distribution = 'norml'; did you mean 'normal'?\nexpected: one of fixed, lognormal"),
-    ('[metrics]\nalso = ["max_jerk", "max_jerk"]', "'max_jerk' stands there 2 times\nexpected: each metric once"),
+    ('[metrics]\nalso = ["max_jerk", "max_jerk"]', "'max_jerk' is listed 2 times\nexpected: each metric once"),
     ("[[constraints]]\nsum = { mass = 'a' }", "constraints[0].sum.mass = 'a'\nexpected: a number"),
     ("[rating.claims]\nCCRs = [3]", "rating.claims.CCRs[0] = 3\nexpected: a text"),
     ("search = 3", "search = 3"),
