@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
-from safevar_sumo.results import MANIFEST, comparable_inputs, differences_now, manifest_of, read_later, read_manifest
+from safevar_sumo.results import MANIFEST, comparable_inputs, differences_now, later_files, manifest_of, read_manifest
 from safevar_sumo.study import Study, StudyLike, load_study, study_names
 from safevar_sumo.terminal import shown
 
@@ -143,7 +143,7 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool = False) ->
     system = assemble(study, str(directory))
     with local_pool(1, study.search.time_limit) as pool:
         sources = {**sources_of(study, pool), **read_by_algorithms(study)}
-    manifest, sources = comparable_inputs(manifest, sources, read_later(directory), study.origin.places)
+    manifest, sources = comparable_inputs(manifest, sources, later_files(directory), study.origin.places)
     changed = differences_now(manifest, manifest_of(study, identity_of(study, system, sources)))
     if changed and not as_it_is_now:
         more = f" (and {len(changed) - MOST_NAMED} more)" if len(changed) > MOST_NAMED else ""

@@ -29,12 +29,13 @@ def direction(member: Characteristic, value: float) -> str:
     return f"{member.name} {'up' if value > member.original else 'down'}"
 
 
-def command(study: str, values: Mapping[str, float], point: str = "") -> str:
+def simulate_command(study: str, values: Mapping[str, float], point: str = "") -> str:
     """The command that simulates these changes of a study, at one point of its matrix if one is named."""
-    return " ".join([ask("simulate", study, point), *(f"--set {quote(f'{name}={value!r}')}" for name, value in values.items())])
+    changes = (f"--set {quote(f'{name}={value!r}')}" for name, value in values.items())
+    return " ".join([question_command("simulate", study, point), *changes])
 
 
-def ask(question: str, place: str, point: str = "") -> str:
+def question_command(question: str, place: str, point: str = "") -> str:
     """The command that asks a question about results or a study, at one point of its matrix if one is named."""
     return " ".join([RUN, question, quote(place), *(["--point", quote(point)] if point else [])])
 

@@ -58,19 +58,19 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
 
 def read_by_algorithms(study: Study) -> Files:
     """Digests of files that a study's algorithms from outside read while they are loaded and instantiated, in this process."""
-    own = _packages(study)
-    if not own:
+    packages = _packages(study)
+    if not packages:
         return {}
     forget_foreign()
     with noted_reading() as reading:
         for label in study.search.labels:
             algorithm_of(label, study)
-    return digests(reading.files(own), study.origin.places)
+    return digests(reading.files(packages), study.origin.places)
 
 
 def search_of(key: RunKey, study: Study, problem: Problem, note: Callable[[Files], None]) -> Search:
     """The search of a run; calls `note` after every step with the files that an algorithm from outside has read."""
-    own, rng, ended = _packages(study), run_generator(study, key), False
+    packages, rng, ended = _packages(study), run_generator(study, key), False
     search: Search | None = None
     answer: Any = None  # starts a generator
     while True:
@@ -80,8 +80,8 @@ def search_of(key: RunKey, study: Study, problem: Problem, note: Callable[[Files
                 step: Any = search.send(answer)
             except StopIteration as end:
                 ended, step = True, end.value
-        if own:
-            note(digests(reading.files(own), study.origin.places))
+        if packages:
+            note(digests(reading.files(packages), study.origin.places))
         if ended:
             return step  # type: ignore[no-any-return]
         answer = yield step

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import accumulate
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -34,6 +34,14 @@ class Observer(Protocol):
         """Something has happened that the user should know."""
 
 
+class _Known(NamedTuple):
+    """A setting's `position` in the run (`SPARE` if the search has not requested it), and its `row` in `evaluations`."""
+
+    position: int
+    evaluations: Evaluations
+    row: int
+
+
 class Run:
     """A search, the settings that it requests, and their known evaluations.
 
@@ -54,12 +62,16 @@ class Run:
 
     def __init__(self, key: RunKey, search: Search, journal: Journal, observer: Observer, budget: int, *, retry: bool = False) -> None:
         self.key, self._search, self._journal, self._observer, self._budget = key, search, journal, observer, budget
-        self._known: dict[bytes, tuple[int, Evaluations, int]] = {}
-        self._taken: set[int] = set()
-        self._asked = 0
+        self._known: dict[bytes, _Known] = {}
+        self._occupied: set[int] = set()
+        """Positions in the run that have an evaluation."""
+        self._requested = 0
+        """Number of settings requested before the present request."""
         self._settings: FloatArray = np.empty((0, 0))
-        self._places: dict[bytes, int] = {}
-        self._fresh = 0
+        self._positions: dict[bytes, int] = {}
+        """Position in the run of each setting of the present request."""
+        self._simulated = 0
+        """Number of simulated settings of the present request."""
         self.result: Evaluations
         self.finished = False
         if journal.cut:
@@ -72,17 +84,17 @@ class Run:
     @property
     def missing(self) -> FloatArray:
         """The distinct requested settings without a known evaluation, shape (k, n)."""
-        return self._settings[[place - self._asked for row, place in self._places.items() if row not in self._known]]
+        return self._settings[[position - self._requested for key, position in self._positions.items() if key not in self._known]]
 
     @property
     def failures(self) -> list[Failure]:
         """Settings of this run that could not be simulated."""
-        return [Failure(self.key.algorithm, self.key.run, position, evaluations.reason(i))
-                for position, evaluations, i in self._asked_for() if evaluations.outcome[i] == FAILED]
+        return [Failure(self.key.algorithm, self.key.run, position, evaluations.reason(row))
+                for position, evaluations, row in self._requests() if evaluations.outcome[row] == FAILED]
 
-    def _asked_for(self) -> list[tuple[int, Evaluations, int]]:
-        """Position, evaluations and row in these for every distinct setting that this run requested, in their order."""
-        return sorted((known for known in self._known.values() if 0 <= known[0] < self._budget), key=lambda known: known[0])
+    def _requests(self) -> list[_Known]:
+        """The evaluations of the distinct settings that this run requested, in their order."""
+        return sorted((known for known in self._known.values() if 0 <= known.position < self._budget), key=lambda known: known.position)
 
     @property
     def collisions(self) -> int:
@@ -96,7 +108,7 @@ class Run:
 
     def _number_of(self, outcome: Outcome) -> int:
         value = outcome.value  # comparisons with the member itself are slow in numpy
-        return sum(evaluations.outcome[i] == value for position, evaluations, i in self._known.values()
+        return sum(evaluations.outcome[row] == value for position, evaluations, row in self._known.values()
                    if 0 <= position < self._budget)
 
     def advance(self) -> bool:
@@ -104,18 +116,18 @@ class Run:
         done = self._journal.content.result(self._budget)
         if done is not None:
             self.result = self._journal.content.by_position(done.positions)
-            self._asked, self.finished = done.asked, True
+            self._requested, self.finished = done.asked, True
             evaluations = self._journal.content.within(self._budget)
             if evaluations is not None:
                 self._observer.evaluated(self.key, evaluations, 0)
             return True
-        if not self._places:
+        if not self._positions:
             self._note_request(next(self._search))
-        while self._places.keys() <= self._known.keys():
-            self._place_spares()
+        while self._positions.keys() <= self._known.keys():
+            self._store_spares()
             evaluations = self._recalled(self._settings)
-            self._observer.evaluated(self.key, evaluations, self._fresh)
-            self._asked, self._fresh = self._asked + len(evaluations), 0
+            self._observer.evaluated(self.key, evaluations, self._simulated)
+            self._requested, self._simulated = self._requested + len(evaluations), 0
             try:
                 self._note_request(self._search.send(evaluations))
             except StopIteration as end:
@@ -125,85 +137,83 @@ class Run:
 
     def samples(self, rng: np.random.Generator) -> list[Evaluations]:
         """The most severe evaluation, which users will look at, the last one, to which most state may have leaked, and random others."""
-        scored = [known for known in self._known.values()
-                  if 0 <= known[0] < self._budget and known[1].valid[known[2]]]
+        scored = [known for known in self._requests() if known.evaluations.valid[known.row]]
         if not scored:
             return []
-        scored.sort(key=lambda known: known[0])
-        severe = min(scored, key=lambda known: np.nan_to_num(known[1].f_safe[known[2]], nan=np.inf))
-        by_chance = [scored[place] for place in rng.permutation(len(scored))[:BY_CHANCE].tolist()]
-        chosen = {known[0]: known for known in (severe, scored[-1], *by_chance)}
-        return [evaluations.take([i]) for _, evaluations, i in chosen.values()]
+        severe = min(scored, key=lambda known: np.nan_to_num(known.evaluations.f_safe[known.row], nan=np.inf))
+        by_chance = [scored[i] for i in rng.permutation(len(scored))[:BY_CHANCE].tolist()]
+        chosen = {known.position: known for known in (severe, scored[-1], *by_chance)}
+        return [evaluations.take([row]) for _, evaluations, row in chosen.values()]
 
     def solutions_and_others(self, rng: np.random.Generator) -> Evaluations:
         """The evaluations to verify in SUMO itself: all solutions, and `VERIFIED` random others."""
-        solutions = {row.tobytes() for row in self.result.settings}
-        scored = [known for known in self._asked_for() if known[1].outcome[known[2]] != FAILED]
-        in_solutions = [known[1].settings[known[2]].tobytes() in solutions for known in scored]
-        others = [known for known, is_solution in zip(scored, in_solutions, strict=True) if not is_solution]
-        chosen = [known for known, is_solution in zip(scored, in_solutions, strict=True) if is_solution]
-        chosen += [others[place] for place in rng.permutation(len(others))[:VERIFIED].tolist()]
-        return self._recalled(np.array([known[1].settings[known[2]] for known in chosen])) if chosen else self.result.take([])
+        solutions = {setting.tobytes() for setting in self.result.settings}
+        settings = [known.evaluations.settings[known.row] for known in self._requests() if known.evaluations.outcome[known.row] != FAILED]
+        chosen = [setting for setting in settings if setting.tobytes() in solutions]
+        others = [setting for setting in settings if setting.tobytes() not in solutions]
+        chosen += [others[i] for i in rng.permutation(len(others))[:VERIFIED].tolist()]
+        return self._recalled(np.array(chosen)) if chosen else self.result.take([])
 
     def is_repeated_by(self, search: Search) -> bool:
-        """Whether a search with this run's evaluations requests the same settings in the same places and returns the same solutions."""
-        settings, asked, places = next(search), 0, dict[bytes, int]()
-        while all(row.tobytes() in self._known for row in settings):
-            for i, row in enumerate(settings):
-                places.setdefault(row.tobytes(), asked + i)
-            asked += len(settings)
+        """Whether a search with this run's evaluations requests the same settings at the same positions and returns the same solutions."""
+        settings, requested, positions = next(search), 0, dict[bytes, int]()
+        while all(setting.tobytes() in self._known for setting in settings):
+            for i, setting in enumerate(settings):
+                positions.setdefault(setting.tobytes(), requested + i)
+            requested += len(settings)
             try:
                 settings = search.send(self._recalled(settings))
             except StopIteration as end:
-                expected = {row: place for row, (place, _, _) in self._known.items() if 0 <= place < self._budget}
-                return places == expected and np.array_equal(end.value.settings, self.result.settings)
+                expected = {key: known.position for key, known in self._known.items() if 0 <= known.position < self._budget}
+                return positions == expected and np.array_equal(end.value.settings, self.result.settings)
         return False
 
     def finish(self) -> None:
         """Journal the result of a search that has ended."""
         if not self.finished:
-            self._journal.finish([self._known[row.tobytes()][0] for row in self.result.settings], self._asked, self._budget)
+            positions = [self._known[setting.tobytes()].position for setting in self.result.settings]
+            self._journal.finish(positions, self._requested, self._budget)
         self.finished = True
-        self._observer.finished(self.key, self._asked)
+        self._observer.finished(self.key, self._requested)
 
     def take(self, evaluations: Evaluations) -> bool:
         """Journal and remember a computed batch; returns whether nothing is missing any more."""
-        self._place(evaluations)
-        self._fresh += len(evaluations)
-        return self._places.keys() <= self._known.keys()
+        self._store(evaluations)
+        self._simulated += len(evaluations)
+        return self._positions.keys() <= self._known.keys()
 
     def close(self) -> None:
         """Close the journal."""
         self._journal.close()
 
     def _note_request(self, settings: FloatArray) -> None:
-        """Note the settings that the search requests next, and the first place of each in the run."""
-        self._settings, self._places = settings, {}
-        for i, row in enumerate(settings):
-            self._places.setdefault(row.tobytes(), self._asked + i)
+        """Note the settings that the search requests next, and the first position of each in the run."""
+        self._settings, self._positions = settings, {}
+        for i, setting in enumerate(settings):
+            self._positions.setdefault(setting.tobytes(), self._requested + i)
 
-    def _place_spares(self) -> None:
-        """Journal the places of evaluations that were known before the search requested them."""
-        spares = [place - self._asked for row, place in self._places.items() if self._known[row][0] == SPARE]
+    def _store_spares(self) -> None:
+        """Journal the positions of evaluations that were known before the search requested them."""
+        spares = [position - self._requested for key, position in self._positions.items() if self._known[key].position == SPARE]
         if spares:
-            self._place(self._recalled(self._settings[spares]))
+            self._store(self._recalled(self._settings[spares]))
 
-    def _place(self, evaluations: Evaluations) -> None:
+    def _store(self, evaluations: Evaluations) -> None:
         """Journal and remember evaluations of the present request."""
-        positions = [self._places[row.tobytes()] for row in evaluations.settings]
-        if not self._taken.isdisjoint(positions):
+        positions = [self._positions[setting.tobytes()] for setting in evaluations.settings]
+        if not self._occupied.isdisjoint(positions):
             raise InputError(self._journal.path, "holds other settings than this search requests", "another --out")
         self._journal.append(positions, evaluations)
         self._remember(positions, evaluations)
 
     def _remember(self, positions: list[int], evaluations: Evaluations) -> None:
-        self._taken.update(position for position in positions if position != SPARE)
-        for i, position in enumerate(positions):
-            self._known[evaluations.settings[i].tobytes()] = (position, evaluations, i)
+        self._occupied.update(position for position in positions if position != SPARE)
+        for row, position in enumerate(positions):
+            self._known[evaluations.settings[row].tobytes()] = _Known(position, evaluations, row)
 
     def _recalled(self, settings: FloatArray) -> Evaluations:
         """The evaluations of known settings, in their order."""
-        known = [self._known[row.tobytes()] for row in settings]
-        parts = list({id(evaluations): evaluations for _, evaluations, _ in known}.values())
-        starts = dict(zip(map(id, parts), accumulate(map(len, parts), initial=0), strict=False))
-        return Evaluations.concatenate(parts).take([starts[id(evaluations)] + i for _, evaluations, i in known])
+        known = [self._known[setting.tobytes()] for setting in settings]
+        batches = list({id(evaluations): evaluations for _, evaluations, _ in known}.values())
+        starts = dict(zip(map(id, batches), accumulate(map(len, batches), initial=0), strict=False))
+        return Evaluations.concatenate(batches).take([starts[id(evaluations)] + row for _, evaluations, row in known])

@@ -36,9 +36,9 @@ class Verification:
         self._study, self._pool, self._begin_search, self._observer = study, pool, begin_search, observer
         self._alone = packed(study, results.inputs, engine=engine, afresh=True) if foreign_names(study) else b""
         self._is_recorded = engine is Engine.RECORDED
-        self._driven = driven_in_sumo(study, assemble(study).weather)
-        inputs = results.inputs if self._driven is study else {**results.inputs, "network": networks_of(assemble(self._driven))}
-        self._in_sumo = Batcher(pool, packed(self._driven, inputs, engine=Engine.LIBSUMO), LARGEST_WORLD)
+        self._sumo_study = driven_in_sumo(study, assemble(study).weather)
+        inputs = results.inputs if self._sumo_study is study else {**results.inputs, "network": networks_of(assemble(self._sumo_study))}
+        self._in_sumo = Batcher(pool, packed(self._sumo_study, inputs, engine=Engine.LIBSUMO), LARGEST_WORLD)
         self._leaks: dict[Future[Evaluations], tuple[Run, Evaluations]] = {}
         self._unverified: dict[Run, tuple[Evaluations, int]] = {}
         """By run: the evaluations that SUMO verifies, and the number of those still missing from SUMO."""
@@ -72,8 +72,8 @@ class Verification:
         known = run.solutions_and_others(rng) if self._is_recorded else None
         if not known:
             return False
-        if self._driven is not self._study:  # SUMO drives settings in a few of a rating's cells
-            known = evaluate(assemble(self._driven), known.settings)
+        if self._sumo_study is not self._study:  # SUMO drives settings in a few of a rating's cells
+            known = evaluate(assemble(self._sumo_study), known.settings)
         self._unverified[run] = known, len(known)
         self._in_sumo.add(run, known.settings)
         return True

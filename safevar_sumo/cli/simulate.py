@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from safevar_sumo.analysis.model_spread import ModelSpread, model_spreads, studies_of_sets
-from safevar_sumo.analysis.words import ask
+from safevar_sumo.analysis.words import question_command
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
 from safevar_sumo.cli.options import (
     PICTURES,
@@ -130,7 +130,7 @@ def _print_results(target: Target, system: System, simulation: Simulation, sprea
         if system.rater is None:
             print_matrix(Console(), points)
         else:
-            print_text(Console(), f"{len(system.matrix)} cells and variations: {ask('rating', target.source)} --matrix")
+            print_text(Console(), f"{len(system.matrix)} cells and variations: {question_command('rating', target.source)} --matrix")
         if types := tags(system.points):
             print_text(Console(), types)
     remarks = [remark for point in system.points for remark in remarks_of(point.scenario)]

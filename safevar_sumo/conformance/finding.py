@@ -115,17 +115,17 @@ class Source:
     """
 
     def __init__(self, member: Member) -> None:
-        self._what = getattr(member.what, "function", member.what)
+        self._object = getattr(member.target, "function", member.target)
         self._is_fmu, self.file = bool(member.file), member.file or self._file()
         self._folder = str(Path(self.file).parent)
         self._last: tuple[str, int] | None = None
-        self._mine: dict[CodeType, bool] = {}
+        self._of_author: dict[CodeType, bool] = {}
 
     def _file(self) -> str:
         try:
-            return inspect.getsourcefile(self._what) or inspect.getfile(self._what)
+            return inspect.getsourcefile(self._object) or inspect.getfile(self._object)
         except TypeError:
-            return str(getattr(sys.modules.get(getattr(self._what, "__module__", "")), "__file__", "") or "")
+            return str(getattr(sys.modules.get(getattr(self._object, "__module__", "")), "__file__", "") or "")
 
     @contextmanager
     def watched(self) -> Iterator[None]:
@@ -141,13 +141,13 @@ class Source:
         if event != "return":
             return
         code = frame.f_code
-        if self._is_mine(code):
+        if self._is_authors(code):
             self._last = code.co_filename, frame.f_lineno
 
-    def _is_mine(self, code: CodeType) -> bool:
-        if code not in self._mine:
-            self._mine[code] = code.co_filename.startswith(self._folder) and "site-packages" not in code.co_filename
-        return self._mine[code]
+    def _is_authors(self, code: CodeType) -> bool:
+        if code not in self._of_author:
+            self._of_author[code] = code.co_filename.startswith(self._folder) and "site-packages" not in code.co_filename
+        return self._of_author[code]
 
     def of_error(self, error: BaseException) -> tuple[str, int]:
         """The innermost line of the author's code that an exception passed through; else the line that returned last."""
@@ -157,7 +157,7 @@ class Source:
         while one is not None:
             frame, place = one.__traceback__, None
             while frame is not None:
-                if self._is_mine(frame.tb_frame.f_code):
+                if self._is_authors(frame.tb_frame.f_code):
                     place = frame.tb_frame.f_code.co_filename, frame.tb_lineno
                 frame = frame.tb_next
             if place is not None and not isinstance(one, InputError):
@@ -174,12 +174,12 @@ class Source:
         if self._is_fmu:
             return self.file, 1
         for name in methods:
-            function = inspect.unwrap(getattr(self._what, name, None) or object)
+            function = inspect.unwrap(getattr(self._object, name, None) or object)
             code = getattr(function, "__code__", None)
             if code is not None and code.co_filename.startswith(self._folder):
                 return code.co_filename, code.co_firstlineno
         try:
-            return self.file, max(inspect.getsourcelines(self._what)[1], 1)
+            return self.file, max(inspect.getsourcelines(self._object)[1], 1)
         except (OSError, TypeError):
             return self.file, 1
 
@@ -193,7 +193,7 @@ class Source:
         if self._is_fmu:
             return None
         try:
-            tree = _part_of(ast.parse(_text(self.file)), str(getattr(self._what, "__name__", "")))
+            tree = _part_of(ast.parse(_text(self.file)), str(getattr(self._object, "__name__", "")))
         except (SyntaxError, ValueError):
             return None
         lines = sorted({*SUSPECTS[check](tree)})
@@ -260,7 +260,7 @@ def _state_lines(tree: ast.AST) -> Iterator[int]:
               for target in (node.targets if isinstance(node, ast.Assign) else [node.target]) if isinstance(target, ast.Name)}
     scalar = {id(one) for one in classes if any("ScalarAds" in ast.unparse(base) for base in one.bases)}
     for function in _functions(tree):
-        outer = {name for node in ast.walk(function) if isinstance(node, ast.Global | ast.Nonlocal) for name in node.names}
+        declared = {name for node in ast.walk(function) if isinstance(node, ast.Global | ast.Nonlocal) for name in node.names}
         for default in [*function.args.defaults, *filter(None, function.args.kw_defaults)]:
             if isinstance(default, ast.List | ast.Dict | ast.Set):
                 yield function.lineno
@@ -272,13 +272,13 @@ def _state_lines(tree: ast.AST) -> Iterator[int]:
             for target in targets:
                 base: ast.expr = target.value if isinstance(target, ast.Attribute | ast.Subscript) else target
                 text = ast.unparse(base)
-                if text in owners or (isinstance(target, ast.Name) and target.id in outer) \
+                if text in owners or (isinstance(target, ast.Name) and target.id in declared) \
                         or (isinstance(target, ast.Subscript) and text.rpartition(".")[2] in shared) \
                         or (isinstance(target, ast.Attribute) and text == "self" and not begins):
                     yield target.lineno
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in MUTATORS:
-                held = ast.unparse(node.func.value)
-                if held.rpartition(".")[2] in shared or (held.startswith("self.") and not begins) or held in owners:
+                receiver = ast.unparse(node.func.value)
+                if receiver.rpartition(".")[2] in shared or (receiver.startswith("self.") and not begins) or receiver in owners:
                     yield node.lineno
             if isinstance(node, ast.Call) and ast.unparse(node.func) in ("next", "setattr") and node.args \
                     and ast.unparse(node.args[0]) in shared | owners:

@@ -234,5 +234,5 @@ class StudyProbe(Probe):
     def cost(self, model: System, seconds: float) -> tuple[float, str]:
         if self.subject.kind != "traci":
             return 0.0, ""
-        mine = seconds / self.number / len(drive_all(model, self.settings).trace.time)
-        return mine, f"{mine * 1e6:.2g} microseconds per vehicle and step, SUMO's own included"
+        per_step = seconds / self.number / len(drive_all(model, self.settings).trace.time)
+        return per_step, f"{per_step * 1e6:.2g} microseconds per vehicle and step, SUMO's own included"

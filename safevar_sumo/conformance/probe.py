@@ -73,9 +73,9 @@ class Probe(ABC):
 def loaded_again(subject: Subject) -> Any:
     """The class, function or record, from its module as it is loaded now."""
     if subject.is_ours or subject.member.file:
-        return subject.member.what
+        return subject.member.target
     with importable():
-        return Lookup("check", subject.study.origin.places).find({}, subject.name, subject.key).what
+        return Lookup("check", subject.study.origin.places).find({}, subject.name, subject.key).target
 
 
 def guard_of(subject: Subject) -> Guard:
@@ -89,10 +89,10 @@ def timed(run: Callable[[], Any]) -> float:
     return (time.perf_counter() - start) / load_factor()
 
 
-def cost_of(mine: float, ours: float, example: str, vehicles: int, steps: int) -> tuple[float, str]:
-    """Time per vehicle and step [s], and a sentence that compares it."""
-    mine, ours = mine / (vehicles * steps), ours / (vehicles * steps)
-    return mine, f"{mine * 1e6:.2g} microseconds per vehicle and step, {vehicles} at once; ours ({example}) takes {ours * 1e6:.2g}"
+def cost_of(seconds: float, reference: float, example: str, vehicles: int, steps: int) -> tuple[float, str]:
+    """Time per vehicle and step [s] of a run that took `seconds`, and a sentence that compares it with the example's `reference` [s]."""
+    own, ours = seconds / (vehicles * steps), reference / (vehicles * steps)
+    return own, f"{own * 1e6:.2g} microseconds per vehicle and step, {vehicles} at once; ours ({example}) takes {ours * 1e6:.2g}"
 
 
 def corners(members: CharacteristicSet) -> FloatArray:

@@ -85,17 +85,17 @@ def subject_of(name: str, study: str | None = None) -> Subject:
     if name.endswith(".fmu"):
         return _fmu_of(name, chosen)
     if ":" not in name:
-        everything = [*study_names(), *OBJECTIVES, *(one for members in KINDS.values() for one in members)]
-        raise unknown("check", f"there is nothing called {name!r}", name, everything, ", package.module:Name, or the path of a study file")
+        names = [*study_names(), *OBJECTIVES, *(one for members in KINDS.values() for one in members)]
+        raise unknown("check", f"there is nothing called {name!r}", name, names, ", package.module:Name, or the path of a study file")
     places = () if chosen is None else chosen.origin.places
     with importable():
         member = Lookup("check", places).find({}, name, "SUBJECT")
     beside = [] if chosen else list(_studies_beside(name, member.folder))
     study_of = chosen or (beside[0] if beside else None)
-    kind = next((kind for kind in KINDS if study_of is not None and _named(study_of, kind, name)), "") or kind_of(member.what)
+    kind = next((kind for kind in KINDS if study_of is not None and _named(study_of, kind, name)), "") or kind_of(member.target)
     if not kind:
         legal = "a class with the methods of an ADS, a vehicle, a scenario, an algorithm or a TraCI controller; a Metric; a Change"
-        raise InputError("check", f"{name!r} is {_short(member.what)}, which is nothing that a study can name", legal)
+        raise InputError("check", f"{name!r} is {_short(member.target)}, which is nothing that a study can name", legal)
     remarks = (f"tried in {beside[0].origin.called}, which names it",) if beside else ()
     return _in_study(Subject(name, kind, member, study_of or load_study(DEFAULT_STUDIES.get(kind, "smoke")), {}, remarks))
 
@@ -130,8 +130,8 @@ def subjects_of(study: Study) -> Iterator[Subject]:
             seen.add(name)
             with importable():
                 member = lookup.find(CHANGES if kind == "objective" else KINDS[kind], name, KEYS.get(kind, f"{kind}.model"))
-            what = "metric" if isinstance(member.what, Metric) else kind
-            yield Subject(name, what, member, study, _parameters(study, what, name))
+            subject_kind = "metric" if isinstance(member.target, Metric) else kind
+            yield Subject(name, subject_kind, member, study, _parameters(study, subject_kind, name))
 
 
 def _fmu(study: Study, kind: str, name: str) -> Subject:
@@ -160,7 +160,7 @@ def kind_of(what: Any) -> str:
 
 def violation(subject: Subject) -> tuple[str, str]:
     """The reason why a subject does not meet its contract, by inspection alone, and the expectation; empty reason if it does."""
-    what, kind = subject.member.what, subject.kind
+    what, kind = subject.member.target, subject.kind
     if kind in ("metric", "objective"):
         record = Metric if kind == "metric" else Change
         fields = "name=..., title=..., unit=..., " + ("more_is_unsafe=..., " if kind == "metric" else "") + "function=..."
@@ -198,26 +198,26 @@ def _in_study(subject: Subject) -> Subject:
     study, kind, name = subject.study, subject.kind, subject.name
     if _named(study, kind, name):
         return subject._replace(parameters=_parameters(study, kind, name))
-    given, guessed = _guess(subject.member.what) if kind in METHODS else ({}, "")
+    parameters, guessed = _guess(subject.member.target) if kind in METHODS else ({}, "")
     remarks = [*subject.remarks, *([guessed] if guessed else [])]
     tables: dict[str, Any] = {}
     if kind in ("ads", "traci"):
-        tables["ads"] = ModelTable(model=name, parameters=given, kind="traci" if kind == "traci" else "")
+        tables["ads"] = ModelTable(model=name, parameters=parameters, kind="traci" if kind == "traci" else "")
     elif kind == "scenario":
-        tables["scenario"], tables["matrix"] = ModelTable(model=name, parameters=given), None
+        tables["scenario"], tables["matrix"] = ModelTable(model=name, parameters=parameters), None
     elif kind == "vehicle":
-        units = getattr(subject.member.what, "UNITS", None)
+        units = getattr(subject.member.target, "UNITS", None)
         rows, note = _characteristics(units if isinstance(units, Mapping) else {}, study)
         remarks += [note] if note else []
-        tables["vehicle"] = msgspec.structs.replace(study.vehicle, model=name, parameters=given, characteristics=rows)
+        tables["vehicle"] = msgspec.structs.replace(study.vehicle, model=name, parameters=parameters, characteristics=rows)
         tables |= {"variation": {}, "correlations": [], "calibration": {}}
     elif kind == "algorithm":
-        tables["search"] = msgspec.structs.replace(study.search, algorithms=[name], parameters={name.rpartition(":")[2]: given})
+        tables["search"] = msgspec.structs.replace(study.search, algorithms=[name], parameters={name.rpartition(":")[2]: parameters})
     elif kind == "metric":
         tables["metrics"] = msgspec.structs.replace(study.metrics, also=[] if name in METRICS else [name])
     else:
         tables["search"] = msgspec.structs.replace(study.search, objectives=["safety_degree", name])
-    return subject._replace(study=msgspec.structs.replace(study, **tables), parameters=given, remarks=tuple(remarks))
+    return subject._replace(study=msgspec.structs.replace(study, **tables), parameters=parameters, remarks=tuple(remarks))
 
 
 def _guess(what: Any) -> tuple[dict[str, Any], str]:

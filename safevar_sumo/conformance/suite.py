@@ -231,8 +231,8 @@ class _Suite:
         advice = ADVICE[check].format(base=BASES[self._subject.kind])
         if self._subject.member.file:
             advice = ADVICE_ON_FMUS.get(check, "see the tutorial on FMUs")
-        elif check == "contract" and self._subject.kind == "ads" and isinstance(self._subject.member.what, type) \
-                and not issubclass(self._subject.member.what, ScalarAds):
+        elif check == "contract" and self._subject.kind == "ads" and isinstance(self._subject.member.target, type) \
+                and not issubclass(self._subject.member.target, ScalarAds):
             advice += "; an ADS for one vehicle derives from safevar_sumo.ads.ScalarAds"
         return Finding(check=check, file=place[0], line=place[1], expected=expected, got=got, advice=advice)
 

@@ -46,11 +46,11 @@ class Reading:
         self.paths: set[str] = set()
         self.modules: set[str] = set()
 
-    def files(self, own: Sequence[str] = ()) -> set[str]:
-        """Every input file: sources in place of Python's caches; of installed packages only those named in `own`."""
-        installed = {file for name in list(sys.modules) if name.partition(".")[0] in own and not is_foreign(file := _file_of(name))}
+    def files(self, packages: Sequence[str] = ()) -> set[str]:
+        """Every input file: sources in place of Python's caches; of installed packages only those named in `packages`."""
+        installed = {file for name in list(sys.modules) if name.partition(".")[0] in packages and not is_foreign(file := _file_of(name))}
         files = {*self.paths, *map(_file_of, self.modules), *installed} - {""}
-        return {path for path in map(_source_of, files) if _counts(path, own)}
+        return {path for path in map(_source_of, files) if _counts(path, packages)}
 
 
 def _file_of(module: str) -> str:
@@ -125,11 +125,11 @@ def _source_of(path: str) -> str:
     return path
 
 
-def _counts(path: str, own: Sequence[str]) -> bool:
+def _counts(path: str, packages: Sequence[str]) -> bool:
     parts = Path(path).parts
     if path in watch.written or any(name in parts for name in CACHES) or not os.path.isfile(path):
         return False
-    return is_foreign(path) or any(parts[parts.index(name) + 1].partition(".")[0] in own for name in LIBRARIES if name in parts)
+    return is_foreign(path) or any(parts[parts.index(name) + 1].partition(".")[0] in packages for name in LIBRARIES if name in parts)
 
 
 def digest_of(path: Path | str) -> str:

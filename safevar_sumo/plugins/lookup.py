@@ -35,7 +35,7 @@ class Member(NamedTuple):
     of that module's top package. An FMU is a `file`; the class that simulates it is the package's own.
     """
 
-    what: Any
+    target: Any
     guard: Guard | None = None
     module: str = ""
     folder: str = ""
@@ -83,11 +83,11 @@ class Lookup(NamedTuple):
             raise InputError(self.source, f"{key} = {name!r}{did_you_mean(name, members)}", legal)
         places = [*self.places, os.getcwd()]
         module, folder = self._imported(module_name, Guard(self.source, f"{key} = {name!r}"), places)
-        what = Guard(self.source, f"{key} = {name!r}", folder).call("import", getattr, module, attribute, _NOTHING)
-        if what is _NOTHING:
+        target = Guard(self.source, f"{key} = {name!r}", folder).call("import", getattr, module, attribute, _NOTHING)
+        if target is _NOTHING:
             problem = f"{key} = {name!r} cannot be imported: AttributeError: {module.__file__ or module_name} has no {attribute!r}"
             raise InputError(self.source, problem, legal)
-        return Member(what, Guard(self.source, f"{key} = {name!r}", folder), module_name, folder)
+        return Member(target, Guard(self.source, f"{key} = {name!r}", folder), module_name, folder)
 
     def class_of(self, members: Mapping[str, Any], name: str, key: str, *contracts: Contract, otherwise: str = "") -> Member:
         """A class by name; a class from outside must meet the first contract that applies to it.
@@ -95,8 +95,8 @@ class Lookup(NamedTuple):
         `otherwise` describes legal values that are no classes.
         """
         member = self.find(members, name, key)
-        contract = next(contract for contract in contracts if contract.applies_to(member.what))
-        reason = contract.violation(member.what) if member.guard else ""
+        contract = next(contract for contract in contracts if contract.applies_to(member.target))
+        reason = contract.violation(member.target) if member.guard else ""
         if reason:
             raise InputError(self.source, f"{key} = {name!r} {reason}", "; or ".join([*map(str, contracts), *filter(None, [otherwise])]))
         return member
@@ -263,7 +263,7 @@ def instance_of(member: Member, parameters: Mapping[str, Any], name: str, key: s
     InputError
         If the class does not take the parameters.
     """
-    cls = member.what
+    cls = member.target
     if issubclass(cls, msgspec.Struct):
         watch.inside += member.guard is not None
         try:

@@ -19,7 +19,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.reference.rows import ReferenceData
-from safevar_sumo.results import fixed, write_whole
+from safevar_sumo.results import evaluation_keys, write_whole
 from safevar_sumo.study import SAFETY_DEGREE, Study, load_study, refuse_other_than_file, study_names
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -315,5 +315,5 @@ def _totals(study: str, file: str, entry: Mapping[str, Any]) -> Totals:
 
 
 def _simulation(study: Study) -> dict[str, Any]:
-    keys = fixed(study)
+    keys = evaluation_keys(study)
     return {name: keys.get(name) for name in COMPARED}

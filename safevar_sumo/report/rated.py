@@ -13,7 +13,7 @@ from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.rating.compute import Rating, rate, remarks
 from safevar_sumo.analysis.rating.render import lost_by_test, matrices_figure, not_simulated, test_in_words, turned_in_words, verdict
-from safevar_sumo.analysis.words import ask
+from safevar_sumo.analysis.words import question_command
 from safevar_sumo.report.input import ReportInput
 from safevar_sumo.results import chosen_handle, position_of
 from safevar_sumo.vehicles import CharacteristicSet
@@ -35,7 +35,7 @@ def rated_study_page(data: ReportInput, jobs: int | None, progress: Progress) ->
     return {"title": case.study.title, "sentence": verdict(rating), "notes": remarks(rating), "points": _points(rating),
             "lost": [(test_in_words(test), f"{lost:.2f}") for test, lost in lost_by_test(rating)], "turned": turned_in_words(rating),
             "picture": picture(rating), "names": [variant.name for variant in rating.variants], "open": not_simulated(rating),
-            "commands": [rating_command, ask("tolerance", str(data.directory)), ask("explain", str(data.directory))]}
+            "commands": [rating_command, *(question_command(question, str(data.directory)) for question in ("tolerance", "explain"))]}
 
 
 def _points(rating: Rating) -> Sequence[tuple[str, Sequence[str], str]]:

@@ -36,7 +36,7 @@ OUTCOMES = {
 _OUTCOME_OF = {code: outcome.value for outcome, code in OUTCOMES.items()}
 BESIDE_METRICS = ("collision_speed", "f_diff", "f_num_diff")
 SPARE = -1
-"""Position of an evaluation that the search has not asked for (again)."""
+"""Position of an evaluation that the search has not requested (again)."""
 
 
 class Owner(msgspec.Struct, frozen=True, tag="owner"):
@@ -58,7 +58,7 @@ class Batch(msgspec.Struct, frozen=True, tag="batch", omit_defaults=True):
 
 
 class Result(msgspec.Struct, frozen=True, tag="result", omit_defaults=True):
-    """The result of a run with a `budget` of evaluations (0 in format 1), by their positions; `asked` is how many the run asked for."""
+    """The result of a run with a `budget` of evaluations (0 in format 1), by their positions; `asked` is the number of its requests."""
 
     positions: list[int]
     asked: int
@@ -91,7 +91,7 @@ class Content(NamedTuple):
         return self.evaluations.take([row_of[position] for position in positions])
 
     def within(self, budget: int) -> Evaluations | None:
-        """The evaluations that a run with a budget asked for; None if there is none."""
+        """The evaluations that a run with this budget requested; None if there is none."""
         if self.evaluations is None:
             return None
         return self.evaluations.take(np.array([0 <= position < budget for position in self.positions], dtype=bool))

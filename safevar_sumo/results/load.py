@@ -11,7 +11,7 @@ import numpy as np
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.results.imported import read_imported
 from safevar_sumo.results.journal import Content, read_journal
-from safevar_sumo.results.manifest import MANIFEST, RUNS, is_edited, owner, read_manifest, refuse_edited_table
+from safevar_sumo.results.manifest import MANIFEST, RUNS, is_edited, owner_digest, read_manifest, refuse_edited_table
 from safevar_sumo.results.store import SOLUTIONS, evaluations_frame, solutions_frame
 from safevar_sumo.study import label_of
 
@@ -133,7 +133,7 @@ def _search_of(place: Path, manifest: Mapping[str, Any]) -> _Search:
 
 def _journals(place: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str, int]]) -> Iterator[tuple[str, int, Content | None]]:
     """Algorithm, run and journal of every run; None for a run without a journal."""
-    study = owner(manifest)
+    study = owner_digest(manifest)
     for algorithm, run in runs:
         path = place / RUNS / f"{algorithm}-{run:02d}.journal"
         yield algorithm, run, read_journal(path, study, path.stem) if path.exists() else None

@@ -52,11 +52,11 @@ def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
         Inputs of its results besides its file, by `LAYERS`; see `safevar_sumo.workers.identity.identity_of`.
     """
     return {
-        "format": FORMAT, "study": tables_of(study), "seed": study.search.seed, "resolved": fixed(study), **identity,
+        "format": FORMAT, "study": tables_of(study), "seed": study.search.seed, "resolved": evaluation_keys(study), **identity,
         "versions": {name: version(name) for name in VERSIONED}}
 
 
-def fixed(study: Study) -> dict[str, Any]:
+def evaluation_keys(study: Study) -> dict[str, Any]:
     """Study keys that affect evaluations."""
     everything: dict[str, Any] = tables_of(study)
     for characteristic in everything["vehicle"]["characteristics"].values():
@@ -70,7 +70,7 @@ def fixed(study: Study) -> dict[str, Any]:
     return {**{key: value for key, value in everything.items() if key not in FREE}, "search": search}
 
 
-def owner(manifest: Mapping[str, Any]) -> str:
+def owner_digest(manifest: Mapping[str, Any]) -> str:
     """The digest that identifies a manifest's study in its journals."""
     if "format" in manifest:
         return _digest({layer: manifest.get(layer) for layer in (LAYERS if manifest["format"] == FORMAT else LAYERS_BEFORE)})
@@ -211,13 +211,13 @@ def places_of(directory: Path) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*filter(os.path.isdir, own), *map(str, directory.resolve().parents[:2])]))
 
 
-def note_reading(directory: Path, name: str, digest: str) -> None:
+def note_later_file(directory: Path, name: str, digest: str) -> None:
     """Note a file that was read after the study began; one note a file, because several processes may write them."""
     make_durable(directory / RUNS)
     write_whole(directory / RUNS / LATER.replace("*", sha256(name.encode()).hexdigest()[:DIGITS]), json.dumps({name: digest}) + "\n")
 
 
-def read_later(directory: Path) -> Files:
+def later_files(directory: Path) -> Files:
     """Digests of files, by name, that were read after the study began."""
     return {name: digest for path in sorted((directory / RUNS).glob(LATER)) for name, digest in _read(path, {}).items()}
 

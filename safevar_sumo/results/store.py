@@ -24,10 +24,10 @@ from safevar_sumo.results.manifest import (
     difference,
     digest_of_table,
     extent_of,
+    later_files,
     manifest_of,
-    note_reading,
-    owner,
-    read_later,
+    note_later_file,
+    owner_digest,
     read_manifest,
     write_manifest,
     write_places,
@@ -87,19 +87,19 @@ class ResultsDirectory:
             If a file has changed since it was first read.
         """
         for name, digest in files.items():
-            recorded = self._known.get(name) or read_later(self.path).get(name, digest)
+            recorded = self._known.get(name) or later_files(self.path).get(name, digest)
             if recorded != digest:
                 raise InputError(name, "is not the file that this study began with: it was changed meanwhile",
                                  "the file as it was, and the same command; or another --out")
             if name not in self._known:
-                note_reading(self.path, name, digest)
+                note_later_file(self.path, name, digest)
                 self._known[name] = digest
 
     def journal(self, run: str) -> Journal:
         """Open and lock the journal of a run, such as nsga2-03."""
         path = self.path / RUNS / f"{run}.journal"
         try:
-            return Journal(path, owner(self.manifest), run)
+            return Journal(path, owner_digest(self.manifest), run)
         except JournalBusy:
             self._refuse_another_owner(path)
             raise
@@ -129,7 +129,7 @@ class ResultsDirectory:
             if others and not (self.path / RUNS).exists():  # if there are journals, their owner decides whose directory this is
                 raise InputError("out", f"{self.path} holds other files: {others[0]}", "an empty directory, or one of this study")
             return
-        stored, later = read_manifest(self.path), read_later(self.path)
+        stored, later = read_manifest(self.path), later_files(self.path)
         if "imported" not in stored and later:
             stored, self.manifest["sources"] = comparable_inputs(stored, self._known, later, self._study.origin.places)
         text, way_back = ("they are imported", "") if "imported" in stored else difference(stored, self.manifest)
@@ -143,7 +143,7 @@ class ResultsDirectory:
         end = time.monotonic() + SECONDS_TO_CLAIM
         while (its_owner := owner_of(path)) is None and time.monotonic() < end:
             time.sleep(SECONDS_TO_CLAIM / 1000)
-        if its_owner != owner(self.manifest):
+        if its_owner != owner_digest(self.manifest):
             raise InputError(self.path, "is in use by another study that is running now", "another --out")
 
     def _remove(self, path: Path) -> None:

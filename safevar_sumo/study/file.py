@@ -106,9 +106,9 @@ def _with_algorithms(raw: dict[str, Any]) -> dict[str, Any]:
     search = raw.get("search")
     if not isinstance(search, dict) or not isinstance(search.get("parameters", {}), dict):
         return raw
-    own = {key: value for key, value in search.items() if isinstance(value, dict) and key not in SearchTable.__struct_fields__}
-    rest = {key: value for key, value in search.items() if key not in own}
-    return {**raw, "search": {**rest, "parameters": {**rest.get("parameters", {}), **own}}} if own else raw
+    of_algorithms = {key: value for key, value in search.items() if isinstance(value, dict) and key not in SearchTable.__struct_fields__}
+    others = {key: value for key, value in search.items() if key not in of_algorithms}
+    return {**raw, "search": {**others, "parameters": {**others.get("parameters", {}), **of_algorithms}}} if of_algorithms else raw
 
 
 def _read(path: Path, seen: tuple[Path, ...]) -> _Raw:
@@ -144,26 +144,26 @@ def _extended(raw: _Raw, path: Path, seen: tuple[Path, ...]) -> _Raw:
         tables["name"] = path.stem
     beside = path.parent / base
     extended = _read(beside if is_file(beside) else study_path(base), (*seen, path))
-    over = _overridden(extended, tables, raw.source)
+    merged = _overridden(extended, tables, raw.source)
     places = tuple(dict.fromkeys((*raw.origin.places, *extended.origin.places)))
-    remarks = () if path.parent == STUDIES else over.origin.remarks  # shipped studies leave keys out on purpose
-    return over._replace(origin=msgspec.structs.replace(over.origin, called=raw.origin.called, places=places, remarks=remarks))
+    remarks = () if path.parent == STUDIES else merged.origin.remarks  # shipped studies leave keys out on purpose
+    return merged._replace(origin=msgspec.structs.replace(merged.origin, called=raw.origin.called, places=places, remarks=remarks))
 
 
-def _overridden(base: _Raw, over: Mapping[str, Any], source: object) -> _Raw:
+def _overridden(base: _Raw, overrides: Mapping[str, Any], source: object) -> _Raw:
     """Override a study's tables; another system does not inherit the keys `OF_ONE_SYSTEM`."""
-    tables = _merged(base.tables, over)
+    tables = _merged(base.tables, overrides)
     other = [key for key in ("weather", "vehicle", "ads", "scenario", "matrix") if _kind(tables.get(key)) != _kind(base.tables.get(key))]
     remarks = base.origin.remarks
     if other:
-        lost = [key for key in OF_ONE_SYSTEM[:2] if key in base.tables and key not in over]
+        dropped = [key for key in OF_ONE_SYSTEM[:2] if key in base.tables and key not in overrides]
         tables = {**{key: value for key, value in tables.items() if key not in OF_ONE_SYSTEM}, "title": tables.get("name", ""),
-                  **{key: over[key] for key in OF_ONE_SYSTEM if key in over}}
+                  **{key: overrides[key] for key in OF_ONE_SYSTEM if key in overrides}}
         if "vehicle" in other or "ads" in other:  # both are about their parameters
-            tables = {key: value for key, value in tables.items() if key in over or key not in ("spread", "model_error")}
-        if lost:
+            tables = {key: value for key, value in tables.items() if key in overrides or key not in ("spread", "model_error")}
+        if dropped:
             remarks = (*remarks, f"{source}: has another {' and another '.join(other)} than study {base.tables.get('name')!r}, whose "
-                                 f"{' and '.join(lost)} it does not inherit")
+                                 f"{' and '.join(dropped)} it does not inherit")
     return _Raw(source, tables, msgspec.structs.replace(base.origin, remarks=remarks))
 
 
@@ -175,10 +175,10 @@ def _kind(table: object) -> object:
     return table.get("model", table), parameters.get("network") if isinstance(parameters, dict) else None
 
 
-def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Override `base` by `over`; another `model` or `distribution`, and the tables `REPLACED`, replace a whole table."""
+def _merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Override `base` by `overrides`; another `model` or `distribution`, and the tables `REPLACED`, replace a whole table."""
     result = dict(base)
-    for key, value in over.items():
+    for key, value in overrides.items():
         result[key] = _merged(base[key], value) if _refines(key, base.get(key), value) else value
     return result
 

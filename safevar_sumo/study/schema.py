@@ -248,7 +248,7 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """
 
     # A new key that changes no result of a campaign also belongs in FREE of results/manifest.py. Any other new key becomes part of the
-    # identity of results: let `fixed` there omit its default, so that older results keep their identity.
+    # identity of results: let `evaluation_keys` there omit its default, so that older results keep their identity.
     name: Annotated[str, Meta(pattern=NAME)]
     title: str
     scenario: ModelTable

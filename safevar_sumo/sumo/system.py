@@ -79,11 +79,11 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
         member = lookup.find(own, name, key)
         if member.guard is None:
             if name in FURTHER:
-                metrics[name] = member.what
-            return member.what  # type: ignore[no-any-return]
+                metrics[name] = member.target
+            return member.target  # type: ignore[no-any-return]
         members.append(member)
-        foreign = isinstance(member.what, Change) and key == OBJECTIVES
-        record = foreign_change(member.what, member.guard) if foreign else foreign_metric(member.what, member.guard)
+        foreign = isinstance(member.target, Change) and key == OBJECTIVES
+        record = foreign_change(member.target, member.guard) if foreign else foreign_metric(member.target, member.guard)
         if record.name in (*RESERVED, *metrics, *FURTHER, *changes, *study.vehicle.characteristics):
             raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a unique name")
         if isinstance(record, Change):
@@ -245,7 +245,7 @@ def _traci(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
     name = f"ads.model = {choice.model!r}"
     with importable():
         member = lookup.find({}, choice.model, "ads.model")
-        what, parameters = member.what, lookup.with_paths(member, choice.parameters, "ads.parameters")
+        what, parameters = member.target, lookup.with_paths(member, choice.parameters, "ads.parameters")
         if not callable(getattr(what, "step", None) if inspect.isclass(what) else what):
             raise InputError(lookup.source, f"{name} has no step", STEP)
         if not inspect.isclass(what):
@@ -255,7 +255,7 @@ def _traci(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
             """A controller for one vehicle, from its own instance of the module."""
             if not inspect.isclass(what):
                 return partial(what, **parameters)
-            return instance_of(member._replace(what=what), parameters, name, "ads.parameters", lookup.source)
+            return instance_of(member._replace(target=what), parameters, name, "ads.parameters", lookup.source)
 
         controller_of(what)
     places, attribute = [*lookup.places, os.getcwd()], choice.model.partition(":")[2]
@@ -356,6 +356,6 @@ def _ads(choice: ModelTable, lookup: Lookup, limit: float) -> tuple[Ads, Member]
     parameters = lookup.with_paths(member, choice.parameters, "ads.parameters")
     make = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
     driver = make()  # for a ScalarAds, too, so that wrong parameters raise their errors here
-    if issubclass(member.what, ScalarAds):
+    if issubclass(member.target, ScalarAds):
         return PerVehicle(make, member.guard or Guard(lookup.source, name)), member
     return (driver if member.guard is None else GuardedAds(driver, member.guard)), member

@@ -177,13 +177,13 @@ def _bounds(constraint: Constraint, study: Study, characteristics: Characteristi
         return _Bounds(constraint, legal, suffix, lambda settings: _weighted(settings, weights), least, most, float(width))
     member = lookup.find({}, constraint.function, f"{key}.function")
     guard = member.guard or Guard(lookup.source, f"{key}.function = {constraint.function!r}")
-    if not callable(member.what):
-        raise InputError(lookup.source, f"{guard.name} is of type {type(member.what).__name__}", "a function of a mapping of arrays")
+    if not callable(member.target):
+        raise InputError(lookup.source, f"{guard.name} is of type {type(member.target).__name__}", "a function of a mapping of arrays")
     members.append(member)
 
     def quantity(settings: FloatArray) -> FloatArray:
         columns = {name: column.copy() for name, column in zip(characteristics.names, settings.T, strict=True)}
-        return guard.numbers("its call", "values", guard.call("its call", member.what, columns), (len(settings),))
+        return guard.numbers("its call", "values", guard.call("its call", member.target, columns), (len(settings),))
 
     ends = quantity(np.stack([characteristics.original, characteristics.lower, characteristics.upper]))
     return _Bounds(constraint, legal, suffix, quantity, least, most, float(np.ptp(ends)) or max(1.0, abs(float(ends[0]))))

@@ -58,14 +58,14 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
     size = min(economical, max(math.ceil(len(unique) / (SHARES * pool.workers)), LEAST_BATCH))
     starts = range(0, len(unique), size)
     futures = {retrying.submit(work, unique[start:start + size]): start for start in starts}
-    verified = np.linspace(0, len(unique) - 1, min(VERIFIED - _verified.get(work, 0), len(unique))).astype(int)
+    sample = np.linspace(0, len(unique) - 1, min(VERIFIED - _verified.get(work, 0), len(unique))).astype(int)
     in_sumo = in_scenes = None
-    if recorded and len(verified):
-        driven = driven_in_sumo(study, assemble(study).weather)
-        driven_inputs = inputs if driven is study else inputs_of(driven, pool)
-        in_sumo = retrying.submit(packed(driven, driven_inputs, engine=Engine.LIBSUMO), unique[verified])
-        if driven is not study:
-            in_scenes = retrying.submit(packed(driven, driven_inputs), unique[verified])
+    if recorded and len(sample):
+        sumo_study = driven_in_sumo(study, assemble(study).weather)
+        sumo_inputs = inputs if sumo_study is study else inputs_of(sumo_study, pool)
+        in_sumo = retrying.submit(packed(sumo_study, sumo_inputs, engine=Engine.LIBSUMO), unique[sample])
+        if sumo_study is not study:
+            in_scenes = retrying.submit(packed(sumo_study, sumo_inputs), unique[sample])
     parts: dict[int, Evaluations] = {}
     while len(parts) < len(futures):
         for future in first_of([future for future, start in futures.items() if start not in parts]):
@@ -73,9 +73,9 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
             done(len(parts[futures[future]]))
     evaluations = Evaluations.concatenate([parts[start] for start in starts])
     if in_sumo is not None:
-        known = evaluations.take(verified) if in_scenes is None else result_of(in_scenes)
+        known = evaluations.take(sample) if in_scenes is None else result_of(in_scenes)
         refuse_unlike_sumo(study, known.take(~known.failed), result_of(in_sumo).take(~known.failed))
-        _verified[work] = _verified.get(work, 0) + len(verified)
+        _verified[work] = _verified.get(work, 0) + len(sample)
     return evaluations.take(row_of.ravel())
 
 

@@ -92,13 +92,13 @@ class ClusterPool:
         return self._workers
 
     def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
-        outer: Future[Evaluations] = Future()
+        future: Future[Evaluations] = Future()
         try:
-            inner = self._executor.submit(_evaluate_within, self._time_limit, _versions(), study, settings)
+            dask_future = self._executor.submit(_evaluate_within, self._time_limit, _versions(), study, settings)
         except RuntimeError as error:
             raise PoolLostError(f"the cluster does not answer any more: {error}") from None
-        inner.add_done_callback(lambda done: _hand_on(done, outer))
-        return outer
+        dask_future.add_done_callback(lambda done: _hand_on(done, future))
+        return future
 
 
 def _evaluate_within(time_limit: float, versions: dict[str, str], study: bytes, settings: FloatArray) -> Evaluations:
@@ -118,16 +118,16 @@ def _versions() -> dict[str, str]:
     return {**{name: version(name) for name in VERSIONED}, "results": str(RESULTS)}
 
 
-def _hand_on(done: Future[Evaluations], outer: Future[Evaluations]) -> None:
+def _hand_on(done: Future[Evaluations], future: Future[Evaluations]) -> None:
     from distributed import KilledWorker
 
     if done.cancelled():
-        outer.set_exception(PoolLostError("the cluster does not answer any more"))
+        future.set_exception(PoolLostError("the cluster does not answer any more"))
         return
     error = done.exception()
     if isinstance(error, KilledWorker):
-        outer.set_exception(WorkerLostError(f"workers of the cluster died: {error}"))
+        future.set_exception(WorkerLostError(f"workers of the cluster died: {error}"))
     elif error is not None:
-        outer.set_exception(error)
+        future.set_exception(error)
     else:
-        outer.set_result(done.result())
+        future.set_result(done.result())

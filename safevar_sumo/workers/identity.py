@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from safevar_sumo.plugins import DIGITS, named_files
-from safevar_sumo.results import RESULTS, fixed
+from safevar_sumo.results import RESULTS, evaluation_keys
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.network import network_files
 from safevar_sumo.sumo.system import System
@@ -36,7 +36,7 @@ def identity_of(study: Study, system: System, sources: Mapping[str, str] = Mappi
     sources
         Digests of the files that other people's code reads: see `safevar_sumo.workers.sources_of`.
     """
-    resolved = fixed(study)
+    resolved = evaluation_keys(study)
     for table, model in (("vehicle", system.vehicle), ("ads", system.ads), ("scenario", system.scenario)):
         if isinstance(model, msgspec.Struct):
             names = {key: value for key, value in resolved[table]["parameters"].items()

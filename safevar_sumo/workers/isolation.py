@@ -63,12 +63,12 @@ def refuse_difference(study: Study, ways: dict[str, Evaluations], again: str = "
     ForeignError
         Naming the models, the first result that differs, and what to do.
     """
-    (here, first), (there, second) = next(iter(ways.items())), list(ways.items())[-1]
-    difference = _difference(first, second)
+    (first_way, first), (other_way, other) = next(iter(ways.items())), list(ways.items())[-1]
+    difference = _difference(first, other)
     if difference:
         name, value, other_value = difference
         problem = (f"with {' and '.join(foreign_names(study))} a result depends on what else is simulated: "
-                   f"{name} is {value} {here} and {other_value} {there}")
+                   f"{name} is {value} {first_way} and {other_value} {other_way}")
         raise ForeignError(f"study {study.name!r}", f"{problem}{again and f'; again by: {again}'}", LEGAL)
 
 
@@ -85,17 +85,18 @@ def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations
         one, other = recorded.take([row]), in_sumo.take([row])
         difference = _difference(one, other, ROUNDING)
         if difference:
-            name, here, there = difference
+            name, value, sumo_value = difference
             values = ", ".join(f"{key} = {value:.17g}" for key, value in zip(study.vehicle.characteristics, setting, strict=True))
-            raise InputError(f"study {study.name!r}", f"{name} is {here} in the recorded scene and {there} in SUMO with {values}",
+            raise InputError(f"study {study.name!r}", f"{name} is {value} in the recorded scene and {sumo_value} in SUMO with {values}",
                              "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or --engine sumo")
 
 
 def _alike(one: Evaluations, other: Evaluations, tolerance: float) -> BoolArray:
     """Whether settings have the same outcome and numbers that differ by at most `tolerance`, shape (N,)."""
     alike = one.outcome == other.outcome
-    for here, there in ((one.collision_speed, other.collision_speed), *((one.metrics[name], other.metrics[name]) for name in one.metrics)):
-        alike &= np.isclose(here, there, rtol=0, atol=tolerance, equal_nan=True)
+    quantities = ((one.collision_speed, other.collision_speed), *((one.metrics[name], other.metrics[name]) for name in one.metrics))
+    for values, other_values in quantities:
+        alike &= np.isclose(values, other_values, rtol=0, atol=tolerance, equal_nan=True)
     return np.asarray(alike)
 
 
@@ -106,7 +107,7 @@ def _difference(one: Evaluations, other: Evaluations, tolerance: float = 0.0) ->
     if one.outcome[0] != other.outcome[0]:
         return "outcome", str(one.outcome[0]), str(other.outcome[0])
     for name in ("collision_speed", *one.metrics):
-        here, there = (evaluation.metrics.get(name, evaluation.collision_speed) for evaluation in (one, other))
-        if not np.allclose(here, there, rtol=0, atol=tolerance, equal_nan=True):
-            return name, float(here[0]), float(there[0])
+        values, other_values = (evaluation.metrics.get(name, evaluation.collision_speed) for evaluation in (one, other))
+        if not np.allclose(values, other_values, rtol=0, atol=tolerance, equal_nan=True):
+            return name, float(values[0]), float(other_values[0])
     return None

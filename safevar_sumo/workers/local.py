@@ -119,13 +119,13 @@ class _Worker:
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         try:
-            self._pipe, theirs = context.Pipe()
-            self._process = context.Process(target=_serve, args=(theirs, reachable()), daemon=True)
+            self._pipe, worker_end = context.Pipe()
+            self._process = context.Process(target=_serve, args=(worker_end, reachable()), daemon=True)
             with _without_main():
                 self._process.start()
         except OSError as error:
             raise PoolLostError(f"no worker process can be started: {error.strerror}") from None
-        theirs.close()
+        worker_end.close()
 
     @property
     def alive(self) -> bool:

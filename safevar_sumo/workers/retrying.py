@@ -129,17 +129,17 @@ class RetryingPool:
 
     def _give_up(self, study: bytes, setting: FloatArray, error: SafevarError, into: Future[Evaluations]) -> None:
         """Give a setting the outcome `simulator-error` if it still fails after the original vehicle has been simulated."""
-        def then_again(evaluations: Evaluations | None, again: BaseException | None) -> None:
+        def then_again(evaluations: Evaluations | None, repeated: BaseException | None) -> None:
             if evaluations is not None:
                 into.set_result(evaluations)
-            elif isinstance(again, SimulationError | WorkerLostError):
+            elif isinstance(repeated, SimulationError | WorkerLostError):
                 self._in_a_row += 1
                 if self._in_a_row >= FAILURES_IN_A_ROW:
-                    into.set_exception(again)
+                    into.set_exception(repeated)
                 else:
-                    into.set_result(self._failed(setting, again))
+                    into.set_result(self._failed(setting, repeated))
             else:
-                into.set_exception(again)
+                into.set_exception(repeated)
 
         def original_done(evaluations: Evaluations | None, fault: BaseException | None) -> None:
             if evaluations is not None:
@@ -164,15 +164,15 @@ class RetryingPool:
             return
         halves = settings[:len(settings) // 2], settings[len(settings) // 2:]
 
-        def second_done(_: Evaluations | None, again: BaseException | None) -> None:
-            if isinstance(again, ForeignError):
-                self._locate(study, halves[1], again, into)
+        def second_done(_: Evaluations | None, located: BaseException | None) -> None:
+            if isinstance(located, ForeignError):
+                self._locate(study, halves[1], located, into)
             else:
                 into.set_exception(error)
 
-        def first_done(_: Evaluations | None, again: BaseException | None) -> None:
-            if isinstance(again, ForeignError):
-                self._locate(study, halves[0], again, into)
+        def first_done(_: Evaluations | None, located: BaseException | None) -> None:
+            if isinstance(located, ForeignError):
+                self._locate(study, halves[0], located, into)
             else:
                 self._computed(study, halves[1], second_done)
 

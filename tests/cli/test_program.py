@@ -162,7 +162,7 @@ def test_every_name_of_the_list_can_be_read_and_typed() -> None:
     assert "…" not in output
     for name in ("f_safe", "f_comfort", "f_diff", "rating_points"):
         assert f"│ {name} " in output.partition("Objectives")[2]
-    assert subject_of("f_comfort").member.what is FURTHER["max_jerk"]
+    assert subject_of("f_comfort").member.target is FURTHER["max_jerk"]
     for name in study_names():
         study = load_study(name)
         for text in (name, study.vehicle.model, study.ads.model, study.scenario.model, *study.vehicle.characteristics):

@@ -9,7 +9,7 @@ import numpy as np
 import openpyxl
 import pytest
 
-from safevar_sumo.analysis.rating.compute import Rated, rate
+from safevar_sumo.analysis.rating.compute import RatedVehicle, rate
 from safevar_sumo.analysis.rating.workbook import Preprocessed, Template
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import EURO_NCAP_2026, points_of, protocol_of
@@ -34,7 +34,7 @@ def template(calculator: Calculator, tmp_path_factory: pytest.TempPathFactory) -
     return calculator.template(tmp_path_factory.mktemp("template"))
 
 
-def agrees(rated: Rated, calculator: Calculator, template: Path, place: Path) -> None:
+def agrees(rated: RatedVehicle, calculator: Calculator, template: Path, place: Path) -> None:
     """The calculator's points of every simulated test and its colour of every cell that it has drawn are ours."""
     place.mkdir(exist_ok=True)
     Template(template, place / "predicted.xlsx").fill(rated)
@@ -70,7 +70,7 @@ def test_vehicles_with_any_colours_score_alike(seed: int, calculator: Calculator
     warning = np.where(rng.random((1, N)) < 0.7, 1.9, rng.choice([np.nan, 1.2, 1.696], (1, N)))
     nominal = [PROTOCOL.matrix_of[cell.block.name, cell.row, cell.column] for cell in PROTOCOL.cells] if seed % 2 else list(range(N))
     cells, claims = CellResults(impact[:, nominal], warning[:, nominal], np.ones((1, N), dtype=bool)), CLAIMS if seed % 3 else {}
-    rated = Rated(name="any", setting={}, protocol=PROTOCOL, cells=cells, scored=points_of(PROTOCOL, cells, claims), claims=claims)
+    rated = RatedVehicle(name="any", setting={}, protocol=PROTOCOL, cells=cells, scored=points_of(PROTOCOL, cells, claims), claims=claims)
     assert rated.fails == (seed == 0)
     agrees(rated, calculator, template, tmp_path)
 

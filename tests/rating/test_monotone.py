@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from safevar_sumo.analysis.rating.compute import Rated, rate
+from safevar_sumo.analysis.rating.compute import RatedVehicle, rate
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -23,7 +23,7 @@ GAIN = {"treadDepth": 4.2, "brakeTorque": 0.87, "brakeResponse": 0.16, "payload"
 """The vehicle of docs/rating.md, which has gained a layer since its tread was 5.1 mm deep."""
 
 
-def monotone(better: Rated, worse: Rated, cells: list[int]) -> bool:
+def monotone(better: RatedVehicle, worse: RatedVehicle, cells: list[int]) -> bool:
     """Whether no cell is hit more slowly by the worse vehicle."""
     speeds = [np.nan_to_num(one.cells.impact[0, cells], nan=0.0) for one in (better, worse)]
     return bool((speeds[1] >= speeds[0]).all())

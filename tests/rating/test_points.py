@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safevar_sumo.analysis.rating.compute import Rated, Rating
+from safevar_sumo.analysis.rating.compute import RatedVehicle, Rating
 from safevar_sumo.analysis.rating.render import verdict
 from safevar_sumo.analysis.rating.workbook import Preprocessed, Template
 from safevar_sumo.cli.program import commands
@@ -43,8 +43,9 @@ def numbers(test: str, kind: str = "", light: str | None = None) -> list[int]:
             and (light is None or cell.block.light == light)]
 
 
-def rated(cells: CellResults, name: str = "original", claims: dict[str, list[str]] | None = None) -> Rated:
-    return Rated(name=name, setting={}, protocol=PROTOCOL, cells=cells, scored=points_of(PROTOCOL, cells, claims), claims=claims or {})
+def rated(cells: CellResults, name: str = "original", claims: dict[str, list[str]] | None = None) -> RatedVehicle:
+    scored = points_of(PROTOCOL, cells, claims)
+    return RatedVehicle(name=name, setting={}, protocol=PROTOCOL, cells=cells, scored=scored, claims=claims or {})
 
 
 @pytest.mark.parametrize("vut", BANDS)

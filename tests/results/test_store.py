@@ -31,7 +31,7 @@ from safevar_sumo.results import (
     solutions_frame,
     status,
 )
-from safevar_sumo.results.manifest import FORMAT, differences_now, owner
+from safevar_sumo.results.manifest import FORMAT, differences_now, owner_digest
 from safevar_sumo.study import ModelTable, Study, load_study, tables_of
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers.identity import identity_of
@@ -124,7 +124,7 @@ def test_what_changes_no_result_locks_nobody_out(tmp_path: Path, study: Study) -
                   with_search(study, time_limit=7, runs=3, evaluations=900),
                   msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, algorithms=["rs"]))):
         directory = ResultsDirectory(tmp_path, other)
-        assert owner(directory.manifest) == owner(ResultsDirectory(tmp_path, study).manifest)
+        assert owner_digest(directory.manifest) == owner_digest(ResultsDirectory(tmp_path, study).manifest)
 
 
 def test_a_whole_number_is_not_the_same_as_one_with_a_point(tmp_path: Path, study: Study) -> None:

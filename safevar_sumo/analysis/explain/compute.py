@@ -156,9 +156,9 @@ def points_of(system: System, at_points: list[AtPoint], unsafe: Unsafe) -> list[
     return [tuple(one.point.name for one, is_unsafe in zip(at_points, column, strict=True) if is_unsafe) for column in at.T]
 
 
-def points_in_words(points: tuple[str, ...], number: int, most: int = NAMED) -> str:
+def points_in_words(points: tuple[str, ...], number: int, limit: int = NAMED) -> str:
     """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25, night; CPLA, speed 60, clear.`"""
-    first, more = "; ".join(points[:most]), len(points) - most
+    first, more = "; ".join(points[:limit]), len(points) - limit
     others = f" and {more} more" if more > 0 else ""
     return f"Fails at {len(points)} of {number} points{': ' + first if points else ''}{others}."
 

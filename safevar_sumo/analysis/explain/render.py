@@ -15,7 +15,7 @@ from safevar_sumo.analysis.explain.compute import points_in_words
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
 from safevar_sumo.analysis.explain.summary import LABELS, Finding, in_short
 from safevar_sumo.analysis.figures import CHANGED, FONT, INVOLVED, NECESSARY, literal, new_figure
-from safevar_sumo.analysis.words import ask, changes, command, decimal, number_of
+from safevar_sumo.analysis.words import changes, decimal, number_of, question_command, simulate_command
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, print_constraints, print_meanings, print_text
@@ -41,12 +41,13 @@ def print_explained(console: Console, place: str, result: Explained, point: str 
     if result.otherwise:
         print_text(console, f"note: {number_of(result.otherwise, 'setting')} with another outcome than recorded; another version or code?")
     if not result.explanations:
-        print_text(console, f"Nothing unsafe found. How far each characteristic may go: {ask('tolerance', place, point)}")
+        print_text(console, f"Nothing unsafe found. How far each characteristic may go: {question_command('tolerance', place, point)}")
         return
-    command_for: CommandFor = partial(command, place, point=point)
+    command_for: CommandFor = partial(simulate_command, place, point=point)
     _print_answer(console, command_for, result, members)
     if not full:
-        print_text(console, f"{number_of(len(result.explanations), 'failure')} explained in full: {ask('explain', place, point)} --full")
+        print_text(console, f"{number_of(len(result.explanations), 'failure')} explained in full: "
+                            f"{question_command('explain', place, point)} --full")
         return
     print_text(console, _sawtooth(result))
     for failure in result.explanations:
@@ -131,7 +132,7 @@ def _print_one(console: Console, command_for: CommandFor, failure: Explanation, 
         if is_rated(result.study):
             print_text(console, f"{number_of(len(failure.points), 'cell')} of {number} turn: {'; '.join(failure.points)}.")
         else:
-            print_text(console, points_in_words(failure.points, number, most=len(failure.points)))
+            print_text(console, points_in_words(failure.points, number, limit=len(failure.points)))
     if failure.preventable:
         print_text(console, f"In the same vehicle: {failure.preventable}.")
     console.print(_side_by_side(failure.because))

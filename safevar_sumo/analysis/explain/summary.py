@@ -15,7 +15,7 @@ from safevar_sumo.analysis.explain.necessity import Robustness, robustness, smal
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, preventability
 from safevar_sumo.analysis.rating.summary import rated_lead
-from safevar_sumo.analysis.words import ENDS, ask, changes, joined, number_of
+from safevar_sumo.analysis.words import ENDS, changes, joined, number_of, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, record
@@ -58,7 +58,7 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
     unsafe = criterion.rows(solutions)
     if not unsafe.any():
         return [f"Nothing unsafe found in {number_of(len(solutions), 'solution')}: no collision, no SD below half of the original's.",
-                f"How far each characteristic may go: {ask('tolerance', place)}"]
+                f"How far each characteristic may go: {question_command('tolerance', place)}"]
     chosen = {reason: chosen_handle(solutions, criterion, choice, study.name) for choice, reason in REASONS.items()}
     rows = solutions.iloc[[position_of(solutions, handle) for handle in chosen.values()]]
     settings = rows[list(evaluator.characteristics.names)].to_numpy(dtype=float)
@@ -72,7 +72,7 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
         end = f"{row['outcome']}, SD {row['f_safe']:.2f}"
         lines.append(f"{LABELS.get(reason, reason).capitalize()}: {handle}, {end}, {size}. {_in_words(evaluator, causes)}{fails}")
     at_worst = f"at the worst point of the first (without --point: at all {len(assemble(study).points)}, which takes long)"
-    return [*lines, f"Why, and how far{f', {at_worst}' if worst else ''}: {ask('explain', place, worst)}"]
+    return [*lines, f"Why, and how far{f', {at_worst}' if worst else ''}: {question_command('explain', place, worst)}"]
 
 
 def _paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Series[bool], original: Evaluations, unsafe: Unsafe,
@@ -110,7 +110,7 @@ def _places(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple[list[st
     if not system.matrix:
         return [""] * len(settings), ""
     at_points = at_every_point(system, settings)
-    words = [f" {points_in_words(points, len(system.matrix), most=3)}" for points in points_of(system, at_points, unsafe)]
+    words = [f" {points_in_words(points, len(system.matrix), limit=3)}" for points in points_of(system, at_points, unsafe)]
     return words, at_points[worst_points(at_points)[0]].point.name
 
 
@@ -211,11 +211,11 @@ def _end(system: System, original: Evaluations) -> str:
 
 def _with_changes(members: CharacteristicSet, failure: Finding) -> str:
     """Such as `a collision at 5 km/h (robust: ...) was found with ten changes: ...; three of them suffice`."""
-    number, needed, what = len(failure.changes), failure.needed, f"{_outcome(failure)} ({_how_robust(failure)})"
+    number, needed, effect = len(failure.changes), failure.needed, f"{_outcome(failure)} ({_how_robust(failure)})"
     listed = _changes(members, failure.changes)
     if needed < number:
-        return f"{what} was found with {_count(number)} changes: {listed}; {_count(needed)} of them {_suffice(needed)}."
-    return f"{_count(number)} {'change' if number == 1 else 'changes'} {_suffice(number)} for {what}: {listed}."
+        return f"{effect} was found with {_count(number)} changes: {listed}; {_count(needed)} of them {_suffice(needed)}."
+    return f"{_count(number)} {'change' if number == 1 else 'changes'} {_suffice(number)} for {effect}: {listed}."
 
 
 def _suffice(number: int) -> str:

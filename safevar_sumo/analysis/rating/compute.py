@@ -44,7 +44,7 @@ class RatedTest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rated:
+class RatedVehicle:
     """One vehicle: its setting, its results and its points; it `fails`, and earns nothing, if a required cell is not green."""
 
     name: str
@@ -121,14 +121,14 @@ class Rating:
 
     study: Study
     protocol: Protocol
-    variants: list[Rated]
+    variants: list[RatedVehicle]
 
     @property
-    def original(self) -> Rated:
+    def original(self) -> RatedVehicle:
         return self.variants[0]
 
     @property
-    def variant(self) -> Rated | None:
+    def variant(self) -> RatedVehicle | None:
         """The vehicle that is compared with the original."""
         return self.variants[1] if len(self.variants) > 1 else None
 
@@ -147,7 +147,7 @@ class Rating:
             open_points += sum(block.points[2] for block in blocks) * len(unknown) / len(layers)
         return round(open_points, DECIMALS)
 
-    def turned(self, variant: Rated | None = None) -> list[tuple[Cell, str | None, str | None]]:
+    def turned(self, variant: RatedVehicle | None = None) -> list[tuple[Cell, str | None, str | None]]:
         """Cells whose colour differs from the original's, with both colours."""
         other = variant or self.variant
         if other is None:
@@ -220,8 +220,8 @@ def rate_on(evaluator: Evaluator, settings: Mapping[str, FloatArray]) -> Rating:
     names = CharacteristicSet.of(evaluator.study.vehicle.characteristics).names
     rows = {"original": evaluator.characteristics.original, **settings}
     cells = evaluator.cells(np.stack(list(rows.values())), "cells and robustness layers")
-    variants = [Rated(name=name, setting=dict(zip(names, setting.tolist(), strict=True)), protocol=rater.protocol, cells=cells.of([row]),
-                      scored=points_of(rater.protocol, cells.of([row]), rater.claims), claims=rater.claims)
+    variants = [RatedVehicle(name=name, setting=dict(zip(names, setting.tolist(), strict=True)), protocol=rater.protocol,
+                             cells=cells.of([row]), scored=points_of(rater.protocol, cells.of([row]), rater.claims), claims=rater.claims)
                 for row, (name, setting) in enumerate(rows.items())]
     return Rating(study=evaluator.study, protocol=rater.protocol, variants=variants)
 

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.text import Text
 
 from safevar_sumo.analysis.figures import FONT, literal, new_figure
-from safevar_sumo.analysis.rating.compute import Rated, RatedTest, Rating, possible
+from safevar_sumo.analysis.rating.compute import RatedTest, RatedVehicle, Rating, possible
 from safevar_sumo.analysis.words import joined, number_of
 from safevar_sumo.protocol import COLOURS, Block
 from safevar_sumo.terminal import WholeTable, print_text
@@ -49,8 +49,8 @@ def verdict(result: Rating) -> str:
     if result.lost < 0:
         return f"With {changed} the vehicle earns {-result.lost:.2f} points more, {variant.points:.2f} in place {of}."
     losses = lost_by_test(result)
-    test, most = losses[0]
-    share = "all" if len(losses) == 1 else "most" if most > result.lost / 2 else f"{most:.2f}"
+    test, largest = losses[0]
+    share = "all" if len(losses) == 1 else "most" if largest > result.lost / 2 else f"{largest:.2f}"
     return f"With {changed} the vehicle loses {result.lost:.2f} {of}, {share} of them in {test_in_words(test)}."
 
 
@@ -88,7 +88,7 @@ def test_in_words(test: RatedTest) -> str:
     return f"{test.block.test}{LIGHTS[test.block.light]}"
 
 
-def _changed(result: Rating, variant: Rated) -> str:
+def _changed(result: Rating, variant: RatedVehicle) -> str:
     members = CharacteristicSet.of(result.study.vehicle.characteristics)
     parts = [f"{member.short_name} {float(member.text(variant.setting[member.name])):g}{member.suffix}" for member in members
              if variant.setting[member.name] != member.original]
@@ -121,8 +121,8 @@ def _layers(result: Rating) -> WholeTable:
         claimed = result.original.claims.get(tests[0].block.test, ())
         for one, test in zip(result.variants, tests, strict=True):
             if test.block.light != "night" and (one is result.original or test.layers != tests[0].layers):
-                holding, failing = ([layer for layer, holds in test.layers.items() if holds is wanted and layer not in claimed]
-                                    for wanted in (True, False))
+                holding, failing = ([layer for layer, holds in test.layers.items() if holds is expected and layer not in claimed]
+                                    for expected in (True, False))
                 table.add_row(test.block.test, one.name, ", ".join(holding), ", ".join(failing), ", ".join(claimed))
     return table
 
@@ -156,7 +156,7 @@ def _cell(result: Rating, block: Block, row: int, column: int) -> Text:
     return text
 
 
-def _cell_text(one: Rated, number: int, *, with_value: bool) -> str:
+def _cell_text(one: RatedVehicle, number: int, *, with_value: bool) -> str:
     cell, colour = one.protocol.cells[number], one.colour(number)
     record = one.cell(number)
     value = record["warning_ttc"] if cell.judged == "warning" else record["relative_impact_speed"]

@@ -6,7 +6,7 @@ from shlex import quote
 
 import pandas as pd
 
-from safevar_sumo.analysis.words import ask, changes, number_of
+from safevar_sumo.analysis.words import changes, number_of, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import chosen_handle, position_of, record
@@ -34,7 +34,7 @@ def rated_lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pla
     losing = unsafe.rows(solutions)
     if not losing.any():
         return [f"No solution loses a point of the original's {points:.2f}.",
-                f"Points against each characteristic: {ask('tolerance', place)}"]
+                f"Points against each characteristic: {question_command('tolerance', place)}"]
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     lines = [f"The original vehicle earns {points:.2f} points. {int(losing.sum())} of {number_of(len(solutions), 'vehicle')} found lose at "
              "least one of them."]
@@ -44,5 +44,5 @@ def rated_lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pla
         row = solutions.iloc[position_of(solutions, handle)]
         setting = {one: float(row[one]) for one in characteristics.names}
         lines.append(f"{title}: {handle} loses {points - row[name]:.2f} points with {changes(characteristics, setting)}.")
-    return [*lines, f"Which cells turn: {ask('rating', place)} --solution {quote(str(handle))} --matrix; which changes do it: "
-                    f"{ask('explain', place)}"]
+    return [*lines, f"Which cells turn: {question_command('rating', place)} --solution {quote(str(handle))} --matrix; which changes do it: "
+                    f"{question_command('explain', place)}"]

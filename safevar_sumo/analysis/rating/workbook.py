@@ -16,7 +16,7 @@ import openpyxl
 from openpyxl.utils import coordinate_to_tuple
 from openpyxl.utils.exceptions import InvalidFileException
 
-from safevar_sumo.analysis.rating.compute import Rated
+from safevar_sumo.analysis.rating.compute import RatedVehicle
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import EURO_NCAP_2026, Block, protocol_of
 from safevar_sumo.protocol.points import DECIMALS, half_up
@@ -51,9 +51,9 @@ class _Book:
             raise InputError(self.source, f"has no sheet {name!r}", self._expected_file)
         return self._book[name]
 
-    def _expect(self, sheet: str, cell: str, expected: object, found: object) -> None:
-        if str(found).strip() != str(expected):
-            raise InputError(self.source, f"sheet {sheet!r}, cell {cell}: {found!r} in place of {str(expected)!r}", self._expected_file)
+    def _expect(self, sheet: str, cell: str, expected: object, value: object) -> None:
+        if str(value).strip() != str(expected):
+            raise InputError(self.source, f"sheet {sheet!r}, cell {cell}: {value!r} in place of {str(expected)!r}", self._expected_file)
 
     def _check_version(self) -> None:
         version = str(self._sheet(VERSION)["B1"].value)
@@ -107,7 +107,7 @@ class Template(_Book):
             if sheet.cell(row, 6).value is not None:
                 yield test, str(sheet.cell(row, 6).value).strip(), sheet.cell(row, 7)
 
-    def fill(self, rated: Rated) -> None:
+    def fill(self, rated: RatedVehicle) -> None:
         """Fill in a vehicle's colours, the function of each row, the layers that hold or are claimed, and the predicted tests."""
         for number, cell in enumerate(self.protocol.cells):
             if not cell.is_varied:
@@ -119,7 +119,7 @@ class Template(_Book):
             for k, row in enumerate(block.rows):
                 if row.choice:
                     self._sheet(block.sheet)[f"{block.function}{top + k}"].value = "FCW" if block.is_warning(k) else "AEB"
-        holds = {(one.block.test, layer): held for one in rated.tests for layer, held in one.layers.items()}
+        holds = {(one.block.test, layer): does_hold for one in rated.tests for layer, does_hold in one.layers.items()}
         for layer in self.protocol.layers:
             self._sheet(layer.sheet)[layer.cell].value = "YES" if holds[layer.test, layer.layer] else "NO"
         for test, parameter, cell in self._parameters():
@@ -136,9 +136,9 @@ class Preprocessed(_Book):
     def __init__(self, source: Path, output: Path) -> None:
         super().__init__(source, output)
         self._sheets = [f"{sheet.removesuffix('pred.')}verif." for sheet in dict.fromkeys(block.sheet for block in self.protocol.blocks)]
-        self._rows = [drawn for sheet in self._sheets for drawn in self._drawn(sheet)]
+        self._rows = [drawn for sheet in self._sheets for drawn in self._drawn_cells(sheet)]
 
-    def _drawn(self, name: str) -> list[tuple[Any, dict[str, int], int, int]]:
+    def _drawn_cells(self, name: str) -> list[tuple[Any, dict[str, int], int, int]]:
         """Sheet, columns by heading, row, and cell number of every drawn cell."""
         sheet, drawn = self._sheet(name), []
         columns: dict[str, int] = {}
@@ -166,7 +166,7 @@ class Preprocessed(_Book):
             raise InputError(self.source, f"sheet {name!r} has no column 'Test point'", self._expected_file)
         return drawn
 
-    def fill(self, rated: Rated) -> None:
+    def fill(self, rated: RatedVehicle) -> None:
         """Fill in the simulated value of every drawn cell, and whether the robustness layer drawn with it holds there."""
         varied = {(cell.block.name, cell.row, cell.column, cell.range, cell.condition): number
                   for number, cell in enumerate(self.protocol.cells) if cell.is_varied}
@@ -182,7 +182,7 @@ class Preprocessed(_Book):
         self._save()
 
 
-def _measured(rated: Rated, number: int) -> float:
+def _measured(rated: RatedVehicle, number: int) -> float:
     """Relative speed of the impact [km/h], 0 without an impact; in a row with FCW, the time to collision at the warning [s]."""
     is_warning = rated.protocol.cells[number].judged == "warning"
     value = float((rated.cells.warning if is_warning else rated.cells.impact)[0, number])

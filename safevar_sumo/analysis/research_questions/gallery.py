@@ -83,14 +83,14 @@ def draw_all(cases: Sequence[Case], directory: Path, kind: str) -> tuple[list[Pa
     InputError
         If the directory cannot be written, or no figure can be drawn.
     """
-    figures, lacking = draw(cases)
+    figures, missing = draw(cases)
     written = []
     for name, figure in figures.items():
         path = directory / f"{_file_name(f'{cases[0].name}-{name}' if len(cases) == 1 else name)}.{kind}"
         directory.mkdir(parents=True, exist_ok=True)
         save(figure, path)
         written.append(path)
-    return written, lacking
+    return written, missing
 
 
 def _file_name(name: str) -> str:

@@ -146,11 +146,11 @@ def _growth(case: Case, evaluations: pd.DataFrame, scale: Scale, grid: np.ndarra
     return volumes
 
 
-def _checked(points: FloatArray, what: str) -> FloatArray:
+def _checked(points: FloatArray, name: str) -> FloatArray:
     """Refuse empty sets and undefined points, for which indicators would return their best value."""
     array = np.asarray(points, dtype=float)
     if array.ndim != 2 or not array.size:
-        raise InputError(what, "is empty", "at least one point, shape (M, m)")
+        raise InputError(name, "is empty", "at least one point, shape (M, m)")
     if not np.isfinite(array).all():
-        raise InputError(what, "holds an undefined value", "points with finite objectives")
+        raise InputError(name, "holds an undefined value", "points with finite objectives")
     return array

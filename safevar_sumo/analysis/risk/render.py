@@ -86,14 +86,14 @@ def sensitivity_figure(result: Risk) -> Figure:
     title = f"{result.study.name}: what decides ({result.confidence:.0%} intervals)"
     figure, (axes,) = new_figure(title, 1, 2, (7.2, 1.5 + 0.28 * max(len(names), 4)))
     frames = {"safety degree": result.sensitivity, f"unsafe ({result.unsafe})": result.sensitivity_of_unsafe}
-    for axis, (what, frame) in zip(axes, frames.items(), strict=True):
+    for axis, (output, frame) in zip(axes, frames.items(), strict=True):
         rows = frame.set_index("characteristic").loc[names]
         for column, label, colour, shift in (("total", "total: with all others", CHANGED, 0.2), ("first_order", "alone", NECESSARY, -0.2)):
             width = (rows[f"{column}_upper"] - rows[column]).clip(lower=0)
             axis.barh(np.arange(len(names)) + shift, rows[column], height=0.36, color=colour, xerr=width, label=label,
                       error_kw={"elinewidth": 0.8, "ecolor": "black"})
         axis.set_yticks(np.arange(len(names)), [literal(name) for name in names])
-        axis.set_title(literal(what), fontsize=FONT)
+        axis.set_title(literal(output), fontsize=FONT)
         axis.set_xlabel("share of the variance [-]")
         axis.set_xlim(0, 1)
         if rows["total"].isna().all():

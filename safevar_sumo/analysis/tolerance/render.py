@@ -63,10 +63,10 @@ def _together(result: Tolerance) -> str:
         return f"{subject}: no box around the original is safe."
     failed = f"; {box.failed} of them could not be simulated and count as unsafe in what follows" if box.failed else ""
     box_settings = "all settings in the box that satisfy the constraints" if result.study.constraints else "all settings in the box"
-    bad = "are unsafe or cannot be simulated" if box.failed else "are unsafe"
+    predicate = "are unsafe or cannot be simulated" if box.failed else "are unsafe"
     return (f"{subject}: each may go {box.factor:.1%} of the way from its original value to either end of its domain. None of "
             f"{box.samples} settings drawn at random in this box is unsafe{failed}. With {box.confidence:.0%} confidence at most "
-            f"{box.unsafe_at_most:.2%} of {box_settings} {bad}.")
+            f"{box.unsafe_at_most:.2%} of {box_settings} {predicate}.")
 
 
 def _alone(result: Tolerance) -> WholeTable:
