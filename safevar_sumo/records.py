@@ -19,8 +19,7 @@ IntArray = npt.NDArray[np.int_]
 STANDSTILL = 1e-3
 """Below this speed a vehicle counts as standing [m/s] (method section 4)."""
 CRUISING, REGULATING = 0.9, 0.05
-"""What regulates speed and does not brake for anybody [-]: shares of a vehicle's highest speed, at which it still cruises, and of its
-largest brake command, below which one only holds that speed."""
+"""Share of its highest speed from which a vehicle cruises, and of its largest brake command below which it only regulates its speed [-]."""
 KMH_PER_MS = 3.6
 """km/h per m/s."""
 GRAVITY = 9.81
@@ -231,13 +230,13 @@ class SimulationRuns:
         return int(np.argmin(np.where(counted, self.encounter.separation[:, column], np.inf))) if counted.any() else None
 
     def brake_onset(self, column: int) -> int | None:
-        """The sample at which one vehicle begins to brake for the obstacle, up to where that is nearest; None if it does not.
+        """The sample at which one vehicle begins to brake for the obstacle, before this is nearest; None if it does not brake for it.
 
-        A braking lasts from where a brake command begins to rise, to `REGULATING` times the largest one or more, until speed is regulated
-        again, by the throttle or by a smaller command. The one that counts is under way when the vehicle cruises for the last time, at
-        `CRUISING` of its highest speed or more, or is the first one after that: whatever braked before, such as a cruise control that had
-        overshot, has not slowed the vehicle down. Where none follows, a vehicle that collides has not braked for the obstacle, and the
-        last braking counts of one that does not.
+        A braking manoeuvre begins where the brake command starts to rise to at least `REGULATING` times the largest command; it ends
+        where speed is regulated again, by the throttle or by a smaller command. The manoeuvre that counts is under way when the vehicle
+        last cruises (at `CRUISING` of its highest speed or more), or is the first one after that: earlier manoeuvres, such as those of
+        a cruise control after an overshoot, did not slow the vehicle down. If there is no such manoeuvre, a vehicle that collides has
+        not braked for the obstacle; of a vehicle that does not collide, the last manoeuvre counts.
         """
         trace, nearest = self.trace, self.nearest(column)
         active = trace.active[:None if nearest is None else nearest + 1, column]
@@ -248,9 +247,9 @@ class SimulationRuns:
         after = brakes[brakes >= cruises]
         if not brakes.size or (not after.size and np.isfinite(self.collision_speed[column])):
             return None
-        one = after[0] if after.size else brakes[-1]
-        driven = np.flatnonzero(((trace.throttle[:one, column] > 0) | (brake[:one] > 0)) & ~braked[:one])
-        first = int(brakes[brakes >= (driven[-1] if driven.size else 0)][0])
+        within = after[0] if after.size else brakes[-1]  # a sample of the manoeuvre that counts
+        regulated = np.flatnonzero(((trace.throttle[:within, column] > 0) | (brake[:within] > 0)) & ~braked[:within])
+        first = int(brakes[brakes >= (regulated[-1] if regulated.size else 0)][0])
         while first > 0 and brake[first - 1] > (brake[first - 2] if first > 1 else 0):
             first -= 1
         return first
