@@ -82,8 +82,7 @@ def refuse_unlike_sumo(study: Study, recorded: Evaluations, in_sumo: Evaluations
     """
     for row in np.flatnonzero(~_alike(recorded, in_sumo, ROUNDING) & ~in_sumo.failed).tolist():
         setting = recorded.settings[row]
-        one, other = recorded.take([row]), in_sumo.take([row])
-        difference = _difference(one, other, ROUNDING)
+        difference = _difference(recorded.take([row]), in_sumo.take([row]), ROUNDING)
         if difference:
             name, value, sumo_value = difference
             values = ", ".join(f"{key} = {value:.17g}" for key, value in zip(study.vehicle.characteristics, setting, strict=True))

@@ -123,11 +123,11 @@ def _braking(runs: SimulationRuns, column: int, first: int, last: int) -> Brakin
 
 def compare_braking(original: RunSummary, changed: RunSummary, place: str = "") -> BrakingComparison:
     """Compare a changed vehicle's run with the original's at the same place."""
-    one, other = original.braking, _braking_or_the_originals(changed, original)
-    if one is None or other is None:
+    before, after = original.braking, _braking_or_the_originals(changed, original)
+    if before is None or after is None:
         return BrakingComparison(original, changed, {}, place)
-    parts, slowing = _parts(one, other)
-    unexplained = original.closest - one.margin, changed.closest - other.margin
+    parts, slowing = _parts(before, after)
+    unexplained = original.closest - before.margin, changed.closest - after.margin
     remainders = [0.0 if np.isnan(value) else value for value in unexplained]
     return BrakingComparison(original, changed, {**parts, "remainder": remainders[0] - remainders[1]}, place, slowing)
 
@@ -139,19 +139,19 @@ def _braking_or_the_originals(changed: RunSummary, original: RunSummary) -> Brak
     return original.braking._replace(time=np.nan, gap=0.0, speed=max(changed.collision_speed, original.braking.speed_lost))
 
 
-def _parts(one: Braking, other: Braking) -> tuple[dict[str, float], tuple[float, float]]:
-    """Parts of the margin lost between two brakings by their causes [m], and the distance that each saves while its pedal moves [m]."""
-    mean_delay, mean_weakness = (one.delay + other.delay) / 2, (1 / one.deceleration + 1 / other.deceleration) / 2
-    speeds = [braking.speed - braking.speed_lost for braking in (one, other)]
+def _parts(before: Braking, after: Braking) -> tuple[dict[str, float], tuple[float, float]]:
+    """Parts by cause of the margin lost from one braking to another [m], and the distance that each saves while its pedal moves [m]."""
+    mean_delay, mean_weakness = (before.delay + after.delay) / 2, (1 / before.deceleration + 1 / after.deceleration) / 2
+    speeds = [braking.speed - braking.speed_lost for braking in (before, after)]
     mean_speed = sum(speeds) / 2
-    driven = [braking.speed - braking.mean_speed_lost for braking in (one, other)]
-    saved = [braking.mean_speed_lost * mean_delay + braking.speed_lost * mean_speed * mean_weakness for braking in (one, other)]
+    driven = [braking.speed - braking.mean_speed_lost for braking in (before, after)]
+    saved = [braking.mean_speed_lost * mean_delay + braking.speed_lost * mean_speed * mean_weakness for braking in (before, after)]
     return {
-        "place": one.gap - other.gap,
-        "speed": (other.speed - one.speed) * (mean_delay + mean_speed * mean_weakness),
-        "delay": (other.delay - one.delay) * sum(driven) / 2,
+        "place": before.gap - after.gap,
+        "speed": (after.speed - before.speed) * (mean_delay + mean_speed * mean_weakness),
+        "delay": (after.delay - before.delay) * sum(driven) / 2,
         "slowing": saved[0] - saved[1],
-        "deceleration": (1 / other.deceleration - 1 / one.deceleration) * (speeds[0]**2 + speeds[1]**2) / 4}, (saved[0], saved[1])
+        "deceleration": (1 / after.deceleration - 1 / before.deceleration) * (speeds[0]**2 + speeds[1]**2) / 4}, (saved[0], saved[1])
 
 
 LEAST_MENTIONED = 0.005
@@ -176,12 +176,12 @@ def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
     """Why the changed vehicle is less safe than the original, in one sentence or two; `full` explains the distance lost."""
     at = f"At {comparison.place}: the" if comparison.place else "The"
     ends = f"{at} original {ending(comparison.original)}; this one {ending(comparison.changed)}."
-    one, other = comparison.original.braking, comparison.changed.braking
-    if one is None and other is None:
+    before, after = comparison.original.braking, comparison.changed.braking
+    if before is None and after is None:
         return f"{ends} Neither of them brakes."
     if not comparison.parts:
-        return f"{ends} {'The original' if one is None else 'It'} does not slow down by its brake."
-    unbraked = "" if other is not None else ", without any effect of its brake"
+        return f"{ends} {'The original' if before is None else 'It'} does not slow down by its brake."
+    unbraked = "" if after is not None else ", without any effect of its brake"
     costs, gains = ("", "gained ") if comparison.lost >= 0 else ("lost ", "")
     parts, is_lost = comparison.parts, comparison.lost >= 0
     pieces = [f"{abs(parts[name]):.2f} m {costs if parts[name] > 0 else gains}because {PARTS[name][parts[name] < 0]}"
@@ -199,12 +199,13 @@ def sentence(comparison: BrakingComparison, *, full: bool = False) -> str:
 
 def _numbers(comparison: BrakingComparison, part: str) -> str:
     """The quantity behind a part, of the changed vehicle and of the original."""
-    one, other = comparison.original.braking, comparison.changed.braking
-    if one is None or other is None:
+    before, after = comparison.original.braking, comparison.changed.braking
+    if before is None or after is None:
         return ""
-    pairs = {"place": (other.gap, one.gap, "m before"), "speed": (other.speed, one.speed, "m/s at the command"),
-             "delay": (other.delay, one.delay, "s after the command"), "slowing": (comparison.slowing[1], comparison.slowing[0], "m saved"),
-             "deceleration": (other.deceleration, one.deceleration, "m/s^2")}
+    pairs = {"place": (after.gap, before.gap, "m before"), "speed": (after.speed, before.speed, "m/s at the command"),
+             "delay": (after.delay, before.delay, "s after the command"),
+             "slowing": (comparison.slowing[1], comparison.slowing[0], "m saved"),
+             "deceleration": (after.deceleration, before.deceleration, "m/s^2")}
     changed, original, unit = pairs[part]
     decimals = next((digits for digits in range(2, 9) if f"{changed:.{digits}f}" != f"{original:.{digits}f}"), 2)
     return f" ({changed:.{decimals}f} instead of {original:.{decimals}f} {unit})"

@@ -29,7 +29,7 @@ COLUMNS_OF_PAIRS = 4
 
 
 def print_rating(console: Console, result: Rating) -> None:
-    """The verdict, points of every test, which robustness layers hold, and what was not simulated."""
+    """Print the verdict, the points of every test, the robustness layers that hold, and the tests not simulated."""
     print_text(console, result.study.title)
     print_text(console, verdict(result))
     console.print(_points(result))
@@ -38,20 +38,20 @@ def print_rating(console: Console, result: Rating) -> None:
 
 
 def verdict(result: Rating) -> str:
-    """The rating in a sentence: what a variant loses and where, or what the original vehicle earns."""
+    """The rating in a sentence: the points that a variant loses and in which test, or the points of the original vehicle."""
     maximum, variant = possible(result.protocol), result.variant
     if variant is None:
         return f"The original vehicle earns {result.original.points:.2f} of the {maximum:g} points of the tests that are simulated."
     changed = _changed(result, variant)
-    of = f"of the {result.original.points:.2f} points that the original earns (of {maximum:g} that are simulated)"
+    reference = f"of the {result.original.points:.2f} points that the original earns (of {maximum:g} that are simulated)"
     if not result.lost:
-        return f"With {changed} the vehicle keeps all {of}."
+        return f"With {changed} the vehicle keeps all {reference}."
     if result.lost < 0:
-        return f"With {changed} the vehicle earns {-result.lost:.2f} points more, {variant.points:.2f} in place {of}."
+        return f"With {changed} the vehicle earns {-result.lost:.2f} points more, {variant.points:.2f} instead {reference}."
     losses = lost_by_test(result)
     test, largest = losses[0]
     share = "all" if len(losses) == 1 else "most" if largest > result.lost / 2 else f"{largest:.2f}"
-    return f"With {changed} the vehicle loses {result.lost:.2f} {of}, {share} of them in {test_in_words(test)}."
+    return f"With {changed} the vehicle loses {result.lost:.2f} {reference}, {share} of them in {test_in_words(test)}."
 
 
 def lost_by_test(result: Rating) -> list[tuple[RatedTest, float]]:

@@ -49,16 +49,16 @@ def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
     InputError
         If a value is NaN.
     """
-    one, other = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    if np.isnan(one).any() or np.isnan(other).any():
+    first, second = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    if np.isnan(first).any() or np.isnan(second).any():
         raise InputError("Mann-Whitney U", "a value is NaN", "samples without undefined values")
-    if not one.size or not other.size:
-        return TwoSampleTest(None, None, None, one.size, other.size, None)
-    both = np.concatenate([one, other])
-    exact = min(one.size, other.size) <= EXACT_UP_TO and np.unique(both).size == both.size
-    test = scipy.stats.mannwhitneyu(one, other, alternative="two-sided", method="exact" if exact else "asymptotic")
-    a12 = float(test.statistic) / (one.size * other.size)
-    return TwoSampleTest(float(test.pvalue), a12, magnitude(a12), one.size, other.size, EXACT if exact else ASYMPTOTIC)
+    if not first.size or not second.size:
+        return TwoSampleTest(None, None, None, first.size, second.size, None)
+    both = np.concatenate([first, second])
+    exact = min(first.size, second.size) <= EXACT_UP_TO and np.unique(both).size == both.size
+    test = scipy.stats.mannwhitneyu(first, second, alternative="two-sided", method="exact" if exact else "asymptotic")
+    a12 = float(test.statistic) / (first.size * second.size)
+    return TwoSampleTest(float(test.pvalue), a12, magnitude(a12), first.size, second.size, EXACT if exact else ASYMPTOTIC)
 
 
 def magnitude(effect_size: float) -> str:
