@@ -177,9 +177,9 @@ class Guard(NamedTuple):
         problem = f"{self.name} raised in {method}: {first_line(error)}{f' ({place})' if place else ''}"
         return ForeignError(self.source, problem, error.legal if isinstance(error, InputError) else "")
 
-    def wrong(self, method: str, what: str, got: object, expected: str) -> ForeignError:
+    def wrong(self, method: str, part: str, got: object, expected: str) -> ForeignError:
         """The error for a wrong part of a result."""
-        return ForeignError(self.source, f"{self.name} returned {what} = {_short(got)} from {method}", expected)
+        return ForeignError(self.source, f"{self.name} returned {part} = {_short(got)} from {method}", expected)
 
     def parts(self, method: str, value: Any, expected: str, number: int = 2) -> tuple[Any, ...]:
         """The parts of a result that must be a tuple or list of `number` parts."""
@@ -195,7 +195,7 @@ class Guard(NamedTuple):
             problem = f"{self.name} returned {_short(value)} from {method}"
             raise ForeignError(self.source, problem, f"an object with the attribute {name}") from None
 
-    def numbers(self, method: str, what: str, value: Any, shape: tuple[int, ...], lowest: float = -INFINITE, highest: float = INFINITE,
+    def numbers(self, method: str, part: str, value: Any, shape: tuple[int, ...], lowest: float = -INFINITE, highest: float = INFINITE,
                 *, above: bool = False, infinite: bool = False, undefined: bool = False) -> FloatArray:
         """A result as a new array of float64.
 
@@ -211,7 +211,7 @@ class Guard(NamedTuple):
         bounds = "" if (lowest, highest) == (-INFINITE, INFINITE) else f" {'above' if above else 'from'} {lowest:g}" \
             if highest == INFINITE else f" in {'(' if above else '['}{lowest:g}, {highest:g}]"
         expected = f"numbers{bounds}, {'' if infinite else 'finite, '}shape {shape}"
-        numbers = self._array(method, what, value, shape, "biuf", expected).astype(float)
+        numbers = self._array(method, part, value, shape, "biuf", expected).astype(float)
         valid = (numbers > lowest) if above else (numbers >= lowest)
         valid &= numbers <= highest
         if not infinite:
@@ -219,22 +219,22 @@ class Guard(NamedTuple):
         if undefined:
             valid |= np.isnan(numbers)
         if not valid.all():
-            raise self.wrong(method, what, float(numbers[~valid][0]), expected)
+            raise self.wrong(method, part, float(numbers[~valid][0]), expected)
         return numbers
 
-    def truths(self, method: str, what: str, value: Any, shape: tuple[int, ...]) -> BoolArray:
+    def truths(self, method: str, part: str, value: Any, shape: tuple[int, ...]) -> BoolArray:
         """A result as a new array of bool."""
-        return self._array(method, what, value, shape, "b", f"truth values, shape {shape}").astype(bool)
+        return self._array(method, part, value, shape, "b", f"truth values, shape {shape}").astype(bool)
 
-    def _array(self, method: str, what: str, value: Any, shape: tuple[int, ...], kinds: str, expected: str) -> np.ndarray:
+    def _array(self, method: str, part: str, value: Any, shape: tuple[int, ...], kinds: str, expected: str) -> np.ndarray:
         try:
             array = np.asarray(value)
         except ValueError:
-            raise self.wrong(method, what, value, expected) from None
+            raise self.wrong(method, part, value, expected) from None
         if array.dtype.kind not in kinds:
-            raise self.wrong(method, what, value, expected)
+            raise self.wrong(method, part, value, expected)
         if array.shape not in (shape, ()):
-            raise ForeignError(self.source, f"{self.name} returned {what} of shape {array.shape} from {method}", expected)
+            raise ForeignError(self.source, f"{self.name} returned {part} of shape {array.shape} from {method}", expected)
         return np.broadcast_to(array, shape)
 
     def _place(self, error: BaseException) -> str:

@@ -54,14 +54,14 @@ class ResultsDirectory:
     study
         The study as it is run.
     identity
-        What the study's results depend on besides the study file; see `safevar_sumo.workers.identity.identity_of`.
+        Inputs of the study's results besides the study file; see `safevar_sumo.workers.identity.identity_of`.
     scoring
         Metrics and objectives.
 
     Raises
     ------
     InputError
-        If the directory cannot be written, holds other things, or belongs to another study or version.
+        If the directory cannot be written, holds other files, or belongs to another study or version.
     """
 
     def __init__(self, path: Path, study: Study, identity: Mapping[str, Any] = MappingProxyType({}), scoring: Scoring = SAFEVAR) -> None:

@@ -62,31 +62,31 @@ class RetryingPool:
         self._attempt(study, settings, 2 * ATTEMPTS if alone else ATTEMPTS, result, must_succeed)
         return result
 
-    def _attempt(self, study: bytes, settings: FloatArray, attempts: int, into: Future[Evaluations], must_succeed: bool) -> None:
+    def _attempt(self, study: bytes, settings: FloatArray, attempts: int, result: Future[Evaluations], must_succeed: bool) -> None:
         def done(evaluations: Evaluations | None, error: BaseException | None) -> None:
             if evaluations is not None:
                 self._in_a_row = 0
-                into.set_result(evaluations)
+                result.set_result(evaluations)
             elif isinstance(error, ForeignError):
-                self._locate(study, settings, error, into)
+                self._locate(study, settings, error, result)
             elif not isinstance(error, SimulationError | WorkerLostError | EnvironmentFault):
-                into.set_exception(error)
+                result.set_exception(error)
             elif attempts > 1:
-                self._attempt(study, settings, attempts - 1, into, must_succeed)
+                self._attempt(study, settings, attempts - 1, result, must_succeed)
             elif isinstance(error, EnvironmentFault):
-                into.set_exception(error)
+                result.set_exception(error)
             elif len(settings) > 1:
-                self._in_parts(study, settings, into)
+                self._split(study, settings, result)
             elif self._foreign and isinstance(error, WorkerLostError):
-                into.set_exception(self._with_command(self._blamed(error), settings))
+                result.set_exception(self._with_command(self._worker_lost_in_foreign_code(error), settings))
             elif must_succeed:
-                into.set_exception(error)
+                result.set_exception(error)
             else:
-                self._give_up(study, settings, error, into)
+                self._give_up(study, settings, error, result)
 
-        self._computed(study, settings, done)
+        self._compute(study, settings, done)
 
-    def _computed(self, study: bytes, settings: FloatArray, then: Then) -> None:
+    def _compute(self, study: bytes, settings: FloatArray, then: Then) -> None:
         """Compute a batch once; call `then` with its evaluations or its error."""
         def done(attempt: Future[Evaluations]) -> None:
             error = PoolLostError("the batch was cancelled") if attempt.cancelled() else attempt.exception()
@@ -104,7 +104,7 @@ class RetryingPool:
         else:
             attempt.add_done_callback(done)
 
-    def _in_parts(self, study: bytes, settings: FloatArray, into: Future[Evaluations]) -> None:
+    def _split(self, study: bytes, settings: FloatArray, result: Future[Evaluations]) -> None:
         """Split a failing batch; parts that fail again are split further."""
         parts = np.array_split(settings, min(PARTS, len(settings)))
         results: dict[int, Evaluations] = {}
@@ -112,43 +112,43 @@ class RetryingPool:
 
         def done(number: int, part: Future[Evaluations]) -> None:
             with lock:
-                if into.done():
+                if result.done():
                     return
                 if part.exception() is not None:
-                    into.set_exception(part.exception())
+                    result.set_exception(part.exception())
                     return
                 results[number] = part.result()
                 if len(results) == len(parts):
-                    into.set_result(Evaluations.concatenate([results[number] for number in range(len(parts))]))
+                    result.set_result(Evaluations.concatenate([results[number] for number in range(len(parts))]))
 
         for number, rows in enumerate(parts):
-            if not into.done():
+            if not result.done():
                 part: Future[Evaluations] = Future()
                 part.add_done_callback(partial(done, number))
                 self._attempt(study, rows, ATTEMPTS if len(rows) == 1 else 1, part, must_succeed=False)
 
-    def _give_up(self, study: bytes, setting: FloatArray, error: SafevarError, into: Future[Evaluations]) -> None:
+    def _give_up(self, study: bytes, setting: FloatArray, error: SafevarError, result: Future[Evaluations]) -> None:
         """Give a setting the outcome `simulator-error` if it still fails after the original vehicle has been simulated."""
         def then_again(evaluations: Evaluations | None, repeated: BaseException | None) -> None:
             if evaluations is not None:
-                into.set_result(evaluations)
+                result.set_result(evaluations)
             elif isinstance(repeated, SimulationError | WorkerLostError):
                 self._in_a_row += 1
                 if self._in_a_row >= FAILURES_IN_A_ROW:
-                    into.set_exception(repeated)
+                    result.set_exception(repeated)
                 else:
-                    into.set_result(self._failed(setting, repeated))
+                    result.set_result(self._failed(setting, repeated))
             else:
-                into.set_exception(repeated)
+                result.set_exception(repeated)
 
         def original_done(evaluations: Evaluations | None, fault: BaseException | None) -> None:
             if evaluations is not None:
-                self._computed(study, setting, then_again)
+                self._compute(study, setting, then_again)
             else:
-                into.set_exception(EnvironmentFault(f"{error}; the original vehicle cannot be simulated either: {fault}")
+                result.set_exception(EnvironmentFault(f"{error}; the original vehicle cannot be simulated either: {fault}")
                                    if isinstance(fault, SimulationError | WorkerLostError) else fault)
 
-        self._computed(study, self._characteristics.original[np.newaxis], original_done)
+        self._compute(study, self._characteristics.original[np.newaxis], original_done)
 
     def _failed(self, setting: FloatArray, error: SafevarError) -> Evaluations:
         undefined = np.full(1, np.nan)
@@ -157,28 +157,28 @@ class RetryingPool:
             metrics=dict.fromkeys(METRICS, undefined), f_diff=self._characteristics.largest_change(setting),
             f_num_diff=self._characteristics.number_changed(setting), reasons={setting[0].tobytes(): " ".join(str(error).split())})
 
-    def _locate(self, study: bytes, settings: FloatArray, error: ForeignError, into: Future[Evaluations]) -> None:
+    def _locate(self, study: bytes, settings: FloatArray, error: ForeignError, result: Future[Evaluations]) -> None:
         """Find the setting on which a user's code fails, by bisection, and name the command that reproduces it."""
         if len(settings) == 1:
-            into.set_exception(self._with_command(error, settings))
+            result.set_exception(self._with_command(error, settings))
             return
         halves = settings[:len(settings) // 2], settings[len(settings) // 2:]
 
         def second_done(_: Evaluations | None, located: BaseException | None) -> None:
             if isinstance(located, ForeignError):
-                self._locate(study, halves[1], located, into)
+                self._locate(study, halves[1], located, result)
             else:
-                into.set_exception(error)
+                result.set_exception(error)
 
         def first_done(_: Evaluations | None, located: BaseException | None) -> None:
             if isinstance(located, ForeignError):
-                self._locate(study, halves[0], located, into)
+                self._locate(study, halves[0], located, result)
             else:
-                self._computed(study, halves[1], second_done)
+                self._compute(study, halves[1], second_done)
 
-        self._computed(study, halves[0], first_done)
+        self._compute(study, halves[0], first_done)
 
-    def _blamed(self, error: WorkerLostError) -> ForeignError:
+    def _worker_lost_in_foreign_code(self, error: WorkerLostError) -> ForeignError:
         """The error for a worker that repeatedly ends or hangs while it runs a user's code."""
         problem = f"{error}, again and again, with {' and '.join(self._foreign)} in it; a dead process cannot report file and line"
         return ForeignError(f"study {self._study.name!r}", problem)

@@ -51,8 +51,8 @@ def _diagram(axis: Axes, algorithms: list[str], mean: FloatArray, difference: fl
     number = len(algorithms)
     axis.set_xlim(0.85, number + 0.25 * number)
     axis.set_ylim(-0.6 * len(mean) - 0.4, number)
-    for place, (name, rank) in enumerate(zip(algorithms, mean, strict=True)):
-        height = number - 1 - place
+    for position, (name, rank) in enumerate(zip(algorithms, mean, strict=True)):
+        height = number - 1 - position
         axis.plot([rank, rank], [height, -0.2], color="black", linewidth=0.8)
         axis.plot(rank, height, marker="o", markersize=4, color="#0072b2")
         axis.annotate(f"{literal(ALGORITHM_TITLES.get(name, name))} {rank:.2f}", (rank, height), xytext=(6, 0),
@@ -111,7 +111,7 @@ def _stairs(points: FloatArray, ends: FloatArray) -> FloatArray:
     if np.sign(ends[0] - np.mean(order[:, 0])) < 0:
         order = order[::-1]
     border = [(order[0, 0], ends[1])]
-    for place, (x, y) in enumerate(order):
+    for position, (x, y) in enumerate(order):
         border.append((x, y))
-        border.append((order[place + 1, 0] if place + 1 < len(order) else ends[0], y))
+        border.append((order[position + 1, 0] if position + 1 < len(order) else ends[0], y))
     return np.array(border)
