@@ -127,7 +127,7 @@ def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(syst
 
 def test_points_in_words() -> None:
     assert points_in_words(("A, 1", "B"), 9) == "Fails at 2 of 9 points: A, 1; B."
-    assert points_in_words(("A", "B", "C"), 9, most=1) == "Fails at 3 of 9 points: A and 2 more."
+    assert points_in_words(("A", "B", "C"), 9, limit=1) == "Fails at 3 of 9 points: A and 2 more."
     assert points_in_words((), 9) == "Fails at 0 of 9 points."
 
 

@@ -183,8 +183,8 @@ def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
 
 def series_of_means(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
     """The means of `run_means`, indexed by the number of the run."""
-    solutions = counted(case.solutions_of(algorithm), metric)
+    numbers, solutions = case.runs_of(algorithm), counted(case.solutions_of(algorithm), metric)
     runs, column = solutions["run"].to_numpy(), solutions[metric.name].to_numpy(dtype=float)
     defined = ~np.isnan(column)
-    samples = {run: column[defined & (runs == run)] for run in case.runs_of(algorithm)}
+    samples = {run: column[defined & (runs == run)] for run in numbers}
     return pd.Series({run: float(np.mean(sample)) for run, sample in samples.items() if sample.size}, dtype=float)
