@@ -35,6 +35,7 @@ def blocks(page: str) -> list[Block]:
     return [Block(*one) for one in result]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", [
     pytest.param(page, marks=[] if page == "README.md" else [pytest.mark.slow]) for page in PAGES if blocks(page)])
 def test_every_block_of_a_page_does_what_it_says(page: str, in_tmp: Path) -> None:
@@ -76,6 +77,7 @@ def test_every_shipped_characteristic_is_explained_in_its_study_and_in_the_gloss
         assert f"| `{key}` | {row.meaning} | {row.counterpart} |" in glossary
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/architecture.md"])
 def test_a_map_of_the_code_names_every_package_and_nothing_that_is_not_there(page: str) -> None:
     text, package = (ROOT / page).read_text(), ROOT / "safevar_sumo"

@@ -45,6 +45,7 @@ def approach(ads: Ads, nominal: Nominal, speed: np.ndarray, gap: np.ndarray) -> 
     return np.stack(pedals)
 
 
+@pytest.mark.slow
 @settings(max_examples=8)
 @given(speed=arrays(float, 6, elements=st.floats(0, 15)), gap=arrays(float, 6, elements=st.floats(0.5, 80)))
 def test_pedals_stay_in_range_and_no_vehicle_knows_of_another(speed: np.ndarray, gap: np.ndarray) -> None:

@@ -48,6 +48,7 @@ def collides(case: Case, settings: list[dict[str, float]]) -> list[bool]:
     return list(Evaluator(case.study, Here()).evaluate(rows, "afresh").collided)
 
 
+@pytest.mark.slow
 def test_every_minimal_cause_is_unsafe_and_no_proper_subset_of_it_is(case: Case, explained: Explained) -> None:
     assert str(explained.unsafe) == "collision"
     causes = [cause.changes for one in explained.explanations for cause in one.causes]
@@ -57,6 +58,7 @@ def test_every_minimal_cause_is_unsafe_and_no_proper_subset_of_it_is(case: Case,
     assert not any(collides(case, proper))
 
 
+@pytest.mark.slow
 def test_every_boundary_is_unsafe_and_just_below_it_is_safe(case: Case, explained: Explained) -> None:
     causes = [cause for one in explained.explanations for cause in one.causes]
     assert all(collides(case, [cause.boundary for cause in causes]))
@@ -66,6 +68,7 @@ def test_every_boundary_is_unsafe_and_just_below_it_is_safe(case: Case, explaine
     assert not any(collides(case, below))
 
 
+@pytest.mark.slow
 def test_the_records_are_those_of_the_solutions(case: Case, explained: Explained) -> None:
     assert repr(explained).startswith(f"<Explained {case.study.name}, unsafe collision: {explained.failures} of ")
     *records, last = json.loads(json.dumps(explained.to_dict(), allow_nan=False))
@@ -91,6 +94,7 @@ def test_the_records_are_those_of_the_solutions(case: Case, explained: Explained
     assert all(share <= last["summary"]["changed"][name] for name, share in last["summary"]["necessary"].items())
 
 
+@pytest.mark.slow
 def test_the_failures_that_matter_come_first(case: Case, explained: Explained) -> None:
     crashes = case.solutions[case.solutions["outcome"] == "collision"]
     reasons = {reason: one for one in explained.explanations for reason in one.reasons}
@@ -99,6 +103,7 @@ def test_the_failures_that_matter_come_first(case: Case, explained: Explained) -
     assert explained.failures == explained.analysed == len(crashes[list(case.characteristics.names)].drop_duplicates())
 
 
+@pytest.mark.slow
 def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: Case, explained: Explained) -> None:
     """Every failure that is smaller, by number of changes and then by the largest, has less than 80 % of unsafe neighbours."""
     (robust,) = [one for one in explained.explanations if "smallest robust" in one.reasons]
@@ -112,6 +117,7 @@ def test_the_failure_to_lead_with_is_the_smallest_that_is_not_borderline(case: C
         assert max(one.share for one in robustness(evaluator, settings[:place], 0.05, explained.unsafe)) < 0.8
 
 
+@pytest.mark.slow
 def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
     safe = case.solutions["f_safe"].idxmax()
     handle = str(handles(case.solutions)[safe])
@@ -141,6 +147,7 @@ def printed(explained: Explained, *, full: bool) -> str:
     return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
 
 
+@pytest.mark.slow
 def test_the_answer_takes_ten_lines_and_the_rest_is_asked_for(explained: Explained) -> None:
     """The vehicle covers v dt between two decisions: that is how high the sawtooth of a profile is."""
     short, full = printed(explained, full=False).splitlines(), printed(explained, full=True)
@@ -180,6 +187,7 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
     assert f"a competent driver avoids {100 * share:.0f} %" in paragraph
 
 
+@pytest.mark.slow
 def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Explained) -> None:
     original = Evaluator(case.study, Here()).original()
     paragraph, first, *others, more = lead(case.study, case.solutions, original, Here(), "my results")
@@ -283,6 +291,7 @@ def test_a_creeping_deceleration_is_no_late_pedal() -> None:
 COLLISION = Unsafe()
 
 
+@pytest.mark.slow
 @given(table=st.lists(st.booleans(), min_size=32, max_size=32), full=st.integers(0, 31))
 def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: list[bool], full: int) -> None:
     def outcome(settings: FloatArray) -> BoolArray:

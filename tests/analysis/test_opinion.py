@@ -109,6 +109,7 @@ def test_every_characteristic_is_in_the_table_or_outside_and_acts_as_the_table_s
     assert rows.items() <= VEHICLES[name].UNITS.items()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
 def test_the_original_vehicle_meets_the_same_encounter(study: str) -> None:
     """The second model starts as ours does, and stops within half a metre of where ours does."""
@@ -169,6 +170,7 @@ class Boat(Wrapping):
 ONE_TEST = {"tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 40}}]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", ["Made", "Wrapping"])
 def test_a_failure_that_our_model_alone_has_is_contradicted(made: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A vehicle of a user's whose brakes fail for payloads around 300 kg; without brakes at all it fails there too."""
@@ -198,6 +200,7 @@ def test_what_cannot_be_represented_at_all_is_refused(tmp_path: Path, monkeypatc
         second_system(study)
 
 
+@pytest.mark.slow
 def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path) -> None:
     """Changes of the engine are outside, with their names."""
     done = CliRunner().invoke(commands, ["opinion", str(slippery), "--json"])

@@ -41,15 +41,18 @@ def vehicle(brakes: float = 1.0, max_rpm: float = 1.0) -> FloatArray:
     return ORIGINAL * [factors.get(name, 1.0) for name in NAMES]
 
 
+@pytest.mark.slow
 def test_a_competent_driver_avoids_what_a_short_sighted_system_does_not_and_nobody_stops_without_brakes() -> None:
     both = np.stack([vehicle(), vehicle(brakes=0.1)])
     assert preventable_by(evaluator(test="CPFA", speed=30), both) == [PreventableBy.COMPETENT_DRIVER, PreventableBy.NOBODY]
 
 
+@pytest.mark.slow
 def test_a_child_that_comes_out_late_is_avoided_by_full_braking_alone() -> None:
     assert preventable_by(evaluator(test="CPNCO", speed=40), vehicle()[np.newaxis]) == [PreventableBy.FULL_BRAKING]
 
 
+@pytest.mark.slow
 def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     """Of 60 collisions, the 40 of the lowest engine speeds are the brakeless ones: those that come first when settings are sorted."""
     collisions = np.stack([vehicle(0.1, 1 - (60 - k) / 1e6) for k in range(40)] + [vehicle(1.0, 1 - k / 1e6) for k in range(20)])
@@ -66,6 +69,7 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     assert expected[0] < 1 / 3 < expected[1]
 
 
+@pytest.mark.slow
 def test_reference_drivers_approach_as_the_driving_system_does() -> None:
     """A competent driver sees no danger before the time to collision is 2 s: until then both are at the same place."""
     rain = assemble(load_study("rain"))
@@ -78,6 +82,7 @@ def test_reference_drivers_approach_as_the_driving_system_does() -> None:
     assert approach(assemble(evaluator(test="CPFA", speed=30).study)) == {}
 
 
+@pytest.mark.slow
 def test_in_a_matrix_the_worst_point_counts() -> None:
     """The child that comes out late is hit at twice the speed: full braking avoids it, a competent driver does not."""
     speeds = {"CPFA": 20, "CPNCO": 40}
@@ -111,6 +116,7 @@ def failure(system: System, weak: np.ndarray) -> PointComparison:
     return one
 
 
+@pytest.mark.slow
 def test_it_fails_where_it_collides_when_simulated_there_alone(system: System, weak: np.ndarray, failure: PointComparison) -> None:
     alone = [point.name for point in system.points if evaluate(system.at(point), weak).collided[0]]
     assert list(failure.points) == alone == ["CPLA, speed 40, clear", "CPLA, speed 40, night", "CPFA, speed 30, clear"]

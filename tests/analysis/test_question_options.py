@@ -51,6 +51,7 @@ print(flag, signature, asked.top, "--top" in asked.command_line("it"), "--top 8"
 """
 
 
+@pytest.mark.slow
 def test_a_default_that_changes_changes_everywhere() -> None:
     done = subprocess.run([sys.executable, "-c", OTHER_DEFAULT], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["5"] * 3 + ["False", "True"]

@@ -65,6 +65,7 @@ def test_analytic_probabilities_over_twenty_seeds(method: str, shape: str, n: in
     assert sum(one.interval[0] <= probability <= one.interval[1] for one in estimates) >= 18
 
 
+@pytest.mark.slow
 def test_a_rare_failure_its_interval_and_its_most_probable_point() -> None:
     """The design point of a plane at the distance beta has components beta / sqrt(n)."""
     estimate = rare(linear(beta_of(1e-5)), 3)
@@ -98,6 +99,7 @@ def test_a_plateau_and_a_frequent_failure_are_left_to_monte_carlo() -> None:
     assert "plain Monte Carlo" in frequent.remark
 
 
+@pytest.mark.slow
 def test_auto_chooses_and_monte_carlo_stays_where_it_is_asked_for() -> None:
     assert rare(linear(beta_of(1e-4)), 2, rare=False).method == "subset_simulation"
     assert rare(linear(beta_of(1e-4)), 2, rare=False, method="monte_carlo").method == "monte_carlo"

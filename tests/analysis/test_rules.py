@@ -36,6 +36,7 @@ def test_two_islands_are_two_rules() -> None:
     assert second == (pytest.approx(9, abs=0.02), None)
 
 
+@pytest.mark.slow
 def test_a_region_that_is_no_box_is_covered_with_honest_densities() -> None:
     result = of(diagonal_band, n=2)
     fresh = np.random.default_rng(5).uniform(0, 10, (20_000, 2))

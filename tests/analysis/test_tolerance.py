@@ -38,6 +38,7 @@ def test_islands_and_the_safe_interval_around_the_original() -> None:
     assert len(first.profile) > 201
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(ends=st.lists(st.floats(0, 10), min_size=2, max_size=2).map(sorted))
 def test_any_interval_is_found_that_is_as_wide_as_two_values_are_apart(ends: list[float]) -> None:
@@ -101,6 +102,7 @@ def test_the_box_varies_the_characteristics_that_are_asked_for() -> None:
     assert result.characteristics == ("a", "b")
 
 
+@pytest.mark.slow
 def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe(monkeypatch: pytest.MonkeyPatch) -> None:
     """Unsafe: where digits of the logarithm of a change are below q. The share is q in every box: any box with a bound below q is wrong.
 

@@ -169,6 +169,7 @@ def test_run_leaves_what_load_reads(results: sv.Results) -> None:
     pd.testing.assert_frame_equal(again.solutions, stored, check_dtype=False)
 
 
+@pytest.mark.slow
 def test_tables_and_figures_are_frames_and_figures(results: sv.Results) -> None:
     answers = sv.tables(results)
     assert {"rq1", "rq2", "rq3.1", "collisions"} <= set(answers)
@@ -180,6 +181,7 @@ def test_tables_and_figures_are_frames_and_figures(results: sv.Results) -> None:
         sv.tables(results, question="rq9")
 
 
+@pytest.mark.slow
 def test_a_script_needs_no_main_guard(in_tmp: Path) -> None:
     Path("script.py").write_text(
         "import safevar_sumo as sv\nprint('begun')\n"
@@ -189,6 +191,7 @@ def test_a_script_needs_no_main_guard(in_tmp: Path) -> None:
     assert done.stdout.split() == ["begun", "True"]
 
 
+@pytest.mark.slow
 def test_the_trace_in_a_matrix_is_of_the_point_where_the_vehicle_comes_off_worst() -> None:
     study = load_study("euro_ncap_pedestrian")
     system = assemble(study)

@@ -27,6 +27,7 @@ from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError
 from tests.campaign.formulas import SUN, FormulaPool, Told, carried_out, evaluated, solutions, with_search
 
 
+@pytest.mark.slow
 def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches(study: Study, tmp_path: Path) -> None:
     carried_out(study, tmp_path / "a")
     for name, pool, batch in (("b", FormulaPool(workers=7), None), ("c", FormulaPool(workers=3, shuffled=True), 3),
@@ -88,6 +89,7 @@ def test_an_original_vehicle_that_collides_is_told(study: Study, tmp_path: Path)
     assert carried_out(study, tmp_path / "safe")[1].warnings == []
 
 
+@pytest.mark.slow
 def test_a_campaign_that_breaks_down_anywhere_is_resumed_where_it_was(study: Study, tmp_path: Path) -> None:
     whole = FormulaPool()
     carried_out(study, tmp_path / "whole", whole)
@@ -143,6 +145,7 @@ def test_a_run_in_other_hands_is_left_to_them(study: Study, tmp_path: Path) -> N
     assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("budgets", [(60, 100), (55, 130), (100, 60), (550, 800)])
 def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_others(
         study: Study, tmp_path: Path, budgets: tuple[int, int]) -> None:
@@ -247,6 +250,7 @@ def test_failures_are_counted_kept_out_and_not_met_again(study: Study, tmp_path:
     assert solutions(tmp_path) == before
 
 
+@pytest.mark.slow
 def test_failed_settings_are_tried_again_when_that_is_asked_for(study: Study, tmp_path: Path) -> None:
     class Outage(FormulaPool):
         """Cannot simulate low tyre friction today."""

@@ -100,6 +100,7 @@ def broken(study: Study, path: Path, disk: Disk) -> bool:
         return False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kinds", [KINDS, *(pytest.param((kind,), marks=pytest.mark.slow) for kind in KINDS)])
 @pytest.mark.parametrize("stays", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_every_step_on_the_disk_may_fail(kinds: tuple[int, ...], stays: bool, tiny: Study, tmp_path: Path) -> None:

@@ -65,12 +65,14 @@ def test_the_package_and_the_help_load_nothing_heavy() -> None:
     assert loaded("import safevar_sumo.cli") == set()
 
 
+@pytest.mark.slow
 def test_one_simulation_loads_sumo_and_no_statistics() -> None:
     code = "from click.testing import CliRunner\nfrom safevar_sumo.cli.program import commands\n"
     assert loaded(code + "print(CliRunner().invoke(commands, ['list']).exit_code)") == set()
     assert loaded(code + "print(CliRunner().invoke(commands, ['simulate', 'sun', '--json']).exit_code)") <= {"libsumo", "traci"}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="a shell that closes streams")
 @pytest.mark.parametrize(("streams", "code"), [(">&-", 0), (">&- 2>&- <&-", 0), ("> /dev/full", 1)])
 def test_closed_and_full_streams_are_no_traceback(streams: str, code: int) -> None:

@@ -147,6 +147,7 @@ DEFECTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DEFECTS)
 def test_a_planted_defect_is_named_with_file_and_line(name: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     defect = DEFECTS[name]
@@ -177,6 +178,7 @@ RIGHT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RIGHT)
 def test_what_is_right_passes(name: str, in_tmp: Path) -> None:
     (in_tmp / "mine.py").write_text(RIGHT[name])
@@ -200,6 +202,7 @@ def test_check_knows_everything_that_a_shipped_study_names(name: str) -> None:
     assert {"vehicle", "ads", "scenario"} <= {subject.kind for subject in subjects_of(load_study(name))}
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) -> None:
     (in_tmp / "mine.py").write_text(DEFECTS["ads out of range"].module)
     (in_tmp / "mine.toml").write_text('extends = "smoke"\n[ads]\nmodel = "mine:Mine"\n')
@@ -217,6 +220,7 @@ def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) 
     run("check", "mine:Mine", expect=2)
 
 
+@pytest.mark.slow
 def test_everything_that_a_study_names_is_checked_and_remembered(in_tmp: Path) -> None:
     """An objective may be named by a metric's column; what has passed is not checked again until a file changes."""
     shutil.copytree(Path(__file__).parents[1] / "plugins/six", "six")

@@ -29,6 +29,7 @@ def test_study_leaves_manifest_and_solutions_and_nothing_else(in_tmp: Path) -> N
     assert set(frame["algorithm"]) == {"nsga2", "rs"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("study", ["rain", pytest.param("lgsvl", marks=SLOW), pytest.param("native", marks=SLOW)])
 def test_the_same_bytes_for_every_batch_size_and_from_run_to_run(study: str, in_tmp: Path) -> None:
     contents = set()
@@ -66,6 +67,7 @@ def test_trace_has_every_quantity_with_its_unit(study: str, in_tmp: Path) -> Non
     assert np.allclose(np.diff(frame["speed [m/s]"]) / step, frame["acceleration [m/s^2]"][1:])
 
 
+@pytest.mark.slow
 def test_a_users_scalar_ads_is_named_in_a_study(in_tmp: Path) -> None:
     Path("my_ads.py").write_text(
         "from safevar_sumo.ads import ScalarAds\n\n\n"

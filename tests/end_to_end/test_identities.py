@@ -58,6 +58,7 @@ def edited(path: str, old: str, new: str) -> None:
     Path(path).write_text(text.replace(old, new))
 
 
+@pytest.mark.slow
 def test_results_go_with_the_files_that_they_were_computed_with() -> None:
     study()
     before = Path("out/solutions.csv").read_bytes()
@@ -139,6 +140,7 @@ def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results
     assert "far.txt has changed since" in Path("page.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_file_that_is_read_later_counts_from_then_on() -> None:
     top = sv.simulate("mine.toml").drives.trace.speed.max()
     Path("my_ads.py").write_text(ADS.replace("def drive(self, seen):", f"""def drive(self, seen):
@@ -156,6 +158,7 @@ def test_a_file_that_is_read_later_counts_from_then_on() -> None:
     assert "tile.txt has changed since" in refused("rules", "out")
 
 
+@pytest.mark.slow
 def test_a_table_that_was_edited_is_refused_until_the_study_writes_it_again() -> None:
     study()
     before = Path("out/solutions.csv").read_text()

@@ -42,6 +42,7 @@ def killed_and_resumed(times: int) -> None:
     study("--out", "out")
 
 
+@pytest.mark.slow
 def test_killed_and_resumed(whole: Path) -> None:
     killed_and_resumed(1)
     assert solutions("out") == solutions(whole)
@@ -251,6 +252,7 @@ def test_a_simulation_that_hangs_is_stopped_on_a_cluster_too(scheduler: tuple[su
     assert "workers of the cluster died" in errors
 
 
+@pytest.mark.slow
 def test_an_address_that_nobody_answers_is_told_in_time(in_tmp: Path) -> None:
     began = time.monotonic()
     refused("study", "smoke", "--cluster", "tcp://127.0.0.1:9", "--out", "out", message=("--cluster: nobody answers at 'tcp://127.0.0.1:9'",))

@@ -37,6 +37,7 @@ def test_shards_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
     pd.testing.assert_frame_equal(load("alone").solutions, expected)
 
 
+@pytest.mark.slow
 def test_more_runs_extend_what_is_there(copied: Path) -> None:
     fewer = copied / "runs" / "rs-01.journal"
     stamp = fewer.stat().st_mtime_ns
@@ -49,6 +50,7 @@ def test_more_runs_extend_what_is_there(copied: Path) -> None:
     pd.testing.assert_frame_equal(extended, load("alone").solutions)
 
 
+@pytest.mark.slow
 def test_a_run_in_the_hands_of_another_process_is_not_started_twice(whole: Path) -> None:
     chosen = load_study("small.toml")
     theirs = ResultsDirectory(Path("out"), chosen, identity_of(chosen, assemble(chosen))).journal("rs-00")

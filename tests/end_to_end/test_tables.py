@@ -50,6 +50,7 @@ def imported(in_tmp: Path) -> Path:
     return in_tmp / "imported"
 
 
+@pytest.mark.slow
 def test_every_question_in_every_format(results: Path) -> None:
     for rq in QUESTIONS:
         for kind, result in FORMATS.items():
@@ -71,6 +72,7 @@ def test_tables_agree_with_the_solutions_that_are_stored(results: Path) -> None:
         assert one["mean"] == pytest.approx(group[one["metric"]].mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "start"), [("svg", b"<?xml"), pytest.param("pdf", b"%PDF", marks=pytest.mark.slow)])
 def test_figures_are_files_of_the_kind_asked_for(kind: str, start: bytes, results: Path, in_tmp: Path) -> None:
     done = run("figures", str(results), "--out", kind, "--format", kind)
@@ -176,6 +178,7 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     refused("figures", "part", "--out", "pictures", message=("no finished run",))
 
 
+@pytest.mark.slow
 def test_sumo_is_not_needed(results: Path, in_tmp: Path) -> None:
     code = ("import sys\nfrom click.testing import CliRunner\nfrom safevar_sumo.cli.program import commands\n"
             f"for line in (['tables', {str(results)!r}], ['figures', {str(results)!r}, '--out', 'pictures']):\n"

@@ -39,6 +39,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_validate_agrees_perfectly_with_itself(data: Path, in_tmp: Path) -> None:
     output = json.loads(run("validate", "sun", str(data), "--json", "--plot", "plot.png", "--totals", "kept.toml").stdout)
     assert list(output) == ["rows", "spearman", "mean_absolute_error", "bias", "collisions", "original", "precision", "recall",
@@ -64,6 +65,7 @@ def test_validate_warns_of_rows_outside_the_domains(data: Path, in_tmp: Path) ->
     assert "5 rows" in done.stderr
 
 
+@pytest.mark.slow
 def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None:
     """A study that starts from another brake gap comes nearer to the one that the data was made with."""
     Path("mine.toml").write_text(
@@ -114,6 +116,7 @@ def test_calibrate_does_not_write_over_what_it_starts_from(data: Path, in_tmp: P
     assert data.read_text().startswith("max_rpm")
 
 
+@pytest.mark.slow
 def test_settings_that_cannot_be_simulated_are_told(data: Path, in_tmp: Path, worker_processes: None) -> None:
     Path("hasty.toml").write_text('extends = "sun"\nname = "hasty"\n[search]\ntime_limit = 0.001\n')
     pd.read_csv(data).head(1).to_csv("one.csv", index=False)
@@ -132,6 +135,7 @@ def test_an_interrupted_calibration_leaves_the_best_so_far(in_tmp: Path, monkeyp
     assert load_study("best.toml").ads.parameters["brake_gap"] == 5.5
 
 
+@pytest.mark.slow
 def test_several_studies_are_fitted_together(data: Path, in_tmp: Path) -> None:
     free = '[calibration]\n"ads.parameters.brake_gap" = { lower = 7, upper = 12, unit = "m", meaning = "gap" }\n'
     Path("mine.toml").write_text(f'extends = "sun"\nname = "mine"\n{free}')

@@ -25,6 +25,7 @@ def memory() -> int:
     return sum(one.memory_info().rss for one in (me, *me.children(recursive=True)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["exported_aeb", "exported_vehicle"])
 def test_an_exported_model_drives_as_the_original(made: Path, name: str) -> None:
     native, fmu = (assemble(load_study(str(made / f"{one}.toml"))) for one in ("native_aeb", name))

@@ -65,6 +65,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(small: Make, edit: Callable[
     assert error.value.exit_code == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("then", "finding"), [
     ("self.pedal = 1.0", None), ("self.pedal = 0.0", "reaction"), ("self.pedal = time.time() % 1", "determinism"),
     ("Small.all = getattr(Small, 'all', 0) + 1; self.pedal = 1 / Small.all", "state")])

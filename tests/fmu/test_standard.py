@@ -56,6 +56,7 @@ def test_the_step_that_an_fmu_cannot_change_is_taken(small: Make) -> None:
     np.testing.assert_allclose(driven(small("self.pedal = self.steps / 100", edit=edit), [20.0] * 3)[1], [0.04, 0.08, 0.12])
 
 
+@pytest.mark.slow
 def test_one_instance_in_a_process_is_enough(small: Make) -> None:
     """Each vehicle then has a process of its own, and fewer drive at once."""
     def degrees(system: System) -> np.ndarray:

@@ -79,6 +79,7 @@ def test_each_vehicle_counts_for_itself_to_the_bit_and_not_on_a_collision(name: 
     assert np.isnan(comfort(name, speed, collision_speed=3.0)).all()
 
 
+@pytest.mark.slow
 def test_the_study_makes_braking_as_jerky_as_it_can_and_reports_what_it_costs(in_tmp: Path) -> None:
     study = load_study("comfort", search={"algorithms": ["nsga2"], "runs": 1, "evaluations": 60, "population": 20})
     system = assemble(study)

@@ -79,6 +79,7 @@ class Mine(ScalarAds):
 """
 
 
+@pytest.mark.slow
 def test_a_class_that_remembers_what_only_a_rare_setting_does(mine: Mine, folder: Path, tmp_path: Path) -> None:
     system = mine(LATCH)
     study = load_study(str(folder / "mine.toml"), search={"algorithms": ["nsga2"], "evaluations": 60, "runs": 1})

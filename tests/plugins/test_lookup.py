@@ -94,6 +94,7 @@ def test_a_module_that_fails_is_told_with_its_line_and_can_be_mended(module: str
     assert "mine" in sys.modules
 
 
+@pytest.mark.slow
 def test_a_numpy_py_in_the_working_directory_is_not_numpy(tmp_path: Path) -> None:
     for name in ("numpy", "random"):
         (tmp_path / f"{name}.py").write_text("raise RuntimeError('not this one')\n")

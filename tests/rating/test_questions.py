@@ -67,6 +67,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rater, "protocol_of", lambda name: protocol)
 
 
+@pytest.mark.slow
 def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
     result = find_tolerances(STUDY, ToleranceOptions(characteristics=("brakeTorque",), unsafe="points=4.0"), pool=Here())
     (scan,) = result.alone
@@ -87,6 +88,7 @@ def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
     assert profiles_figure(result).get_axes()
 
 
+@pytest.mark.slow
 def test_explain_names_the_cells_that_turn_and_the_summary_the_points_that_are_lost() -> None:
     evaluator = Evaluator(STUDY, Here())
     members = evaluator.characteristics
@@ -110,6 +112,7 @@ def test_explain_names_the_cells_that_turn_and_the_summary_the_points_that_are_l
     assert isinstance(case.solutions, pd.DataFrame)
 
 
+@pytest.mark.slow
 def test_a_rating_prints_draws_and_stands_in_a_page() -> None:
     result = compute.rate_variant(STUDY, RatingOptions(changes={"brakeTorque": 0.5}), pool=Here())
     assert result.lost > 0
@@ -128,6 +131,7 @@ def test_a_rating_prints_draws_and_stands_in_a_page() -> None:
     assert result.to_frame().groupby("vehicle")["total"].sum().loc["variant"] == pytest.approx(result.variant.points)  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 def test_at_one_cell_a_collision_is_unsafe_and_points_are_no_column() -> None:
     """One cell has no rating: metres would be compared with points of the whole study."""
     evaluator = Evaluator(STUDY, Here())

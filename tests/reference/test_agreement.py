@@ -75,6 +75,7 @@ def test_rank_correlation_of_known_orders() -> None:
     assert rank_correlation(np.array([]), np.array([])) is None
 
 
+@pytest.mark.slow
 def test_the_picture_is_drawn_whatever_the_data(tmp_path: Path) -> None:
     for i, rows in enumerate((1, 40)):
         safety = np.linspace(-1, 3, rows).tolist()

@@ -65,6 +65,7 @@ def test_a_road_in_any_direction_looks_the_same(angle: float, crash: Comparison)
         assert np.allclose(np.cos(one.heading - other.heading), 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["gif", "html", pytest.param("mp4", marks=pytest.mark.slow)])
 def test_the_same_bytes_twice(kind: str, crash: Comparison, tmp_path: Path) -> None:
     for name in ("a", "b"):

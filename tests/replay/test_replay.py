@@ -41,6 +41,7 @@ def simulated(*arguments: str) -> Result:
     return CliRunner().invoke(commands, ["simulate", *arguments])
 
 
+@pytest.mark.slow
 def test_the_command_replays_every_solution_of_solutions_csv(slippery: Path) -> None:
     frame = pd.read_csv(slippery / "solutions.csv")
     for handle, (_, row) in list(zip(handles(frame), frame.iterrows(), strict=True))[::4]:
@@ -173,6 +174,7 @@ def test_at_an_impact_the_pedals_are_those_that_were_in_force() -> None:
     assert shown.evaluations.metrics["safety_degree"][1] == -drives.collision_speed[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["png", "svg"])
 def test_the_same_bytes_twice(kind: str, comparison: Comparison, tmp_path: Path) -> None:
     for name in ("a", "b"):

@@ -102,6 +102,7 @@ def never_again(few_samples: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Here, "submit", ask)
 
 
+@pytest.mark.slow
 def test_the_page_is_sound_html_and_whole_in_itself(page: str) -> None:
     outline = Outline(page)
     assert outline.open == []
@@ -115,6 +116,7 @@ def test_the_page_is_sound_html_and_whole_in_itself(page: str) -> None:
     assert len(page.encode()) < 3_000_000
 
 
+@pytest.mark.slow
 def test_the_sections_stand_in_their_order_and_tell_what_was_found(page: str, slippery: Path, explained: Explained) -> None:
     places = [page.index(f'<h2 id="{name}">') for name in SECTIONS]
     assert places == sorted(places)
@@ -137,6 +139,7 @@ def test_the_sections_stand_in_their_order_and_tell_what_was_found(page: str, sl
     assert low < 100 * 0.5 / 2.9 < high
 
 
+@pytest.mark.slow
 def test_bars_are_where_their_values_lie_in_the_domain(page: str) -> None:
     bar = r'<rect class="{}" x="([\d.]+)" y="[\d.]+" width="([\d.]+)"[^>]*><title>tireFric from {}'
     (start, safe), (left, unsafe) = (map(float, re.findall(bar.format(look, ends), page)[0])
@@ -146,6 +149,7 @@ def test_bars_are_where_their_values_lie_in_the_domain(page: str) -> None:
     assert left + unsafe == pytest.approx(start, abs=0.2)
 
 
+@pytest.mark.slow
 def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderline(
         slippery: Path, tmp_path: Path, explained: Explained) -> None:
     """The values beside it are those of its solution: no number is another one further down."""
@@ -175,6 +179,7 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
     assert result["figures"][0]["value"].startswith(f"{len(first['changes'])} changes")
 
 
+@pytest.mark.slow
 def test_every_replay_that_is_linked_is_there_and_hits_as_recorded(page: str, slippery: Path) -> None:
     (data,) = read_inputs([slippery])
     players = re.findall(r'<details class="replay" id="(.*?)".*?<script type="application/json">(.*?)</script>', page, re.DOTALL)
@@ -189,6 +194,7 @@ def test_every_replay_that_is_linked_is_there_and_hits_as_recorded(page: str, sl
             assert changed["gap"][changed["nearest"]] == pytest.approx(row["f_safe"], abs=0.006)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("never_again")
 @pytest.mark.parametrize("only", [["verdict", "causes", "trust"], ["tolerance", "risk", "rules"],
                                   pytest.param(list(SECTIONS), marks=pytest.mark.slow)])
@@ -218,6 +224,7 @@ def test_a_kept_answer_belongs_to_its_options_and_to_the_code_that_computed_it(
     assert computed == ["first", "other results", "another sample size", "other code"]
 
 
+@pytest.mark.slow
 def test_what_is_not_as_the_results_say_any_more_is_told(page: str, slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Somebody's driving system was edited since: here another one drives."""
     assert "differs from the results" not in page
@@ -235,6 +242,7 @@ def test_only_some_sections(slippery: Path) -> None:
         make_report([slippery], only=["risks"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bad", ["<script>alert(1)</script>", "</script><b>\"'&{{ 7 * 7 }}"])
 def test_text_of_a_study_stays_text(bad: str, slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "copy")
@@ -247,6 +255,7 @@ def test_text_of_a_study_stays_text(bad: str, slippery: Path, tmp_path: Path) ->
     assert "49" not in re.findall(r"<strong>(.*?)</strong>", page)[0]
 
 
+@pytest.mark.slow
 def test_studies_stand_side_by_side(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "other", ignore=shutil.ignore_patterns("answers"))
     page = make_report([slippery, tmp_path / "other"], only=["tested", "verdict", "trust", "reproduce"])
@@ -254,6 +263,7 @@ def test_studies_stand_side_by_side(slippery: Path, tmp_path: Path) -> None:
     assert len(Outline(page).ids) == len(set(Outline(page).ids))
 
 
+@pytest.mark.slow
 def test_results_without_a_solution_have_a_report(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "begun", ignore=shutil.ignore_patterns("answers", "nsga2*", "rs*", "solutions.csv"))
     page = make_report([tmp_path / "begun"], only=["tested", "verdict", "causes", "questions", "trust", "reproduce"], jobs=1)
@@ -322,6 +332,7 @@ def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path:
     assert '<details class="replay"' in page
 
 
+@pytest.mark.slow
 def test_of_an_original_that_collides_no_change_is_called_the_cause(
         slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))

@@ -106,6 +106,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return searched(study, tmp_path_factory.mktemp("matrix") / "results")
 
 
+@pytest.mark.slow
 def test_all_of_it_is_of_the_point(results: Path) -> None:
     (whole,), (there,) = read_inputs([results]), read_inputs([results], DAY)
     assert [point.name for point in whole.system.points] == [DAY, RAIN]  # type: ignore[union-attr]

@@ -95,6 +95,7 @@ def test_what_cannot_be_asked_says_why() -> None:
         pairs(made_up(row("nsga2"), row("rs"), has_runs=False))
 
 
+@pytest.mark.slow
 def test_tables_and_figures_of_three_algorithms_can_be_made() -> None:
     case = three_algorithms()
     for name in ("rq2-pairs", "rq2-ranks"):

@@ -108,6 +108,7 @@ def test_convergence_grows_to_the_hypervolume_of_all() -> None:
 SAMPLES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=20)
 
 
+@pytest.mark.slow
 @given(x=SAMPLES, y=SAMPLES)
 def test_effect_size_is_the_share_of_pairs_won_and_half_of_those_tied(x: list[float], y: list[float]) -> None:
     won = sum((a > b) + 0.5 * (a == b) for a in x for b in y)

@@ -177,6 +177,7 @@ def case() -> Case:
     return made_up(*rows, evaluations=evaluations)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("study", ["made-up", "lgsvl"])
 @pytest.mark.parametrize("name", [*FIGURES_OF_ALL_CASES, *FIGURES_OF_ONE_CASE])
 def test_axes_are_labelled_and_no_text_lies_on_another(name: str, study: str, case: Case) -> None:
@@ -187,6 +188,7 @@ def test_axes_are_labelled_and_no_text_lies_on_another(name: str, study: str, ca
     _check_layout(figure, name)
 
 
+@pytest.mark.slow
 def test_cases_stand_side_by_side_in_one_figure(case: Case) -> None:
     cases = [dataclasses.replace(case, name=f"case {i}") for i in range(2)]
     figure = number_of_changes(cases)
@@ -243,6 +245,7 @@ def _texts(figure: Figure) -> Iterator[Text]:
                 yield from (tick.label2 for tick in axis.get_major_ticks() if low - 1e-9 <= tick.get_loc() <= high + 1e-9)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_drawn_says_why(tmp_path: Path) -> None:
     imported = made_up(row(values=(1100, 2, 0.1)), has_runs=False)
     written, lacking = draw_all([imported], tmp_path, "svg")
@@ -256,6 +259,7 @@ def test_what_cannot_be_drawn_says_why(tmp_path: Path) -> None:
         draw_all([made_up()], tmp_path, "png")
 
 
+@pytest.mark.slow
 def test_names_are_no_formulas(tmp_path: Path) -> None:
     strange = made_up(row(values=(1100, 2, 0.1)), study=made_up_study())
     object.__setattr__(strange, "name", "a$b$c ^_/é")

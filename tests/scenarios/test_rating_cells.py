@@ -152,6 +152,7 @@ def check(cells: list[Cell]) -> None:
         assert run.relative_speed[0] == pytest.approx(cell.relative, abs=0.1 * KMH), scenario
 
 
+@pytest.mark.slow
 def test_cells_at_the_edges_and_their_layers_are_where_the_closed_forms_have_them() -> None:
     check([*at_the_edges()])
 

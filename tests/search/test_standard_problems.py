@@ -175,6 +175,7 @@ def random_front(seed: int) -> np.ndarray:
     return np.concatenate([objectives, objectives[rng.integers(0, size, int(rng.integers(0, size + 1)))]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hundred", range(10))
 def test_survivors_of_spea2_are_those_of_pymoo_on_random_fronts(hundred: int) -> None:
     """The same objectives as often; but which of dominated ones of equal fitness is the last to survive, pymoo's sort leaves open."""

@@ -99,6 +99,7 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
         assert "satisfy the study's constraints: mass - maxBrakeTorque at least 700 kg" in run(*question.split()).stdout, question
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(st.data())
 def test_searches_and_designs_stay_in_any_linear_region_around_the_original(data: st.DataObject) -> None:

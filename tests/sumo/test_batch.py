@@ -33,6 +33,7 @@ def same_bits(one: Evaluations, other: Evaluations) -> bool:
     return bool(np.array_equal(one.outcome, other.outcome)) and all(a.tobytes() == b.tobytes() for a, b in numbers)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
 @settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 23), data=st.data())
@@ -227,6 +228,7 @@ def test_rains_driver_lets_go_of_the_accelerator_and_brakes_a_hesitation_later()
     assert late.throttle[decides:brakes].max() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted({*ADS} - {"world_on_rails", "apollo"}))
 def test_with_another_driver_rain_is_sun_but_for_the_road_and_the_sensors(name: str) -> None:
     """The shipped rain changes neither; a weather that does is the same for both studies."""

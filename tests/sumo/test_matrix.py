@@ -47,6 +47,7 @@ def same(one: Evaluations, other: Evaluations) -> bool:
         one.metrics[name].tobytes() == other.metrics[name].tobytes() for name in one.metrics)
 
 
+@pytest.mark.slow
 def test_a_setting_is_worth_what_it_is_at_its_worst_point_and_each_point_is_as_if_alone() -> None:
     population = drawn(SYSTEM, 3)
     points = at_every_point(SYSTEM, population)
@@ -64,6 +65,7 @@ def test_a_setting_is_worth_what_it_is_at_its_worst_point_and_each_point_is_as_i
     assert whole.collided.tolist() == np.any(collided, axis=0).tolist()
 
 
+@pytest.mark.slow
 def test_neither_the_batch_nor_the_order_of_points_nor_how_many_share_a_simulation_matters(monkeypatch: pytest.MonkeyPatch) -> None:
     population = drawn(SYSTEM, 3)
     whole = evaluate(SYSTEM, population)

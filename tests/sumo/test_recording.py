@@ -140,6 +140,7 @@ def test_a_pedestrian_who_reacts_is_driven_in_sumo_without_being_asked(reacting:
     assert "'reacting'" in engine["reason"]
 
 
+@pytest.mark.slow
 def test_a_scenario_that_claims_that_nobody_reacts_although_he_does_is_found_out(reacting: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(reacting)
     Path("claims.py").write_text(CLAIM)

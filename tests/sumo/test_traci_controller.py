@@ -181,6 +181,7 @@ REFUSED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("line", "problem"), REFUSED)
 def test_calls_that_are_not_a_controllers_are_refused_even_if_it_goes_on(line: str, problem: str, tmp_path: Path,
                                                                       monkeypatch: pytest.MonkeyPatch) -> None:

@@ -57,6 +57,7 @@ def test_deceleration_is_that_of_two_axles_of_which_none_brakes_more_than_its_lo
     assert CAR.sumo_type(p).decel[0] == pytest.approx(low, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_stopping_distances_of_worn_tyres_are_in_the_published_ratios_on_a_wet_road_and_equal_on_a_dry_one() -> None:
     """MIRA for RoSPA: +36.8 % from 6.7 to 1.6 mm; MIRA for Continental, from 50 mph: 31.7 m at 3 mm, 39.9 m at 1.6 mm."""
     worn = stopping_distance(1.6)
