@@ -90,7 +90,7 @@ class Simulation:
         Requested values that the filter put back to the original, by name.
     evaluation
         Outcome, metrics and objectives as arrays of one row.
-    drives
+    runs
         The trajectory and outcome, of one vehicle.
     scoring
         The metrics, and the objectives that a search would minimise.
@@ -102,7 +102,7 @@ class Simulation:
     setting: Mapping[str, float]
     put_back: Mapping[str, float]
     evaluation: Evaluations
-    drives: SimulationRuns
+    runs: SimulationRuns
     scoring: Scoring
     _recording: RecordingAds
     _original: Simulation | None = None
@@ -142,7 +142,7 @@ class Simulation:
     @cached_property
     def trace(self) -> pd.DataFrame:
         """One row per step, units in the columns' names; NaN where a value does not exist."""
-        return trace_frame(self.drives, self._recording)
+        return trace_frame(self.runs, self._recording)
 
     @property
     def verdict(self) -> str:
@@ -216,10 +216,10 @@ def load_and_assemble(study: StudyLike, source: str = "") -> tuple[Study, System
 def _simulate_one(study: Study, system: System, requested: FloatArray, setting: FloatArray, engine: Engine = Engine.LIBSUMO) -> Simulation:
     recording = RecordingAds(system.ads)
     rows = setting[np.newaxis]
-    drives = drive(replace(at_worst(system, rows), ads=recording), rows, engine)  # in SUMO itself
+    runs = drive(replace(at_worst(system, rows), ads=recording), rows, engine)  # in SUMO itself
     return Simulation(
         study=study, setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
-        put_back=_put_back(system, requested, setting), evaluation=score(system, rows, drives), drives=drives,
+        put_back=_put_back(system, requested, setting), evaluation=score(system, rows, runs), runs=runs,
         scoring=system.measuring.scoring, _recording=recording)
 
 

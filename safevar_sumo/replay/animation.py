@@ -125,12 +125,12 @@ class _Canvas:
                 draw.polygon(self._pixels(np.concatenate([light, light[::-1] + forward]), sample), fill=BRAKE)
 
     def _brakes(self, row: int, sample: int) -> bool:
-        trace = self._scene.comparison.film.drives.trace
+        trace = self._scene.comparison.film.runs.trace
         return bool(trace.brake[min(sample, self._scene.moments[row].end), row] > 0)
 
     def _words(self, draw: ImageDraw, sample: int) -> None:
         """Draw the time and, for each vehicle, its speed, its gap and, at the end, its outcome."""
-        trace = self._scene.comparison.film.drives.trace
+        trace = self._scene.comparison.film.runs.trace
         self._word(draw, (12, 14), f"{sample * self._scene.step:.2f} s", INK, 26)
         for row in self._scene.comparison.rows:
             moments = self._scene.moments[row]

@@ -38,14 +38,14 @@ class Moments(NamedTuple):
     end: int
 
 
-def moments(drives: SimulationRuns, row: int) -> Moments:
+def moments(runs: SimulationRuns, row: int) -> Moments:
     """The moments of one of N runs."""
-    return Moments(drives.brake_onset(row), drives.nearest(row), int(np.flatnonzero(drives.trace.active[:, row])[-1]))
+    return Moments(runs.brake_onset(row), runs.nearest(row), int(np.flatnonzero(runs.trace.active[:, row])[-1]))
 
 
-def divergence(drives: SimulationRuns, first: int = 0, second: int = 1) -> int | None:
+def divergence(runs: SimulationRuns, first: int = 0, second: int = 1) -> int | None:
     """The first sample at which the speeds of two of N runs have diverged, None if they never do."""
-    trace = drives.trace
+    trace = runs.trace
     both = trace.active[:, first] & trace.active[:, second]
     diverged = np.flatnonzero(both & (np.abs(trace.speed[:, first] - trace.speed[:, second]) > DIVERGED))
     return int(diverged[0]) if diverged.size else None
@@ -87,13 +87,13 @@ class Comparison:
 
     def verdict(self, row: int) -> str:
         """How a run ended, in words: collides at 3.9 m/s, or stops with 2.22 m to spare."""
-        drives = self.film.drives
-        if not math.isnan(drives.collision_speed[row]):
-            return f"collides at {drives.collision_speed[row]:.1f} m/s"
-        nearest = moments(drives, row).nearest
-        word = ENDS[Outcome(str(drives.outcome[row]))]
-        if nearest is not None and drives.outcome[row] == Outcome.STOPPED:
-            word = f"{word} with {drives.trace.gap[nearest, row]:.2f} m to spare"
+        runs = self.film.runs
+        if not math.isnan(runs.collision_speed[row]):
+            return f"collides at {runs.collision_speed[row]:.1f} m/s"
+        nearest = moments(runs, row).nearest
+        word = ENDS[Outcome(str(runs.outcome[row]))]
+        if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
+            word = f"{word} with {runs.trace.gap[nearest, row]:.2f} m to spare"
         values = [(metric, self.evaluations.metrics[metric.name][row]) for metric in self.objectives]
         return ", ".join([word, *(f"{metric.title} {value:.1f} {metric.unit}" for metric, value in values if np.isfinite(value))])
 
@@ -161,8 +161,8 @@ def compare_setting(study: Study, system: System, setting: FloatArray) -> Compar
     recording = film(worst, settings)
     return Comparison(title=study.title + "".join(names[:1]), characteristics=system.characteristics,
                       ttc_threshold=system.metrics.ttc_threshold, network=staged(worst.scenario).folder,
-                      evaluations=score(worst, settings, recording.drives),
-                      film=replace(recording, drives=_up_to_impacts(recording.drives)), objectives=_further_objectives(worst.measuring))
+                      evaluations=score(worst, settings, recording.runs),
+                      film=replace(recording, runs=_up_to_impacts(recording.runs)), objectives=_further_objectives(worst.measuring))
 
 
 def _further_objectives(measuring: Measuring) -> tuple[MetricFacts, ...]:
@@ -171,15 +171,15 @@ def _further_objectives(measuring: Measuring) -> tuple[MetricFacts, ...]:
     return tuple(metric for metric in measuring.scoring.metrics if metric.name in objectives - {*METRICS, RATING_POINTS.name})
 
 
-def _up_to_impacts(drives: SimulationRuns) -> SimulationRuns:
+def _up_to_impacts(runs: SimulationRuns) -> SimulationRuns:
     """Runs with the pedals of the sample before as those at an impact: a command at the impact has no effect any more."""
-    trace = drives.trace
+    trace = runs.trace
     throttle, brake = trace.throttle.copy(), trace.brake.copy()
-    for row in np.flatnonzero(~np.isnan(drives.collision_speed)).tolist():
-        end = moments(drives, row).end
+    for row in np.flatnonzero(~np.isnan(runs.collision_speed)).tolist():
+        end = moments(runs, row).end
         for pedal in (throttle, brake):
             pedal[end, row] = pedal[max(end - 1, 0), row]
-    return replace(drives, trace=replace(trace, throttle=throttle, brake=brake))
+    return replace(runs, trace=replace(trace, throttle=throttle, brake=brake))
 
 
 def differences(replayed: Evaluations, recorded: Mapping[str, Any]) -> list[str]:

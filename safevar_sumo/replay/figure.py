@@ -36,7 +36,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
     with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT, "axes.labelsize": FONT}]):
         figure = Figure(figsize=(9.6, 6.2), layout=ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.08))
         axes = figure.subplots(2, 2, sharex=True).ravel()
-    ttc = time_to_collision(comparison.film.drives)
+    ttc = time_to_collision(comparison.film.runs)
     for row in comparison.rows:
         _speed(axes[0], comparison, row)
         _gap(axes[1], comparison, row)
@@ -65,21 +65,21 @@ def draw_comparison(comparison: Comparison) -> Figure:
 
 def _end_time(comparison: Comparison) -> float:
     """Time at which the last of the vehicles is nearest or comes to rest [s]."""
-    drives = comparison.film.drives
-    ends = [at for row in comparison.rows for at in (moments(drives, row).nearest, _comes_to_rest(drives, row)) if at is not None]
-    return float(drives.trace.time[min(max(ends) + 1, len(drives.trace.time) - 1)])
+    runs = comparison.film.runs
+    ends = [at for row in comparison.rows for at in (moments(runs, row).nearest, _comes_to_rest(runs, row)) if at is not None]
+    return float(runs.trace.time[min(max(ends) + 1, len(runs.trace.time) - 1)])
 
 
-def _comes_to_rest(drives: SimulationRuns, row: int) -> int:
+def _comes_to_rest(runs: SimulationRuns, row: int) -> int:
     """The last sample of a run in which the vehicle moves; 0 if it never does."""
-    return int(np.flatnonzero(drives.trace.active[:, row] & (drives.trace.speed[:, row] > STANDSTILL)).max(initial=0))
+    return int(np.flatnonzero(runs.trace.active[:, row] & (runs.trace.speed[:, row] > STANDSTILL)).max(initial=0))
 
 
 def _legend(figure: Figure, comparison: Comparison) -> None:
     """Draw the legend: vehicles and marks."""
     from matplotlib.lines import Line2D
 
-    hit = bool(np.isfinite(comparison.film.drives.collision_speed).any())
+    hit = bool(np.isfinite(comparison.film.runs.collision_speed).any())
     marks = {"begins to brake": BRAKING, "nearest": NEAREST, **({"impact": IMPACT} if hit else {})}
     entries = [Line2D([], [], color=COLOURS[row], linestyle=DASHES[row], label=f"{comparison.name(row)} vehicle: {comparison.verdict(row)}")
                for row in comparison.rows]
@@ -92,8 +92,8 @@ def _legend(figure: Figure, comparison: Comparison) -> None:
 
 def _line(axis: Axes, comparison: Comparison, row: int, values: FloatArray) -> None:
     """Draw a quantity of one run until its end."""
-    end = moments(comparison.film.drives, row).end + 1
-    time = comparison.film.drives.trace.time[:end]
+    end = moments(comparison.film.runs, row).end + 1
+    time = comparison.film.runs.trace.time[:end]
     axis.plot(time, values[:end], color=COLOURS[row], linestyle=DASHES[row], linewidth=1.6, zorder=3 + row)
 
 
@@ -106,35 +106,35 @@ def _mark(axis: Axes, row: int, place: tuple[float, float], mark: str, text: str
 
 
 def _speed(axis: Axes, comparison: Comparison, row: int) -> None:
-    trace, at = comparison.film.drives.trace, moments(comparison.film.drives, row)
+    trace, at = comparison.film.runs.trace, moments(comparison.film.runs, row)
     _line(axis, comparison, row, trace.speed[:, row])
     if at.brake is not None:
         _mark(axis, row, (trace.time[at.brake], trace.speed[at.brake, row]), BRAKING)
-    hit = float(comparison.film.drives.collision_speed[row])
+    hit = float(comparison.film.runs.collision_speed[row])
     if not np.isnan(hit):
         _mark(axis, row, (trace.time[at.end], hit), IMPACT, f"{hit:.1f} m/s", is_speed=True)
 
 
 def _gap(axis: Axes, comparison: Comparison, row: int) -> None:
-    drives = comparison.film.drives
-    gap, at = np.where(np.isfinite(drives.trace.gap[:, row]), drives.trace.gap[:, row], np.nan), moments(drives, row)
+    runs = comparison.film.runs
+    gap, at = np.where(np.isfinite(runs.trace.gap[:, row]), runs.trace.gap[:, row], np.nan), moments(runs, row)
     _line(axis, comparison, row, gap)
     if at.nearest is not None and not np.isnan(gap[at.nearest]):
-        hit = not np.isnan(drives.collision_speed[row])
+        hit = not np.isnan(runs.collision_speed[row])
         text = "impact" if hit else f"{gap[at.nearest]:.2f} m"
-        _mark(axis, row, (drives.trace.time[at.nearest], gap[at.nearest]), IMPACT if hit else NEAREST, text)
+        _mark(axis, row, (runs.trace.time[at.nearest], gap[at.nearest]), IMPACT if hit else NEAREST, text)
 
 
 def _pedals(axis: Axes, comparison: Comparison, row: int) -> None:
-    trace = comparison.film.drives.trace
+    trace = comparison.film.runs.trace
     _line(axis, comparison, row, trace.throttle[:, row] - trace.brake[:, row])
 
 
 def _mark_divergence(axes: np.ndarray, comparison: Comparison) -> None:
-    sample = divergence(comparison.film.drives)
+    sample = divergence(comparison.film.runs)
     if sample is not None:
         for axis in axes:
-            axis.axvline(comparison.film.drives.trace.time[sample], color="0.35", linewidth=0.9, linestyle="-.", zorder=1)
+            axis.axvline(comparison.film.runs.trace.time[sample], color="0.35", linewidth=0.9, linestyle="-.", zorder=1)
 
 
 def _heading(figure: Figure, comparison: Comparison) -> None:

@@ -51,13 +51,13 @@ class Film:
     meaningless, for SUMO goes on with the rest of the batch.
     """
 
-    drives: SimulationRuns
+    runs: SimulationRuns
     tracks: Mapping[str, Track]
     road: tuple[Lane, ...]
 
     @property
     def last(self) -> np.ndarray:
-        active = self.drives.trace.active
+        active = self.runs.trace.active
         return np.asarray(len(active) - 1 - np.argmax(active[::-1], axis=0))
 
 
@@ -72,8 +72,8 @@ def film(system: System, settings: FloatArray) -> Film:
         As `simulate`.
     """
     camera, system = _Camera(len(settings)), at_worst(system, settings)
-    drives = simulate(system, settings, watch=camera.record)
-    return Film(drives=drives, tracks=camera.tracks(), road=road_of(staged(system.scenario).folder))
+    runs = simulate(system, settings, watch=camera.record)
+    return Film(runs=runs, tracks=camera.tracks(), road=road_of(staged(system.scenario).folder))
 
 
 class _Camera:

@@ -98,11 +98,11 @@ def _show(window: Window, scene: FlatScene, sample: int, layout: _Layout) -> Non
         for name, track in film.tracks.items():
             x, y = float(track.x[at, row]), float(track.y[at, row])
             if not np.isnan(x):
-                brakes = name == VUT and bool(film.drives.trace.brake[at, row] > 0)
+                brakes = name == VUT and bool(film.runs.trace.brake[at, row] > 0)
                 places.append(Place(_id(row, name), x + float(offset[0]), y + float(offset[1]), float(track.angle[at, row]), brakes))
         frame = _frame(scene, sample) + offset
         corners.append(frame)
-        words = f"{comparison.name(row)} ({NAMES[row]}): {film.drives.trace.speed[at, row]:.1f} m/s"
+        words = f"{comparison.name(row)} ({NAMES[row]}): {film.runs.trace.speed[at, row]:.1f} m/s"
         finished = sample >= (scene.moments[row].end if scene.moments[row].nearest is None else int(scene.moments[row].nearest or 0))
         middle = frame.mean(axis=0)
         window.write(f"legend.{row}", float(middle[0]), float(frame[:, 1].min()) + LEGEND_HEIGHT,

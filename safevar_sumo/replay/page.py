@@ -48,12 +48,12 @@ def animation_page(scene: FlatScene) -> str:
 def player_data(scene: FlatScene) -> dict[str, Any]:
     """The data of the template `player`: the still picture, and under `played` the data of the script. y points down."""
     view, key = scene.view, scene.key_sample
-    drives = [_drive(scene, row) for row in scene.comparison.rows]
+    runs = [_drive(scene, row) for row in scene.comparison.rows]
     bodies = sorted(scene.bodies, key=lambda body: (body.is_vut, body.row))
     left = _numbers(view.left)
     box = {"left": left, "top": round(-view.bottom - view.height, CENTIMETRES), "width": round(view.width, CENTIMETRES),
            "height": round(view.height, CENTIMETRES)}
-    shared = {"step": scene.step, "length": scene.length, "key": key, "view": box, "drives": drives}
+    shared = {"step": scene.step, "length": scene.length, "key": key, "view": box, "drives": runs}
     return {
         **shared,
         "description": _description(scene), "moments": _moments(scene), "bottom": round(-view.bottom, CENTIMETRES),
@@ -80,13 +80,13 @@ def _moments(scene: FlatScene) -> list[dict[str, Any]]:
         if moments.brake is not None:
             jumps.append({"name": f"{name} brakes", "sample": moments.brake})
         if moments.nearest is not None:
-            hit = not np.isnan(scene.comparison.film.drives.collision_speed[row])
+            hit = not np.isnan(scene.comparison.film.runs.collision_speed[row])
             jumps.append({"name": f"{name} {'collides' if hit else 'is nearest'}", "sample": moments.nearest})
     return sorted(jumps, key=lambda moment: moment["sample"])
 
 
 def _drive(scene: FlatScene, row: int) -> dict[str, Any]:
-    trace, moments = scene.comparison.film.drives.trace, scene.moments[row]
+    trace, moments = scene.comparison.film.runs.trace, scene.moments[row]
     samples = slice(0, moments.end + 1)
     return {"name": scene.comparison.name(row), "verdict": scene.comparison.verdict(row), "end": moments.end,
             "nearest": moments.end if moments.nearest is None else moments.nearest, "speed": _list(trace.speed[samples, row]),
@@ -108,7 +108,7 @@ def _still(body: FlatBody, scene: FlatScene) -> dict[str, Any]:
     key = scene.key_sample
     x, y, heading = (_list(values[key:key + 1])[0] for values in (body.x, -body.y, -np.rad2deg(body.heading)))
     look = {ORIGINAL: "original", CHANGED: "changed"}[body.row] if body.is_vut else "other"
-    brake = scene.comparison.film.drives.trace.brake[min(key, scene.moments[body.row].end), body.row]
+    brake = scene.comparison.film.runs.trace.brake[min(key, scene.moments[body.row].end), body.row]
     return {"name": body.name, "person": body.is_person, "length": body.length, "width": body.width, "look": look,
             "title": f"{scene.comparison.name(body.row)} vehicle" if body.is_vut else body.name,
             "radius": max(body.length, body.width) / 2, "drive": body.row if body.is_vut else None,

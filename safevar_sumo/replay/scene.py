@@ -92,13 +92,13 @@ def scene_of(comparison: Comparison) -> FlatScene:
     turn = np.deg2rad(90 - vut.angle[0, 0])
     to_scene = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     start = np.array([vut.x[0, 0], vut.y[0, 0]])
-    all_moments = tuple(moments(film.drives, row) for row in comparison.rows)
+    all_moments = tuple(moments(film.runs, row) for row in comparison.rows)
     length = max(one.end for one in all_moments) + 1
     bodies = tuple(_body(name, track, row, all_moments[row].end, length, to_scene, start, turn)
                    for name, track in film.tracks.items() for row in comparison.rows
                    if name == VUT or (_is_near(film, name, row) and not _is_duplicate(comparison, name, row)))
     road = tuple(lane._replace(line=(lane.line - start) @ to_scene.T) for lane in film.road)
-    return FlatScene(comparison=comparison, step=film.drives.trace.step, length=length, road=road, bodies=bodies, moments=all_moments,
+    return FlatScene(comparison=comparison, step=film.runs.trace.step, length=length, road=road, bodies=bodies, moments=all_moments,
                  view=_view(bodies, length))
 
 

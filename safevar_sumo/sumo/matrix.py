@@ -47,7 +47,7 @@ class AtPoint(NamedTuple):
 
     point: Point
     evaluations: Evaluations
-    drives: SimulationRuns
+    runs: SimulationRuns
 
 
 def point_record(result: AtPoint, row: int = 0) -> dict[str, Any]:
@@ -55,12 +55,12 @@ def point_record(result: AtPoint, row: int = 0) -> dict[str, Any]:
     before the system acted [km/h], the time to collision at the first warning [s], the side and place of the contact [%]; None if
     undefined.
     """
-    evaluations, relative = result.evaluations, result.drives.relative_speed
+    evaluations, relative = result.evaluations, result.runs.relative_speed
     numbers = {"impact_speed": evaluations.collision_speed[row], "relative_impact_speed": relative[row],
                SAFETY_DEGREE: evaluations.f_safe[row],
-               "test_speed_error": np.broadcast_to(result.drives.test_speed_error, relative.shape)[row] / KMH,
-               "warning_ttc": np.broadcast_to(result.drives.warning_ttc, relative.shape)[row]}
-    side, place = (np.broadcast_to(values, relative.shape)[row] for values in result.drives.contact)
+               "test_speed_error": np.broadcast_to(result.runs.test_speed_error, relative.shape)[row] / KMH,
+               "warning_ttc": np.broadcast_to(result.runs.warning_ttc, relative.shape)[row]}
+    side, place = (np.broadcast_to(values, relative.shape)[row] for values in result.runs.contact)
     return {"point": result.point.name, **dict(result.point.place), "outcome": str(evaluations.outcome[row]),
             **{name: None if np.isnan(value) else float(value) for name, value in numbers.items()},
             **({"contact": {"side": str(side), "place": float(place)}} if side else {})}
@@ -115,7 +115,7 @@ def rated_settings(system: System, settings: FloatArray, engine: Engine = Engine
     for group in _groups(system, settings, engine):
         for result in group:
             name = result.point.name
-            scored[name], columns[name] = Scored(result.point, result.evaluations), cell_columns(result.drives)
+            scored[name], columns[name] = Scored(result.point, result.evaluations), cell_columns(result.runs)
     cells = joined_cells([columns[point.name] for point in system.points])
     evaluations = aggregated([scored[point.name] for point in system.points])
     if system.rater is None:  # only some of the cells are simulated
@@ -177,7 +177,7 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     if watch is not None or engine is Engine.GUI:
         return drive_all(at_worst(system, settings), settings, engine, options, watch)
     at_points = at_every_point(system, settings, engine, options)
-    return _selected_runs([result.drives for result in at_points], worst_points(at_points))
+    return _selected_runs([result.runs for result in at_points], worst_points(at_points))
 
 
 def at_every_point(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = ()) -> list[AtPoint]:
@@ -192,10 +192,10 @@ def _groups(system: System, settings: FloatArray, engine: Engine, options: tuple
     recorded = engine is Engine.RECORDED and not reason_for_sumo(system)
     most, all_options = largest_batch(system) // max(n, 1), (*step_options(system), *options)
     for points in _together(system.points, most, all_options) if recorded else ((point,) for point in system.points):
-        drives = drive_all(replace(system, matrix=points), settings, engine, options)
-        evaluations = score(system, np.tile(settings, (len(points), 1)), drives)
+        runs = drive_all(replace(system, matrix=points), settings, engine, options)
+        evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
         parts = [slice(k * n, (k + 1) * n) for k in range(len(points))]
-        yield [AtPoint(point, evaluations.take(np.arange(rows.start, rows.stop)), drives.of(rows))
+        yield [AtPoint(point, evaluations.take(np.arange(rows.start, rows.stop)), runs.of(rows))
                for point, rows in zip(points, parts, strict=True)]
 
 
@@ -272,26 +272,27 @@ def worst_points(at_points: Sequence[AtPoint | Scored]) -> npt.NDArray[np.intp]:
     return np.asarray(np.array(order)[np.argmin(degrees, axis=0)])
 
 
-def _selected_runs(drives: Sequence[SimulationRuns], number: npt.NDArray[np.intp]) -> SimulationRuns:
+def _selected_runs(at_points: Sequence[SimulationRuns], number: npt.NDArray[np.intp]) -> SimulationRuns:
     """For every vehicle one of several runs; shorter runs repeat their last sample, marked as inactive."""
-    length, columns = max(len(runs.trace.time) for runs in drives), np.arange(len(number))
+    length, columns = max(len(runs.trace.time) for runs in at_points), np.arange(len(number))
 
     def select_samples(values: list[np.ndarray]) -> np.ndarray:
         padded = [np.concatenate([samples, np.repeat(samples[-1:], length - len(samples), axis=0)]) for samples in values]
         return np.stack(padded)[number, :, columns].T
 
-    longest = max((runs.trace for runs in drives), key=lambda trace: len(trace.time))
+    longest = max((runs.trace for runs in at_points), key=lambda trace: len(trace.time))
     def select(values: list[np.ndarray]) -> np.ndarray:
         return np.stack([np.broadcast_to(column, number.shape) for column in values])[number, columns]
 
     names = [field.name for field in fields(Trace) if np.ndim(getattr(longest, field.name)) == 2]
-    columns_of: dict[str, Any] = {name: select_samples([getattr(runs.trace, name) for runs in drives]) for name in names}
+    columns_of: dict[str, Any] = {name: select_samples([getattr(runs.trace, name) for runs in at_points]) for name in names}
     trace = replace(longest, **columns_of)
-    ended = np.array([len(runs.trace.time) for runs in drives])[number]
+    ended = np.array([len(runs.trace.time) for runs in at_points])[number]
     active = trace.active & (np.arange(length)[:, np.newaxis] < ended)
-    encounters = zip(*(runs.encounter for runs in drives), strict=True)
+    encounters = zip(*(runs.encounter for runs in at_points), strict=True)
     return SimulationRuns(
         trace=replace(trace, active=active), encounter=Encounter._make(select_samples(list(values)) for values in encounters),
-        outcome=select([runs.outcome for runs in drives]), collision_speed=select([runs.collision_speed for runs in drives]),
-        contact=Contact._make(select(list(values)) for values in zip(*(runs.contact for runs in drives), strict=True)),
-        test_speed_error=select([runs.test_speed_error for runs in drives]), warning_ttc=select([runs.warning_ttc for runs in drives]))
+        outcome=select([runs.outcome for runs in at_points]), collision_speed=select([runs.collision_speed for runs in at_points]),
+        contact=Contact._make(select(list(values)) for values in zip(*(runs.contact for runs in at_points), strict=True)),
+        test_speed_error=select([runs.test_speed_error for runs in at_points]),
+        warning_ttc=select([runs.warning_ttc for runs in at_points]))

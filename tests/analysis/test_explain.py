@@ -230,8 +230,8 @@ def drive_of(*vehicles: tuple[float, float, float, float]) -> SimulationRuns:
 
 
 def compared(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> BrakingComparison:
-    drives = drive_of(one, other)
-    return compare_braking(*(summary_of(drives, column, 1.0) for column in (0, 1)))
+    runs = drive_of(one, other)
+    return compare_braking(*(summary_of(runs, column, 1.0) for column in (0, 1)))
 
 
 SAME = (10.0, 15.0, 0.2, 6.0)
@@ -252,11 +252,11 @@ def test_one_difference_is_one_part(other: tuple[float, float, float, float], pa
 
 def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> None:
     """Two overshoot; the throttle ends that, or a brake that fades until the hazard. The last one does nothing else before it collides."""
-    drives = drive_of(SAME, SAME, SAME, (10.0, -5.0, 0.2, 6.0))
-    drives.trace.brake[50:150, 1:3] = 0.5
-    drives.trace.throttle[150:200, 1] = 0.1
-    drives.trace.brake[150:250, 2:] = 0.01
-    plain, overshot, settling, unbraked = (summary_of(drives, column, 1.0).braking for column in range(4))
+    runs = drive_of(SAME, SAME, SAME, (10.0, -5.0, 0.2, 6.0))
+    runs.trace.brake[50:150, 1:3] = 0.5
+    runs.trace.throttle[150:200, 1] = 0.1
+    runs.trace.brake[150:250, 2:] = 0.01
+    plain, overshot, settling, unbraked = (summary_of(runs, column, 1.0).braking for column in range(4))
     assert overshot == settling == plain
     assert plain is not None
     assert plain.time == pytest.approx(0.5)
@@ -265,23 +265,23 @@ def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> Non
 
 def test_pulses_are_one_braking() -> None:
     """The brake is let go for a tenth of a second at 95 % of the speed, and at a quarter of it."""
-    drives = drive_of(SAME, SAME)
+    runs = drive_of(SAME, SAME)
     for share in (0.95, 0.25):
-        at = int(np.argmax(drives.trace.speed[:, 1] < share * 10))
-        drives.trace.brake[at:at + 50, 1] = 0.0
-    assert summary_of(drives, 1, 1.0).braking == summary_of(drives, 0, 1.0).braking is not None
+        at = int(np.argmax(runs.trace.speed[:, 1] < share * 10))
+        runs.trace.brake[at:at + 50, 1] = 0.0
+    assert summary_of(runs, 1, 1.0).braking == summary_of(runs, 0, 1.0).braking is not None
 
 
 def test_a_creeping_deceleration_is_no_late_pedal() -> None:
     """Both pedals are down 0.1 s after the command; one vehicle decelerates with 6 m/s^2 at once, the other comes to 6 within a second."""
-    drives = drive_of((10.0, 15.0, 0.1, 6.0), (10.0, 15.0, 0.1, 6.0))
-    time, begins = drives.trace.time, 0.5
+    runs = drive_of((10.0, 15.0, 0.1, 6.0), (10.0, 15.0, 0.1, 6.0))
+    time, begins = runs.trace.time, 0.5
     rises = np.clip(time - begins - 0.1, 0.0, None)
     slower = 10 - np.where(rises < 1, 3 * rises**2, 3 + 6 * (rises - 1))
-    drives.trace.speed[:, 1] = np.maximum(slower, 0.0)
-    drives.trace.position[1:, 1] = np.cumsum((drives.trace.speed[1:, 1] + drives.trace.speed[:-1, 1]) / 2) * STEP
-    drives.trace.gap[:, 1] = OBSTACLE - drives.trace.position[:, 1]
-    comparison = compare_braking(*(summary_of(drives, column, 1.0) for column in (0, 1)))
+    runs.trace.speed[:, 1] = np.maximum(slower, 0.0)
+    runs.trace.position[1:, 1] = np.cumsum((runs.trace.speed[1:, 1] + runs.trace.speed[:-1, 1]) / 2) * STEP
+    runs.trace.gap[:, 1] = OBSTACLE - runs.trace.position[:, 1]
+    comparison = compare_braking(*(summary_of(runs, column, 1.0) for column in (0, 1)))
     assert comparison.parts["delay"] == 0
     assert comparison.parts["deceleration"] == pytest.approx(comparison.lost)
     assert "later" not in sentence(comparison)

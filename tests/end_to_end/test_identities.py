@@ -142,7 +142,7 @@ def test_whatever_a_matrix_reads_counts_and_every_command_that_simulates_results
 
 @pytest.mark.slow
 def test_a_file_that_is_read_later_counts_from_then_on() -> None:
-    top = sv.simulate("mine.toml").drives.trace.speed.max()
+    top = sv.simulate("mine.toml").runs.trace.speed.max()
     Path("my_ads.py").write_text(ADS.replace("def drive(self, seen):", f"""def drive(self, seen):
         if seen.speed > {float(top)!r}:
             open("tile.txt").read()"""))

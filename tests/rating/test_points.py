@@ -126,8 +126,8 @@ def test_cells_are_what_their_points_are_alone_and_in_any_batch() -> None:
     assert [point.name.rpartition(", ")[0] for point in points] == [CELLS[number].name for number in numbers_]
     for column, point in enumerate(points):
         (alone,) = at_every_point(assemble(study_at(study, point.name, "")), settings_[::-1])
-        np.testing.assert_array_equal(found.cells.impact[:, column], alone.drives.relative_speed[::-1] * 3.6)
-        np.testing.assert_array_equal(found.cells.warning[:, column], np.broadcast_to(alone.drives.warning_ttc, 2)[::-1])
+        np.testing.assert_array_equal(found.cells.impact[:, column], alone.runs.relative_speed[::-1] * 3.6)
+        np.testing.assert_array_equal(found.cells.warning[:, column], np.broadcast_to(alone.runs.warning_ttc, 2)[::-1])
 
 
 def test_a_rated_study_has_its_points_as_an_objective_and_another_one_has_not() -> None:

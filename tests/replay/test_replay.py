@@ -84,21 +84,21 @@ def test_a_film_shows_what_is_simulated(study: str) -> None:
     settings = np.stack([system.characteristics.original, system.characteristics.lower])
     result, plain = film(system, settings), simulate(system, settings)
     for name, values in score(system, settings, plain).metrics.items():
-        assert np.array_equal(values, score(system, settings, result.drives).metrics[name], equal_nan=True)
+        assert np.array_equal(values, score(system, settings, result.runs).metrics[name], equal_nan=True)
     vut = result.tracks["vut"]
-    assert np.array_equal(vut.x, result.drives.trace.position)
-    assert vut.length == result.drives.trace.vehicle_length
+    assert np.array_equal(vut.x, result.runs.trace.position)
+    assert vut.length == result.runs.trace.vehicle_length
     assert not np.isnan(vut.y).any()
     for row, end in enumerate(result.last):
-        assert result.drives.trace.active[end, row]
-        assert not result.drives.trace.active[end + 1:, row].any()
+        assert result.runs.trace.active[end, row]
+        assert not result.runs.trace.active[end + 1:, row].any()
 
 
 def test_a_film_of_the_crossing_has_its_pedestrian_and_its_crossing(sun: System) -> None:
     result = film(sun, sun.characteristics.original[np.newaxis])
     pedestrian = result.tracks["pedestrian"]
     assert pedestrian.is_person
-    assert np.allclose(pedestrian.y[:, 0] - result.tracks["vut"].y[:, 0], result.drives.trace.lateral[:, 0])
+    assert np.allclose(pedestrian.y[:, 0] - result.tracks["vut"].y[:, 0], result.runs.trace.lateral[:, 0])
     (crossing,) = [lane for lane in result.road if lane.kind == "crossing"]
     assert np.allclose(crossing.line[:, 0], pedestrian.x[0, 0], atol=0.01)
     assert {lane.kind for lane in result.road} == {"road", "path", "crossing", "area"}
@@ -106,8 +106,8 @@ def test_a_film_of_the_crossing_has_its_pedestrian_and_its_crossing(sun: System)
 
 def test_moments_of_a_drive(case: Case) -> None:
     comparison = compare_setting(case.study, assemble(case.study), case.solutions[list(case.characteristics.names)].to_numpy()[0])
-    drives = comparison.film.drives
-    trace, original, hit = drives.trace, moments(drives, 0), moments(drives, 1)
+    runs = comparison.film.runs
+    trace, original, hit = runs.trace, moments(runs, 0), moments(runs, 1)
     assert original.brake is not None
     assert trace.brake[original.brake, 0] > 0
     assert not trace.brake[trace.time < trace.time[original.brake], 0].any()
@@ -115,7 +115,7 @@ def test_moments_of_a_drive(case: Case) -> None:
     assert hit.nearest == hit.end
     assert comparison.verdict(0) == f"stops with {comparison.evaluations.f_safe[0]:.2f} m to spare"
     assert comparison.verdict(1) == f"collides at {-comparison.evaluations.f_safe[1]:.1f} m/s"
-    apart = divergence(drives)
+    apart = divergence(runs)
     assert apart is not None
     assert abs(trace.speed[apart, 0] - trace.speed[apart, 1]) > 0.1
     assert np.all(np.abs(trace.speed[:apart, 0] - trace.speed[:apart, 1]) <= 0.1)
@@ -129,7 +129,7 @@ def comparison(slippery: Path) -> Comparison:
 
 def test_it_draws_both_drives_as_far_as_they_go(comparison: Comparison) -> None:
     figure = draw_comparison(comparison)
-    trace = comparison.film.drives.trace
+    trace = comparison.film.runs.trace
     for axis, values in zip(figure.axes, (trace.speed, trace.gap, trace.throttle - trace.brake), strict=False):
         for row, line in zip(comparison.rows, axis.lines[:1] + [one for one in axis.lines[1:] if len(one.get_xdata()) > 9], strict=False):
             end = comparison.film.last[row] + 1
@@ -166,12 +166,12 @@ def test_at_an_impact_the_pedals_are_those_that_were_in_force() -> None:
     setting = system.characteristics.original.copy()
     for name, value in (("tireFric", 1.0), ("mass", 2600.0)):
         setting[system.characteristics.names.index(name)] = value
-    shown, drives = compare_setting(study, system, setting), simulate(system, setting[np.newaxis])
-    trace, end = shown.film.drives.trace, shown.film.last[-1]
+    shown, runs = compare_setting(study, system, setting), simulate(system, setting[np.newaxis])
+    trace, end = shown.film.runs.trace, shown.film.last[-1]
     assert shown.verdict(1).startswith("collides")
-    assert drives.trace.brake[end, 0] == 0
-    assert trace.brake[end, 1] == trace.brake[end - 1, 1] == drives.trace.brake[end - 1, 0] == 1
-    assert shown.evaluations.metrics["safety_degree"][1] == -drives.collision_speed[0]
+    assert runs.trace.brake[end, 0] == 0
+    assert trace.brake[end, 1] == trace.brake[end - 1, 1] == runs.trace.brake[end - 1, 0] == 1
+    assert shown.evaluations.metrics["safety_degree"][1] == -runs.collision_speed[0]
 
 
 @pytest.mark.slow
@@ -209,7 +209,7 @@ def test_both_vehicles_are_in_the_window_at_the_nearest_moment(slippery: Path, t
     system = assemble(case.study)
     comparison = compare_setting(case.study, system, case.solutions[list(case.characteristics.names)].to_numpy()[0])
     show_in_gui(comparison, system.scenario.network, slower=0.01, rest=0.0, pictures=tmp_path)
-    first, second = (moments(comparison.film.drives, row) for row in comparison.rows)
+    first, second = (moments(comparison.film.runs, row) for row in comparison.rows)
     assert {path.stem for path in tmp_path.iterdir()} == {f"{sample:04d}" for sample in (first.nearest, second.nearest, first.end)}
     with Image.open(tmp_path / f"{second.nearest:04d}.png") as image:
         picture = np.asarray(image.convert("RGB"))

@@ -141,7 +141,7 @@ def check(cells: list[Cell]) -> None:
     points = tuple(Point(cell.scenario, WEATHERS["clear"], str(k)) for k, cell in enumerate(cells))
     system = replace(CARLA, ads=Hold(), matrix=points)
     for cell, there in zip(cells, at_every_point(system, system.characteristics.original[np.newaxis]), strict=True):
-        run, scenario = there.drives, cell.scenario
+        run, scenario = there.runs, cell.scenario
         assert run.outcome[0] == Outcome.COLLISION, scenario
         assert set(run.contact.side) == {"front"}, scenario
         late = at_contact(run, run.trace.time) - cell.arrival
@@ -176,11 +176,11 @@ def test_further_targets_are_hit_in_a_recorded_scene_as_in_sumo_to_the_last_bit(
     system = replace(CARLA, ads=Hold(brakes_at), matrix=(Point(scenario, WEATHERS["clear"]),))
     settings = np.repeat(system.characteristics.original[np.newaxis], n, axis=0)
     (here,), (there,) = (at_every_point(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO))
-    assert here.drives.outcome.tolist() == there.drives.outcome.tolist()
-    assert set(here.drives.outcome) > {Outcome.COLLISION}
+    assert here.runs.outcome.tolist() == there.runs.outcome.tolist()
+    assert set(here.runs.outcome) > {Outcome.COLLISION}
     for name in ("collision_speed", "relative_speed", "warning_ttc"):
-        np.testing.assert_array_equal(getattr(here.drives, name), getattr(there.drives, name), err_msg=name)
-    for ours, theirs in zip(here.drives.contact, there.drives.contact, strict=True):
+        np.testing.assert_array_equal(getattr(here.runs, name), getattr(there.runs, name), err_msg=name)
+    for ours, theirs in zip(here.runs.contact, there.runs.contact, strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 

@@ -45,7 +45,7 @@ def test_who_does_not_brake_is_where_the_protocol_says_at_every_point(study: str
     domain = system.characteristics
     corners = np.where(np.random.default_rng(7).random((6, len(domain))) < 0.5, domain.lower, domain.upper)
     for there in at_every_point(system, np.concatenate([domain.original[np.newaxis], corners])):
-        scenario, run = there.point.scenario, there.drives
+        scenario, run = there.point.scenario, there.runs
         assert there.evaluations.collided.all(), there.point.name
         assert set(run.contact.side) == {"front"}, there.point.name
         assert run.contact.place == pytest.approx(np.full(7, scenario.impact_location), abs=2), there.point.name

@@ -45,7 +45,7 @@ def assert_same(system: System, number: int, seed: int) -> list[str]:
         np.testing.assert_array_equal(here.collision_speed, there.collision_speed)
         for name, values in there.metrics.items():
             np.testing.assert_array_equal(here.metrics[name], values, err_msg=name)
-        for ours, theirs in zip(recorded.drives.contact, copies.drives.contact, strict=True):
+        for ours, theirs in zip(recorded.runs.contact, copies.runs.contact, strict=True):
             np.testing.assert_array_equal(ours, theirs)
         outcomes += here.outcome.tolist()
     return outcomes

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from safevar_sumo.records import GRAVITY, Command, Observation
 from safevar_sumo.vehicles.carla import AIR_DENSITY, ENGINE_INERTIA, FINAL_RATIO, FRONTAL_AREA, GEAR_RATIOS, RPM, WHEELS, Carla
-from tests.vehicles.drives import STEP, SYSTEMS, braking_after, drawn, drive, ends, original
+from tests.vehicles.runs import STEP, SYSTEMS, braking_after, drawn, drive, ends, original
 
 
 def carla() -> Carla:

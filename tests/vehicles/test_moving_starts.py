@@ -16,7 +16,7 @@ from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import LEVEL, at_start, slope_of
-from tests.vehicles.drives import STEP, SYSTEMS, drawn, drive, original
+from tests.vehicles.runs import STEP, SYSTEMS, drawn, drive, original
 
 SPEEDS = (10, 20, 30, 40, 50, 60)  # km/h, where the original vehicles' gearboxes hold their gear
 

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from safevar_sumo.records import Command, Observation
 from safevar_sumo.vehicles.lgsvl import _tyre_stiffness
-from tests.vehicles.drives import STEP, SYSTEMS, drive, full_throttle, original
+from tests.vehicles.runs import STEP, SYSTEMS, drive, full_throttle, original
 
 GRAVITY = 9.81
 

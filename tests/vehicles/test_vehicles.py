@@ -12,7 +12,7 @@ from safevar_sumo.vehicles import VEHICLES
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, FINAL_RATIO, GEAR_RATIOS, Carla
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.sensors import delayed
-from tests.vehicles.drives import (
+from tests.vehicles.runs import (
     STEP,
     SYSTEMS,
     Drive,

@@ -126,9 +126,9 @@ def compare_at_points(system: System, original: FloatArray, settings: FloatArray
     comparisons = []
     for row, (failing, k) in enumerate(zip(names, worst.tolist(), strict=True), 1):
         at_point = at_points[k]
-        original_run, changed_run = (summary_of(at_point.drives, column, float(at_point.evaluations.f_safe[column])) for column in (0, row))
+        original_run, changed_run = (summary_of(at_point.runs, column, float(at_point.evaluations.f_safe[column])) for column in (0, row))
         comparisons.append(PointComparison(compare_braking(original_run, changed_run, at_point.point.name), failing))
-    return comparisons, at_points[0].drives.trace.step
+    return comparisons, at_points[0].runs.trace.step
 
 
 def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: FloatArray) -> tuple[list[PointComparison], float]:
@@ -141,10 +141,10 @@ def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: Float
         worse = colours[row] - colours[0]
         point = system.matrix[int(np.argmax(worse))]
         (at_point,) = at_every_point(system.at(point), np.concatenate([original, settings[row - 1:row]]))
-        original_run, changed_run = (summary_of(at_point.drives, column, float(at_point.evaluations.f_safe[column])) for column in (0, 1))
+        original_run, changed_run = (summary_of(at_point.runs, column, float(at_point.evaluations.f_safe[column])) for column in (0, 1))
         names = tuple(system.matrix[k].name for k in np.flatnonzero(worse).tolist())
         comparisons.append(PointComparison(compare_braking(original_run, changed_run, point.name), names))
-        step = at_point.drives.trace.step
+        step = at_point.runs.trace.step
     return comparisons, step
 
 

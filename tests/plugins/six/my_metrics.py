@@ -3,9 +3,9 @@ import numpy as np
 from safevar_sumo.metrics import Metric
 
 
-def largest_jerk(drives, thresholds):
+def largest_jerk(runs, thresholds):
     """The largest change of the acceleration per time [m/s^3]."""
-    trace = drives.trace
+    trace = runs.trace
     acceleration = np.diff(trace.speed, axis=0) / trace.step
     jerk = np.abs(np.diff(acceleration, axis=0)) / trace.step
     return np.max(np.where(trace.active[2:], jerk, 0.0), axis=0)
