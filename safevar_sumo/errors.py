@@ -91,7 +91,7 @@ def unknown(source: object, problem: str, name: object, names: Iterable[str], ot
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:
     """`; did you mean 'rain'?` with the nearest name, upper and lower case ignored; empty if no name is near."""
-    by_lower = {known.lower(): known for known in names}
+    by_lower = {option.lower(): option for option in names}
     near = get_close_matches(str(name).lower(), by_lower, n=1)
     return f"; did you mean {by_lower[near[0]]!r}?" if near else ""
 

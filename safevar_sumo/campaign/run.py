@@ -94,7 +94,7 @@ class Run:
 
     def _requests(self) -> list[_Known]:
         """The evaluations of the distinct settings that this run requested, in their order."""
-        return sorted((known for known in self._known.values() if 0 <= known.position < self._budget), key=lambda known: known.position)
+        return sorted((entry for entry in self._known.values() if 0 <= entry.position < self._budget), key=lambda entry: entry.position)
 
     @property
     def collisions(self) -> int:
@@ -137,18 +137,18 @@ class Run:
 
     def samples(self, rng: np.random.Generator) -> list[Evaluations]:
         """The most severe evaluation, which users will look at, the last one, to which most state may have leaked, and random others."""
-        scored = [known for known in self._requests() if known.evaluations.valid[known.row]]
+        scored = [entry for entry in self._requests() if entry.evaluations.valid[entry.row]]
         if not scored:
             return []
-        severe = min(scored, key=lambda known: np.nan_to_num(known.evaluations.f_safe[known.row], nan=np.inf))
+        severe = min(scored, key=lambda entry: np.nan_to_num(entry.evaluations.f_safe[entry.row], nan=np.inf))
         by_chance = [scored[i] for i in rng.permutation(len(scored))[:BY_CHANCE].tolist()]
-        chosen = {known.position: known for known in (severe, scored[-1], *by_chance)}
+        chosen = {entry.position: entry for entry in (severe, scored[-1], *by_chance)}
         return [evaluations.take([row]) for _, evaluations, row in chosen.values()]
 
     def solutions_and_others(self, rng: np.random.Generator) -> Evaluations:
         """The evaluations to verify in SUMO itself: all solutions, and `VERIFIED` random others."""
         solutions = {setting.tobytes() for setting in self.result.settings}
-        settings = [known.evaluations.settings[known.row] for known in self._requests() if known.evaluations.outcome[known.row] != FAILED]
+        settings = [entry.evaluations.settings[entry.row] for entry in self._requests() if entry.evaluations.outcome[entry.row] != FAILED]
         chosen = [setting for setting in settings if setting.tobytes() in solutions]
         others = [setting for setting in settings if setting.tobytes() not in solutions]
         chosen += [others[i] for i in rng.permutation(len(others))[:VERIFIED].tolist()]
@@ -164,7 +164,7 @@ class Run:
             try:
                 settings = search.send(self._recalled(settings))
             except StopIteration as end:
-                expected = {key: known.position for key, known in self._known.items() if 0 <= known.position < self._budget}
+                expected = {key: entry.position for key, entry in self._known.items() if 0 <= entry.position < self._budget}
                 return positions == expected and np.array_equal(end.value.settings, self.result.settings)
         return False
 
@@ -213,7 +213,7 @@ class Run:
 
     def _recalled(self, settings: FloatArray) -> Evaluations:
         """The evaluations of known settings, in their order."""
-        known = [self._known[setting.tobytes()] for setting in settings]
-        batches = list({id(evaluations): evaluations for _, evaluations, _ in known}.values())
+        entries = [self._known[setting.tobytes()] for setting in settings]
+        batches = list({id(evaluations): evaluations for _, evaluations, _ in entries}.values())
         starts = dict(zip(map(id, batches), accumulate(map(len, batches), initial=0), strict=False))
-        return Evaluations.concatenate(batches).take([starts[id(evaluations)] + row for _, evaluations, row in known])
+        return Evaluations.concatenate(batches).take([starts[id(evaluations)] + row for _, evaluations, row in entries])

@@ -62,20 +62,20 @@ class Verification:
         """
         self._refuse_unrepeatable(run)
         rng = run_generator(self._study, run.key._replace(algorithm=f"recheck {run.key.algorithm}"))
-        for known in run.samples(rng) if self._alone else ():
-            self._leaks[self._pool.submit(self._alone, known.settings)] = run, known
+        for expected in run.samples(rng) if self._alone else ():
+            self._leaks[self._pool.submit(self._alone, expected.settings)] = run, expected
         return self._awaits_leaks(run) or self._begin_in_sumo(run)
 
     def _begin_in_sumo(self, run: Run) -> bool:
         """Begin to verify a run in SUMO, once nothing leaks between its settings; returns whether there are any to verify."""
         rng = run_generator(self._study, run.key._replace(algorithm=f"verify {run.key.algorithm}"))
-        known = run.solutions_and_others(rng) if self._is_recorded else None
-        if not known:
+        expected = run.solutions_and_others(rng) if self._is_recorded else None
+        if not expected:
             return False
         if self._sumo_study is not self._study:  # SUMO drives settings in a few of a rating's cells
-            known = evaluate(assemble(self._sumo_study), known.settings)
-        self._unverified[run] = known, len(known)
-        self._in_sumo.add(run, known.settings)
+            expected = evaluate(assemble(self._sumo_study), expected.settings)
+        self._unverified[run] = expected, len(expected)
+        self._in_sumo.add(run, expected.settings)
         return True
 
     def _awaits_leaks(self, run: Run) -> bool:
@@ -84,15 +84,15 @@ class Verification:
 
     def _verify(self, run: Run, in_sumo: Evaluations) -> bool:
         """Compare evaluations from SUMO with a run's; returns whether these were the last ones."""
-        known, missing = self._unverified.pop(run)
-        rows = {row.tobytes(): i for i, row in enumerate(known.settings)}
-        refuse_unlike_sumo(self._study, known.take([rows[row.tobytes()] for row in in_sumo.settings]), in_sumo)
+        expected, missing = self._unverified.pop(run)
+        rows = {row.tobytes(): i for i, row in enumerate(expected.settings)}
+        refuse_unlike_sumo(self._study, expected.take([rows[row.tobytes()] for row in in_sumo.settings]), in_sumo)
         failed = np.flatnonzero(in_sumo.failed).tolist()
         if failed:
-            self._observer.warned(f"run {run.key}: {len(failed)} of {len(known)} settings could not be verified in SUMO: "
+            self._observer.warned(f"run {run.key}: {len(failed)} of {len(expected)} settings could not be verified in SUMO: "
                                   f"{in_sumo.reason(failed[0])}")
         if missing > len(in_sumo):
-            self._unverified[run] = known, missing - len(in_sumo)
+            self._unverified[run] = expected, missing - len(in_sumo)
         return run not in self._unverified
 
     def _refuse_unrepeatable(self, run: Run) -> None:
@@ -121,7 +121,7 @@ class Verification:
         """
         if done in self._in_sumo.under_way:
             return [run for run, in_sumo in self._in_sumo.take(done) if self._verify(run, in_sumo)]
-        run, known = self._leaks.pop(done)
-        reproduction = reproducing(self._study, known.settings[0])
-        refuse_difference(self._study, {f"in run {run.key}": known, "alone": done.result()}, reproduction)
+        run, expected = self._leaks.pop(done)
+        reproduction = reproducing(self._study, expected.settings[0])
+        refuse_difference(self._study, {f"in run {run.key}": expected, "alone": done.result()}, reproduction)
         return [] if self._awaits_leaks(run) or self._begin_in_sumo(run) else [run]

@@ -225,7 +225,7 @@ def _nearest(name: str, names: Sequence[str]) -> str:
     if not names:
         return "a study with a matrix"
     parts = {part.strip() for part in name.split(",")}
-    order = sorted(names, key=lambda known: (-len(parts & set(known.split(", "))), -SequenceMatcher(None, known, name).ratio()))
+    order = sorted(names, key=lambda point: (-len(parts & set(point.split(", "))), -SequenceMatcher(None, point, name).ratio()))
     legal = "; ".join(order[:NEAREST])
     return legal if len(names) <= NEAREST else f"one of {len(names)} points, the most similar: {legal}"
 

@@ -155,9 +155,9 @@ class RecordedWorld:
         position = positions[min(self._now, len(positions) - 1)]  # of a batch in which other scenes last longer
         if math.isnan(position[0]):
             raise not_on_the_road(actor, self._now * self.step_length)
-        found = np.empty((self.n, 2))
-        found[:] = position
-        return found
+        result = np.empty((self.n, 2))
+        result[:] = position
+        return result
 
     def _track(self, actor: str) -> Track:
         track: Track = self._known(self._recordings[0].tracks, actor)
@@ -201,10 +201,10 @@ class RecordedWorld:
         SUMO checks twice in a step: after persons have moved but before vehicles have, and after vehicles have
         moved (`MSNet::simulationStep`: `STAGE_EVENTS`, `STAGE_MOVEMENTS`).
         """
-        self._struck, found = {}, dict[int, float]()
+        self._struck, result = {}, dict[int, float]()
         near = self._near(open_)
         if not len(near):
-            return found
+            return result
         tracks = [self._others[k][number] for k, number in near.tolist()]
         others = Body.columns([_body(track, self._sample) for track in tracks])
         persons = np.array([track.is_person for track in tracks])
@@ -212,10 +212,10 @@ class RecordedWorld:
         hits = [(pair, row, phase) for phase, (fronts, _) in enumerate((still, moved)) if phase or persons.any()
                 for pair, row in self._overlaps(fronts, open_, near[:, 0], others, persons, still=not phase)]
         for pair, row, phase in sorted(hits, key=itemgetter(0, 2)):
-            if row not in found:
-                found[row] = float((moved if phase else still)[1][row])
+            if row not in result:
+                result[row] = float((moved if phase else still)[1][row])
                 self._struck[row] = Body._make(column[pair] for column in others)
-        return dict(sorted(found.items()))
+        return dict(sorted(result.items()))
 
     def _overlaps(self, fronts: FloatArray, open_: BoolArray, scenes: Any, others: Body, persons: BoolArray, *,
                   still: bool) -> Iterator[tuple[int, int]]:

@@ -97,11 +97,11 @@ class Subscriptions:
 
 def _variables(domain: str, requested: Any, parameters: Any) -> dict[int, tuple[Any, ...]]:
     """Further arguments of the functions for variables, by variable."""
-    known = {_constant(name): name for name in VARIABLES}
+    names_by_constant = {_constant(name): name for name in VARIABLES}
     default = ("VAR_TIME",) if domain == "simulation" else DEFAULT
     chosen = [*map(_constant, default)] if requested is None else list(requested)
     for variable in chosen:
-        if variable not in known:
+        if variable not in names_by_constant:
             raise InputError(f"traci.{domain}.subscribe", f"variable {variable!r}", f"traci.constants.{', '.join(VARIABLES)}")
     arguments = {variable: value[1:] if isinstance(value, tuple) else (value,) for variable, value in (parameters or {}).items()}
     return {variable: arguments.get(variable, ()) for variable in chosen}

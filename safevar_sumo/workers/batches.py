@@ -73,8 +73,8 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
             done(len(parts[futures[future]]))
     evaluations = Evaluations.concatenate([parts[start] for start in starts])
     if in_sumo is not None:
-        known = evaluations.take(sample) if in_scenes is None else result_of(in_scenes)
-        refuse_unlike_sumo(study, known.take(~known.failed), result_of(in_sumo).take(~known.failed))
+        expected = evaluations.take(sample) if in_scenes is None else result_of(in_scenes)
+        refuse_unlike_sumo(study, expected.take(~expected.failed), result_of(in_sumo).take(~expected.failed))
         _verified[work] = _verified.get(work, 0) + len(sample)
     return evaluations.take(row_of.ravel())
 

@@ -136,9 +136,9 @@ def _refuse_changes(expected: Inputs, system: System) -> None:
 
 def _unknown(task: _Work, files: Files) -> Files:
     """The files that the study did not begin with; refuses files that have changed since it began."""
-    known = task.inputs.get("sources", {})
-    _refuse([name for name, digest in files.items() if known.get(name, digest) != digest])
-    return {name: digest for name, digest in files.items() if name not in known}
+    sources = task.inputs.get("sources", {})
+    _refuse([name for name, digest in files.items() if sources.get(name, digest) != digest])
+    return {name: digest for name, digest in files.items() if name not in sources}
 
 
 def _refuse(files: list[str]) -> None:

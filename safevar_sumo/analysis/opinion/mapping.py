@@ -216,6 +216,6 @@ def declared_of(study: Study, vehicle: Any) -> Declared:
         parameters = {one.name: getattr(own, one.name, study.vehicle.parameters.get(one.name, shipped.get(one.name, one.default)))
                       for one in msgspec.structs.fields(kind)}
         return Declared(name, kind(**parameters), table, tuple(key for key, unit in units.items() if kind.UNITS.get(key) != unit))
-    known = f"one of {', '.join(TABLES)}, a class derived from one, or one with the same characteristics in the same units"
+    allowed = f"one of {', '.join(TABLES)}, a class derived from one, or one with the same characteristics in the same units"
     problem = f"vehicle.model = {study.vehicle.model!r} with {', '.join(units)} is no vehicle that the second model can represent"
-    raise InputError(study.source, problem, known)
+    raise InputError(study.source, problem, allowed)
