@@ -41,6 +41,9 @@ from safevar_sumo.workers.evaluation import Pool, evaluate_batch, packed
 from safevar_sumo.workers.identity import identity_of
 from safevar_sumo.workers.local import local_pool
 
+Batch = tuple[bytes, FloatArray]
+"""A packed study, which says where its vehicles drive, and the settings."""
+
 
 class Silent:
     """Hears how a campaign goes on, and says nothing."""
@@ -60,14 +63,14 @@ class Recording:
 
     def __init__(self, pool: Pool) -> None:
         self._pool = pool
-        self.batches: list[FloatArray] = []
+        self.batches: list[Batch] = []
 
     @property
     def workers(self) -> int:
         return self._pool.workers
 
     def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
-        self.batches.append(settings)
+        self.batches.append((study, settings))
         return self._pool.submit(study, settings)
 
 
@@ -76,11 +79,11 @@ class Cost(NamedTuple):
 
     clock: float
     processor: float
-    batches: list[FloatArray]
+    batches: list[Batch]
 
     @property
     def simulated(self) -> int:
-        return sum(map(len, self.batches))
+        return sum(len(settings) for _, settings in self.batches)
 
 
 def processors() -> float:
@@ -108,24 +111,22 @@ def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
         return Cost(clock, processors() - before, recording.batches)
 
 
-def simulation(study: Study, batches: list[FloatArray]) -> float:
-    """Processor seconds of the same batches in one process that has nothing else to do."""
-    work = packed(study)
-    evaluate_batch(work, max(batches, key=len))
-    return processor_seconds(lambda: compute(work, batches))
+def simulation(batches: list[Batch]) -> float:
+    """Processor seconds of the same batches, in recorded scenes and in SUMO, in one process that has nothing else to do."""
+    compute(batches[:1])
+    return processor_seconds(lambda: compute(batches))
 
 
-def compute(work: bytes, batches: list[FloatArray]) -> None:
-    for settings in batches:
+def compute(batches: list[Batch]) -> None:
+    for work, settings in batches:
         evaluate_batch(work, settings)
 
 
-def ceiling(study: Study, batches: list[FloatArray]) -> float:
+def ceiling(batches: list[Batch]) -> float:
     """How much faster two processes are than one that only compute the same batches."""
-    work = packed(study)
     with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as processes:
         def together(n: int) -> None:
-            for future in [processes.submit(compute, work, batches) for _ in range(n)]:
+            for future in [processes.submit(compute, batches) for _ in range(n)]:
                 future.result()
 
         together(2)
@@ -153,10 +154,10 @@ def two_dask_workers(study: Study) -> Iterator[Pool]:
 def turn(study: Study) -> dict[str, float]:
     """Every ratio once: what is compared is measured one right after the other."""
     one = campaign(study, local_pool(1, study.search.time_limit))
-    alone, bare_each = simulation(study, one.batches), floor(study)
+    alone, bare_each = simulation(one.batches), floor(study)
     two = campaign(study, local_pool(2, study.search.time_limit))
     cluster = campaign(study, two_dask_workers(study))
-    most = ceiling(study, one.batches)
+    most = ceiling(one.batches)
     return {"campaign": one.processor / one.simulated / bare_each, "outside_simulation": 1 - alone / one.processor,
             "two_workers": one.clock / two.clock, "ceiling": most, "two_workers_of_ceiling": one.clock / two.clock / most,
             "cluster": two.clock / cluster.clock}

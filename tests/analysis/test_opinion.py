@@ -71,6 +71,7 @@ def stopping_distance(study: str, speed: float, road: float, **changes: float) -
     return way
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [8.0, 25.0])
 @pytest.mark.parametrize(("study", "changes", "deceleration"), [
     ("wear", {"brakeTorque": 0.3}, 0.3 * 16500 / 1575), ("wear", {"brakeTorque": 0.5, "payload": 525.0}, 0.5 * 16500 / 2025),
@@ -81,6 +82,7 @@ def test_below_the_tyres_limit_braking_is_the_closed_form(study: str, changes: d
     assert stopping_distance(study, speed, 1.0, **changes) == pytest.approx(speed**2 / (2 * deceleration), rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [0.9, 0.6, 0.2])
 def test_at_the_limit_the_anti_lock_controller_uses_the_friction(friction: float) -> None:
     """UN Regulation 13-H, annex 6: at least 0.75 of what the friction would give; and never more than all of it."""

@@ -222,6 +222,7 @@ def test_a_setting_that_is_asked_for_twice_stands_where_it_was_asked_for_first(t
     assert read_journal(tmp_path / "a.journal", "study", "nsga2-00").positions == [0, 1]
 
 
+@pytest.mark.slow
 def test_failures_are_counted_kept_out_and_not_met_again(study: Study, tmp_path: Path) -> None:
     class Deadly(FormulaPool):
         """A worker dies of low tyre friction."""

@@ -50,6 +50,7 @@ def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them
     assert "changed vehicle" not in simulate("rain").stdout
 
 
+@pytest.mark.slow
 def test_a_sweep_is_a_table_under_the_original_or_a_list() -> None:
     result = simulate("rain", "--set", "tireFric=1.0..1.5:3", "--json")
     records = json.loads(result.stdout)

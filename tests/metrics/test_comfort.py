@@ -49,6 +49,7 @@ def test_a_ramp_has_its_jerk_and_is_as_harsh_as_its_last_half_second() -> None:
     assert comfort("brake_harshness", speed)[0] == pytest.approx(5.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frequency", [0.2, 0.5, 1.0, 2.0, 5.0])
 def test_weighting_is_that_of_iso_2631_1(frequency: float) -> None:
     """The magnitude of H(s) by the standard's formula, on a sine that has settled, at a step short enough for it."""

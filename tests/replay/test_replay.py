@@ -203,6 +203,7 @@ def of_colour(picture: np.ndarray, red: int, green: int, blue: int) -> np.ndarra
     return np.argwhere(np.abs(picture.astype(int) - [red, green, blue]).max(axis=2) < 30)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("screen")
 def test_both_vehicles_are_in_the_window_at_the_nearest_moment(slippery: Path, tmp_path: Path) -> None:
     (case,) = load_cases([slippery])

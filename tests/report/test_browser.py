@@ -87,6 +87,7 @@ def try_player(browser: Chrome, player: object) -> None:
     assert "brakes" in player.text  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_an_animation_plays_and_scrubs_as_a_file(browser: Chrome, slippery: Path, tmp_path: Path) -> None:
     (case,) = load_cases([slippery])
     setting = case.solutions[list(case.characteristics.names)].to_numpy()[0]

@@ -85,6 +85,7 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
     assert same(first, batch(0)), "positions count from 0: the first three"
 
 
+@pytest.mark.slow
 @in_one_folder
 @given(st.data())
 def test_any_truncation_loads_what_was_whole_and_goes_on(tmp_path: Path, data: st.DataObject) -> None:

@@ -89,6 +89,7 @@ def changed(of: System, **values: float) -> np.ndarray:
     return of.characteristics.setting(values, "test")[np.newaxis]
 
 
+@pytest.mark.slow
 def test_a_module_that_imports_traci_talks_to_the_simulation_and_keeps_its_state_for_one_vehicle(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "helper.py").write_text(HELPER)

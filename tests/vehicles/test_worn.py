@@ -117,6 +117,7 @@ def test_filter_is_idempotent_and_keeps_or_restores(settings: np.ndarray) -> Non
     assert np.all((filtered == settings) | (filtered == SUN.original))
 
 
+@pytest.mark.slow
 @given(settings_in_domain)
 def test_objectives_of_change_agree_with_a_loop(settings: np.ndarray) -> None:
     filtered = SUN.filter(settings)

@@ -130,6 +130,7 @@ def test_what_is_read_while_models_are_loaded_made_and_first_run_counts_wherever
     assert read(place.parent / "copy") == result, "no name holds where the study lies"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["my_ads.py", "my_maps/rules.py", "my_space/roads.py", "my_lazy.py", "tiles/1.txt", "table.bin", "map.db"])
 def test_an_edit_of_whatever_was_read_is_seen(name: str, place: Path) -> None:
     before = read(place)

@@ -39,6 +39,7 @@ def pool() -> Iterator[LocalPool]:
         yield pool
 
 
+@pytest.mark.slow
 def test_workers_start_when_they_are_needed_and_end_with_the_block() -> None:
     with local_pool(2, 30.0) as pool:
         assert not processes()
@@ -50,6 +51,7 @@ def test_workers_start_when_they_are_needed_and_end_with_the_block() -> None:
         pool.submit(SMOKE, ORIGINAL)
 
 
+@pytest.mark.slow
 def test_the_end_does_not_wait_for_what_is_computed() -> None:
     with local_pool(1, 600.0) as pool:
         pool.submit(SMOKE, ORIGINAL).result(timeout=30)
