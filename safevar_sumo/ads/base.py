@@ -1,4 +1,4 @@
-"""The contract of an automated driving system (ADS), the base of an ADS for a single vehicle, and checks of ADSs from outside."""
+"""The contract of an automated driving system (ADS), the base of an ADS for a single vehicle, and checks of a user's own ADS."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ NotNegative = Annotated[float, Meta(ge=0, le=1e3)]
 
 
 REACTIONS = ("recognition_delay", "hesitation")
-"""Parameters of an ADS that delay its reaction, such as in bad weather [s]."""
+"""Names of the parameters of an ADS that delay its reaction [s]; a study may raise them in bad weather."""
 
 
 class Ads(Protocol):
-    """An ADS that drives N vehicles at once. Its fields are the parameters of `ads.parameters`.
+    """An ADS that drives N vehicles at once. Its fields are filled from the study's table `ads.parameters`.
 
     It gets an `Observation` and knows the original vehicle (`Nominal`), never the setting.
-    Element i of a command depends on element i of the observations alone, to the bit.
+    Neither N nor another vehicle changes a bit of element i of a command: it depends on element i of the observations.
 
     Optional: a method `warns(memory) -> BoolArray`, called after `drive`, returns which drivers are warned, shape (N,).
     """
@@ -64,7 +64,7 @@ SCALAR_ADS_CONTRACT = Contract.of(ScalarAds, "a ScalarAds")
 
 
 class GuardedAds:
-    """An ADS from outside: it gets read-only copies, and its commands are checked."""
+    """A user's own ADS: it gets read-only copies, and its commands are checked."""
 
     def __init__(self, ads: Ads, guard: Guard) -> None:
         self._ads, self._guard = ads, guard

@@ -81,5 +81,5 @@ def _print_catalogue(console: Console, studies: list[Study]) -> None:
                 for row in catalogue["weathers"]]
     print_names(console, "Weathers", weathers, ("name", "friction", "sight", "delay, s", "light", "road"))
     for title, key in (("ADSs", "ads"), ("Scenarios", "scenarios"), ("Algorithms", "algorithms"), ("Metrics", "metrics"),
-                       ("Objectives, beside all metrics", "objectives")):
+                       ("Objectives (every metric can be one, too)", "objectives")):
         print_names(console, title, [(row["name"], row["description"]) for row in catalogue[key]], ("name", "description"))

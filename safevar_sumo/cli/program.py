@@ -108,7 +108,7 @@ def commands() -> None:
 
 
 def main() -> None:
-    """Run the program; its exit code is 0, 1 (failed), 2 (bad input) or 130 (interrupted)."""
+    """Run the program; its exit code is 0, 1 (failed, or `check` has findings), 2 (bad input) or 130 (interrupted)."""
     _ensure_standard_streams()
     warnings.showwarning = _show_warning
     for stream in (sys.stdout, sys.stderr):

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 BINS = 8
 """Number of bins, with equally many rows, of a characteristic's values in the figure."""
 FLIP = 2.0
-"""Repeats may change an outcome whose safety degree is within this many of their standard deviations of a collision."""
+"""An outcome is undecided if its safety degree is at most this many standard deviations (of repeats) from 0, the collision."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,9 +52,9 @@ class Agreement:
     collision_speed
         Mean over the collisions of both sides, in the reference and here [m/s].
     in_repeats
-        By metric: mean absolute error over the standard deviation of repeats of one setting in the reference.
+        By metric: mean absolute error divided by the standard deviation of repeats of one setting in the reference.
     undecided
-        Number of settings that collide only in the reference or only here, and how many of these repeats may explain: their
+        Number of settings that collide only in the reference or only here, and how many of these may be scatter between repeats: their
         safety degree in the reference or here is at most two standard deviations from a collision.
     by_predicted
         Bins of equally many settings by their safety degree here: ends, number of settings, and mean error [m].

@@ -1,4 +1,4 @@
-"""The manifest of a results directory: inputs of its results, digests of its files, and differences from another study."""
+"""The manifest of a results directory: the inputs of the results and digests of the files; and how two manifests differ."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from safevar_sumo.study import WORDS, RatingTable, Study, refuse_other_than_file
 
 MANIFEST, RUNS = "manifest.json", "runs"
 PLACES, LATER = "places.json", "read-*.json"
-"""Files beside the journals: the folders of the study, relative to the results; and one for each file that was read later."""
+"""Files beside the journals: the first lists the study's folders, relative to the results; each of the others records one file that was
+first read after the study began."""
 FORMAT = 3
 READABLE = (2, FORMAT)
 RESULTS = 2
@@ -30,7 +31,7 @@ FREE_OF_SEARCH = ("runs", "algorithms", "evaluations", "time_limit")
 LAYERS = {
     "resolved": "the same study and options", "network": "the network's file as it was", "sources": "the file as it was",
     "results": "that version", "versions": "those versions", "platform": "such a machine"}
-"""Inputs that results depend on, and the way back to each after a change."""
+"""Inputs that results depend on. The texts complete "expected: another --out, or ..." where one has changed."""
 OF_FILES = ("network", "sources")
 """Layers that hold digests by file."""
 LAYERS_BEFORE = ("resolved", "network", "sources", "code", "versions", "platform")
@@ -38,7 +39,7 @@ LAYERS_BEFORE = ("resolved", "network", "sources", "code", "versions", "platform
 SIMULATORS = ("libsumo", "eclipse-sumo")
 """Versions on which a single simulation depends."""
 DIGESTS = "digests"
-"""Key of the digests of the directory's own files: of its table, and of the manifest without that digest."""
+"""Key of the digests of the directory's own files: of its table, and of all of the manifest but this key."""
 
 
 def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
@@ -49,7 +50,7 @@ def manifest_of(study: Study, identity: Mapping[str, Any]) -> dict[str, Any]:
     study
         The study as it is run.
     identity
-        Inputs of its results besides its file, by `LAYERS`; see `safevar_sumo.workers.identity.identity_of`.
+        Everything but the study file that the results depend on, by `LAYERS`; see `safevar_sumo.workers.identity.identity_of`.
     """
     return {
         "format": FORMAT, "study": tables_of(study), "seed": study.search.seed, "resolved": evaluation_keys(study), **identity,
@@ -96,7 +97,7 @@ def differences_now(stored: Mapping[str, Any], new: Mapping[str, Any]) -> list[s
     if stored.get("format") != FORMAT:
         return [f"version {stored['versions'].get('safevar_sumo')} wrote them"]
     texts = [f"{key} was {before!r} and is {now!r} now" for key, before, now in _pairs(stored["resolved"], new["resolved"])
-             if before is not None]  # whether a key added since changes results is up to `RESULTS`
+             if before is not None]  # a new key is ignored: had it changed results, `RESULTS` would have been raised
     texts += [text for layer in (*OF_FILES, "results") for text in _differences(layer, stored.get(layer, {}), new[layer])]
     before, now = ({name: manifest["versions"].get(name) for name in SIMULATORS} for manifest in (stored, new))
     return [*texts, *_differences("versions", before, now)]
@@ -125,7 +126,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         If there is no manifest, or its file is something else or was edited.
     """
     file = directory / MANIFEST
-    legal = "a directory that the command study has written"
+    legal = "a directory written by the command study"
     try:
         refuse_other_than_file(file)
         manifest = json.loads(file.read_text(encoding="utf-8", errors="replace"))
@@ -139,7 +140,7 @@ def read_manifest(directory: Path) -> dict[str, Any]:
         raise InputError(file, f"cannot be read: {error.strerror}") from None
     except json.JSONDecodeError as error:
         raise InputError(file, f"is torn or was edited, line {error.lineno} is no JSON: {error.msg}",
-                         "the file as it was, or none: the same command again writes it anew") from None
+                         "the file as it was, or no file: the same command then writes it again") from None
     except (ValueError, KeyError, TypeError, RecursionError):
         readable = False
     if not readable:
@@ -185,12 +186,12 @@ def _differences(layer: str, stored: Any, new: Any) -> Iterator[str]:
         if layer in OF_FILES:
             yield f"{key} {'no longer exists' if now is None else 'is new' if before is None else 'has changed since'}"
         else:
-            name = f"version of {key}" if layer == "versions" else key or "the number of the package's results"
+            name = f"version of {key}" if layer == "versions" else key or "the version of the package's results"
             yield f"{name} was {before!r} and is {now!r} now"
 
 
 def _pairs(stored: Any, new: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """The innermost keys at which two values differ, with both; 2 and 2.0 are different."""
+    """The innermost keys at which two values differ, with the first and the second value; 2 and 2.0 are different."""
     if isinstance(stored, dict) and isinstance(new, dict):
         for name in sorted({*stored, *new}):
             yield from _pairs(stored.get(name), new.get(name), f"{key}.{name}" if key else name)
@@ -206,13 +207,13 @@ def write_places(directory: Path, study: Study) -> None:
 
 
 def places_of(directory: Path) -> tuple[str, ...]:
-    """Folders of the plug-ins and files of a directory's study: the study's own if they exist, then the two above the directory."""
+    """Folders of the plug-ins and files of a directory's study: the study's own if they exist, then the directory's two parents."""
     own = [os.path.abspath(directory.resolve() / place) for place in _read(directory / RUNS / PLACES, [])]
     return tuple(dict.fromkeys([*filter(os.path.isdir, own), *map(str, directory.resolve().parents[:2])]))
 
 
 def note_later_file(directory: Path, name: str, digest: str) -> None:
-    """Note a file that was read after the study began; one note a file, because several processes may write them."""
+    """Note a file that was read after the study began, in a JSON file of its own, because several processes may write notes."""
     make_durable(directory / RUNS)
     write_whole(directory / RUNS / LATER.replace("*", sha256(name.encode()).hexdigest()[:DIGITS]), json.dumps({name: digest}) + "\n")
 
@@ -226,7 +227,8 @@ def comparable_inputs(stored: Mapping[str, Any], now: Mapping[str, str], later: 
                   ) -> tuple[dict[str, Any], Files]:
     """A stored manifest and the files that its study reads now, ready to be compared.
 
-    Files that were read later are omitted from both, unless they have changed or are gone: then both have them.
+    Files that were read after the study began are omitted from both. One that has changed is in both; a missing one is in the
+    manifest alone.
     """
     at_start, at_present = dict(stored.get("sources", {})), dict(now)
     for name, digest in later.items():
@@ -249,7 +251,7 @@ def _relative(place: str, directory: Path) -> str:
 
 
 def _read(path: Path, default: Any) -> Any:
-    """A JSON file of this package beside the journals; the default if there is none."""
+    """A JSON file of this package beside the journals; the default if it is missing or damaged."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

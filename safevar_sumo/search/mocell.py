@@ -97,7 +97,7 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def replaced(cell: Individual, child: Individual, mates: list[Individual]) -> Individual:
-    """The individual in a cell after its child is evaluated; `mates` are the cell and its neighbours."""
+    """The survivor in a cell after its child is evaluated; `mates` are the cell and its neighbours, whose `standing` this may change."""
     if child.failed or (not cell.failed and cell.fitness.dominates(child.fitness)):
         return cell
     if cell.failed or child.fitness.dominates(cell.fitness):
@@ -109,7 +109,7 @@ def replaced(cell: Individual, child: Individual, mates: list[Individual]) -> In
 def archived(archive: list[Individual], offspring: list[Individual], size: int) -> list[Individual]:
     """The non-dominated individuals of archive and offspring, without duplicates and without the most crowded; sets their `standing`.
 
-    Offspring are copied into the archive, as the same individual has another standing in its cell.
+    Offspring are copied into the archive, because archive and grid each set the `standing` of their own copy.
     """
     distinct = {member.fitness.values: member for member in archive}
     for child in offspring:

@@ -1,4 +1,4 @@
-"""SUMO's own vehicle type as a vehicle, with the sensors and actuators that its ADS relies on."""
+"""A vehicle with the parameters of a SUMO vType, and the sensors and actuators that its ADS relies on."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     reference_mass
         Mass to which accel and decel refer [kg]; at another mass the forces stay the same.
     tyre_friction
-        Friction coefficient of the tyres on a dry road [-]; it limits every acceleration over g.
+        Friction coefficient of the tyres on a dry road [-]; no acceleration exceeds this times g.
     """
 
     UNITS = {
@@ -98,7 +98,7 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return late, state._replace(seen=past)
 
     def advance(self, prepared: _Prepared, state: SumoState, command: Command) -> SumoState:
-        """The wheels follow the pedals with the actuator lag T: dv/dt = a - g sin, da/dt = (wanted - a) / T."""
+        """The wheels follow the pedals with the actuator lag T: dv/dt = a - g sin(slope), da/dt = (wanted - a) / T."""
         p = prepared
         commands = remembered(state.brake_commands, command.brake)
         brake = delayed(commands, p.brake_delay, p.step)

@@ -181,7 +181,7 @@ def test_what_is_simulated_now_hangs_on_files_and_the_number_of_results_not_on_k
     stored = {"format": FORMAT, "resolved": {"a": 1}, "network": {}, "sources": {"x.py": "0"}, "results": 1, "versions": {"numpy": "1"}}
     assert differences_now(stored, {**stored, "resolved": {"a": 1, "b": False}, "versions": {"numpy": "2"}}) == []
     assert differences_now(stored, {**stored, "resolved": {"a": 2}, "sources": {}, "results": 2}) == [
-        "a was 1 and is 2 now", "x.py no longer exists", "the number of the package's results was 1 and is 2 now"]
+        "a was 1 and is 2 now", "x.py no longer exists", "the version of the package's results was 1 and is 2 now"]
 
 
 FRAME = pd.DataFrame({

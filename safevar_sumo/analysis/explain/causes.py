@@ -42,7 +42,7 @@ class _Subset(NamedTuple):
 
 
 def minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> list[list[MinimalCause]]:
-    """All smallest unsafe subsets of the changes of every setting, shape (M, n); none where no subset is unsafe.
+    """For each of M settings, shape (M, n), all smallest unsafe subsets of its changes; none where no subset is unsafe.
 
     The empty subset counts: a study whose original vehicle is unsafe needs no change.
     """
@@ -93,7 +93,7 @@ def involved(causes: Sequence[MinimalCause]) -> frozenset[int]:
 
 
 GRID = 32
-"""Number of points first simulated on a line, which finds every unsafe island as wide as their distance."""
+"""Number of points first simulated on a line: an unsafe stretch at least as long as their distance cannot be missed."""
 FINER = 8
 """Number of parts into which the interval with the boundary is divided, `ROUNDS` times."""
 ROUNDS = 3
@@ -112,7 +112,7 @@ class End(StrEnum):
 class Boundary(NamedTuple):
     """The smallest unsafe share of a cause's changes, and the setting there, shape (n,).
 
-    `alone` has, by column, the value to which this change can be reduced while the others stay as they are. `end` is the state
+    `alone` has for each column the value to which its change can be reduced while the other changes stay. `end` is the state
     just below the share; if that is the filter's threshold, `at_threshold` is the column whose change the filter undoes.
     """
 

@@ -141,8 +141,8 @@ def print_matrices(console: Console, result: Rating) -> None:
         console.print(table)
     names = ", ".join(f"{letter} {colour}" for colour, letter in LETTERS.items())
     compared = "; original>variant where they differ" if result.variant else ""
-    print_text(console, f"{names}; small letters: extended range; with the relative speed of the impact [km/h], or with the time to "
-                        f"collision of the warning [s] in rows with FCW{compared}.")
+    print_text(console, f"{names}; small letters: extended range. The number is the relative speed of the impact [km/h]; in rows with "
+                        f"FCW it is the time to collision at the warning [s]{compared}.")
 
 
 def _cell(result: Rating, block: Block, row: int, column: int) -> Text:
