@@ -75,7 +75,8 @@ def _print_catalogue(console: Console, studies: list[Study]) -> None:
                 for row in vehicle["characteristics"]]
         heads = ("characteristic", "unit", "original", "lower", "upper", "threshold")
         print_names(console, f"Vehicle {vehicle['name']}", rows, heads)
-        print_meanings(console, members[vehicle["name"]])
+        if vehicle["name"] in members:
+            print_meanings(console, members[vehicle["name"]])
     numbers = ("road_friction", "visibility", "recognition_delay")
     weathers = [(row["name"], *(f"{row[key]:g}" for key in numbers), row["light"], "wet" if row["wet"] else "dry")
                 for row in catalogue["weathers"]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
@@ -50,7 +51,7 @@ def verdict(result: Rating) -> str:
         return f"With {changed} the vehicle earns {-result.lost:.2f} points more, {variant.points:.2f} instead {reference}."
     losses = lost_by_test(result)
     test, largest = losses[0]
-    share = "all" if len(losses) == 1 else "most" if largest > result.lost / 2 else f"{largest:.2f}"
+    share = "all" if math.isclose(largest, result.lost, abs_tol=1e-6) else "most" if largest > result.lost / 2 else f"{largest:.2f}"
     return f"With {changed} the vehicle loses {result.lost:.2f} {reference}, {share} of them in {test_in_words(test)}."
 
 
