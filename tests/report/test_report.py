@@ -86,6 +86,7 @@ def page(slippery: Path, explained: Explained) -> str:
     """The whole page; of the domain it asks a formula: tyre frictions from 1 to 1.5 collide, of 1 to 3.9."""
     study = load_cases([slippery])[0].study
     friction = list(study.vehicle.characteristics).index("tireFric")
+    shutil.rmtree(slippery / "answers", ignore_errors=True)  # of tests that simulated before
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(findings, "explain", lambda *_, **__: explained)
         patch.setattr(report_input, "SAMPLES", 400)
