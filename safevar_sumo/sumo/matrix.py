@@ -272,27 +272,28 @@ def worst_points(at_points: Sequence[AtPoint | Scored]) -> npt.NDArray[np.intp]:
     return np.asarray(np.array(order)[np.argmin(degrees, axis=0)])
 
 
-def _selected_runs(at_points: Sequence[SimulationRuns], number: npt.NDArray[np.intp]) -> SimulationRuns:
+def _selected_runs(runs_at_points: Sequence[SimulationRuns], number: npt.NDArray[np.intp]) -> SimulationRuns:
     """For every vehicle one of several runs; shorter runs repeat their last sample, marked as inactive."""
-    length, columns = max(len(runs.trace.time) for runs in at_points), np.arange(len(number))
+    length, columns = max(len(runs.trace.time) for runs in runs_at_points), np.arange(len(number))
 
     def select_samples(values: list[np.ndarray]) -> np.ndarray:
         padded = [np.concatenate([samples, np.repeat(samples[-1:], length - len(samples), axis=0)]) for samples in values]
         return np.stack(padded)[number, :, columns].T
 
-    longest = max((runs.trace for runs in at_points), key=lambda trace: len(trace.time))
+    longest = max((runs.trace for runs in runs_at_points), key=lambda trace: len(trace.time))
     def select(values: list[np.ndarray]) -> np.ndarray:
         return np.stack([np.broadcast_to(column, number.shape) for column in values])[number, columns]
 
     names = [field.name for field in fields(Trace) if np.ndim(getattr(longest, field.name)) == 2]
-    columns_of: dict[str, Any] = {name: select_samples([getattr(runs.trace, name) for runs in at_points]) for name in names}
+    columns_of: dict[str, Any] = {name: select_samples([getattr(runs.trace, name) for runs in runs_at_points]) for name in names}
     trace = replace(longest, **columns_of)
-    ended = np.array([len(runs.trace.time) for runs in at_points])[number]
+    ended = np.array([len(runs.trace.time) for runs in runs_at_points])[number]
     active = trace.active & (np.arange(length)[:, np.newaxis] < ended)
-    encounters = zip(*(runs.encounter for runs in at_points), strict=True)
+    encounters = zip(*(runs.encounter for runs in runs_at_points), strict=True)
     return SimulationRuns(
         trace=replace(trace, active=active), encounter=Encounter._make(select_samples(list(values)) for values in encounters),
-        outcome=select([runs.outcome for runs in at_points]), collision_speed=select([runs.collision_speed for runs in at_points]),
-        contact=Contact._make(select(list(values)) for values in zip(*(runs.contact for runs in at_points), strict=True)),
-        test_speed_error=select([runs.test_speed_error for runs in at_points]),
-        warning_ttc=select([runs.warning_ttc for runs in at_points]))
+        outcome=select([runs.outcome for runs in runs_at_points]),
+        collision_speed=select([runs.collision_speed for runs in runs_at_points]),
+        contact=Contact._make(select(list(values)) for values in zip(*(runs.contact for runs in runs_at_points), strict=True)),
+        test_speed_error=select([runs.test_speed_error for runs in runs_at_points]),
+        warning_ttc=select([runs.warning_ttc for runs in runs_at_points]))
