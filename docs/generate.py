@@ -13,6 +13,7 @@ from msgspec.inspect import type_info
 from safevar_sumo.ads import ADS
 from safevar_sumo.analysis.opinion.mapping import TABLES as REPRESENTED
 from safevar_sumo.metrics import FURTHER, METRICS, SAFEVAR
+from safevar_sumo.results import FILES
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import VEHICLES
@@ -114,6 +115,11 @@ def metric_columns() -> str:
     return _table(("column", "unit", "content"), [*objectives, *metrics])
 
 
+def results_files() -> str:
+    """Every file of a results directory."""
+    return _table(("file", "content", "written by"), [(f"`{one.name}`", one.content, one.writer) for one in FILES])
+
+
 def second_model() -> str:
     """Which characteristic is which parameter of the second vehicle model."""
     parts = []
@@ -127,4 +133,4 @@ def second_model() -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "study_keys": study_keys, "vehicles": models(VEHICLES), "ads": models(ADS), "algorithms": models(ALGORITHMS),
-    "metric_columns": metric_columns, "second_model": second_model}
+    "metric_columns": metric_columns, "results_files": results_files, "second_model": second_model}

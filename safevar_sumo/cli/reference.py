@@ -43,7 +43,7 @@ from safevar_sumo.reference.effects import LEAST as LEAST_EFFECT
 from safevar_sumo.reference.effects import SHARE as EFFECT_SHARE
 from safevar_sumo.reference.profiles import plot_profiles
 from safevar_sumo.reference.replication import Nearness, nearness, pair_cases, replication
-from safevar_sumo.results import write_imported, write_whole
+from safevar_sumo.results import MANIFEST, write_imported, write_whole
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, load_study, study_names, write_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, stages
@@ -215,7 +215,7 @@ def import_command(study: str, out: Path, original: str | None, **paths: Path | 
     files = {algorithm: path for algorithm, path in paths.items() if path is not None}
     if not files:
         raise InputError("import", "no file is given", "at least one of --nsga2, --rs, --safe-fuzzer")
-    adds = original is None and (out / "manifest.json").exists()
+    adds = original is None and (out / MANIFEST).exists()
     metrics = None if adds else original_metrics(original, chosen.published)
     characteristics = CharacteristicSet.of(chosen.vehicle.characteristics)
     solutions = {}

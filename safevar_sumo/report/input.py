@@ -27,9 +27,7 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
 from safevar_sumo.replay.page import player_data
 from safevar_sumo.replay.scene import scene_of
-from safevar_sumo.results import RESULTS, SolutionId, handles, write_whole
-from safevar_sumo.results.manifest import MANIFEST, read_manifest
-from safevar_sumo.results.store import SOLUTIONS
+from safevar_sumo.results import ANSWERS, MANIFEST, RESULTS, SOLUTIONS, SolutionId, handles, read_manifest, write_whole
 from safevar_sumo.scenarios import Point
 from safevar_sumo.shipped import PACKAGE
 from safevar_sumo.study import SAFETY_DEGREE, foreign_names, refuse_other_than_file
@@ -218,10 +216,6 @@ def _at_point(case: Case, point: str) -> Case:
                    solutions=solutions.assign(**{name: values[1:] for name, values in measured.items()}))
 
 
-FOLDER = "answers"
-"""Folder of stored answers in a results directory."""
-
-
 def stored_answer(data: ReportInput, name: str, compute: Callable[[], Any]) -> Any:
     """The result of `compute` as plain values, read from the results directory if it was computed before.
 
@@ -230,7 +224,7 @@ def stored_answer(data: ReportInput, name: str, compute: Callable[[], Any]) -> A
     if data.changed or ("imported" in data.manifest and foreign_names(data.case.study)):
         return json.loads(json.dumps(compute(), allow_nan=False))
     suffix = f"-{data.anchor(data.point)}" if data.point else ""
-    file, identity = data.directory / FOLDER / f"{name}{suffix}.json", _identity(data, name)
+    file, identity = data.directory / ANSWERS / f"{name}{suffix}.json", _identity(data, name)
     try:
         refuse_other_than_file(file)
         content = json.loads(file.read_text(encoding="utf-8"))

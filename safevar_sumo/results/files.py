@@ -1,15 +1,51 @@
-"""Files and directories of results: written whole or not at all, and still there after a power cut."""
+"""Files of a results directory: their names, contents and writers; files that are written whole or not at all; notes beside journals."""
 
 from __future__ import annotations
 
 import errno
+import json
 import os
 import secrets
 import tempfile
+from hashlib import sha256
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from safevar_sumo.errors import InputError, SafevarError
-from safevar_sumo.study import refuse_other_than_file
+from safevar_sumo.plugins import DIGITS, Files
+from safevar_sumo.study import Study, refuse_other_than_file
+
+MANIFEST, SOLUTIONS, RUNS, ANSWERS = "manifest.json", "solutions.csv", "runs", "answers"
+ORIGINAL = "original"
+"""Name of the original vehicle's journal; the study that writes it first owns the directory."""
+PLACES, LATER = "places.json", "read-*.json"
+
+
+class ResultsFile(NamedTuple):
+    """A file of a results directory: its name, or a pattern of names; its content; and the command that writes it."""
+
+    name: str
+    content: str
+    writer: str
+
+
+FILES = (
+    ResultsFile(MANIFEST, "the study as it was run, the original vehicle's metrics, versions and digests: "
+                "[what results depend on](results.md)", "`study`, `import`"),
+    ResultsFile(SOLUTIONS, "a row for each solution of each finished run", "`study` after its last run, `import`"),
+    ResultsFile(f"{RUNS}/*-*.journal", "every evaluation of the run ALGORITHM-NN, from which an interrupted study continues",
+                "`study` after each batch"),
+    ResultsFile(f"{RUNS}/{ORIGINAL}.journal", "the original vehicle's evaluation", "`study` before its first run"),
+    ResultsFile(f"{RUNS}/{PLACES}", "folders of your own code and files, relative to the directory", "`study` before its first run"),
+    ResultsFile(f"{RUNS}/{LATER}", "a file that your own code read in the middle of a study, with its digest", "`study` after each batch"),
+    ResultsFile(f"{ANSWERS}/*.json", "results that `report` computed; reused for the same results, options and program; safe to delete",
+                "`report`"))
+"""Every file of a results directory; the manual's list is made from them."""
+
+
+def journal_file(directory: Path, run: str) -> Path:
+    """The journal of a run, such as nsga2-03, or of the `ORIGINAL`."""
+    return directory / RUNS / f"{run}.journal"
 
 
 def make_directory(path: Path) -> None:
@@ -73,3 +109,42 @@ def sync_directory(path: Path) -> None:
             raise
     finally:
         os.close(handle)
+
+
+def write_places(directory: Path, study: Study) -> None:
+    """Write the folders of a study's files, relative to the directory; the manifest does not depend on them."""
+    if study.origin.places:
+        make_durable(directory / RUNS)
+        write_whole(directory / RUNS / PLACES, json.dumps([_relative(place, directory.resolve()) for place in study.origin.places]) + "\n")
+
+
+def places_of(directory: Path) -> tuple[str, ...]:
+    """Folders of the plug-ins and files of a directory's study: the study's own if they exist, then the directory's two parents."""
+    own = [os.path.abspath(directory.resolve() / place) for place in _read(directory / RUNS / PLACES, [])]
+    return tuple(dict.fromkeys([*filter(os.path.isdir, own), *map(str, directory.resolve().parents[:2])]))
+
+
+def note_later_file(directory: Path, name: str, digest: str) -> None:
+    """Note a file that was read after the study began, in a JSON file of its own, because several processes may write notes."""
+    make_durable(directory / RUNS)
+    write_whole(directory / RUNS / LATER.replace("*", sha256(name.encode()).hexdigest()[:DIGITS]), json.dumps({name: digest}) + "\n")
+
+
+def later_files(directory: Path) -> Files:
+    """Digests of files, by name, that were read after the study began."""
+    return {name: digest for path in sorted((directory / RUNS).glob(LATER)) for name, digest in _read(path, {}).items()}
+
+
+def _relative(place: str, directory: Path) -> str:
+    try:
+        return os.path.relpath(place, directory)
+    except ValueError:  # on another drive
+        return place
+
+
+def _read(path: Path, default: Any) -> Any:
+    """A JSON file of this package beside the journals; the default if it is missing or damaged."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return default

@@ -12,18 +12,9 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results.files import make_directory, write_whole
-from safevar_sumo.results.manifest import (
-    DIGESTS,
-    FORMAT,
-    MANIFEST,
-    RUNS,
-    digest_of_table,
-    read_manifest,
-    refuse_edited_table,
-    write_manifest,
-)
-from safevar_sumo.results.store import SOLUTIONS, solutions_frame
+from safevar_sumo.results.files import MANIFEST, RUNS, SOLUTIONS, make_directory, write_whole
+from safevar_sumo.results.manifest import DIGESTS, FORMAT, digest_of_table, read_manifest, refuse_edited_table, write_manifest
+from safevar_sumo.results.store import solutions_frame
 from safevar_sumo.study import Study, refuse_other_than_file, tables_of
 
 if TYPE_CHECKING:

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, warn
+from safevar_sumo.results.files import MANIFEST, SOLUTIONS, journal_file
 from safevar_sumo.results.imported import read_imported
 from safevar_sumo.results.journal import Content, read_journal
-from safevar_sumo.results.manifest import MANIFEST, RUNS, is_edited, owner_digest, read_manifest, refuse_edited_table
-from safevar_sumo.results.store import SOLUTIONS, evaluations_frame, solutions_frame
+from safevar_sumo.results.manifest import is_edited, owner_digest, read_manifest, refuse_edited_table
+from safevar_sumo.results.store import evaluations_frame, solutions_frame
 from safevar_sumo.study import label_of
 
 if TYPE_CHECKING:
@@ -135,7 +136,7 @@ def _journals(place: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str
     """Algorithm, run and journal of every run; None for a run without a journal."""
     study = owner_digest(manifest)
     for algorithm, run in runs:
-        path = place / RUNS / f"{algorithm}-{run:02d}.journal"
+        path = journal_file(place, f"{algorithm}-{run:02d}")
         yield algorithm, run, read_journal(path, study, path.stem) if path.exists() else None
 
 
@@ -158,9 +159,8 @@ def load(directory: str | Path) -> StoredResults:
     evaluated, solved, positions, failures = [], [], [], []
     for algorithm, run, content in _journals(place, manifest, search.runs):
         if content is not None and content.torn and content.result(search.budget) is None:
-            journal = place / RUNS / f"{algorithm}-{run:02d}.journal"
-            warn(f"{journal}: the last {content.torn} bytes are torn, so the run is left out; running the same study again "
-                 "simulates what they held")
+            warn(f"{journal_file(place, f'{algorithm}-{run:02d}')}: the last {content.torn} bytes are torn, so the run is left out; "
+                 "running the same study again simulates what they held")
         if content is None or content.evaluations is None:
             continue
         order = sorted((position, row) for row, position in enumerate(content.positions) if 0 <= position < search.budget)

@@ -1,9 +1,8 @@
-"""The manifest of a results directory: the inputs of the results and digests of the files; and how two manifests differ."""
+"""The manifest of a results directory: the inputs of the results and digests of its files; and how two manifests differ."""
 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from hashlib import sha256
 from importlib.metadata import version
@@ -11,14 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import DIGITS, Files, digest_of, located
-from safevar_sumo.results.files import make_durable, write_whole
+from safevar_sumo.plugins import Files, digest_of, located
+from safevar_sumo.results.files import MANIFEST, write_whole
 from safevar_sumo.study import WORDS, RatingTable, Study, refuse_other_than_file, tables_of
 
-MANIFEST, RUNS = "manifest.json", "runs"
-PLACES, LATER = "places.json", "read-*.json"
-"""Files beside the journals: the first lists the study's folders, relative to the results; each of the others records one file that was
-first read after the study began."""
 FORMAT = 3
 READABLE = (2, FORMAT)
 RESULTS = 2
@@ -199,30 +194,6 @@ def _pairs(stored: Any, new: Any, key: str = "") -> Iterator[tuple[str, Any, Any
         yield key, stored, new
 
 
-def write_places(directory: Path, study: Study) -> None:
-    """Write the folders of a study's files, relative to the directory; the manifest does not depend on them."""
-    if study.origin.places:
-        make_durable(directory / RUNS)
-        write_whole(directory / RUNS / PLACES, json.dumps([_relative(place, directory.resolve()) for place in study.origin.places]) + "\n")
-
-
-def places_of(directory: Path) -> tuple[str, ...]:
-    """Folders of the plug-ins and files of a directory's study: the study's own if they exist, then the directory's two parents."""
-    own = [os.path.abspath(directory.resolve() / place) for place in _read(directory / RUNS / PLACES, [])]
-    return tuple(dict.fromkeys([*filter(os.path.isdir, own), *map(str, directory.resolve().parents[:2])]))
-
-
-def note_later_file(directory: Path, name: str, digest: str) -> None:
-    """Note a file that was read after the study began, in a JSON file of its own, because several processes may write notes."""
-    make_durable(directory / RUNS)
-    write_whole(directory / RUNS / LATER.replace("*", sha256(name.encode()).hexdigest()[:DIGITS]), json.dumps({name: digest}) + "\n")
-
-
-def later_files(directory: Path) -> Files:
-    """Digests of files, by name, that were read after the study began."""
-    return {name: digest for path in sorted((directory / RUNS).glob(LATER)) for name, digest in _read(path, {}).items()}
-
-
 def comparable_inputs(stored: Mapping[str, Any], now: Mapping[str, str], later: Mapping[str, str], places: Sequence[str]
                   ) -> tuple[dict[str, Any], Files]:
     """A stored manifest and the files that its study reads now, ready to be compared.
@@ -241,18 +212,3 @@ def comparable_inputs(stored: Mapping[str, Any], now: Mapping[str, str], later: 
 
 def _digest(value: Any) -> str:
     return sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
-
-
-def _relative(place: str, directory: Path) -> str:
-    try:
-        return os.path.relpath(place, directory)
-    except ValueError:  # on another drive
-        return place
-
-
-def _read(path: Path, default: Any) -> Any:
-    """A JSON file of this package beside the journals; the default if it is missing or damaged."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return default

@@ -1,4 +1,4 @@
-"""A results directory: `manifest.json`, the journals of the runs and `solutions.csv`; the same bytes for the same study and seed."""
+"""The results directory that a study writes, with the same bytes for the same study and seed; and tables of evaluations and solutions."""
 
 from __future__ import annotations
 
@@ -14,32 +14,35 @@ import numpy as np
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS, SAFEVAR, Scoring
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results.files import make_directory, sync_directory, write_whole
+from safevar_sumo.results.files import (
+    MANIFEST,
+    RUNS,
+    SOLUTIONS,
+    journal_file,
+    later_files,
+    make_directory,
+    note_later_file,
+    sync_directory,
+    write_places,
+    write_whole,
+)
 from safevar_sumo.results.journal import Journal, JournalBusy, owner_of
 from safevar_sumo.results.manifest import (
     DIGESTS,
-    MANIFEST,
-    RUNS,
     comparable_inputs,
     difference,
     digest_of_table,
     extent_of,
-    later_files,
     manifest_of,
-    note_later_file,
     owner_digest,
     read_manifest,
     write_manifest,
-    write_places,
 )
 from safevar_sumo.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd
 
-SOLUTIONS = "solutions.csv"
-ORIGINAL = "original"
-"""Name of the original vehicle's journal; the study that writes it first owns the directory."""
 SECONDS_TO_CLAIM = 10.0
 """How long another process may take to write the owner into a new journal [s]."""
 
@@ -97,7 +100,7 @@ class ResultsDirectory:
 
     def journal(self, run: str) -> Journal:
         """Open and lock the journal of a run, such as nsga2-03."""
-        path = self.path / RUNS / f"{run}.journal"
+        path = journal_file(self.path, run)
         try:
             return Journal(path, owner_digest(self.manifest), run)
         except JournalBusy:

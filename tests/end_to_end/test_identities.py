@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from click.testing import CliRunner
 import safevar_sumo as sv
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.results import load
+from safevar_sumo.results import FILES, load
 from safevar_sumo.shipped import NETWORKS
 from tests.in_process import run
 
@@ -149,6 +150,9 @@ def test_a_file_that_is_read_later_counts_from_then_on() -> None:
     Path("tile.txt").write_text("a tile")
     edited("mine.toml", "evaluations = 30", "evaluations = 60")
     study()
+    files = [path.relative_to("out").as_posix() for path in Path("out").rglob("*") if path.is_file()]
+    assert {row.name for row in FILES if any(fnmatch(name, row.name) for name in files)} == {row.name for row in FILES} - {"answers/*.json"}
+    assert [name for name in files if not any(fnmatch(name, row.name) for row in FILES)] == [], "a file that the manual does not list"
     assert "tile.txt" not in json.loads(Path("out/manifest.json").read_text())["sources"], "the original vehicle is never so fast"
     before = Path("out/solutions.csv").read_bytes()
     study()

@@ -15,7 +15,7 @@ import pandas as pd
 from safevar_sumo.errors import InputError, first_line
 from safevar_sumo.metrics import SAFEVAR, MetricFacts, Scoring, Unsafe
 from safevar_sumo.records import FloatArray, Outcome
-from safevar_sumo.results import Failure, failure_lines, load, places_of
+from safevar_sumo.results import MANIFEST, Failure, failure_lines, load, places_of
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Origin, Study, Weather, invalid, of_today
 from safevar_sumo.vehicles import CharacteristicSet
@@ -172,14 +172,14 @@ def load_case(directory: Path) -> Case:
     try:
         study = msgspec.structs.replace(msgspec.convert(of_today(manifest["study"]), Study), origin=Origin(places=places_of(directory)))
     except msgspec.ValidationError as error:
-        raise invalid(directory / "manifest.json", manifest["study"], error, "study") from None
+        raise invalid(directory / MANIFEST, manifest["study"], error, "study") from None
     original = manifest.get("original")
     if not isinstance(original, dict):
-        raise InputError(directory / "manifest.json", "does not describe the original vehicle", "one written by the command study")
+        raise InputError(directory / MANIFEST, "does not describe the original vehicle", "one written by the command study")
     try:
         scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else SAFEVAR
     except msgspec.ValidationError as error:
-        raise invalid(directory / "manifest.json", manifest["scoring"], error, "scoring") from None
+        raise invalid(directory / MANIFEST, manifest["scoring"], error, "scoring") from None
     return case_of(study, original, solutions, evaluations, finished, "imported" not in manifest, failures, scoring)
 
 
