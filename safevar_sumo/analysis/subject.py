@@ -90,8 +90,10 @@ def load(directory: str | Path) -> Results:
     return Results(Path(directory), load_cases([directory])[0])
 
 
-def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False) -> Study | Case:
+def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False, results_only: bool = False) -> Study | Case:
     """The subject of a question: a study, or the case of results (given as such or by their directory).
+
+    With `results_only` names and paths are those of directories, also where a study has the same name.
 
     Warns
     -----
@@ -103,10 +105,13 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False) ->
     InputError
         If `source` is neither, or an input of the results has changed since they were computed.
     """
-    if isinstance(source, str | Path) and str(source) not in study_names():
-        if os.path.isdir(source):  # accepts any text, unlike the methods of a path
+    if isinstance(source, str | Path):
+        is_directory, is_study = os.path.isdir(source), str(source) in study_names()  # `os.path` accepts any text, unlike paths
+        if results_only and not is_directory and (is_study or os.path.isfile(source)):
+            raise InputError(source, "is a study and has no solutions", "a directory that the command study has written")
+        if results_only or (is_directory and not is_study):
             source = load(source)
-        elif not os.path.exists(source):
+        elif not (is_study or os.path.exists(source)):
             expected = f"a directory that the command study has written, {one_of(study_names())}, or the path of a study file (TOML)"
             problem = f"is no results directory, no study and no file{did_you_mean(source, study_names())}"
             raise InputError(source, problem, expected)

@@ -89,7 +89,7 @@ def opinion(place: str, more: tuple[str, ...], point: str | None, jobs: int | No
     from safevar_sumo.analysis.opinion.render import print_opinions
 
     options = OpinionOptions(**{**values, "solutions": (*values["solutions"], *more)})
-    result = _answer(ask_for_opinions, results_or_study(place, point), options, jobs)
+    result = _answer(ask_for_opinions, results_or_study(place, point, results_only=True), options, jobs)
     if not as_json:
         print_opinions(Console(), result)
         return

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import fields, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
@@ -15,7 +14,7 @@ from safevar_sumo.cli.options import Within
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import UNKNOWN, SolutionId, chosen_handle, position_of
-from safevar_sumo.study import Study, study_names
+from safevar_sumo.study import Study
 
 if TYPE_CHECKING:
     from safevar_sumo.analysis.research_questions.case import Case
@@ -57,13 +56,8 @@ def target_of(place: str, solution: str | None, choice: str | None) -> Target:
         raise InputError("--solution", f"{solution!r} and --{choice.replace('_', '-')} both choose a solution", "one of them")
     if solution is None and choice is None:
         return Target(study_at_point(place), place)
-    if place in study_names() and not Path(place).is_dir():
-        raise InputError(place, "is a study and has no solutions", "a directory that the command study has written")
-    from safevar_sumo.analysis.research_questions.case import load_cases  # takes longer to load than the simulation
-
-    case = results_or_study(place)
-    if isinstance(case, Study):
-        (case,) = load_cases([place])
+    case = results_or_study(place, results_only=True)
+    assert not isinstance(case, Study)
     named = None if solution is None else SolutionId.parse(solution)
     handle = named or chosen_handle(case.solutions, case.unsafe, str(choice), place)
     row = case.solutions.iloc[position_of(case.solutions, handle)]
@@ -122,8 +116,8 @@ def _names(text: str | None) -> tuple[str, ...] | None:
     return None if text is None else tuple(name.strip() for name in text.split(","))
 
 
-def results_or_study(place: str, point: str | None = None) -> Study | Case:
-    """The case in a results directory, or a study by name or path; at `point` of its matrix if given.
+def results_or_study(place: str, point: str | None = None, *, results_only: bool = False) -> Study | Case:
+    """The case in a results directory, or unless `results_only` a study by name or path; at `point` of its matrix if given.
 
     Raises
     ------
@@ -134,7 +128,7 @@ def results_or_study(place: str, point: str | None = None) -> Study | Case:
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        source = study_or_case(place, as_it_is_now=as_it_is_now())
+        source = study_or_case(place, as_it_is_now=as_it_is_now(), results_only=results_only)
     for warning in caught:
         click.echo(f"warning: {warning.message}", err=True)
     if point is None:

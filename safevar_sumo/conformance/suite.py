@@ -21,7 +21,7 @@ from safevar_sumo.plugins import guard_process_state
 from safevar_sumo.study import Study, load_study, study_names
 
 LONGEST = 6.0
-"""Time that a run of a probe may take before the subject counts as hung [s]."""
+"""Time that a run of a probe may take, imports aside, before the subject counts as hung [s]."""
 SLOWEST = 1e-3
 """Time per vehicle and step above which a subject is slow [s]: a run of 1,000 simulations then takes minutes."""
 ALONE = 2

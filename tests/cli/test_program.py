@@ -20,6 +20,7 @@ from click.testing import CliRunner
 from rich.console import Console
 
 from safevar_sumo import cli
+from safevar_sumo.cli import catalogue
 from safevar_sumo.cli.program import COMMANDS, commands, main
 from safevar_sumo.conformance.subject import subject_of
 from safevar_sumo.errors import InputError
@@ -158,8 +159,10 @@ def test_names_stay_whole_and_the_rest_goes_on_in_the_next_line(width: int) -> N
     assert "…" not in "".join(lines)
 
 
-def test_every_name_of_the_list_can_be_read_and_typed() -> None:
-    output = CliRunner(env={"COLUMNS": "80"}).invoke(commands, ["list"]).stdout
+def test_every_name_of_the_list_can_be_read_and_typed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(catalogue.VEHICLES, "in_no_study", catalogue.VEHICLES["sumo"])
+    output = CliRunner(env={"COLUMNS": "80"}).invoke(commands, ["list"], catch_exceptions=False).stdout
+    assert "Vehicle in_no_study" in output, "a vehicle without a study has no characteristics to explain"
     assert "┃ name            ┃ friction ┃ sight ┃ delay, s ┃ light ┃ road ┃" in output
     assert "…" not in output
     for name in ("f_safe", "f_comfort", "f_diff", "rating_points"):

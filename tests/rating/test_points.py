@@ -157,6 +157,11 @@ def test_the_verdict_names_what_is_lost_and_where() -> None:
     result.variants[1].__dict__["setting"] = {**result.variants[0].setting, "treadDepth": 3.0}
     assert verdict(result).startswith("With tread depth of the tyres 3 mm the vehicle loses 1.")
     assert verdict(result).endswith("all of them in CPNCO by night.")
+    elsewhere = np.full(N, np.nan)
+    elsewhere[numbers("CPNCO", "standard", "day")[:3]] = 40.0
+    gains = replace(result, variants=[rated(results(elsewhere)), result.variants[1]])
+    gains.original.__dict__["setting"] = result.original.setting
+    assert verdict(gains).endswith("most of them in CPNCO by night."), "in another test the variant gains"
     record = json.loads(json.dumps(result.to_dict(), allow_nan=False))
     assert set(record) == {"study", "variants", "not_simulated"}
     assert set(record["variants"][0]) == {"name", "setting", "points", "possible", "tests"}

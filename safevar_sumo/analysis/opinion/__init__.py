@@ -49,4 +49,4 @@ def opinion(source: str | Path | Results, *, solutions: Sequence[str] = OpinionO
     """
     from safevar_sumo.analysis.opinion.compute import ask_for_opinions
 
-    return answer_question(ask_for_opinions, study_or_case(source, as_it_is_now=as_it_is_now), OpinionOptions, locals())
+    return answer_question(ask_for_opinions, study_or_case(source, as_it_is_now=as_it_is_now, results_only=True), OpinionOptions, locals())
