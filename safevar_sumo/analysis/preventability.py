@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 from msgspec.structs import replace
@@ -36,6 +37,16 @@ class PreventableBy(StrEnum):
     COMPETENT_DRIVER = "preventable by a competent driver"
     FULL_BRAKING = "preventable by full braking at the first possible moment"
     NOBODY = "preventable by nobody"
+
+
+class PreventedShares(msgspec.Struct, frozen=True, kw_only=True):
+    """Shares of the collisions by class, and their number; shares and interval are None without any collision."""
+
+    competent_driver: float | None
+    full_braking: float | None
+    nobody: float | None
+    looked_at: int
+    interval_competent_driver: list[float] | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,11 +84,14 @@ class Preventability:
             return None if share is None else (share, share)
         return clopper_pearson(self.numbers.get(by, 0), self.looked_at)
 
-    def to_dict(self) -> dict[str, Any]:
-        """As `explain --json` prints it; shares and interval are None without any collision."""
+    @property
+    def shares(self) -> PreventedShares:
+        """The shares as `explain --json` prints them."""
         interval = self.interval(PreventableBy.COMPETENT_DRIVER)
-        return {**{by.name.lower(): self.share(by) for by in PreventableBy}, "looked_at": self.looked_at,
-                "interval_competent_driver": None if interval is None else list(interval)}
+        return PreventedShares(
+            competent_driver=self.share(PreventableBy.COMPETENT_DRIVER), full_braking=self.share(PreventableBy.FULL_BRAKING),
+            nobody=self.share(PreventableBy.NOBODY), looked_at=self.looked_at,
+            interval_competent_driver=None if interval is None else list(interval))
 
     def __str__(self) -> str:
         """One line; nothing without any collision."""

@@ -1,25 +1,25 @@
-"""Failures with their minimal causes, and selected solutions, each with its replay."""
+"""Minimal causes of failures, and selected solutions, each with its replay."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from markupsafe import Markup
 
 from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.explain.compute import explain_failures as explain
 from safevar_sumo.analysis.explain.necessity import is_borderline
+from safevar_sumo.analysis.explain.result import CauseEntry, FailureEntry, SummaryEntry
 from safevar_sumo.analysis.opinion.compute import Cause, opinions_of, second_system
 from safevar_sumo.analysis.research_questions.indicators import nondominated
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import differences, number, raised, spaced
-from safevar_sumo.report.input import ReportInput, stored_answer
+from safevar_sumo.report.input import Change, FailingPlaces, ReportInput, stored_answer
 from safevar_sumo.report.svg import Bar, rows
-from safevar_sumo.results import SolutionId, chosen_handle
 
-Failures = list[dict[str, Any]]
-"""The failures of `explain --json`, with their explanations."""
 CAUSES = 6
 """Maximum number of minimal causes in a report."""
 REPLAYS = 10
@@ -29,26 +29,89 @@ FIRST = ("fewest", "smallest", "most_severe")
 OBJECTIVES = ["f_safe", "f_diff", "f_num_diff"]
 
 
-def explanations(data: ReportInput, jobs: int | None, progress: Progress) -> Failures:
+class Explanations(NamedTuple):
+    """The answer of `explain`: the failures that matter, and the shares of all analysed failures."""
+
+    failures: list[FailureEntry]
+    summary: SummaryEntry
+
+
+class CauseRow(NamedTuple):
+    """A change of a cause: characteristic, its short and long description, and its values with their unit."""
+
+    name: str
+    short: str
+    words: str
+    original: str
+    value: str
+    boundary: str
+
+
+class SecondOpinion(msgspec.Struct, frozen=True):
+    """The second vehicle model's opinion on a cause: a verdict, and its reason in a sentence."""
+
+    opinion: str
+    because: str
+
+
+class CauseSection(NamedTuple):
+    """A cause on the page.
+
+    `end` tells how its run ends; scaled to `fraction` all changes are still unsafe, `below` is the state just below. `handle` is that of a
+    failure with this cause, `whole` the anchor of its replay; `because`, `robustness` and `borderline` describe the whole failure.
+    """
+
+    title: str
+    anchor: str
+    rows: list[CauseRow]
+    end: str
+    fraction: float
+    below: str
+    where: FailingPlaces | None
+    replay: dict[str, Any]
+    handle: str
+    whole: str
+    because: str
+    robustness: float
+    borderline: bool
+    opinion: SecondOpinion | None
+
+
+class Replay(NamedTuple):
+    """A solution on the page, with its `replay` if the study can be simulated; `differences` are those from the results."""
+
+    handle: str
+    anchor: str
+    outcome: str
+    f_safe: float
+    f_diff: float
+    f_num_diff: int
+    changes: list[Change]
+    open: bool
+    where: FailingPlaces | None = None
+    replay: dict[str, Any] | None = None
+    differences: Sequence[str] = ()
+
+
+def explanations(data: ReportInput, jobs: int | None, progress: Progress) -> Explanations:
     """The failures that matter with their explanations, computed once for these results."""
-    return list(stored_answer(data, "explain", lambda: explain(
-        data.case, data.options["explain"], jobs=jobs, progress=progress).to_dict()))
+    *failures, last = stored_answer(data, "explain", lambda: explain(
+        data.case, data.options["explain"], jobs=jobs, progress=progress).to_dict())
+    return Explanations(msgspec.convert(failures, list[FailureEntry]), msgspec.convert(last["summary"], SummaryEntry))
 
 
-def necessity_chart(failures: Failures, data: ReportInput) -> Markup | None:
+def necessity_chart(summary: SummaryEntry, data: ReportInput) -> Markup | None:
     """A chart of how often failures change each characteristic, and how often they need the change."""
-    shares: dict[str, dict[str, Any]] = next((one["summary"] for one in failures if "summary" in one), {})
-    names = [name for name in shares.get("necessary", {}) if shares["changed"].get(name)]
+    changed, necessary = summary.changed, summary.necessary
+    names = sorted((name for name in necessary if changed.get(name)), key=lambda name: (-necessary[name], -changed[name], name))
     if not names:
         return None
-    ordered = sorted(names, key=lambda name: (-shares["necessary"][name], -shares["changed"][name], name))
-    bars = [[Bar(0, shares["changed"][name], "weak", f"{name}: changed in {shares['changed'][name]:.0%} of the failures"),
-             Bar(0, shares["necessary"][name], "hit", f"{name}: needed in {shares['necessary'][name]:.0%} of the failures")]
-            for name in ordered]
-    ends = [("", f"needed {shares['necessary'][name]:.0%}{_interval(*shares['necessary_interval'][name])}, "
-                 f"changed {shares['changed'][name]:.0%}") for name in ordered]
+    bars = [[Bar(0, changed[name], "weak", f"{name}: changed in {changed[name]:.0%} of the failures"),
+             Bar(0, necessary[name], "hit", f"{name}: needed in {necessary[name]:.0%} of the failures")] for name in names]
+    ends = [("", f"needed {necessary[name]:.0%}{_interval(*summary.necessary_interval[name])}, changed {changed[name]:.0%}")
+            for name in names]
     description = f"{data.case.name}: how often a characteristic is needed for a failure, beside how often it is changed"
-    return rows(description, ordered, bars, [None] * len(ordered), ends)
+    return rows(description, names, bars, [None] * len(names), ends)
 
 
 def _interval(low: float, high: float) -> str:
@@ -56,20 +119,20 @@ def _interval(low: float, high: float) -> str:
     return f" ({low:.0%} to {high:.0%})" if low < high else ""
 
 
-def causes(failures: Failures, data: ReportInput) -> list[dict[str, Any]]:
+def causes(failures: Sequence[FailureEntry], data: ReportInput) -> list[CauseSection]:
     """The distinct minimal causes with replays, in the order of the number and size of their changes."""
-    distinct: dict[tuple[str, ...], dict[str, Any]] = {}
+    distinct: dict[tuple[str, ...], tuple[CauseEntry, FailureEntry]] = {}
     for failure in failures:
-        for cause in _causes_of(failure):
-            key = tuple(cause["changes"])
-            if key not in distinct or _size(data, cause) < _size(data, distinct[key]["cause"]):
-                distinct[key] = {"cause": cause, "because": raised(failure["because"]), "robustness": failure["robustness"],
-                                 "handle": handle_of(failure)}
-    ordered = sorted(distinct.values(), key=lambda entry: _size(data, entry["cause"]))[:CAUSES]
-    if ordered:
-        data.simulate_again([data.setting_with(entry["cause"]["changes"]) for entry in ordered])
-    opinions = _opinions(data, ordered) if ordered and not no_opinion(data) else [None] * len(ordered)
-    return [{**_cause(data, number, entry), "opinion": opinions[number - 1]} for number, entry in enumerate(ordered, 1)]
+        for cause in failure.minimal_causes:
+            key = tuple(cause.changes)
+            if key and (key not in distinct or _size(data, cause) < _size(data, distinct[key][0])):
+                distinct[key] = cause, failure
+    ordered = sorted(distinct.values(), key=lambda entry: _size(data, entry[0]))[:CAUSES]
+    if not ordered:
+        return []
+    data.simulate_again([data.setting_with(cause.changes) for cause, _ in ordered])
+    opinions = [None] * len(ordered) if no_opinion(data) else _opinions(data, ordered)
+    return [_section(data, number, *entry, opinion) for number, (entry, opinion) in enumerate(zip(ordered, opinions, strict=True), 1)]
 
 
 def no_opinion(data: ReportInput) -> str:
@@ -81,73 +144,57 @@ def no_opinion(data: ReportInput) -> str:
     return ""
 
 
-def _opinions(data: ReportInput, ordered: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _opinions(data: ReportInput, ordered: Sequence[tuple[CauseEntry, FailureEntry]]) -> list[SecondOpinion]:
     """The second vehicle model's opinion on each cause, computed once for these results."""
-    causes = [Cause(entry["handle"] or None, entry["cause"]["changes"], entry["cause"]["fraction"]) for entry in ordered]
-    return list(stored_answer(data, "opinion", lambda: opinions_of(data.case.study, causes, data.case.unsafe).to_dict()))
+    causes = [Cause(failure.handle or None, cause.changes, cause.fraction) for cause, failure in ordered]
+    opinions = stored_answer(data, "opinion", lambda: opinions_of(data.case.study, causes, data.case.unsafe).to_dict())
+    return msgspec.convert(opinions, list[SecondOpinion])
 
 
-def _causes_of(failure: dict[str, Any]) -> list[dict[str, Any]]:
-    """The minimal causes of a failure; none if the original vehicle itself is unsafe."""
-    return [cause for cause in failure.get("minimal_causes", []) if cause["changes"]]
+def _size(data: ReportInput, cause: CauseEntry) -> tuple[int, float]:
+    setting = data.setting_with(cause.boundary)
+    return len(cause.changes), float(data.case.characteristics.largest_change(setting[np.newaxis])[0])
 
 
-def handle_of(failure: dict[str, Any]) -> str:
-    """The handle of an explained failure; empty if it is no solution."""
-    return "" if failure["algorithm"] is None else f"{failure['algorithm']}:{failure['run']}:{failure['index']}"
-
-
-def _size(data: ReportInput, cause: dict[str, Any]) -> tuple[int, float]:
-    setting = data.setting_with(cause["boundary"])
-    return len(cause["changes"]), float(data.case.characteristics.largest_change(setting[np.newaxis])[0])
-
-
-def _cause(data: ReportInput, place: int, entry: dict[str, Any]) -> dict[str, Any]:
-    """A cause for the template; `place` is its number, from 1."""
-    cause = entry["cause"]
-    setting = data.setting_with(cause["changes"])
+def _section(data: ReportInput, place: int, cause: CauseEntry, failure: FailureEntry, opinion: SecondOpinion | None) -> CauseSection:
+    """A cause on the page; `place` is its number, from 1."""
+    setting = data.setting_with(cause.changes)
     members = {member.name: member for member in data.case.characteristics}
-    table = [{"name": name, "short": members[name].short_name, "words": members[name].words,
-              **{column: f"{number(shown)}{spaced(members[name].unit)}" for column, shown in (
-                  ("original", members[name].original), ("value", value), ("boundary", cause["boundary"][name]))}}
-             for name, value in cause["changes"].items()]
+    table = [CauseRow(name, members[name].short_name, members[name].words, *(
+        f"{number(shown)}{spaced(members[name].unit)}" for shown in (members[name].original, value, cause.boundary[name])))
+        for name, value in cause.changes.items()]
     comparison = data.compared(setting)
-    return {"title": f"Cause {place}: {', '.join(cause['changes'])}", "anchor": data.anchor("cause", place), "rows": table,
-            "end": comparison.verdict(comparison.rows[-1]), "because": entry["because"], "robustness": entry["robustness"],
-            "borderline": entry["robustness"] is not None and is_borderline(entry["robustness"]),
-            "handle": entry["handle"], "where": data.where(setting),
-            "whole": data.anchor("replay", entry["handle"]),
-            "fraction": cause["fraction"], "below": cause["end"], "replay": data.replay(setting)}
+    return CauseSection(
+        title=f"Cause {place}: {', '.join(cause.changes)}", anchor=data.anchor("cause", place), rows=table,
+        end=comparison.verdict(comparison.rows[-1]), fraction=cause.fraction, below=cause.end, where=data.where(setting),
+        replay=data.replay(setting), handle=failure.handle, whole=data.anchor("replay", failure.handle), because=raised(failure.because),
+        robustness=failure.robustness, borderline=is_borderline(failure.robustness), opinion=opinion)
 
 
-def replays(data: ReportInput, failures: Failures | None) -> list[dict[str, Any]]:
+def replays(data: ReportInput, explained: Explanations | None) -> list[Replay]:
     """The solutions with a replay: the choices of `FIRST`, explained ones, and non-dominated unsafe ones."""
-    entries, chosen = [], _chosen(data, failures)
-    if data.system is not None and chosen:
-        data.simulate_again([data.setting_of(SolutionId.parse(handle)) for handle in chosen])
-    for place, handle in enumerate(chosen):
-        row, setting = data.solutions[handle], data.setting_of(SolutionId.parse(handle))
-        entry = {"handle": handle, "anchor": data.anchor("replay", handle), "f_safe": row["f_safe"], "f_diff": row["f_diff"],
-                 "f_num_diff": row["f_num_diff"], "outcome": row["outcome"], "open": place == 0 and not failures,
-                 "differences": [], "where": None, "changes": data.changes(setting)}
-        entries.append(entry if data.system is None else {
-            **entry, "replay": data.replay(setting), "where": data.where(setting),
-            "differences": differences(data.simulate_again([setting])[0].evaluation, row)})
-    return sorted(entries, key=lambda entry: (entry["f_safe"], entry["handle"]))
+    entries, handles = [], _chosen(data, explained.failures if explained else [])
+    if data.system is not None and handles:
+        data.simulate_again([data.setting_of(handle) for handle in handles])
+    for place, handle in enumerate(handles):
+        row, setting = data.solutions[handle], data.setting_of(handle)
+        entry = Replay(handle, data.anchor("replay", handle), row["outcome"], row["f_safe"], row["f_diff"], row["f_num_diff"],
+                       data.changes(setting), open=place == 0 and explained is None)
+        entries.append(entry if data.system is None else entry._replace(
+            replay=data.replay(setting), where=data.where(setting),
+            differences=differences(data.simulate_again([setting])[0].evaluation, row)))
+    return sorted(entries, key=lambda entry: (entry.f_safe, entry.handle))
 
 
-def _chosen(data: ReportInput, failures: Failures | None) -> list[str]:
+def _chosen(data: ReportInput, failures: Sequence[FailureEntry]) -> list[str]:
     """Handles of the solutions with a replay, each once."""
-    solutions, criterion = data.case.solutions, data.case.unsafe
-    if solutions.empty:
+    if data.case.solutions.empty:
         return []
-    unsafe = criterion.rows(solutions).tolist()
-    choices = FIRST if any(unsafe) else FIRST[-1:]
-    chosen = [str(chosen_handle(solutions, criterion, choice, data.directory)) for choice in choices]
-    chosen += [handle_of(failure) for failure in failures or [] if failure.get("algorithm") is not None]
-    best = best_of([row for row, is_unsafe in zip(data.solutions.values(), unsafe, strict=True) if is_unsafe])
+    choices = FIRST if any(data.unsafe_solutions) else FIRST[-1:]
+    chosen = [*map(data.chosen, choices), *(failure.handle for failure in failures if failure.handle)]
+    best = best_of([row for row, is_unsafe in zip(data.solutions.values(), data.unsafe_solutions, strict=True) if is_unsafe])
     chosen += [best[index]["handle"] for index in evenly_spaced(len(best), REPLAYS)]
-    return list(dict.fromkeys(chosen))[:max(REPLAYS, len(choices) + len(failures or []))]
+    return list(dict.fromkeys(chosen))[:max(REPLAYS, len(choices) + len(failures))]
 
 
 def best_of(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -27,18 +27,35 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
 from safevar_sumo.replay.page import player_data
 from safevar_sumo.replay.scene import scene_of
-from safevar_sumo.results import ANSWERS, MANIFEST, RESULTS, SOLUTIONS, SolutionId, handles, read_manifest, write_whole
+from safevar_sumo.results import ANSWERS, MANIFEST, RESULTS, SOLUTIONS, chosen_handle, handles, read_manifest, write_whole
 from safevar_sumo.scenarios import Point
 from safevar_sumo.shipped import PACKAGE
 from safevar_sumo.study import SAFETY_DEGREE, foreign_names, refuse_other_than_file
 from safevar_sumo.sumo.matrix import aggregated, at_every_point, evaluate, study_at
 from safevar_sumo.sumo.system import System, assemble
 
+
+class FailingPlaces(NamedTuple):
+    """A table of the tests that fail: a sentence, the columns' heads, and rows of a name and a cell for each head."""
+
+    summary: str
+    heads: list[str]
+    rows: list[tuple[str, list[str]]]
+
+
+class Change(NamedTuple):
+    """A change from the original: both values in a text, and the short and the long description of the characteristic, if any."""
+
+    text: str
+    short: str
+    words: str
+
+
 SPEED, LOCATION = "speed", "impact_location"
 AVOIDED, FAILS = "–", "fails"  # noqa: RUF001
 
 
-def failing_places(matrix: Sequence[Point], failing: Collection[str]) -> dict[str, Any]:
+def failing_places(matrix: Sequence[Point], failing: Collection[str]) -> FailingPlaces:
     """A table of the tests that fail: tests and weathers down, speeds across, impact locations in the cells.
 
     Parameters
@@ -50,7 +67,8 @@ def failing_places(matrix: Sequence[Point], failing: Collection[str]) -> dict[st
 
     Returns
     -------
-    A sentence `summary`, column `heads`, and `rows` of a name and a cell for each head; a cell without a test is empty.
+    FailingPlaces
+        A cell without a test is empty.
     """
     places = [(point.name in failing, dict(point.place)) for point in matrix]
     speeds = sorted({place[SPEED] for _, place in places if SPEED in place})
@@ -63,11 +81,11 @@ def failing_places(matrix: Sequence[Point], failing: Collection[str]) -> dict[st
             cell.append(FAILS if location is None else f"{location:g} %")
     columns = [*speeds, *([None] if any(None in cells for cells in rows.values()) else [])]
     has_location = any(LOCATION in dict(point.place) for point in matrix if point.name in failing)
-    return {
-        "summary": f"Fails at {len(failing)} of {len(matrix)} points.{' Percentages are impact locations.' if has_location else ''}",
-        "heads": ["" if speed is None else f"{speed:g} km/h" for speed in columns],
-        "rows": [(name, [", ".join(cells[speed]) or AVOIDED if speed in cells else "" for speed in columns])
-                 for name, cells in rows.items() if any(cells.values())]}
+    return FailingPlaces(
+        summary=f"Fails at {len(failing)} of {len(matrix)} points.{' Percentages are impact locations.' if has_location else ''}",
+        heads=["" if speed is None else f"{speed:g} km/h" for speed in columns],
+        rows=[(name, [", ".join(cells[speed]) or AVOIDED if speed in cells else "" for speed in columns])
+              for name, cells in rows.items() if any(cells.values())])
 
 
 SAMPLES = 4000
@@ -107,9 +125,18 @@ class ReportInput:
         named = zip(handles(self.case.solutions), self.case.solutions.to_dict("records"), strict=True)
         return {str(handle): {**{str(name): value for name, value in row.items()}, "handle": str(handle)} for handle, row in named}
 
-    def setting_of(self, handle: SolutionId) -> FloatArray:
+    @cached_property
+    def unsafe_solutions(self) -> list[bool]:
+        """Whether each solution is unsafe."""
+        return [] if self.case.solutions.empty else list(self.case.unsafe.rows(self.case.solutions).tolist())
+
+    def chosen(self, choice: str) -> str:
+        """The handle of the solution that a choice selects: fewest, smallest or most_severe."""
+        return str(chosen_handle(self.case.solutions, self.case.unsafe, choice, self.directory))
+
+    def setting_of(self, handle: str) -> FloatArray:
         """A solution's setting, shape (n,)."""
-        row = self.solutions[str(handle)]
+        row = self.solutions[handle]
         return np.array([row[name] for name in self.case.characteristics.names], dtype=float)
 
     def setting_with(self, changes: Mapping[str, float]) -> FloatArray:
@@ -119,11 +146,11 @@ class ReportInput:
             setting[self.case.characteristics.names.index(name)] = value
         return setting
 
-    def changes(self, setting: FloatArray) -> list[dict[str, str]]:
-        """The changes from the original: a text with both values, and the description of the characteristic, if there is one."""
+    def changes(self, setting: FloatArray) -> list[Change]:
+        """The changes from the original."""
         members = [member for member, value in zip(self.case.characteristics, setting.tolist(), strict=True) if value != member.original]
         texts = changes_in_words(self.case.characteristics, setting)
-        return [{"text": text, "short": member.short_name, "words": member.words} for member, text in zip(members, texts, strict=True)]
+        return [Change(text, member.short_name, member.words) for member, text in zip(members, texts, strict=True)]
 
     def compared(self, setting: FloatArray) -> Comparison:
         """The comparison of a setting with the original vehicle, simulated once."""
@@ -158,7 +185,7 @@ class ReportInput:
         """Whether the original vehicle itself collides: then no change causes anything."""
         return self.case.original[SAFETY_DEGREE] < 0
 
-    def where(self, setting: FloatArray) -> dict[str, Any] | None:
+    def where(self, setting: FloatArray) -> FailingPlaces | None:
         """The points of the matrix at which a setting fails; None without a matrix, or if the page is about one point."""
         if self.system is None or not self.system.matrix or self.point:
             return None

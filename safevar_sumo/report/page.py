@@ -197,25 +197,25 @@ def _study(data: ReportInput, wanted: Sequence[str], jobs: int | None, show: Pro
     def progress(stage: str, done: int, total: int) -> None:
         show(f"{data.case.name}: {stage}", done, total)
 
-    failures = explanations(data, jobs, progress) if "causes" in wanted and data.system is not None else None
+    explained = explanations(data, jobs, progress) if "causes" in wanted and data.system is not None else None
     limits = {name: make(data, jobs, progress) for name, make in LIMITS.items()
               if name in wanted and data.system is not None}
     progress("replays", 0, 1)
-    replayed = replays(data, failures) if "causes" in wanted else []
+    replayed = replays(data, explained) if "causes" in wanted else []
     sections: dict[str, Callable[[], Any]] = {
         "tested": lambda: tested(data),
-        "verdict": lambda: verdict(data, failures, limits.get("tolerance")),
-        "causes": lambda: causes(failures or [], data),
+        "verdict": lambda: verdict(data, explained, limits.get("tolerance")),
+        "causes": lambda: causes(explained.failures if explained else [], data),
         "no_opinion": lambda: "" if data.system is None else no_opinion(data),
-        "necessity": lambda: necessity_chart(failures or [], data),
-        "trust": lambda: trust(data, failures)}
-    different = [solution["handle"] for solution in replayed if solution.get("differences")]
+        "necessity": lambda: necessity_chart(explained.summary, data) if explained else None,
+        "trust": lambda: trust(data, explained)}
+    different = [solution.handle for solution in replayed if solution.differences]
     if different:
         warn(f"{data.directory}: simulated again with different results: {', '.join(different)}; other versions or code than in the study?")
     return {"name": data.case.name, "title": data.case.study.title, "anchor": data.anchor(), "replays": replayed,
             "different": different,
             "problem": data.problem, "changed": data.changed, "original_fails": data.original_fails,
-            "front": front(data, [solution["handle"] for solution in replayed]) if replayed else None,
+            "front": front(data, [solution.handle for solution in replayed]) if replayed else None,
             **limits, **{name: make() for name, make in sections.items()
                          if name in wanted or (name in ("necessity", "no_opinion") and "causes" in wanted)}}
 

@@ -5,44 +5,53 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from safevar_sumo.ads import ADS
 from safevar_sumo.analysis.explain.necessity import BORDERLINE, is_borderline
-from safevar_sumo.analysis.explain.result import REASONS, ROBUST
-from safevar_sumo.analysis.model_spread import model_spreads
+from safevar_sumo.analysis.explain.result import REASONS, ROBUST, FailureEntry
+from safevar_sumo.analysis.model_spread import ModelSpread, model_spreads
+from safevar_sumo.analysis.preventability import PreventedShares
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, collided
 from safevar_sumo.analysis.words import number_of
 from safevar_sumo.metrics import METRICS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, FloatArray, Outcome
 from safevar_sumo.reference import Totals, quoted
 from safevar_sumo.replay.comparison import number, raised
-from safevar_sumo.report.findings import FIRST, Failures, handle_of
-from safevar_sumo.report.input import ReportInput, stored_answer
-from safevar_sumo.results import SolutionId, chosen_handle
+from safevar_sumo.report.findings import FIRST, Explanations
+from safevar_sumo.report.input import Change, FailingPlaces, ReportInput, stored_answer
 from safevar_sumo.scenarios import SCENARIOS, Point, tags
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.sumo.matrix import vehicle_remarks
 from safevar_sumo.vehicles import VEHICLES
 
 
-def tested(data: ReportInput) -> dict[str, Any]:
-    """What was tested: sentences, and the varied characteristics."""
+class Tested(NamedTuple):
+    """What was tested: sentences, and rows of texts: name, unit, original, ends, threshold and meaning of each varied characteristic."""
+
+    subject: str
+    tags: str
+    search: str
+    characteristics: list[tuple[str, ...]]
+    remarks: list[str]
+
+
+def tested(data: ReportInput) -> Tested:
+    """The tested vehicle, driving system and scenario, and the search."""
     case, study = data.case, data.case.study
-    return {
-        "subject": f"Vehicle: {_described(VEHICLES, study.vehicle.model) or study.vehicle.model} "
-                   f"({number_of(len(case.characteristics), 'varied characteristic')}). Driving system: {_named(ADS, study.ads.model)}. "
-                   f"Scenario: {_named(SCENARIOS, study.scenario.model)}; {_where(data)}.",
-        "tags": "" if data.system is None else tags(data.system.points),
-        "search": _search(data),
-        "characteristics": [
-            {"name": member.name, "unit": "" if member.unit == "-" else raised(member.unit), "original": number(member.original),
-             "lower": number(member.lower), "upper": number(member.upper), "threshold": number(member.threshold),
-             "words": member.words} for member in case.characteristics],
-        "remarks": [*case.remarks, *([data.problem] if data.problem else []),
-                    *(vehicle_remarks(data.system) if data.system else [])]}
+    return Tested(
+        subject=f"Vehicle: {_described(VEHICLES, study.vehicle.model) or study.vehicle.model} "
+                f"({number_of(len(case.characteristics), 'varied characteristic')}). Driving system: {_named(ADS, study.ads.model)}. "
+                f"Scenario: {_named(SCENARIOS, study.scenario.model)}; {_where(data)}.",
+        tags="" if data.system is None else tags(data.system.points), search=_search(data),
+        characteristics=[
+            (member.name, "" if member.unit == "-" else raised(member.unit),
+             *map(number, (member.original, member.lower, member.upper, member.threshold)), member.words)
+            for member in case.characteristics],
+        remarks=[*case.remarks, *([data.problem] if data.problem else []), *(vehicle_remarks(data.system) if data.system else [])])
 
 
 def _where(data: ReportInput) -> str:
@@ -91,24 +100,67 @@ TITLES = {ROBUST: "Smallest robust failure", REASONS["fewest"]: "Fewest changes"
 UNKNOWN = "–"  # noqa: RUF001
 
 
-def verdict(data: ReportInput, failures: Failures | None, tolerance: Mapping[str, Any] | None) -> dict[str, Any]:
-    """The original's outcome, and the selected failures, the smallest robust failure first.
+class Finding(NamedTuple):
+    """A selected failure in the verdict; all values are its solution's, not scaled back.
 
-    All values of a failure are its solution's, not scaled back.
+    `share` is the unsafe share of its neighbours, and `needed` the number of changes that suffice; None if it was not explained.
     """
-    case = data.case
-    unsafe = case.solutions[case.unsafe.rows(case.solutions)]
-    any_collision = bool(collided(case.solutions).any())
-    result: dict[str, Any] = {"unsafe": len(unsafe), "solutions": len(case.solutions), "rule": _rule(case.unsafe), "findings": [],
-                              "original": _original(data), "any_collision": any_collision, "figures": [],
-                              "agreement": agreement_with_published(data)}
-    if unsafe.empty and case.solutions.empty:
-        result["headline"] = "No solution was found."
-        return result
-    result["findings"] = _findings(data, failures or [], any_unsafe=not unsafe.empty)
-    result["headline"] = _headline(result, data, failures)
-    result["figures"] = _figures(result, data, failures or [], tolerance)
-    return result
+
+    title: str
+    handle: str
+    reasons: list[str]
+    anchor: str
+    changes: list[Change]
+    largest: float
+    size: str
+    end: str
+    f_safe: float
+    where: FailingPlaces | None
+    share: float | None
+    needed: int | None
+
+    @property
+    def borderline(self) -> bool:
+        return self.share is not None and is_borderline(self.share)
+
+
+class KeyFigure(NamedTuple):
+    """A key figure of the verdict."""
+
+    title: str
+    value: str
+    note: str
+
+
+class Agreement(NamedTuple):
+    """How well a study agrees with published data: a sentence, and a row of texts for each file; no rows without such data."""
+
+    sentence: str
+    rows: list[list[str]]
+
+
+class Verdict(NamedTuple):
+    """The original's outcome, and the selected failures, the smallest robust failure first."""
+
+    headline: str
+    unsafe: int
+    solutions: int
+    rule: str
+    original: str
+    agreement: Agreement
+    findings: list[Finding]
+    figures: list[KeyFigure]
+
+
+def verdict(data: ReportInput, explained: Explanations | None, tolerance: Mapping[str, Any] | None) -> Verdict:
+    """The verdict on one study."""
+    solutions = data.case.solutions
+    findings = [] if solutions.empty else _findings(data, explained)
+    return Verdict(
+        headline="No solution was found." if solutions.empty else _headline(data, findings, explained),
+        unsafe=sum(data.unsafe_solutions), solutions=len(solutions), rule=_rule(data.case.unsafe), original=_original(data),
+        agreement=agreement_with_published(data), findings=findings,
+        figures=[] if solutions.empty else _figures(data, findings, explained, tolerance))
 
 
 def _rule(unsafe: Unsafe) -> str:
@@ -123,35 +175,28 @@ def _original(data: ReportInput) -> str:
     return f"The original vehicle {data.compared(data.case.characteristics.original).verdict(0)}."
 
 
-def _findings(data: ReportInput, failures: Failures, *, any_unsafe: bool) -> list[dict[str, Any]]:
+def _findings(data: ReportInput, explained: Explanations | None) -> list[Finding]:
     """The selected failures with the reasons for their selection; without explanations, selected only among the solutions."""
-    reasons: dict[str, list[str]] = {}
-    shares: dict[str, float] = {}
-    for failure in failures:
-        for reason in failure.get("reasons", []):
-            if reason in TITLES and handle_of(failure):
-                reasons.setdefault(handle_of(failure), []).append(reason)
-                shares[handle_of(failure)] = failure["robustness"]
+    failures = {failure.handle: failure for failure in explained.failures if failure.handle} if explained else {}
+    reasons = {handle: chosen for handle, failure in failures.items() if (chosen := [name for name in failure.reasons if name in TITLES])}
     if not reasons:
-        for choice in REASONS if any_unsafe else ("most_severe",):
-            handle = chosen_handle(data.case.solutions, data.case.unsafe, choice, data.directory)
-            reasons.setdefault(str(handle), []).append(REASONS[choice])
+        for choice in REASONS if any(data.unsafe_solutions) else ("most_severe",):
+            reasons.setdefault(data.chosen(choice), []).append(REASONS[choice])
     order = list(TITLES)
-    needed = {handle_of(failure): len(failure["minimal_causes"][0]["changes"]) for failure in failures if failure.get("minimal_causes")}
-    chosen = sorted(reasons.items(), key=lambda item: min(order.index(reason) for reason in item[1]))
-    return [{**_finding(data, handle, why, shares.get(handle)), "needed": needed.get(handle)} for handle, why in chosen]
+    ordered = sorted(reasons, key=lambda handle: min(map(order.index, reasons[handle])))
+    return [_finding(data, handle, reasons[handle], failures.get(handle)) for handle in ordered]
 
 
-def _finding(data: ReportInput, handle: str, reasons: list[str], share: float | None) -> dict[str, Any]:
-    setting = data.setting_of(SolutionId.parse(handle))
-    changes = data.changes(setting)
-    largest = float(data.case.characteristics.largest_change(setting[np.newaxis])[0])
-    titles = [TITLES[reason] for reason in TITLES if reason in reasons]
-    return {"title": "; ".join([titles[0], *(title.lower() for title in titles[1:])]), "handle": handle, "reasons": reasons,
-            "anchor": data.anchor("replay", handle), "changes": changes, "end": _end(data, handle, setting),
-            "where": data.where(setting), "share": share, "borderline": share is not None and is_borderline(share),
-            "size": f"{len(changes)} of {len(setting)} characteristics changed, by at most {largest:.0%}",
-            "short": f"{number_of(len(changes), 'change')} of at most {largest:.0%}", "f_safe": data.solutions[handle]["f_safe"]}
+def _finding(data: ReportInput, handle: str, reasons: list[str], failure: FailureEntry | None) -> Finding:
+    setting = data.setting_of(handle)
+    changes, largest = data.changes(setting), float(data.case.characteristics.largest_change(setting[np.newaxis])[0])
+    first, *others = [TITLES[reason] for reason in TITLES if reason in reasons]
+    return Finding(
+        title="; ".join([first, *map(str.lower, others)]), handle=handle, reasons=reasons, anchor=data.anchor("replay", handle),
+        changes=changes, largest=largest, size=f"{len(changes)} of {len(setting)} characteristics changed, by at most {largest:.0%}",
+        end=_end(data, handle, setting), f_safe=data.solutions[handle]["f_safe"], where=data.where(setting),
+        share=failure.robustness if failure else None,
+        needed=len(failure.minimal_causes[0].changes) if failure and failure.minimal_causes else None)
 
 
 def _end(data: ReportInput, handle: str, setting: FloatArray) -> str:
@@ -161,82 +206,81 @@ def _end(data: ReportInput, handle: str, setting: FloatArray) -> str:
     return comparison.verdict(comparison.rows[-1])
 
 
-def _headline(result: Mapping[str, Any], data: ReportInput, failures: Failures | None) -> str:
-    if not result["unsafe"]:
-        return f"None of {result['solutions']} solutions is unsafe; the nearest miss is shown below."
+def _headline(data: ReportInput, findings: Sequence[Finding], explained: Explanations | None) -> str:
+    if not any(data.unsafe_solutions):
+        return f"None of {len(data.case.solutions)} solutions is unsafe; the nearest miss is shown below."
     if data.original_fails:
         return "No change is needed: the original vehicle itself collides."
-    first = result["findings"][0]
-    if first["needed"] == 0:
+    first = findings[0]
+    if first.needed == 0:
         return "No change is needed: the original vehicle itself is unsafe."
-    outcome = "a collision" if result["any_collision"] else "an unsafe outcome"
-    robust = f"{outcome} that is robust" if ROBUST in first["reasons"] else outcome
-    borderline = "Every failure analysed is borderline. The one with the fewest changes: " if failures and robust == outcome else ""
+    outcome = "a collision" if collided(data.case.solutions).any() else "an unsafe outcome"
+    robust = f"{outcome} that is robust" if ROBUST in first.reasons else outcome
+    borderline = "Every failure analysed is borderline. The one with the fewest changes: " if explained and robust == outcome else ""
     now = "simulated with the present files and versions, " if data.changed else ""
-    return f"{borderline}{_changes_lead_to(first, robust)}: {now}the vehicle {first['end']}."
+    return f"{borderline}{_changes_lead_to(first, robust)}: {now}the vehicle {first.end}."
 
 
-def _changes_lead_to(finding: Mapping[str, Any], outcome: str) -> str:
+def _changes_lead_to(finding: Finding, outcome: str) -> str:
     """Such as `10 changes lead to a collision (3 of them suffice)`; only for an explained failure is it known how many suffice."""
-    number, needed = len(finding["changes"]), finding["needed"]
+    number, needed = len(finding.changes), finding.needed
     if number == needed:
         return f"{number_of(number, 'change')} suffice{'s' if number == 1 else ''} for {outcome}"
     some = "" if needed is None else f" ({needed} of them suffice{'s' if needed == 1 else ''} to be unsafe)"
     return f"{number_of(number, 'change')} lead{'s' if number == 1 else ''} to {outcome}{some}"
 
 
-def _figures(result: Mapping[str, Any], data: ReportInput, failures: Failures,
-             tolerance: Mapping[str, Any] | None) -> list[dict[str, str]]:
-    """The four key figures, each a title, a value and a note."""
-    by_reason = {reason: finding for finding in result["findings"] for reason in finding["reasons"]}
-    preventable = next((one["summary"].get("preventable") for one in failures if "summary" in one), None)
-    return [_smallest(by_reason.get(ROBUST), failures, result), _severity(by_reason.get(REASONS["most_severe"]), data),
-            _avoided(preventable, result), _together(tolerance)]
+def _figures(data: ReportInput, findings: Sequence[Finding], explained: Explanations | None,
+             tolerance: Mapping[str, Any] | None) -> list[KeyFigure]:
+    """The four key figures."""
+    by_reason = {reason: finding for finding in findings for reason in finding.reasons}
+    return [_smallest(by_reason.get(ROBUST), explained, data), _severity(by_reason.get(REASONS["most_severe"]), data),
+            _avoided(explained.summary.preventable if explained else None, data), _together(tolerance)]
 
 
-def _smallest(robust: Mapping[str, Any] | None, failures: Failures, result: Mapping[str, Any]) -> dict[str, str]:
-    title = TITLES[ROBUST]
+def _smallest(robust: Finding | None, explained: Explanations | None, data: ReportInput) -> KeyFigure:
     if robust is None:
-        reason = "every failure analysed is borderline" if failures else "not computed"
-        note = reason if result["unsafe"] else "no solution is unsafe"
-        return {"title": title, "value": UNKNOWN, "note": note}
-    return {"title": title, "value": robust["short"], "note": f"{robust['share']:.0%} of its neighbours are unsafe too"}
+        reason = "every failure analysed is borderline" if explained else "not computed"
+        return KeyFigure(TITLES[ROBUST], UNKNOWN, reason if any(data.unsafe_solutions) else "no solution is unsafe")
+    return KeyFigure(TITLES[ROBUST], f"{number_of(len(robust.changes), 'change')} of at most {robust.largest:.0%}",
+                     f"{robust.share:.0%} of its neighbours are unsafe too")
 
 
-def _severity(worst: Mapping[str, Any] | None, data: ReportInput) -> dict[str, str]:
-    degree = float(data.case.solutions["f_safe"].min()) if worst is None else worst["f_safe"]
+def _severity(worst: Finding | None, data: ReportInput) -> KeyFigure:
+    degree = float(data.case.solutions["f_safe"].min()) if worst is None else worst.f_safe
     if degree < 0:
-        return {"title": "Most severe", "value": f"collision at {-degree:.1f} m/s", "note": f"{-KMH_PER_MS * degree:.0f} km/h"}
-    return {"title": "Most severe", "value": f"{degree:.2f} m to spare", "note": "no collision among the solutions"}
+        return KeyFigure("Most severe", f"collision at {-degree:.1f} m/s", f"{-KMH_PER_MS * degree:.0f} km/h")
+    return KeyFigure("Most severe", f"{degree:.2f} m to spare", "no collision among the solutions")
 
 
-def _avoided(preventable: Mapping[str, Any] | None, result: Mapping[str, Any]) -> dict[str, str]:
+def _avoided(preventable: PreventedShares | None, data: ReportInput) -> KeyFigure:
     title = "A competent driver avoids"
-    if preventable is None or preventable["competent_driver"] is None:
-        return {"title": title, "value": UNKNOWN, "note": "not computed" if result["any_collision"] else "there is no collision to avoid"}
-    low, high = preventable["interval_competent_driver"]
+    if preventable is None or preventable.competent_driver is None or preventable.interval_competent_driver is None:
+        any_collision = collided(data.case.solutions).any()
+        return KeyFigure(title, UNKNOWN, "not computed" if any_collision else "there is no collision to avoid")
+    low, high = preventable.interval_competent_driver
     sampled = "all" if low == high else f"95 % interval {low:.0%} to {high:.0%};"
-    note = f"in the same vehicle ({sampled} {preventable['looked_at']} collisions analysed)"
-    return {"title": title, "value": f"{preventable['competent_driver']:.0%} of the collisions", "note": note}
+    return KeyFigure(title, f"{preventable.competent_driver:.0%} of the collisions",
+                     f"in the same vehicle ({sampled} {preventable.looked_at} collisions analysed)")
 
 
-def _together(tolerance: Mapping[str, Any] | None) -> dict[str, str]:
+def _together(tolerance: Mapping[str, Any] | None) -> KeyFigure:
     title = "All characteristics together may go"
     if tolerance is None:
-        return {"title": title, "value": UNKNOWN, "note": "not computed"}
+        return KeyFigure(title, UNKNOWN, "not computed")
     factor, samples = tolerance["joint"]["factor"], tolerance["joint"]["samples"]
     if not factor:
-        return {"title": title, "value": "nowhere", "note": "no box around the original is safe"}
-    return {"title": title, "value": f"{factor:.1%} of the way",
-            "note": f"from the original to the ends of their domains; none of {samples} vehicles sampled there is unsafe"}
+        return KeyFigure(title, "nowhere", "no box around the original is safe")
+    return KeyFigure(title, f"{factor:.1%} of the way",
+                     f"from the original to the ends of their domains; none of {samples} vehicles sampled there is unsafe")
 
 
-def agreement_with_published(data: ReportInput) -> dict[str, Any]:
-    """How well the study agrees with published data: a sentence, and the rows of a table; no rows without such data."""
+def agreement_with_published(data: ReportInput) -> Agreement:
+    """How well the study agrees with published data."""
     totals = quoted(data.case.study)
     if not totals:
-        return {"sentence": "This study was not compared with published data: how far another simulator or a real vehicle does the same "
-                            "is unknown.", "rows": []}
+        return Agreement("This study was not compared with published data: how far another simulator or a real vehicle does the same "
+                         "is unknown.", [])
     first = max(totals, key=lambda one: (one.reference, one.rows))
     shares = "no published collision is among them" if first.recall is None else (
         f"{first.both} of the {first.reference} published collisions collide here too (recall {first.recall:.2f})")
@@ -244,17 +288,17 @@ def agreement_with_published(data: ReportInput) -> dict[str, Any]:
         shares += f", and {first.both} of the {first.here} collisions here are published ones (precision {first.precision:.2f})"
     rho = first.spearman.get(SAFETY_DEGREE)
     order = "" if rho is None else f" safety degrees are in the same order with a rank correlation of {rho:.2f} (1 is perfect);"
-    return {"sentence": f"Agreement with published data, {first.rows} vehicles simulated again:{order} {shares}.",
-            "rows": [_row(one) for one in totals]}
+    return Agreement(f"Agreement with published data, {first.rows} vehicles simulated again:{order} {shares}.", list(map(_row, totals)))
 
 
-def _row(totals: Totals) -> dict[str, str]:
+def _row(totals: Totals) -> list[str]:
+    """File, vehicles, rank correlation, mean error, collisions published, here and in both, recall, precision."""
     def decimal(value: float | None) -> str:
         return UNKNOWN if value is None else f"{value:.2f}"
 
-    return {"file": totals.file, "vehicles": str(totals.rows), "rho": decimal(totals.spearman.get(SAFETY_DEGREE)),
-            "error": decimal(totals.mean_absolute_error.get(SAFETY_DEGREE)), "reference": str(totals.reference), "here": str(totals.here),
-            "both": str(totals.both), "recall": decimal(totals.recall), "precision": decimal(totals.precision)}
+    quality = totals.spearman.get(SAFETY_DEGREE), totals.mean_absolute_error.get(SAFETY_DEGREE)
+    return [totals.file, str(totals.rows), *map(decimal, quality), *map(str, (totals.reference, totals.here, totals.both)),
+            *map(decimal, (totals.recall, totals.precision))]
 
 
 NOT_MODELLED = (
@@ -265,11 +309,25 @@ NOT_MODELLED = (
 )
 
 
-def trust(data: ReportInput, failures: Failures | None) -> dict[str, Any]:
+class Trust(NamedTuple):
+    """The limits of one study's findings, and its agreement with published data.
+
+    `published` are metrics of the original vehicle: name, published value, value here. `spread` are names of vehicles, their safety
+    degrees here, and those with the study's other parameter sets.
+    """
+
+    general: Sequence[str]
+    remarks: list[str]
+    published: list[tuple[str, float, float]]
+    agreement: list[list[str]]
+    spread: list[tuple[str, float, ModelSpread]]
+
+
+def trust(data: ReportInput, explained: Explanations | None) -> Trust:
     """The limits of one study's findings, and its agreement with published data."""
     case = data.case
-    rows = [{"name": name, "published": case.study.published[name], "here": case.original[name]}
-            for name in METRICS if name in case.study.published and not math.isnan(case.original[name])]
+    published = [(name, case.study.published[name], case.original[name])
+                 for name in METRICS if name in case.study.published and not math.isnan(case.original[name])]
     remarks = []
     failed = int((case.evaluations["outcome"] == str(Outcome.SIMULATOR_ERROR)).sum())
     if failed:
@@ -278,31 +336,26 @@ def trust(data: ReportInput, failures: Failures | None) -> dict[str, Any]:
     if invalid:
         remarks.append(f"{invalid} of {len(case.evaluations)} settings left the tolerance of a test's speed before the driving system "
                        "acted: they are neither failures nor successes.")
-    if failures:
-        shares = [failure["robustness"] for failure in failures if failure.get("robustness") is not None]
-        if shares:
-            fragile = sum(map(is_borderline, shares))
-            remarks.append(f"{fragile} of {len(shares)} failures analysed are borderline: "
-                        f"fewer than {BORDERLINE:.0%} of their neighbours are unsafe too.")
-    if not rows:
+    if explained and explained.failures:
+        borderline = sum(is_borderline(failure.robustness) for failure in explained.failures)
+        remarks.append(f"{borderline} of {len(explained.failures)} failures analysed are borderline: "
+                       f"fewer than {BORDERLINE:.0%} of their neighbours are unsafe too.")
+    if not published:
         remarks.append("There are no published values of the original vehicle to compare the study with.")
-    return {"published": rows, "remarks": remarks, "general": NOT_MODELLED, "agreement": agreement_with_published(data)["rows"],
-            "spread": own_uncertainty(data)}
+    return Trust(NOT_MODELLED, remarks, published, agreement_with_published(data).rows, own_uncertainty(data))
 
 
-def own_uncertainty(data: ReportInput) -> list[dict[str, Any]]:
+def own_uncertainty(data: ReportInput) -> list[tuple[str, float, ModelSpread]]:
     """Results of the original vehicle and of the first solutions with the study's other parameter sets; empty without such sets."""
     case = data.case
     if not case.study.spread or data.system is None:
         return []
-    unsafe = not case.solutions.empty and case.unsafe.rows(case.solutions).any()
-    chosen = [str(chosen_handle(case.solutions, case.unsafe, choice, data.directory)) for choice in FIRST] if unsafe else []
-    handles = list(dict.fromkeys(chosen))
-    settings = [case.characteristics.original, *(data.setting_of(SolutionId.parse(handle)) for handle in handles)]
+    handles = list(dict.fromkeys(map(data.chosen, FIRST))) if any(data.unsafe_solutions) else []
+    settings = [case.characteristics.original, *map(data.setting_of, handles)]
 
     def compute() -> list[dict[str, Any]]:
         return [one.to_dict() for one in model_spreads(case.study, np.stack(settings), data.point)]
 
-    here = [case.original[SAFETY_DEGREE], *(data.solutions[handle]["f_safe"] for handle in handles)]
-    return [{"name": name, "here": value, **one} for name, value, one in zip(
-        ("original vehicle", *handles), here, stored_answer(data, "spread", compute), strict=True)]
+    spreads = msgspec.convert(stored_answer(data, "spread", compute), list[ModelSpread])
+    degrees = [case.original[SAFETY_DEGREE], *(data.solutions[handle]["f_safe"] for handle in handles)]
+    return list(zip(("original vehicle", *handles), degrees, spreads, strict=True))

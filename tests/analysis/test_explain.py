@@ -183,7 +183,7 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
     largest = max((member for member in members if member.name in fewest.changed),
                   key=lambda member: abs(fewest.setting[member.name] / member.original - 1))
     assert f"{largest.short_name} {100 * (fewest.setting[largest.name] / largest.original - 1):+.0f} %" in paragraph
-    share = explained.preventability.to_dict()["competent_driver"]
+    share = explained.preventability.shares.competent_driver
     assert f"a competent driver avoids {100 * share:.0f} %" in paragraph
 
 

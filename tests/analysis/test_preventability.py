@@ -57,12 +57,12 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     """Of 60 collisions, the 40 of the lowest engine speeds are the brakeless ones: those that come first when settings are sorted."""
     collisions = np.stack([vehicle(0.1, 1 - (60 - k) / 1e6) for k in range(40)] + [vehicle(1.0, 1 - k / 1e6) for k in range(20)])
     here = evaluator(test="CPFA", speed=30)
-    whole = preventability(here, np.concatenate([collisions, collisions])).to_dict()
+    whole = msgspec.structs.asdict(preventability(here, np.concatenate([collisions, collisions])).shares)
     assert whole == {"competent_driver": pytest.approx(1 / 3), "full_braking": 0, "nobody": pytest.approx(2 / 3), "looked_at": 60,
                      "interval_competent_driver": [pytest.approx(1 / 3)] * 2}
-    sample = preventability(here, collisions, limit=60).to_dict()
+    sample = msgspec.structs.asdict(preventability(here, collisions, limit=60).shares)
     assert sample["looked_at"] == 30
-    assert sample == preventability(here, collisions[::-1], limit=60).to_dict()
+    assert sample == msgspec.structs.asdict(preventability(here, collisions[::-1], limit=60).shares)
     hits = round(sample["competent_driver"] * 30)
     expected = scipy.stats.beta.ppf(0.025, hits, 31 - hits), scipy.stats.beta.ppf(0.975, hits + 1, 30 - hits)
     assert sample["interval_competent_driver"] == pytest.approx(expected)

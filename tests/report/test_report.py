@@ -18,7 +18,8 @@ import pytest
 from click.testing import CliRunner
 
 from safevar_sumo.ads.full_braking import FullBraking
-from safevar_sumo.analysis.explain.result import Explained
+from safevar_sumo.analysis.explain.result import Explained, FailureEntry, SummaryEntry
+from safevar_sumo.analysis.preventability import PreventedShares
 from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
@@ -26,6 +27,7 @@ from safevar_sumo.replay.comparison import changes_in_words
 from safevar_sumo.report import SECTIONS, findings, make_report
 from safevar_sumo.report import input as report_input
 from safevar_sumo.report import verdict as what
+from safevar_sumo.report.findings import Explanations
 from safevar_sumo.report.input import AVOIDED, failing_places, stored_answer
 from safevar_sumo.report.limits import LIMITS, _percent
 from safevar_sumo.report.page import PARTS, read_inputs
@@ -155,29 +157,26 @@ def test_the_verdict_leads_with_the_robust_failure_and_calls_the_others_borderli
         slippery: Path, tmp_path: Path, explained: Explained) -> None:
     """The values beside it are those of its solution: no number is another one further down."""
     (data,) = read_inputs([shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))])
-    fewest, robust = explained.to_dict()[:1] * 2
+    *entries, last = explained.to_dict()
+    summary = msgspec.structs.replace(msgspec.convert(last["summary"], SummaryEntry), preventable=PreventedShares(
+        competent_driver=0.14, full_braking=0.1, nobody=0.76, looked_at=40, interval_competent_driver=[0.05, 0.29]))
     failing = [row for row in data.solutions.values() if row["outcome"] == "collision"]
-    fewest = fewest | {"reasons": ["fewest changes"], "robustness": 0.79}
-    robust = robust | {"reasons": ["smallest robust"], "robustness": 0.81}
-    for record, row in zip((fewest, robust), failing, strict=False):
-        algorithm, run, index = row["handle"].split(":")
-        record |= {"algorithm": algorithm, "run": int(run), "index": int(index)}
-    summary = {"summary": {"preventable": {"competent_driver": 0.14, "full_braking": 0.1, "nobody": 0.76, "looked_at": 40,
-                                           "interval_competent_driver": [0.05, 0.29]}}}
-    result = verdict(data, [fewest, robust, summary], {"joint": {"factor": 0.42, "samples": 1024}})
-    assert [(one["title"], one["borderline"]) for one in result["findings"]] == [
-        ("Smallest robust failure", False), ("Fewest changes", True)]
-    first = result["findings"][0]
-    setting = data.setting_of(SolutionId.parse(first["handle"]))
-    assert [one["text"] for one in first["changes"]] == changes_in_words(data.case.characteristics, setting)
-    number, needed = len(first["changes"]), len(robust["minimal_causes"][0]["changes"])
+    entry = msgspec.convert(entries[0], FailureEntry)
+    fewest, robust = (msgspec.structs.replace(
+        entry, reasons=[reason], robustness=share, **dict(zip(("algorithm", "run", "index"), SolutionId.parse(row["handle"]), strict=True)))
+        for reason, share, row in zip(("fewest changes", "smallest robust"), (0.79, 0.81), failing, strict=False))
+    result = verdict(data, Explanations([fewest, robust], summary), {"joint": {"factor": 0.42, "samples": 1024}})
+    assert [(one.title, one.borderline) for one in result.findings] == [("Smallest robust failure", False), ("Fewest changes", True)]
+    first = result.findings[0]
+    assert [one.text for one in first.changes] == changes_in_words(data.case.characteristics, data.setting_of(first.handle))
+    number, needed = len(first.changes), len(robust.minimal_causes[0].changes)
     assert 0 < needed < number, "or the next line tells nothing"
-    assert result["headline"].startswith(f"{number} changes lead to a collision that is robust ({needed} of them suffice")
-    robust["minimal_causes"] = [{"changes": {one["text"]: 1.0 for one in first["changes"]}}]
-    every = verdict(data, [fewest, robust, summary], None)["headline"]
+    assert result.headline.startswith(f"{number} changes lead to a collision that is robust ({needed} of them suffice")
+    all_changes = msgspec.structs.replace(robust.minimal_causes[0], changes={one.text: 1.0 for one in first.changes})
+    every = verdict(data, Explanations([fewest, msgspec.structs.replace(robust, minimal_causes=[all_changes])], summary), None).headline
     assert every.startswith(f"{number} changes suffice for a collision that is robust: the vehicle collides")
-    assert [one["value"] for one in result["figures"][2:]] == ["14% of the collisions", "42.0% of the way"]
-    assert result["figures"][0]["value"].startswith(f"{len(first['changes'])} changes")
+    assert [one.value for one in result.figures[2:]] == ["14% of the collisions", "42.0% of the way"]
+    assert result.figures[0].value.startswith(f"{number} changes")
 
 
 @pytest.mark.slow
@@ -309,15 +308,15 @@ def test_tests_and_weathers_stand_down_and_speeds_across() -> None:
               point("along 30", test="along", speed=30, weather="clear"), point("along 40", test="along", speed=40, weather="clear"),
               point("safe 10", test="safe", speed=10, weather="clear")]
     result = failing_places(matrix, ("near 20 50", "near 30 25", "near 30 50", "along 40"))
-    assert result["summary"] == "Fails at 4 of 9 points. Percentages are impact locations."
-    assert result["heads"] == ["10 km/h", "20 km/h", "30 km/h", "40 km/h"]
-    assert dict(result["rows"]) == {"near, night": [AVOIDED, "50 %", "25 %, 50 %", ""], "along, clear": ["", "", AVOIDED, "fails"]}
+    assert result.summary == "Fails at 4 of 9 points. Percentages are impact locations."
+    assert result.heads == ["10 km/h", "20 km/h", "30 km/h", "40 km/h"]
+    assert dict(result.rows) == {"near, night": [AVOIDED, "50 %", "25 %, 50 %", ""], "along, clear": ["", "", AVOIDED, "fails"]}
 
 
 def test_a_matrix_of_something_else_than_speeds_has_a_table_too() -> None:
     result = failing_places([point("a", test="a", weather="fog", slope=0.1), point("b", test="b", weather="fog")], ["a"])
-    assert (result["heads"], result["rows"]) == ([""], [("a, fog, slope 0.1", ["fails"])])
-    assert failing_places([point("b", test="b", weather="fog")], [])["rows"] == []
+    assert (result.heads, result.rows) == ([""], [("a, fog, slope 0.1", ["fails"])])
+    assert failing_places([point("b", test="b", weather="fog")], []).rows == []
 
 
 def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path: Path) -> None:
@@ -335,14 +334,15 @@ def test_a_study_that_cannot_be_simulated_has_its_page(slippery: Path, tmp_path:
 
 @pytest.mark.slow
 def test_of_an_original_that_collides_no_change_is_called_the_cause(
-        slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        slippery: Path, tmp_path: Path, explained: Explained, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(slippery, tmp_path / "copy", ignore=shutil.ignore_patterns("answers"))
     manifest = json.loads((slippery / "manifest.json").read_text())
     manifest["original"] |= {"outcome": "collision", "collision": True, "collision_speed": 3.9, "safety_degree": -3.9, "f_safe": -3.9}
     write_manifest(tmp_path / "copy", manifest)
     empty = {"changes": {}, "boundary": {}, "fraction": 0.0, "end": "safe", "outcome": "collision", "safety_degree": -3.9}
-    failure = {"algorithm": "nsga2", "run": 0, "index": 0, "minimal_causes": [empty], "robustness": 1.0, "because": "it collides anyhow"}
-    monkeypatch.setattr(findings, "explain", lambda *_, **__: SimpleNamespace(to_dict=lambda: [failure]))
+    failure, *_, summary = explained.to_dict()
+    monkeypatch.setattr(findings, "explain", lambda *_, **__: SimpleNamespace(
+        to_dict=lambda: [failure | {"minimal_causes": [empty]}, summary]))
     page = make_report([tmp_path / "copy"], only=["verdict", "causes"], jobs=1)
     assert "No change is needed: the original vehicle itself collides." in page
     assert "No change is a cause" in page
@@ -357,9 +357,9 @@ def test_what_comes_from_outside_is_called_by_its_name_once(slippery: Path) -> N
     others: Any = SimpleNamespace(case=dataclasses.replace(data.case, study=study), manifest=data.manifest, problem="", point="",
                                   system=SimpleNamespace(points=points, matrix=(), vehicle=None))
     result = what.tested(others)
-    assert "Driving system: my_controller:Pilot. Scenario: pedestrian_crossing (" in result["subject"]
-    assert "NSGA-II (1 run)" in result["search"]
-    assert not result["tags"]
+    assert "Driving system: my_controller:Pilot. Scenario: pedestrian_crossing (" in result.subject
+    assert "NSGA-II (1 run)" in result.search
+    assert not result.tags
 
 
 def test_an_estimate_stands_beside_its_error_and_just_below_nothing_it_is_nothing() -> None:

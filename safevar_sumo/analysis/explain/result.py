@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
 import pandas as pd
 
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
 from safevar_sumo.analysis.explain.causes import End
 from safevar_sumo.analysis.explain.necessity import Robustness
-from safevar_sumo.analysis.preventability import Preventability
+from safevar_sumo.analysis.preventability import Preventability, PreventedShares
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import SolutionId
@@ -20,6 +22,51 @@ from safevar_sumo.vehicles import CharacteristicSet
 ROBUST = "smallest robust"
 REASONS = {"fewest": "fewest changes", "smallest": "smallest changes", "most_severe": "most severe"}
 """Reasons for the choice of a failure, as in JSON."""
+
+
+class CauseEntry(msgspec.Struct, frozen=True, kw_only=True):
+    """A minimal cause in the JSON of `explain`; fields as in `Cause`."""
+
+    changes: dict[str, float]
+    boundary: dict[str, float]
+    fraction: float
+    outcome: str
+    safety_degree: float | None
+    end: End
+
+
+class FailureEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """A failure in the JSON of `explain`: its handle in three keys, None if it is no solution; other fields as in `Explanation`.
+
+    `robustness` is the unsafe share of its neighbours, `because` a sentence.
+    """
+
+    algorithm: str | None
+    run: int | None
+    index: int | None
+    setting: dict[str, float]
+    outcome: str
+    safety_degree: float | None
+    changed: list[str]
+    minimal_causes: list[CauseEntry]
+    robustness: float
+    because: str
+    reasons: list[str]
+    points: list[str] = []
+
+    @property
+    def handle(self) -> str:
+        """The handle of the solution; empty if it is no solution."""
+        return "" if self.algorithm is None else f"{self.algorithm}:{self.run}:{self.index}"
+
+
+class SummaryEntry(msgspec.Struct, frozen=True, kw_only=True):
+    """The last entry in the JSON of `explain`: shares of the analysed failures by characteristic, and 95 % intervals of `necessary`."""
+
+    necessary: dict[str, float]
+    changed: dict[str, float]
+    necessary_interval: dict[str, list[float]]
+    preventable: PreventedShares
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,15 +128,13 @@ class Explanation:
 
     def to_dict(self) -> dict[str, Any]:
         """An entry of `explain --json`."""
-        return {
-            "algorithm": self.handle.algorithm if self.handle else None, "run": self.handle.run if self.handle else None,
-            "index": self.handle.row if self.handle else None, "setting": self.setting, "outcome": self.outcome,
-            SAFETY_DEGREE: self.safety_degree, "changed": list(self.changed),
-            "minimal_causes": [
-                {name: getattr(cause, name) for name in ("changes", "boundary", "fraction", "outcome", "safety_degree", "end")}
-                for cause in self.causes],
-            "robustness": self.robustness.share, "because": sentence(self.because),
-            "reasons": list(self.reasons), **({"points": list(self.points)} if self.points else {})}
+        algorithm, run, index = self.handle or (None, None, None)
+        entry = FailureEntry(
+            algorithm=algorithm, run=run, index=index, setting=self.setting, outcome=self.outcome, safety_degree=self.safety_degree,
+            changed=list(self.changed),
+            minimal_causes=[CauseEntry(**{name: getattr(cause, name) for name in CauseEntry.__struct_fields__}) for cause in self.causes],
+            robustness=self.robustness.share, because=sentence(self.because), reasons=list(self.reasons), points=list(self.points))
+        return dict(msgspec.to_builtins(entry))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,11 +169,14 @@ class Explained:
 
     def to_dict(self) -> list[dict[str, Any]]:
         """The JSON of `explain`: a list with an entry for each explained failure, and a summary."""
-        frame = self.necessity.set_index("characteristic")
-        shares: dict[str, Any] = {name: frame[name].to_dict() for name in ("necessary", "changed")}
-        shares["necessary_interval"] = {name: list(ends) for name, *ends in frame[["necessary_lower", "necessary_upper"]].itertuples()}
-        summary = {**shares, "preventable": self.preventability.to_dict()}
-        return [*(failure.to_dict() for failure in self.explanations), {"summary": summary}]
+        def columns(*names: str) -> Iterable[Any]:
+            return self.necessity[["characteristic", *names]].itertuples(index=False)
+
+        summary = SummaryEntry(
+            necessary=dict(columns("necessary")), changed=dict(columns("changed")),
+            necessary_interval={name: ends for name, *ends in columns("necessary_lower", "necessary_upper")},
+            preventable=self.preventability.shares)
+        return [*(failure.to_dict() for failure in self.explanations), {"summary": msgspec.to_builtins(summary)}]
 
     def __repr__(self) -> str:
         return f"<Explained {self.study.name}, unsafe {self.unsafe}: {self.failures} of {self.looked_at}, {len(self.explanations)} in full>"
