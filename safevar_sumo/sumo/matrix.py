@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import fields, replace
 from difflib import SequenceMatcher
 from typing import Any, NamedTuple
@@ -133,8 +133,7 @@ def in_cells(system: System, settings: FloatArray, part: tuple[int, int], engine
 
 def settings_per_batch(system: System, engine: Engine) -> int:
     """Number of settings of an efficient batch."""
-    recorded = engine is Engine.RECORDED and not reason_for_sumo(system)
-    return max(largest_batch(system) // len(system.points), LARGEST_WORLD) if recorded else LARGEST_WORLD
+    return max(largest_batch(system) // len(system.points), LARGEST_WORLD) if _is_recorded(system, engine) else LARGEST_WORLD
 
 
 def largest_batch(system: System) -> int:
@@ -142,9 +141,14 @@ def largest_batch(system: System) -> int:
     return min(LARGEST_BATCH, *(getattr(model, "most_vehicles", LARGEST_BATCH) for model in (system.vehicle, system.ads)))
 
 
+def _is_recorded(system: System, engine: Engine) -> bool:
+    """Whether the vehicles drive in recorded scenes, and not in SUMO."""
+    return engine is Engine.RECORDED and not reason_for_sumo(system)
+
+
 def _most_vehicles(system: System, engine: Engine) -> int:
     """Largest number of vehicles of one simulation: in recorded scenes, or in copies of the largest network."""
-    if engine is Engine.RECORDED and not reason_for_sumo(system):
+    if _is_recorded(system, engine):
         return largest_batch(system)
     lanes = max(lanes_of(network) for network in {point.scenario.network for point in system.points})
     return min(max(LARGEST_ROADS // max(lanes, 1), 1), LARGEST_WORLD, largest_batch(system))
@@ -189,14 +193,14 @@ def at_every_point(system: System, settings: FloatArray, engine: Engine = Engine
 def _groups(system: System, settings: FloatArray, engine: Engine, options: tuple[str, ...] = ()) -> Iterator[list[AtPoint]]:
     """Settings at every point, in groups of points that are simulated together."""
     n = len(settings)
-    recorded = engine is Engine.RECORDED and not reason_for_sumo(system)
-    most, all_options = largest_batch(system) // max(n, 1), (*step_options(system), *options)
-    for points in _together(system.points, most, all_options) if recorded else ((point,) for point in system.points):
+    groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
+    if _is_recorded(system, engine):
+        groups = _together(system.points, largest_batch(system) // max(n, 1), (*step_options(system), *options))
+    for points in groups:
         runs = drive_all(replace(system, matrix=points), settings, engine, options)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
-        parts = [slice(k * n, (k + 1) * n) for k in range(len(points))]
-        yield [AtPoint(point, evaluations.take(np.arange(rows.start, rows.stop)), runs.of(rows))
-               for point, rows in zip(points, parts, strict=True)]
+        yield [AtPoint(point, evaluations.take(np.arange(first, first + n)), runs.of(slice(first, first + n)))
+               for point, first in zip(points, range(0, len(points) * n, n), strict=True)]
 
 
 def at_worst(system: System, settings: FloatArray) -> System:
@@ -207,20 +211,18 @@ def at_worst(system: System, settings: FloatArray) -> System:
 
 
 def named_point(system: System, name: str, source: object) -> System:
-    """The system at a named point of a matrix.
-
-    Raises
-    ------
-    InputError
-        If there is no point of that name.
-    """
-    for point in system.matrix:
-        if point.name == name:
-            return system.at(point)
-    raise InputError(source, repr(name), _nearest(name, [point.name for point in system.matrix]))
+    """The system at a named point of a matrix; raises the errors of `study_at`."""
+    return system.at(_point(system, name, source))
 
 
-def _nearest(name: str, names: Sequence[str]) -> str:
+def _point(system: System, name: str, source: object) -> Point:
+    points = {point.name: point for point in system.matrix}
+    if name not in points:
+        raise InputError(source, repr(name), _similar(name, list(points)))
+    return points[name]
+
+
+def _similar(name: str, names: Sequence[str]) -> str:
     """Points similar to an unknown name: those that share most of its parts, then the most similar ones."""
     if not names:
         return "a study with a matrix"
@@ -231,13 +233,18 @@ def _nearest(name: str, names: Sequence[str]) -> str:
 
 
 def study_at(study: Study, name: str, source: object) -> Study:
-    """The study reduced to a named point of its matrix; raises the errors of `named_point`."""
+    """The study reduced to a named point of its matrix.
+
+    Raises
+    ------
+    InputError
+        If there is no point of that name.
+    """
     system = assemble(study)
-    named_point(system, name, source)
+    place = dict(_point(system, name, source).place)
     assert study.matrix is not None
     if system.rater is not None:
-        return in_some_cells(study, system.weather, [next(k for k, point in enumerate(system.matrix) if point.name == name)])
-    place = dict(next(point for point in system.matrix if point.name == name).place)
+        return in_some_cells(study, system.weather, [[point.name for point in system.matrix].index(name)])
     title, weather = place.pop("test"), place.pop("weather")
     test = next(row for row in study.matrix.tests
                 if row.name == title and row.over.keys() == place.keys() and all(value in row.over[key] for key, value in place.items()))
@@ -276,24 +283,21 @@ def _selected_runs(runs_at_points: Sequence[SimulationRuns], number: npt.NDArray
     """For every vehicle one of several runs; shorter runs repeat their last sample, marked as inactive."""
     length, columns = max(len(runs.trace.time) for runs in runs_at_points), np.arange(len(number))
 
-    def select_samples(values: list[np.ndarray]) -> np.ndarray:
+    def select_samples(values: Sequence[np.ndarray]) -> np.ndarray:
         padded = [np.concatenate([samples, np.repeat(samples[-1:], length - len(samples), axis=0)]) for samples in values]
         return np.stack(padded)[number, :, columns].T
 
-    longest = max((runs.trace for runs in runs_at_points), key=lambda trace: len(trace.time))
-    def select(values: list[np.ndarray]) -> np.ndarray:
+    def select(values: Iterable[np.ndarray]) -> np.ndarray:
         return np.stack([np.broadcast_to(column, number.shape) for column in values])[number, columns]
 
+    longest = max((runs.trace for runs in runs_at_points), key=lambda trace: len(trace.time))
     names = [field.name for field in fields(Trace) if np.ndim(getattr(longest, field.name)) == 2]
     columns_of: dict[str, Any] = {name: select_samples([getattr(runs.trace, name) for runs in runs_at_points]) for name in names}
     trace = replace(longest, **columns_of)
     ended = np.array([len(runs.trace.time) for runs in runs_at_points])[number]
     active = trace.active & (np.arange(length)[:, np.newaxis] < ended)
-    encounters = zip(*(runs.encounter for runs in runs_at_points), strict=True)
-    return SimulationRuns(
-        trace=replace(trace, active=active), encounter=Encounter._make(select_samples(list(values)) for values in encounters),
-        outcome=select([runs.outcome for runs in runs_at_points]),
-        collision_speed=select([runs.collision_speed for runs in runs_at_points]),
-        contact=Contact._make(select(list(values)) for values in zip(*(runs.contact for runs in runs_at_points), strict=True)),
-        test_speed_error=select([runs.test_speed_error for runs in runs_at_points]),
-        warning_ttc=select([runs.warning_ttc for runs in runs_at_points]))
+    encounters, contacts = ([*zip(*(getattr(runs, name) for runs in runs_at_points), strict=True)] for name in ("encounter", "contact"))
+    by_vehicle: dict[str, Any] = {name: select(getattr(runs, name) for runs in runs_at_points)
+                                  for name in ("outcome", "collision_speed", "test_speed_error", "warning_ttc")}
+    return SimulationRuns(trace=replace(trace, active=active), encounter=Encounter._make(map(select_samples, encounters)),
+                          contact=Contact._make(map(select, contacts)), **by_vehicle)

@@ -37,13 +37,13 @@ class Meetings:
         self._sample, self._approached = 0, np.zeros(world.n, dtype=bool)
 
     @classmethod
-    def of(cls, scenarios: Sequence[Scenario], parts: Sequence[RecordedWorld], world: RecordedWorld, size: int) -> Meetings | None:
-        """The meetings in the parts of a world; None unless all scenarios have a target that does not react, and the same lane."""
+    def of(cls, scenarios: Sequence[Scenario], world: RecordedWorld, size: int) -> Meetings | None:
+        """The meetings in the scenes of a world; None unless all scenarios have a target that does not react, and the same lane."""
         if not all(isinstance(scenario, TargetTest) for scenario in scenarios):
             return None
-        samples = [part.samples() for part in parts]
-        meetings, targets = zip(*(scenario.at_all_samples(part, scene, world.step_length)  # type: ignore[attr-defined]
-                                  for scenario, part, scene in zip(scenarios, parts, samples, strict=True)), strict=True)
+        samples = [scene.samples() for scene in world.scenes]
+        meetings, targets = zip(*(scenario.at_all_samples(*scene, world.step_length)  # type: ignore[attr-defined]
+                                  for scenario, *scene in zip(scenarios, world.scenes, samples, strict=True)), strict=True)
         frames = {meeting.frame for meeting in meetings}
         return cls(frames.pop(), [meeting.course for meeting in meetings], targets, samples, world, size) if len(frames) == 1 else None
 

@@ -46,16 +46,16 @@ class PointBatch:
         self._size = size = n // len(points)
         self._points, self._step = points, world.step_length
         self._rows = [slice(k * size, (k + 1) * size) for k in range(len(points))]
-        self._worlds = [world] if len(points) == 1 else [world.part(rows.start, size) for rows in self._rows]
+        self._recorded, self._scenes, self._memories = isinstance(world, RecordedWorld), list[Scene](), list[Any]()
+        self._worlds = world.scenes if self._recorded else [world]
         weathers = [point.weather for point in points]
         self._perceptions = [(Perception(weather, self._step), np.repeat([other == weather for other in weathers], size).nonzero()[0])
                              for k, weather in enumerate(weathers) if weather not in weathers[:k]]
         self._order = np.argsort(np.concatenate([rows for _, rows in self._perceptions]))
-        self._recorded, self._scenes, self._memories = isinstance(world, RecordedWorld), list[Scene](), list[Any]()
         self.last = np.repeat([round(point.scenario.duration / self._step) for point in points], size)
-        self._meetings = Meetings.of([point.scenario for point in points], self._worlds, world, size) if self._recorded else None
+        self._meetings = Meetings.of([point.scenario for point in points], world, size) if self._recorded else None
         if self._meetings is None:
-            self._memories = [begin(point.scenario, part) for point, part in zip(points, self._worlds, strict=True)]
+            self._memories = [begin(point.scenario, one) for point, one in zip(points, self._worlds, strict=True)]
 
     def scene(self, open_: BoolArray) -> Scene:
         """The scene of all vehicles now; a recorded scene without open runs keeps its last state."""

@@ -20,7 +20,7 @@ from safevar_sumo.scenarios import VUT, Lane
 from safevar_sumo.scenarios.base import lane_through
 from safevar_sumo.sumo.recording import Recording, Track
 from safevar_sumo.sumo.world import Body, direction_of
-from safevar_sumo.vehicles import Sensors, SumoType
+from safevar_sumo.vehicles import Sensors
 
 NUMERICAL_EPS = 0.001
 """SUMO, utils/common/StdDefs.h [m]."""
@@ -63,55 +63,98 @@ class Samples:
     person_positions = vehicle_positions
 
 
-class RecordedWorld:
-    """N vehicles in each of several recorded scenes of one network, with the methods of `SumoWorld`; shapes (N,) and (N, 2)."""
+class RecordedScene:
+    """The vehicles of one scene of a recorded world, with the methods of `SumoWorld` that scenarios call; shapes (N,) and (N, 2).
+
+    All other actors move as recorded, so commands to them have no effect.
+    """
 
     lookup_errors = (UnknownActorError,)
 
-    def __init__(self, recordings: Sequence[Recording], n: int, whole: RecordedWorld | None = None, first: int = 0) -> None:
-        self._recordings, self._size, self._whole, self._first = recordings, n, whole, first
-        self.n, self.step_length = n * len(recordings), recordings[0].step_length
-        self._sample = 0
+    def __init__(self, world: RecordedWorld, recording: Recording, rows: slice) -> None:
+        self._world, self._recording, self._rows = world, recording, rows
+        self.n, self.step_length = rows.stop - rows.start, recording.step_length
+
+    def walk(self, *_: object) -> None:
+        """Do nothing."""
+
+    drive = turn_back = walk
+
+    def samples(self) -> Samples:
+        """The scene at all of its samples."""
+        return Samples(self._recording.tracks)
+
+    def speeds(self) -> FloatArray:
+        return self._world.speeds()[self._rows]
+
+    def vehicle_positions(self, actor: str) -> FloatArray:
+        if actor == VUT:
+            return self._world.vehicle_positions(VUT)[self._rows]
+        sample, positions = self._world.sample, self._track(actor).position
+        position = positions[min(sample, len(positions) - 1)]  # of a batch in which other scenes last longer
+        if math.isnan(position[0]):
+            raise not_on_the_road(actor, sample * self.step_length)
+        result = np.empty((self.n, 2))
+        result[:] = position
+        return result
+
+    person_positions = vehicle_positions
+
+    def vehicle_length(self, actor: str) -> float:
+        return self._recording.length if actor == VUT else self._track(actor).length
+
+    def vehicle_width(self, actor: str) -> float:
+        return self._recording.width if actor == VUT else self._track(actor).width
+
+    def person_width(self, actor: str) -> float:
+        return self._track(actor).width
+
+    def lane(self, lane: str) -> Lane:
+        return lane_through(lane, self._known(self._recording.lanes, lane))
+
+    def lane_start(self, lane: str) -> tuple[float, float]:
+        return self._known(self._recording.lanes, lane)[0]  # type: ignore[no-any-return]
+
+    def lane_of(self, vehicle: str) -> Lane:
+        return self.lane(self._known(self._recording.lane_of, vehicle))
+
+    def _track(self, actor: str) -> Track:
+        track: Track = self._known(self._recording.tracks, actor)
+        return track
+
+    @staticmethod
+    def _known(table: dict[str, Any], name: str) -> Any:
+        if name not in table:
+            raise UnknownActorError(f"{name!r} is not known")
+        return table[name]
+
+
+class RecordedWorld:
+    """N vehicles in each of several recorded scenes of one network, with the methods of `SumoWorld` for vehicles under test."""
+
+    def __init__(self, recordings: Sequence[Recording], n: int) -> None:
+        self._recordings, self._size, road = recordings, n, recordings[0]
+        self.n, self.step_length, self.sample = n * len(recordings), road.step_length, 0
+        self.scenes = [RecordedScene(self, one, slice(k * n, (k + 1) * n)) for k, one in enumerate(recordings)]
+        self.vehicle_length, self.lane_of = self.scenes[0].vehicle_length, self.scenes[0].lane_of
         self._speeds = np.repeat([one.speed for one in recordings], n)
         self._lane, self._place = np.zeros(self.n, dtype=np.intp), np.repeat([one.start for one in recordings], n)
-        self._lanes, self._left = recordings[0].way.at(self._lane), np.zeros(self.n, dtype=bool)
+        self._lanes, self._left = road.way.at(self._lane), np.zeros(self.n, dtype=bool)
         self._front: FloatArray | None = None
         self._struck: dict[int, Body] = {}
         self.sensors = Sensors.perfect(self.n)
-        if whole is None:
-            self._front_before, self._speeds_before = self.vehicle_positions(VUT), self._speeds
-            self._ahead_before = self._front_before @ recordings[0].along
-            self._extents, self._others = _joined_extents(recordings), [[*one.tracks.values()] for one in recordings]
+        self._front_before, self._speeds_before = self.vehicle_positions(VUT), self._speeds
+        self._ahead_before = self._front_before @ road.along
+        self._extents, self._others = _joined_extents(recordings), [[*one.tracks.values()] for one in recordings]
 
-    def set_types(self, types: SumoType) -> None:
-        """Do nothing: SUMO obeys every speed that is set, so types do not affect how vehicles move."""
+    def set_types(self, *_: object) -> None:
+        """Do nothing: everybody has departed, and SUMO obeys every speed that is set, whatever a vehicle's type and decelerations."""
 
-    def set_decelerations(self, decel: FloatArray) -> None:
-        """Do nothing: decelerations do not affect how vehicles move either."""
-
-    def depart(self) -> None:
-        """Do nothing: everybody has departed."""
+    depart = set_decelerations = set_types
 
     def leave(self, copies: Sequence[int]) -> None:
         """Freeze position and speed of vehicles whose runs are over."""
         self._left[copies] = True
-
-    def walk(self, person: str, speed: float) -> None:
-        """Do nothing: all other actors move as recorded."""
-
-    def drive(self, vehicle: str, speed: float) -> None:
-        """Do nothing: as recorded."""
-
-    def turn_back(self, person: str) -> None:
-        """Do nothing: as recorded."""
-
-    def part(self, first: int, n: int) -> RecordedWorld:
-        """The world of `n` vehicles of one scene, from row `first` on."""
-        return RecordedWorld([self._recordings[first // self._size]], n, self, first)
-
-    def samples(self) -> Samples:
-        """The only scene, at all of its samples."""
-        return Samples(self._recordings[0].tracks)
 
     def advance(self, speeds: FloatArray) -> None:
         """One step in which the vehicles reach `speeds` [m/s], at a constant acceleration.
@@ -126,7 +169,7 @@ class RecordedWorld:
         if np.count_nonzero(self._left):
             speeds, way = np.where(self._left, self._speeds, speeds), np.where(self._left, 0.0, way)
         self._place = self._place + way
-        self._speeds, self._front, self._sample = speeds, None, self._sample + 1
+        self._speeds, self._front, self.sample = speeds, None, self.sample + 1
         while np.count_nonzero(beyond := self._place > self._lanes.end):
             way_ahead = self._recordings[0].way
             if (self._lane[beyond] == len(way_ahead.end) - 1).any():
@@ -136,64 +179,13 @@ class RecordedWorld:
             self._lanes = way_ahead.at(self._lane)
 
     def speeds(self) -> FloatArray:
-        return self._speeds if self._whole is None else self._whole.speeds()[self._rows]
+        return self._speeds
 
-    def vehicle_positions(self, actor: str) -> FloatArray:
-        if actor != VUT:
-            return self._recorded(actor)
-        if self._whole is not None:
-            return self._whole.vehicle_positions(VUT)[self._rows]
+    def vehicle_positions(self, _: str) -> FloatArray:
+        """Positions of the vehicles under test."""
         if self._front is None:
             self._front = self._lanes.positions(self._place)
         return self._front
-
-    person_positions = vehicle_positions
-
-    def _recorded(self, actor: str) -> FloatArray:
-        """Position of a recorded actor, repeated for all vehicles; there must be one scene only."""
-        positions = self._track(actor).position
-        position = positions[min(self._now, len(positions) - 1)]  # of a batch in which other scenes last longer
-        if math.isnan(position[0]):
-            raise not_on_the_road(actor, self._now * self.step_length)
-        result = np.empty((self.n, 2))
-        result[:] = position
-        return result
-
-    def _track(self, actor: str) -> Track:
-        track: Track = self._known(self._recordings[0].tracks, actor)
-        return track
-
-    @staticmethod
-    def _known(table: dict[str, Any], name: str) -> Any:
-        if name not in table:
-            raise UnknownActorError(f"{name!r} is not known")
-        return table[name]
-
-    @property
-    def _rows(self) -> slice:
-        return slice(self._first, self._first + self.n)
-
-    @property
-    def _now(self) -> int:
-        return self._sample if self._whole is None else self._whole._sample
-
-    def vehicle_length(self, actor: str) -> float:
-        return self._recordings[0].length if actor == VUT else self._track(actor).length
-
-    def vehicle_width(self, actor: str) -> float:
-        return self._recordings[0].width if actor == VUT else self._track(actor).width
-
-    def person_width(self, actor: str) -> float:
-        return self._track(actor).width
-
-    def lane(self, lane: str) -> Lane:
-        return lane_through(lane, self._known(self._recordings[0].lanes, lane))
-
-    def lane_start(self, lane: str) -> tuple[float, float]:
-        return self._known(self._recordings[0].lanes, lane)[0]  # type: ignore[no-any-return]
-
-    def lane_of(self, vehicle: str) -> Lane:
-        return self.lane(self._known(self._recordings[0].lane_of, vehicle))
 
     def collisions(self, open_: BoolArray) -> dict[int, float]:
         """Vehicles of open runs whose body overlaps another, and their speeds [m/s].
@@ -206,7 +198,7 @@ class RecordedWorld:
         if not len(near):
             return result
         tracks = [self._others[k][number] for k, number in near.tolist()]
-        others = Body.columns([_body(track, self._sample) for track in tracks])
+        others = Body.columns([_body(track, self.sample) for track in tracks])
         persons = np.array([track.is_person for track in tracks])
         moved, still = (self.vehicle_positions(VUT), self._speeds), (self._front_before, self._speeds_before)
         hits = [(pair, row, phase) for phase, (fronts, _) in enumerate((still, moved)) if phase or persons.any()
@@ -249,9 +241,9 @@ class RecordedWorld:
         """Pairs (scene, actor), by number, with a vehicle of an open run beside the actor now or a step ago; shape (M, 2)."""
         ahead, before = self.vehicle_positions(VUT) @ self._recordings[0].along, self._ahead_before
         self._ahead_before = ahead
-        if self._sample >= self._extents.shape[1]:
+        if self.sample >= self._extents.shape[1]:
             return NOBODY
-        rears, fronts = self._extents[:, self._sample]
+        rears, fronts = self._extents[:, self.sample]
         if not np.count_nonzero(rears < np.maximum.reduce(ahead.reshape(-1, self._size), axis=1)[:, np.newaxis]):
             return NOBODY
         foremost = np.where(open_, ahead, -np.inf).reshape(-1, self._size).max(axis=1)

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from safevar_sumo.ads.driver import STEP_DECIMALS
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.sumo.world import SumoWorld
 
 LEADER_RANGE = 1000.0  # m, within which SUMO looks for a leader
-STEP_DECIMALS = 6  # to which a delay in steps is rounded, so that a whole number of steps is exact
 PLACE = ("getPosition", "getPosition3D", "getSpeed", "getAngle", "getRoadID", "getLaneID", "getLanePosition")
 SENSED: Mapping[str, tuple[str, ...]] = {
     "vehicle": (*PLACE, "getLaneIndex", "getAcceleration", "getLateralSpeed", "getLateralLanePosition", "getSignals"), "person": PLACE}

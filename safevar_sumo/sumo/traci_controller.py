@@ -84,7 +84,7 @@ class _Driver:
         """The commanded acceleration [m/s^2]."""
         self.view.time = time
         self._call("step", self._step)
-        return self.view.wish.acceleration(speed, time, self.view.speed_of_sumo(speed))
+        return self.view.commanded.acceleration(speed, time, self.view.speed_of_sumo(speed))
 
     def _call(self, method: str, function: Callable[..., Any]) -> None:
         with self._modules.inside(), driving(self.view, self._subscriptions):

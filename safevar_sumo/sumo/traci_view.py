@@ -21,36 +21,36 @@ from safevar_sumo.sumo.engine import Engine, engine_api
 from safevar_sumo.sumo.sensing import SENSED, Sensing
 from safevar_sumo.sumo.world import SumoWorld
 
-WISHES: Mapping[str, tuple[str, ...]] = {
+COMMANDS: Mapping[str, tuple[str, ...]] = {
     "setSpeed": ("speed",), "slowDown": ("speed", "duration"), "setAcceleration": ("acceleration", "duration"), "setAccel": ("accel",),
     "setDecel": ("decel",), "setMaxSpeed": ("speed",), "setSpeedMode": ("mode",)}
 """Commands of a controller, and their numeric arguments."""
-ELSE = "a controller reads and commands in its step"
-BACK = -1.0
+IN_ITS_STEP = "a controller reads and commands in its step"
+GIVE_BACK = -1.0
 """The speed and the speed mode that give control back to SUMO's own driver."""
-READS = re.compile("(get|is|has|find|convert|couldChangeLane).*")
-SHOWN = ("setColor", "highlight")
-STEPS = ("simulationStep", "simulationStepLegacy", "executeMove", "step")
-STARTS = ("start", "init", "connect", "load", "close", "switch", "switchConnection", "setOrder", "loadState", "saveState")
+QUERIES = re.compile("(get|is|has|find|convert|couldChangeLane).*")
+DISPLAYS = ("setColor", "highlight")
+ADVANCES = ("simulationStep", "simulationStepLegacy", "executeMove", "step")
+STARTS_AND_ENDS = ("start", "init", "connect", "load", "close", "switch", "switchConnection", "setOrder", "loadState", "saveState")
 """Functions that advance, begin or end simulations."""
-KNOWN = re.compile("get(Length|Width|Height|MinGap|VehicleClass|ShapeClass|TypeID|Color|(Emergency|Apparent)?Decel|Accel|MaxSpeed"
+VISIBLE = re.compile("get(Length|Width|Height|MinGap|VehicleClass|ShapeClass|TypeID|Color|(Emergency|Apparent)?Decel|Accel|MaxSpeed"
                    "|Tau|Mass)")
 """Functions about other actors whose values are visible at once or known from the type of actor."""
-BLIND: Mapping[str, re.Pattern[str]] = {
+UNSENSED: Mapping[str, re.Pattern[str]] = {
     "vehicle": re.compile("getFollower|get(Left|Right)(Followers|Leaders)|getNeighbors|getJunctionFoes|.*LaneChange.*|couldChangeLane"
                           "|getLoadedIDList|getTeleportingIDList|getTaxiFleet|getSpeedWithoutTraCI"),
     "person": re.compile("getTaxiReservations"),
     "simulation": re.compile("get(Arrived|BusStop|Colli|Departed|Emergency|Ending|Loaded|Parking|Pending|Starting|Stop).*"),
     "trafficlight": re.compile("get(Blocking|Rival|Priority|Served).*"),
 }
-BLIND_ROADS = re.compile("getLastStep.*|getWaitingTime|getTraveltime|getPendingVehicles|get.*(Emission|Consumption)")
+UNSENSED_ON_ROADS = re.compile("getLastStep.*|getWaitingTime|getTraveltime|getPendingVehicles|get.*(Emission|Consumption)")
 """Functions about other actors whose values no sensor of the vehicle measures."""
-SENSIBLE = "getLeader, getIDList, and positions, speeds, angles and lanes of vehicles and persons: these pass the sensors"
+WHAT_SENSORS_MEASURE = "getLeader, getIDList, and positions, speeds, angles and lanes of vehicles and persons: these pass the sensors"
 INVALID = -1073741824
 """SUMO's value for a property of an actor that is not on the road."""
 
 
-class Wish:
+class CommandedSpeed:
     """Commands of a controller, and the acceleration that they result in under SUMO's speed modes."""
 
     SAFE_SPEED, OWN_ACCELERATION, OWN_DECELERATION, USUAL_MODE, LARGEST_MODE = 1, 2, 4, 31, 127
@@ -69,16 +69,16 @@ class Wish:
         InputError
             Naming an illegal number.
         """
-        numbers = [self._number(name, what, value) for what, value in zip(WISHES[name], values, strict=True)]
+        numbers = [self._number(name, what, value) for what, value in zip(COMMANDS[name], values, strict=True)]
         if name == "setSpeed":
-            self._speed, self._until = (None if numbers[0] == BACK else numbers[0]), -1.0
+            self._speed, self._until = (None if numbers[0] == GIVE_BACK else numbers[0]), -1.0
         elif name == "slowDown":
             duration = max(numbers[1], self._step)
             self._speed, self._until, self._change = None, time + duration, (numbers[0] - speed) / duration
         elif name == "setAcceleration":
             self._speed, self._until, self._change = None, time + numbers[1], numbers[0]
         elif name == "setSpeedMode":
-            self._mode = self.USUAL_MODE if numbers[0] == BACK else int(numbers[0])
+            self._mode = self.USUAL_MODE if numbers[0] == GIVE_BACK else int(numbers[0])
         else:
             setattr(self, {"setAccel": "_accel", "setDecel": "_decel", "setMaxSpeed": "_fastest"}[name], numbers[0])
 
@@ -87,7 +87,7 @@ class Wish:
             number = float(value)
         except (TypeError, ValueError):
             number = math.nan
-        gives_back = number == BACK and name in ("setSpeed", "setSpeedMode")
+        gives_back = number == GIVE_BACK and name in ("setSpeed", "setSpeedMode")
         good = math.isfinite(number) and (number >= 0 or what == "acceleration" or gives_back)
         legal = "a finite number" if what == "acceleration" else "a finite number from 0 on"
         if name == "setSpeedMode":
@@ -113,7 +113,7 @@ class TraciView:
     def __init__(self, world: SumoWorld, copy: int, names: frozenset[str], sensing: Sensing, nominal: Nominal, step: float) -> None:
         self._world, self._copy, self._names, self._sensing, self._decel = world, copy, names, sensing, nominal.decel
         self._vut = copied_id(copy, VUT)
-        self.wish, self.time = Wish(nominal, step), 0.0
+        self.commanded, self.time = CommandedSpeed(nominal, step), 0.0
         self.refused: InputError | None = None
         """The last error that was raised to the controller, even if the controller caught it."""
 
@@ -160,15 +160,15 @@ class TraciView:
 
     def _called(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
         called = f"traci.{domain}.{name}" if domain else f"traci.{name}"
-        if name in STEPS and domain in ("", "simulation"):
-            raise InputError(called, "safevar advances the simulation; remove this call", ELSE)
-        if name in STARTS and domain in ("", "simulation"):
-            raise InputError(called, "safevar starts and ends the simulation; remove this call", ELSE)
-        if not READS.fullmatch(name):
+        if name in ADVANCES and domain in ("", "simulation"):
+            raise InputError(called, "safevar advances the simulation; remove this call", IN_ITS_STEP)
+        if name in STARTS_AND_ENDS and domain in ("", "simulation"):
+            raise InputError(called, "safevar starts and ends the simulation; remove this call", IN_ITS_STEP)
+        if not QUERIES.fullmatch(name):
             return self._command(domain, name, called, arguments)
         if not domain:
             return getattr(self._world.api, name)(*arguments)
-        blind = BLIND_ROADS if domain in ("edge", "lane") else BLIND.get(domain)
+        unsensed = UNSENSED_ON_ROADS if domain in ("edge", "lane") else UNSENSED.get(domain)
         if domain in SENSED:
             value = self._sensed(domain, name, arguments)
             if value is not NotImplemented:
@@ -179,23 +179,23 @@ class TraciView:
             return self.time if name == "getTime" else round(self.time * 1000)
         elif domain == "simulation" and name == "getMinExpectedNumber":
             return sum(len(self._ids(kind)) for kind in SENSED)
-        if blind is not None and blind.fullmatch(name):
-            raise InputError(called, "returns values of other actors that no sensor of the vehicle measures", SENSIBLE)
+        if unsensed is not None and unsensed.fullmatch(name):
+            raise InputError(called, "returns values of other actors that no sensor of the vehicle measures", WHAT_SENSORS_MEASURE)
         if name == "getIDCount":
-            return len(self._translated(getattr(self._world.api, domain).getIDList()))
-        return self._passed_on(domain, name, arguments)
+            return len(self._with_original_ids(getattr(self._world.api, domain).getIDList()))
+        return self._from_sumo(domain, name, arguments)
 
     def _command(self, domain: str, name: str, called: str, arguments: tuple[Any, ...]) -> Any:
-        if domain != "vehicle" or name not in (*WISHES, *SHOWN):
-            raise InputError(called, f"is not for a controller of {VUT!r}", f"of traci.vehicle {', '.join(WISHES)}")
+        if domain != "vehicle" or name not in (*COMMANDS, *DISPLAYS):
+            raise InputError(called, f"is not for a controller of {VUT!r}", f"of traci.vehicle {', '.join(COMMANDS)}")
         if not arguments or arguments[0] != VUT:
             vehicle_id = repr(arguments[0]) if arguments else "nothing"
             raise InputError(called, f"vehID = {vehicle_id} is not the vehicle under test",
                              f"{VUT!r}: a controller commands no other vehicle")
-        if name in SHOWN:
-            return self._passed_on(domain, name, arguments)
+        if name in DISPLAYS:
+            return self._from_sumo(domain, name, arguments)
         speed = float(self._world.api.vehicle.getSpeed(self._vut))
-        return self.wish.command(name, self.time, speed, arguments[1:])
+        return self.commanded.command(name, self.time, speed, arguments[1:])
 
     def _sensed(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
         """The value of an actor as sensed; NotImplemented if the function does not depend on sensors."""
@@ -205,13 +205,13 @@ class TraciView:
         if domain == "vehicle" and arguments[:1] == (VUT,):
             return self._leader(*arguments[1:]) if name == "getLeader" else NotImplemented
         called, others = f"traci.{domain}.{name}", self._sensing.seen(self._copy).others(domain)
-        if not arguments or KNOWN.fullmatch(name):
+        if not arguments or VISIBLE.fullmatch(name):
             return NotImplemented
         if name not in SENSED[domain]:
-            raise InputError(called, f"returns a value of {arguments[0]!r} that no sensor of the vehicle measures", SENSIBLE)
+            raise InputError(called, f"returns a value of {arguments[0]!r} that no sensor of the vehicle measures", WHAT_SENSORS_MEASURE)
         if arguments[0] in others:
-            return self._translated(others[arguments[0]][name])
-        return _invalid(self._passed_on(domain, name, arguments))
+            return self._with_original_ids(others[arguments[0]][name])
+        return _invalid(self._from_sumo(domain, name, arguments))
 
     def _ids(self, domain: str) -> tuple[str, ...]:
         return (*((VUT,) if domain == "vehicle" else ()), *self._sensing.seen(self._copy).others(domain))
@@ -229,18 +229,18 @@ class TraciView:
         names = tuple(actor for actor, values in actors.items() if values.get(function) == copied_id(self._copy, road))
         return len(names) if name == "getLastStepVehicleNumber" else names
 
-    def _passed_on(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
+    def _from_sumo(self, domain: str, name: str, arguments: tuple[Any, ...]) -> Any:
         """The value from SUMO itself."""
         function = getattr(getattr(self._world.api, domain), name)
-        return self._translated(function(*(self._inner(argument) for argument in arguments)))
+        return self._with_original_ids(function(*(self._with_copied_ids(argument) for argument in arguments)))
 
-    def _inner(self, value: Any) -> Any:
+    def _with_copied_ids(self, value: Any) -> Any:
         seen = self._sensing.seen(self._copy)
         if isinstance(value, str) and (value in self._names or value in seen.vehicle or value in seen.person):
             return copied_id(self._copy, value)
-        return type(value)(map(self._inner, value)) if type(value) in (list, tuple) else value
+        return type(value)(map(self._with_copied_ids, value)) if type(value) in (list, tuple) else value
 
-    def _translated(self, value: Any) -> Any:
+    def _with_original_ids(self, value: Any) -> Any:
         """A result with the traffic file's ids, without elements of other copies."""
         if isinstance(value, str):
             for mark in ("", ":", "!"):
@@ -251,14 +251,15 @@ class TraciView:
         if value is None or isinstance(value, bool | int | float | bytes):
             return value
         if isinstance(value, tuple | list):
-            elements = [self._translated(element) for element in value if not self._foreign(element)]
+            elements = [self._with_original_ids(element) for element in value if not self._is_of_other_copy(element)]
             return type(value)(*elements) if hasattr(value, "_fields") else type(value)(elements)
         if isinstance(value, Mapping):
-            return {self._translated(key): self._translated(element) for key, element in value.items() if not self._foreign(key)}
-        names = [name for name in dir(value) if not name.startswith("_") and name not in ("this", "thisown")]
-        return SimpleNamespace(**{name: self._translated(getattr(value, name)) for name in names if not callable(getattr(value, name))})
+            return {self._with_original_ids(key): self._with_original_ids(element)
+                    for key, element in value.items() if not self._is_of_other_copy(key)}
+        fields = {name: getattr(value, name) for name in dir(value) if not name.startswith("_") and name not in ("this", "thisown")}
+        return SimpleNamespace(**{name: self._with_original_ids(field) for name, field in fields.items() if not callable(field)})
 
-    def _foreign(self, value: Any) -> bool:
+    def _is_of_other_copy(self, value: Any) -> bool:
         if not isinstance(value, str):
             return False
         copy, dot, name = value.removeprefix(":").removeprefix("!").partition(".")
@@ -286,7 +287,7 @@ def real_traci() -> Any:
 def positional(domain: str, name: str, arguments: tuple[Any, ...], named: Mapping[str, Any]) -> tuple[Any, ...]:
     """Positional arguments in the order of TraCI's function."""
     signature = _signature(domain, name)
-    if signature is None or not (named or name in WISHES):
+    if signature is None or not (named or name in COMMANDS):
         return arguments
     bound = signature.bind(*arguments, **named)
     bound.apply_defaults()
