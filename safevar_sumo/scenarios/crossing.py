@@ -72,37 +72,84 @@ PRE_CRASH = {"adult": PreCrash.PEDESTRIAN, "child": PreCrash.PEDESTRIAN, "cyclis
              "motorcyclist": PreCrash.STRAIGHT_PATHS, "car": PreCrash.STRAIGHT_PATHS}
 
 
+class _Start(NamedTuple):
+    """The start of a test.
+
+    Attributes
+    ----------
+    mover, direction, extent
+        How SUMO moves the target, where to, and the size of its body along the lane and across it [m].
+    impact_left
+        Distance of the impact to the left of the lane's middle [m].
+    distance, time
+        From the target's start to the impact [m, s].
+    walk
+        The target's motion.
+    """
+
+    mover: OnFoot | OnWheels
+    direction: Direction
+    extent: Body
+    impact_left: float
+    distance: float
+    time: float
+    walk: Walk
+
+    @classmethod
+    def of(cls, test: Crossing) -> _Start:
+        """The start of a test.
+
+        Raises
+        ------
+        InputError
+            If the target cannot be at the impact in time.
+        """
+        target, lateral_start, is_near = test.parameter("target"), test.parameter("lateral_start"), test.parameter("side") == "near"
+        speed, sign, impact_lateral = test.parameter("target_speed") * KMH, 1.0 if is_near else -1.0, lateral_of(
+            test.impact_location, test.vut_width)
+        direction = (FROM_RIGHT if is_near else FROM_LEFT).turned(test.heading)
+        if lateral_start is None:
+            if test.acceleration_distance is not None:
+                raise InputError("scenario.parameters", "acceleration_distance: the target starts at its speed", "lateral_start too")
+            time = float(test.time_to_impact or TIME_TO_IMPACT) * test.start_share
+            distance, walk = speed * time, Walk(0.0, speed, 0.0)
+        else:
+            distance, run_up = (lateral_start + impact_lateral) * test.start_share, test.parameter("acceleration_distance")
+            needed = (distance + run_up) / speed
+            time = test.time_to_impact or float(max(TIME_TO_IMPACT, math.ceil(needed / ROUNDED_TO) * ROUNDED_TO))
+            walk = Walk.reaching(distance, time, speed, run_up)
+        mover = OnFoot(target, sign, -lateral_start) if test.is_on_foot else OnWheels(target, direction)
+        return cls(mover, direction, direction.extent(BODIES[target]), sign * impact_lateral, distance, time, walk)
+
+
 class _Meeting(NamedTuple):
-    """A vehicle and a target that crosses its lane at `path` [m]; `extent` is the target's size in the lane's frame; see `Meeting`."""
+    """A vehicle and a target that crosses its lane at `path` [m]; see `Meeting`."""
 
     frame: Frame
     course: Course
     path: float
-    walk: Walk
-    mover: OnFoot | OnWheels
-    extent: Body
-    direction: Direction
+    start: _Start
     vut_width: float
 
     def begin(self, world: World) -> float:
-        return self.mover.begin(world, self.walk)
+        return self.start.mover.begin(world, self.start.walk)
 
     def positions(self, world: World) -> FloatArray:
-        return self.mover.positions(world)
+        return self.start.mover.positions(world)
 
     def target(self, positions: FloatArray, times: Times) -> Target:
-        along, left = self.mover.middle(self.frame, positions)
-        lateral = left if self.direction.left > 0 else -left
+        direction, extent, walk = self.start.direction, self.start.extent, self.start.walk
+        along, left = self.start.mover.middle(self.frame, positions)
+        lateral = left if direction.left > 0 else -left
         ahead = np.zeros_like(left) if along is None else along - self.path
-        speed_share = self.direction.along
-        return Target(self.path - self.extent.length / 2 + ahead, lateral, has_left=lateral > (self.vut_width + self.extent.width) / 2,
-                      speed=at(times, lambda time: speed_share * self.walk.speed_at(time)) if speed_share else 0.0, ahead=ahead)
+        return Target(self.path - extent.length / 2 + ahead, lateral, has_left=lateral > (self.vut_width + extent.width) / 2,
+                      speed=at(times, lambda time: direction.along * walk.speed_at(time)) if direction.along else 0.0, ahead=ahead)
 
     def next_speed(self, sample: int, step: float) -> float:
-        return self.mover.next_speed(self.walk, sample, step)
+        return self.start.mover.next_speed(self.start.walk, sample, step)
 
     def set_speed(self, world: World, speed: float) -> None:
-        self.mover.set_speed(world, speed)
+        self.start.mover.set_speed(world, speed)
 
 
 class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -175,12 +222,12 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def __post_init__(self) -> None:
         if not self.network:
-            force_setattr(self, "network", NETWORK_ON_FOOT if self._on_foot else JUNCTION)
+            force_setattr(self, "network", NETWORK_ON_FOOT if self.is_on_foot else JUNCTION)
 
     @property
     def pre_crash(self) -> PreCrash:
         """NHTSA's pre-crash type."""
-        return PRE_CRASH[self._parameter("target")]
+        return PRE_CRASH[self.parameter("target")]
 
     @property
     def test_speed(self) -> float:
@@ -190,7 +237,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
     @property
     def duration(self) -> float:
         """Length of a run [s]."""
-        return self._impact_time + self.time_after
+        return _Start.of(self).time + self.time_after
 
     def remarks(self) -> list[str]:
         """Remarks on parameters outside the protocol."""
@@ -198,25 +245,25 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def lanes(self, roads: Roads) -> Actors:
         """Changes to the crossing lane: its direction."""
-        return self._mover.lanes(Frame.of(roads.lane(APPROACH)), roads)
+        return _Start.of(self).mover.lanes(Frame.of(roads.lane(APPROACH)), roads)
 
     def actors(self, roads: Roads) -> Actors:
         """The vehicle ahead of the target's path, the target beside the lane, and the parked cars, if any."""
-        frame, mover, walk = Frame.of(roads.lane(APPROACH)), self._mover, self._walk
-        path = mover.path(frame, roads, self._impact_left)
-        front = path - self._extent.length / 2 - self.speed * KMH * self._impact_time
+        frame, start = Frame.of(roads.lane(APPROACH)), _Start.of(self)
+        path = start.mover.path(frame, roads, start.impact_left)
+        front = path - start.extent.length / 2 - self.speed * KMH * start.time
         if front - self.vut_length < 0:
-            raise InputError("scenario.parameters", f"{self.speed:g} km/h for {self._impact_time:g} s is longer than the road")
-        changes = {
+            raise InputError("scenario.parameters", f"{self.speed:g} km/h for {start.time:g} s is longer than the road")
+        return {
             "vType[@id='vut']": {"length": repr(self.vut_length), "width": repr(self.vut_width)},
             "vehicle[@id='vut']": {"departPos": repr(front), "departSpeed": repr(self.speed * KMH)},
-            **mover.actors(frame, roads, self._impact_left, self._distance, walk),
+            **start.mover.actors(frame, roads, start.impact_left, start.distance, start.walk),
+            **self._parked(frame, path, roads),
         }
-        return {**changes, **self._parked(frame, path, roads)}
 
     def _parked(self, frame: Frame, path: float, roads: Roads) -> Actors:
         """The parked cars beside the lane, if any."""
-        if not self._parameter("hidden"):
+        if not self.parameter("hidden"):
             return {f"vehicle[@id='{car}']": None for car in PARKED_LENGTH}
         start, left = frame.place_of(roads.lane(KERB).start)
         changes, end, across = dict[str, dict[str, str]](), path - PARKED_GAP - start, self._parked_side - PARKED_WIDTH / 2 - left
@@ -227,98 +274,33 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         return changes
 
     def _meeting(self, world: World) -> _Meeting:
-        frame, mover, extent = Frame.of(world.lane(APPROACH)), self._mover, self._extent
-        course = Course(past=-extent.length - self.vut_length)
-        if self._parameter("hidden"):
-            course = course._replace(hidden=True, to_middle=extent.length / 2, setback=self.sensor_setback, kerb=-self._parked_side)
-        path = mover.path(frame, world, self._impact_left)
-        return _Meeting(frame, course, path, self._walk, mover, extent, self._direction, self.vut_width)
+        frame, start = Frame.of(world.lane(APPROACH)), _Start.of(self)
+        course = Course(past=-start.extent.length - self.vut_length)
+        if self.parameter("hidden"):
+            course = course._replace(hidden=True, to_middle=start.extent.length / 2, setback=self.sensor_setback, kerb=-self._parked_side)
+        return _Meeting(frame, course, start.mover.path(frame, world, start.impact_left), start, self.vut_width)
 
     def encounter(self, trace: Trace) -> Encounter:
         """Distance between the vehicle's front and the target's body, along and across the lane; TTC from its rate of change."""
-        ahead, across = np.maximum(trace.gap, 0.0), gap_beside(trace.lateral, (self.vut_width + self._extent.width) / 2)
+        extent = _Start.of(self).extent
+        ahead, across = np.maximum(trace.gap, 0.0), gap_beside(trace.lateral, (self.vut_width + extent.width) / 2)
         distance = np.sqrt(ahead * ahead + across * across)
         approach = (trace.speed - trace.obstacle_speed) * ahead - np.sign(trace.lateral) * trace.lateral_speed * across
         return Encounter(separation=distance, distance=distance, closing_speed=approach / np.maximum(distance, 1e-9),
-                         in_conflict=trace.gap > -self._extent.length - self.vut_length)
+                         in_conflict=trace.gap > -extent.length - self.vut_length)
 
     @property
-    def _on_foot(self) -> bool:
+    def is_on_foot(self) -> bool:
         """Whether the target is a person in SUMO: a pedestrian who crosses at right angles, starting on a footpath."""
-        return self._parameter("target") in ("adult", "child") and self.heading == 0 and self.start_share == 1
-
-    @property
-    def _mover(self) -> OnFoot | OnWheels:
-        target = self._parameter("target")
-        if self._on_foot:
-            return OnFoot(target, self._sign, -self._parameter("lateral_start"))
-        return OnWheels(target, self._direction)
-
-    @property
-    def _direction(self) -> Direction:
-        return (FROM_RIGHT if self._parameter("side") == "near" else FROM_LEFT).turned(self.heading)
-
-    @property
-    def _extent(self) -> Body:
-        """Size of the target's body along the lane and across it [m]."""
-        return self._direction.extent(BODIES[self._parameter("target")])
-
-    @property
-    def _sign(self) -> float:
-        """Sign of `lateral` for positions to the left of the lane."""
-        return 1.0 if self._parameter("side") == "near" else -1.0
-
-    @property
-    def _impact_lateral(self) -> float:
-        """The `lateral` of the impact location [m]."""
-        return lateral_of(self.impact_location, self.vut_width)
-
-    @property
-    def _impact_left(self) -> float:
-        """Distance of the impact to the left of the lane's middle [m]."""
-        return self._sign * self._impact_lateral
+        return self.parameter("target") in ("adult", "child") and self.parameter("lateral_start") is not None \
+            and self.heading == 0 and self.start_share == 1
 
     @property
     def _parked_side(self) -> float:
         """Position of the parked cars' sides that face the lane, to the left of its middle [m]."""
         return -self.vut_width / 2 - PARKED_GAP
 
-    @property
-    def _distance(self) -> float:
-        """Distance from the target's start to the impact [m]."""
-        if self._starts_at_speed:
-            return self._target_speed * self._impact_time
-        return (self._parameter("lateral_start") + self._impact_lateral) * self.start_share  # type: ignore[no-any-return]
-
-    @property
-    def _impact_time(self) -> float:
-        """Time from the start to the impact [s]."""
-        if self._starts_at_speed:
-            return float(self.time_to_impact or TIME_TO_IMPACT) * self.start_share
-        if self.time_to_impact is not None:
-            return self.time_to_impact
-        needed = (self._distance + self._parameter("acceleration_distance")) / self._target_speed
-        return float(max(TIME_TO_IMPACT, math.ceil(needed / ROUNDED_TO) * ROUNDED_TO))
-
-    @property
-    def _walk(self) -> Walk:
-        if self._starts_at_speed:
-            if self.acceleration_distance is not None:
-                raise InputError("scenario.parameters", "acceleration_distance: the target starts at its speed", "lateral_start too")
-            return Walk(0.0, self._target_speed, 0.0)
-        return Walk.reaching(self._distance, self._impact_time, self._target_speed, self._parameter("acceleration_distance"))
-
-    @property
-    def _starts_at_speed(self) -> bool:
-        """Whether the target moves at its speed from the start on."""
-        return self._parameter("lateral_start") is None
-
-    @property
-    def _target_speed(self) -> float:
-        """Speed of the moving target [m/s]."""
-        return self._parameter("target_speed") * KMH  # type: ignore[no-any-return]
-
-    def _parameter(self, name: str) -> Any:
+    def parameter(self, name: str) -> Any:
         """A parameter of the study, by default the protocol's."""
         value = getattr(self, name)
         return getattr(TESTS[self.test], name) if value is None else value

@@ -42,6 +42,11 @@ def test_whoever_does_not_brake_hits_the_impact_location_when_it_is_time(test: s
     assert struck == pytest.approx(location / 100, abs=1e-6)
 
 
+def test_a_pedestrian_in_the_place_of_a_cyclist_starts_at_speed() -> None:
+    run = driven(Crossing(test="CBNA", target="adult", speed=20.0))
+    assert at_contact(run, run.trace.time) == pytest.approx(6.0, abs=1e-6)
+
+
 @pytest.mark.parametrize("test", NUMBERS)
 def test_the_pedestrian_is_where_the_closed_form_has_him(test: str) -> None:
     """s = a (t - t0)^2 / 2 up to the acceleration distance, with a = u^2 / (2 s_a); then steady; at the impact location at 6 s."""
@@ -130,7 +135,9 @@ def test_the_original_with_aeb_avoids_and_with_half_its_brakes_does_not(test: st
 @pytest.mark.parametrize(("parameters", "message"), [
     ({"speed": -10}, "speed"), ({"speed": 0}, "speed"), ({"impact_location": 151}, "impact_location"), ({"test": "CPXX"}, "test"),
     ({"time_to_impact": 2}, "needs 3.38 s to the impact"), ({"lateral_start": 2.0}, "lateral_start"),
-    ({"acceleration_distance": 9}, "acceleration_distance"), ({"speed": 250, "time_to_impact": 20}, "is longer than the road"),
+    ({"acceleration_distance": 9}, "acceleration_distance"),
+    ({"test": "CBNA", "acceleration_distance": 1}, "the target starts at its speed"),
+    ({"speed": 250, "time_to_impact": 20}, "is longer than the road"),
 ])
 def test_impossible_parameters_are_refused(parameters: dict[str, object], message: str) -> None:
     with pytest.raises((InputError, msgspec.ValidationError), match=message):
