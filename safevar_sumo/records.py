@@ -18,8 +18,6 @@ IntArray = npt.NDArray[np.int_]
 
 STANDSTILL = 1e-3
 """Below this speed a vehicle counts as standing [m/s] (method section 4)."""
-CRUISING, REGULATING = 0.9, 0.05
-"""Share of its highest speed from which a vehicle cruises, and of its largest brake command below which it only regulates its speed [-]."""
 KMH_PER_MS = 3.6
 """km/h per m/s."""
 GRAVITY = 9.81
@@ -228,31 +226,6 @@ class SimulationRuns:
             return int(np.flatnonzero(active)[-1])
         counted = active & self.encounter.in_conflict[:, column]
         return int(np.argmin(np.where(counted, self.encounter.separation[:, column], np.inf))) if counted.any() else None
-
-    def brake_onset(self, column: int) -> int | None:
-        """The sample at which one vehicle begins to brake for the obstacle, before this is nearest; None if it does not brake for it.
-
-        A braking manoeuvre begins where the brake command starts to rise to at least `REGULATING` times the largest command; it ends
-        where speed is regulated again, by the throttle or by a smaller command. The manoeuvre that counts is under way when the vehicle
-        last cruises (at `CRUISING` of its highest speed or more), or is the first one after that: earlier manoeuvres, such as those of
-        a cruise control after an overshoot, did not slow the vehicle down. If there is no such manoeuvre, a vehicle that collides has
-        not braked for the obstacle; of a vehicle that does not collide, the last manoeuvre counts.
-        """
-        trace, nearest = self.trace, self.nearest(column)
-        active = trace.active[:None if nearest is None else nearest + 1, column]
-        speed = np.where(active, trace.speed[:len(active), column], 0.0)
-        brake = np.where(speed > STANDSTILL, trace.brake[:len(active), column], 0.0)
-        braked = (brake > 0) & (brake >= REGULATING * brake.max())
-        brakes, cruises = np.flatnonzero(braked), np.flatnonzero(speed >= CRUISING * speed.max())[-1]
-        after = brakes[brakes >= cruises]
-        if not brakes.size or (not after.size and np.isfinite(self.collision_speed[column])):
-            return None
-        within = after[0] if after.size else brakes[-1]  # a sample of the manoeuvre that counts
-        regulated = np.flatnonzero(((trace.throttle[:within, column] > 0) | (brake[:within] > 0)) & ~braked[:within])
-        first = int(brakes[brakes >= (regulated[-1] if regulated.size else 0)][0])
-        while first > 0 and brake[first - 1] > (brake[first - 2] if first > 1 else 0):
-            first -= 1
-        return first
 
     @property
     def relative_speed(self) -> FloatArray:

@@ -23,7 +23,7 @@ STEP_DECIMALS = 6
 """Decimals to which a delay in steps is rounded, so that a whole number of steps is exact."""
 
 
-class Late(NamedTuple):
+class DelayLine(NamedTuple):
     """A delay line: the delay as `steps` and a `fraction` of a step, and the past values, oldest first."""
 
     steps: int
@@ -31,12 +31,12 @@ class Late(NamedTuple):
     past: tuple[FloatArray, ...] = ()
 
     @classmethod
-    def by(cls, delay: float, step: float) -> Late:
+    def by(cls, delay: float, step: float) -> DelayLine:
         """The delay line for a delay [s] at a time step [s]."""
         steps, fraction = divmod(round(delay / step, STEP_DECIMALS), 1)
         return cls(int(steps), fraction)
 
-    def shown(self, now: FloatArray) -> tuple[FloatArray, Late]:
+    def delayed(self, now: FloatArray) -> tuple[FloatArray, DelayLine]:
         """The values of a delay ago, linear between two steps, and the next state; before the first step the first values hold."""
         past = (*(self.past[1:] or (now,) * (self.steps + 1)), now)
         before, after = past[0], past[1]

@@ -7,7 +7,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.driver import Late
+from safevar_sumo.ads.driver import DelayLine
 from safevar_sumo.records import KMH_PER_MS, BoolArray, Command, FloatArray, Nominal, Observation
 
 NotNegative = Annotated[float, Meta(ge=0, le=60)]
@@ -29,8 +29,8 @@ class _Memory(NamedTuple):
 
     brakes: BoolArray
     under_way: tuple[Command, ...]
-    recognised: Late
-    brake_delay_line: Late
+    recognised: DelayLine
+    brake_delay_line: DelayLine
 
 
 class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -72,16 +72,16 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         idle = Command(np.zeros(n), np.zeros(n))
-        return _Memory(np.zeros(n, dtype=bool), (idle,) * round(self.latency / step), Late.by(self.recognition_delay, step),
-                       Late.by(self.hesitation, step))
+        return _Memory(np.zeros(n, dtype=bool), (idle,) * round(self.latency / step), DelayLine.by(self.recognition_delay, step),
+                       DelayLine.by(self.hesitation, step))
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        (gap, lateral), recognised = memory.recognised.shown(np.array([seen.gap, seen.lateral]))
+        (gap, lateral), recognised = memory.recognised.delayed(np.array([seen.gap, seen.lateral]))
         brakes = self._brakes(seen._replace(gap=gap, lateral=lateral), memory.brakes)
         waits = (seen.speed == 0) & (seen.time < self.first_command)
         throttle = np.where(brakes | waits | (seen.speed > SPEED_LIMIT), 0.0, self._throttle(seen.speed))
         command, *under_way = (*memory.under_way, Command(throttle, brakes.astype(float)))
-        delayed_brake, brake_delay_line = memory.brake_delay_line.shown(command.brake)
+        delayed_brake, brake_delay_line = memory.brake_delay_line.delayed(command.brake)
         memory = _Memory(brakes, tuple(under_way), recognised, brake_delay_line)
         return Command(command.throttle, np.minimum(command.brake, delayed_brake)), memory
 

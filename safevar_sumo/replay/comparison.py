@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from safevar_sumo.analysis.explain.braking_comparison import brake_onset
 from safevar_sumo.analysis.words import ENDS
 from safevar_sumo.api.simulation import changed_setting, load_and_assemble
 from safevar_sumo.metrics import METRICS, RATING_POINTS, MetricFacts
@@ -40,7 +41,7 @@ class Moments(NamedTuple):
 
 def moments(runs: SimulationRuns, row: int) -> Moments:
     """The moments of one of N runs."""
-    return Moments(runs.brake_onset(row), runs.nearest(row), int(np.flatnonzero(runs.trace.active[:, row])[-1]))
+    return Moments(brake_onset(runs, row), runs.nearest(row), int(np.flatnonzero(runs.trace.active[:, row])[-1]))
 
 
 def divergence(runs: SimulationRuns, first: int = 0, second: int = 1) -> int | None:

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from safevar_sumo.ads.driver import Late
+from safevar_sumo.ads.driver import DelayLine
 from safevar_sumo.records import EVERYWHERE, BoolArray, Encounter, FloatArray, Observation, Trace
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.base import Scene
@@ -24,7 +24,7 @@ class Perception:
     """Observations of N vehicles in one weather, one step after the other."""
 
     def __init__(self, weather: Weather, step: float) -> None:
-        self._visibility, self._scenes = weather.visibility, Late.by(weather.recognition_delay, step)
+        self._visibility, self._scenes = weather.visibility, DelayLine.by(weather.recognition_delay, step)
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
         """The observation at this step; must be called in every step. An occluded obstacle is infinitely far away and still."""
@@ -32,7 +32,7 @@ class Perception:
         now[0], now[1], now[2], now[3], now[4] = scene.gap, scene.lateral, scene.lateral_speed, scene.obstacle_speed, speed
         if scene.visible is not EVERYWHERE:
             now[:-1] = np.where(scene.visible, now[:-1], HIDDEN)
-        (gap, lateral, lateral_speed, obstacle_speed, own), self._scenes = self._scenes.shown(now)
+        (gap, lateral, lateral_speed, obstacle_speed, own), self._scenes = self._scenes.delayed(now)
         return Observation(time, speed, gap, own - obstacle_speed, lateral, lateral_speed, self._visibility, obstacle_speed)
 
 

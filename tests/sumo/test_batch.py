@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.ads.driver import Late
+from safevar_sumo.ads.driver import DelayLine
 from safevar_sumo.records import Command, Evaluations, Nominal, Observation, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather, load_study
@@ -203,9 +203,9 @@ def test_what_appears_between_two_steps_is_not_there_yet() -> None:
 
 def pressed(hesitation: float, wanted: list[float]) -> list[float]:
     """How hard one vehicle brakes that wants to brake so hard."""
-    late, brakes = Late.by(hesitation, STEP), []
+    late, brakes = DelayLine.by(hesitation, STEP), []
     for brake in wanted:
-        sure, late = late.shown(np.array([brake]))
+        sure, late = late.delayed(np.array([brake]))
         brakes.append(float(np.minimum(brake, sure)[0]))
     return brakes
 

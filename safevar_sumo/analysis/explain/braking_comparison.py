@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.analysis.words import ENDS, joined
-from safevar_sumo.records import Outcome, SimulationRuns
+from safevar_sumo.records import STANDSTILL, Outcome, SimulationRuns
 
 FULL = 0.9
 """Share of the command at which the brake pedal counts as having followed it [-]: 0.9 where full braking is commanded."""
@@ -26,6 +26,8 @@ COASTING = 0.1
 """Deceleration of a vehicle that rolls without a brake [m/s^2]: a rolling resistance of 1 % of its weight."""
 REMAINDER = 0.05
 """Largest unexplained part of the distance lost that a sentence leaves out [m]."""
+CRUISING, REGULATING = 0.9, 0.05
+"""Share of its highest speed from which a vehicle cruises, and of its largest brake command below which it only regulates its speed [-]."""
 
 
 class Braking(NamedTuple):
@@ -34,7 +36,7 @@ class Braking(NamedTuple):
     Attributes
     ----------
     time, gap, speed
-        Time, gap and speed when the brake was commanded (`SimulationRuns.brake_onset`) [s, m, m/s].
+        Time, gap and speed when the brake was commanded (`brake_onset`) [s, m, m/s].
     delay
         Time from the command until the brake pedal has followed it [s].
     mean_speed_lost, speed_lost
@@ -94,9 +96,35 @@ class BrakingComparison(NamedTuple):
         return sum(self.parts.values())
 
 
+def brake_onset(runs: SimulationRuns, column: int) -> int | None:
+    """The sample at which one of N vehicles begins to brake for the obstacle, before this is nearest; None if it does not brake for it.
+
+    A braking manoeuvre begins where the brake command starts to rise to at least `REGULATING` times the largest command; it ends
+    where speed is regulated again, by the throttle or by a smaller command. The manoeuvre that counts is under way when the vehicle
+    last cruises (at `CRUISING` of its highest speed or more), or is the first one after that: earlier manoeuvres, such as those of
+    a cruise control after an overshoot, did not slow the vehicle down. If there is no such manoeuvre, a vehicle that collides has
+    not braked for the obstacle; of a vehicle that does not collide, the last manoeuvre counts.
+    """
+    trace, nearest = runs.trace, runs.nearest(column)
+    active = trace.active[:None if nearest is None else nearest + 1, column]
+    speed = np.where(active, trace.speed[:len(active), column], 0.0)
+    brake = np.where(speed > STANDSTILL, trace.brake[:len(active), column], 0.0)
+    braked = (brake > 0) & (brake >= REGULATING * brake.max())
+    brakes, cruises = np.flatnonzero(braked), np.flatnonzero(speed >= CRUISING * speed.max())[-1]
+    after = brakes[brakes >= cruises]
+    if not brakes.size or (not after.size and np.isfinite(runs.collision_speed[column])):
+        return None
+    within = after[0] if after.size else brakes[-1]  # a sample of the manoeuvre that counts
+    regulated = np.flatnonzero(((trace.throttle[:within, column] > 0) | (brake[:within] > 0)) & ~braked[:within])
+    first = int(brakes[brakes >= (regulated[-1] if regulated.size else 0)][0])
+    while first > 0 and brake[first - 1] > (brake[first - 2] if first > 1 else 0):
+        first -= 1
+    return first
+
+
 def summary_of(runs: SimulationRuns, column: int, safety_degree: float) -> RunSummary:
     """Summary of one of N runs."""
-    impact_speed, nearest, onset = float(runs.collision_speed[column]), runs.nearest(column), runs.brake_onset(column)
+    impact_speed, nearest, onset = float(runs.collision_speed[column]), runs.nearest(column), brake_onset(runs, column)
     closest, braking = np.nan, None
     if nearest is not None and np.isnan(impact_speed):
         closest = float(runs.trace.gap[nearest, column])
