@@ -81,6 +81,8 @@ def _rho(result: Agreement) -> str:
 
 NEAR = 0.02
 """Initial standard deviation of a search around known values, as a share of the bounds' width."""
+REFINEMENT = 3
+"""A search around known values has a population this many times smaller: it need not find a valley, and learns once a generation."""
 STAGES = (64, 16)
 """Percentages of the trials from scratch that fit the first study alone, and then the others' own parameters; the rest fit all."""
 MILLIMETRES = 3
@@ -166,7 +168,7 @@ def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[
         raise SimulationError(f"{names} cannot be simulated with {'its' if len(studies) == 1 else 'their'} own values")
     searches = [] if staged else search.from_random_places(_first_of_key(free), fit.starts, fit.screened, fit.width, rng)
     if staged or not from_scratch:
-        searches.append(search.begin(trial.shares(start), NEAR, fit.seed + 1))
+        searches.append(search.begin(trial.shares(start), NEAR, fit.seed + 1, _refining_population(fit.population, len(free))))
     search.race(searches)
     assert search.best is not None, "there is at least one trial"
     reached, results = [one.lowest for one in searches if one.lowest < np.inf], []
@@ -183,6 +185,11 @@ def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[
             frozenset(one.key for one in parameters if len(one.studies) > 1),
             {one.key: profiles.interval(i) for i, one in enumerate(free) if k in one.studies}, profiles))
     return results
+
+
+def _refining_population(population: int, parameters: int) -> int:
+    """A population `REFINEMENT` times smaller, but not below the usual one of CMA-ES (Hansen 2016)."""
+    return min(population, max(population // REFINEMENT, 4 + int(3 * math.log(parameters))))
 
 
 def _first_of_key(free: Sequence[Free]) -> list[int]:

@@ -83,7 +83,7 @@ class Search:
     Parameters
     ----------
     population
-        Trials in a generation.
+        Trials in a generation of a search that has no population of its own.
     done
         Called after every trial with the lowest cost so far, and the studies that have it.
     alike
@@ -108,9 +108,9 @@ class Search:
             self._done(self.cost, self.best)
         return costs
 
-    def begin(self, place: FloatArray, spread: float, seed: int) -> OneSearch:
-        """A search from a place in the unit cube, `spread` wide at first (standard deviation)."""
-        return OneSearch(self, place, spread, seed)
+    def begin(self, place: FloatArray, spread: float, seed: int, population: int | None = None) -> OneSearch:
+        """A search from a place in the unit cube, `spread` wide at first (standard deviation), with a population of its own if given."""
+        return OneSearch(self, place, spread, seed, population or self.population)
 
     def from_random_places(self, same: Sequence[int], starts: int, screened: int, spread: float,
                            rng: np.random.Generator) -> list[OneSearch]:
@@ -137,25 +137,25 @@ class Search:
         for _ in range(rounds):
             each = share // len(racing)
             for one in racing:
-                one.advance(each - each % self.population if each > self.population else each)
+                one.advance(each - each % one.population if each > one.population else each)
             racing = sorted(racing, key=lambda one: one.lowest)[:(len(racing) + 1) // 2]
         racing[0].advance(self.left)
 
 
 class OneSearch:
-    """CMA-ES (Hansen 2016) from one place; `lowest` is its lowest cost so far."""
+    """CMA-ES (Hansen 2016) from one place, with its population; `lowest` is its lowest cost so far."""
 
-    def __init__(self, search: Search, place: FloatArray, spread: float, seed: int) -> None:
+    def __init__(self, search: Search, place: FloatArray, spread: float, seed: int, population: int) -> None:
         import cma  # takes longer to load than all the rest
 
-        self._search, self.lowest = search, np.inf
+        self._search, self.lowest, self.population = search, np.inf, population
         self._strategy: Any = cma.CMAEvolutionStrategy(place, spread, {
-            "bounds": [0, 1], "seed": seed, "verbose": -9, "popsize": search.population, "maxstd": np.inf})
+            "bounds": [0, 1], "seed": seed, "verbose": -9, "popsize": population, "maxstd": np.inf})
 
     def advance(self, trials: int) -> None:
         """Run generations; CMA-ES does not learn from a last generation that is cut short."""
         search = self._search
-        for left in range(trials, 0, -search.population):
+        for left in range(trials, 0, -self.population):
             shares = self._strategy.ask()
             costs = search.try_studies([search.trial.at(share) for share in shares[:left]])
             search.kept += [(cost, share) for cost, share in zip(costs, shares, strict=False) if cost <= KEPT_COST * search.cost]

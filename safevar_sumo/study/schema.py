@@ -209,9 +209,9 @@ class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own values and from
     `starts` random places in the bounds; the worse half gives up after every round. With `screened`, the random places are the best of
     that many, but at most a quarter of the trials is spent on that. A search from a random place begins with a standard deviation of
-    `width` of the bounds. `seed` is the seed of all random numbers. From scratch, studies that are fitted together are searched in
-    stages: first the first study alone, then the other studies' own parameters, finally all parameters from there. All stages but the
-    last use one row in `thinning`.
+    `width` of the bounds; one around known values has a third of the `population`. `seed` is the seed of all random numbers. From
+    scratch, studies that are fitted together are searched in stages: first the first study alone, then the other studies' own
+    parameters, finally all parameters from there. All stages but the last use one row in `thinning`.
     """
 
     trials: PositiveInt = 1200

@@ -12,7 +12,7 @@ import pytest
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.reference import ReferenceData, Subject, agreement, calibrate, calibrate_together, with_values
-from safevar_sumo.reference.calibration import _thinned, _Trial
+from safevar_sumo.reference.calibration import _refining_population, _thinned, _Trial
 from safevar_sumo.reference.effects import covered_by_spread, error_beyond_spread, linear_effects
 from safevar_sumo.reference.fit import Search, original_cost, reference_cost
 from safevar_sumo.reference.parameters import Free, free_parameters, value_of
@@ -195,7 +195,7 @@ class Runner:
     """Has found what it has found, and counts its trials."""
 
     def __init__(self, lowest: float) -> None:
-        self.lowest, self.rounds = lowest, list[int]()
+        self.lowest, self.population, self.rounds = lowest, 1, list[int]()
 
     def advance(self, trials: int) -> None:
         self.rounds.append(trials)
@@ -210,6 +210,20 @@ def test_the_worse_half_gives_up_after_every_round() -> None:
     Search(Bowl(), 1, 300, silent).race(runners)  # type: ignore[arg-type]
     # Rounds of 5, 3, 2 and 1 searches with 75 trials each; the winner gets what remains, which these runners never take.
     assert [runner.rounds for runner in runners] == [[15], [15, 25, 37, 75, 300], [15], [15, 25, 37], [15, 25]]
+
+
+def test_a_search_around_known_values_has_smaller_generations() -> None:
+    class Counted(Bowl):
+        def costs(self, studies: Sequence[Any]) -> list[float]:
+            generations.append(len(studies))
+            return super().costs(studies)
+
+    generations = list[int]()
+    search = Search(Counted(), 12, 100, silent)
+    search.race([search.begin(np.full(3, 0.5), 0.1, 1, _refining_population(12, 3))])
+    # 4 + 3 ln 3 = 7.3, the usual population, is more than a third of 12.
+    assert generations == [7] * 14 + [2]
+    assert (_refining_population(80, 26), _refining_population(6, 2)) == (26, 6)
 
 
 def test_searches_begin_at_the_best_of_many_places_with_what_is_the_same_at_one_place() -> None:
