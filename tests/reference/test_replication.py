@@ -19,6 +19,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.reference import Agreement, keep_totals, quoted, validation
 from safevar_sumo.reference.conclusions import DIFFERS, DIRECTION, HOLDS, OPEN, compared_tables, conclusions, grade, pair_cases
 from safevar_sumo.reference.validation import rank_correlation
+from safevar_sumo.report.verdict import Agreement as AgreementOnPage
 from safevar_sumo.report.verdict import agreement_with_published
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import simulate
@@ -124,7 +125,7 @@ MADE_UP = Agreement(
     undecided={}, by_predicted=[])
 
 
-def page_of(study: Any) -> dict[str, Any]:
+def page_of(study: Any) -> AgreementOnPage:
     material: Any = SimpleNamespace(case=SimpleNamespace(study=study))
     return agreement_with_published(material)
 
@@ -143,9 +144,8 @@ def test_the_page_says_how_well_the_study_agrees() -> None:
     searched_otherwise = load_study("rain", title="Mine", search={"seed": 5, "evaluations": 100})
     page = page_of(searched_otherwise)
     for words in ("80 vehicles", "rank correlation of 0.61", "10 of the 40 published collisions", "recall 0.25", "precision 0.50"):
-        assert words in page["sentence"]
-    assert page["rows"] == [{"file": "made_up.csv", "vehicles": "80", "rho": "0.61", "error": "0.25", "reference": "40", "here": "20",
-                             "both": "10", "recall": "0.25", "precision": "0.50"}]
+        assert words in page.sentence
+    assert page.rows == [["made_up.csv", "80", "0.61", "0.25", "40", "20", "10", "0.25", "0.50"]]
 
 
 @pytest.mark.usefixtures("totals")
@@ -155,7 +155,7 @@ def test_nobody_elses_agreement_is_claimed() -> None:
     other = msgspec.structs.replace(rain, ads=msgspec.structs.replace(rain.ads, parameters={**rain.ads.parameters, "margin": 9.0}))
     for study in (load_study("sun"), other):
         assert quoted(study) == []
-        assert "was not compared with published data" in page_of(study)["sentence"]
+        assert "was not compared with published data" in page_of(study).sentence
 
 
 def test_an_entry_is_replaced_and_others_stay(totals: Path) -> None:
