@@ -39,7 +39,10 @@ def new_figure(title: str, rows: int, columns: int, size: tuple[float, float], *
 
 
 def panels(title: str, number: int, across: int, panel: tuple[float, float], least_width: float, above: float) -> tuple[Figure, list[Axes]]:
-    """A figure with `number` panels of the size `panel` [inches], at most `across` side by side, and the panels' axes."""
+    """A figure with `number` panels of the size `panel`, at most `across` side by side, and the panels' axes.
+
+    The figure is at least `least_width` wide, and its title takes the height `above`; all sizes in inches.
+    """
     columns = min(across, number)
     rows = -(-number // columns)
     figure, axes = new_figure(title, rows, columns, (max(panel[0] * columns, least_width), above + panel[1] * rows))

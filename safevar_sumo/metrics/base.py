@@ -94,6 +94,11 @@ class Metric(MetricFacts, frozen=True, kw_only=True):
         return MetricFacts(**{name: getattr(self, name) for name in MetricFacts.__struct_fields__})
 
 
+def without_collision(runs: SimulationRuns, values: FloatArray) -> FloatArray:
+    """A metric's values, shape (N,), undefined on a collision."""
+    return np.where(np.isnan(runs.collision_speed), values, np.nan)
+
+
 def foreign_metric(metric: Any, guard: Guard) -> Metric:
     """A metric from outside: its record and its results are checked, its function gets read-only copies.
 

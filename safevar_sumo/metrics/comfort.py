@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.metrics.base import Metric, total
+from safevar_sumo.metrics.base import Metric, total, without_collision
 from safevar_sumo.records import BoolArray, FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 
@@ -65,14 +65,14 @@ def max_jerk(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     accelerations, counts = _accelerations(runs)
     steps = _steps(JERK_TIME, runs.trace.step, len(accelerations) - 1)
     jerk = np.abs(accelerations[steps:] - accelerations[:-steps]) / (steps * runs.trace.step)
-    return _without_collision(runs, np.max(np.where(counts[steps:], jerk, 0.0), axis=0, initial=0.0))
+    return without_collision(runs, np.max(np.where(counts[steps:], jerk, 0.0), axis=0, initial=0.0))
 
 
 def rms_acceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Root mean square of the weighted acceleration over the run [m/s^2]; shape (N,), NaN on a collision."""
     accelerations, counts = _accelerations(runs)
     squares = np.where(counts, weighted(np.where(counts, accelerations, 0.0), runs.trace.step), 0.0) ** 2
-    return _without_collision(runs, np.sqrt(total(squares) / np.maximum(np.count_nonzero(counts, axis=0), 1)))
+    return without_collision(runs, np.sqrt(total(squares) / np.maximum(np.count_nonzero(counts, axis=0), 1)))
 
 
 def brake_harshness(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
@@ -80,7 +80,7 @@ def brake_harshness(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArra
     speed, active = runs.trace.speed, runs.trace.active
     steps = _steps(BRAKING_TIME, runs.trace.step, len(speed) - 1)
     decelerations = (speed[:-steps] - speed[steps:]) / (steps * runs.trace.step)
-    return _without_collision(runs, np.max(np.where(active[steps:], decelerations, 0.0), axis=0, initial=0.0))
+    return without_collision(runs, np.max(np.where(active[steps:], decelerations, 0.0), axis=0, initial=0.0))
 
 
 def _accelerations(runs: SimulationRuns) -> tuple[FloatArray, BoolArray]:
@@ -90,10 +90,6 @@ def _accelerations(runs: SimulationRuns) -> tuple[FloatArray, BoolArray]:
 
 def _steps(time: float, step: float, most: int) -> int:
     return max(1, min(round(time / step), most))
-
-
-def _without_collision(runs: SimulationRuns, values: FloatArray) -> FloatArray:
-    return np.where(np.isnan(runs.collision_speed), values, np.nan)
 
 
 MAX_JERK = Metric(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from safevar_sumo.metrics.base import Metric, sampling_stride, total
+from safevar_sumo.metrics.base import Metric, sampling_stride, total, without_collision
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 
@@ -24,15 +24,14 @@ def time_to_collision(runs: SimulationRuns) -> FloatArray:
 def time_exposed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s]; shape (N,), NaN on a collision."""
     critical, interval = _critical(runs, thresholds)
-    exposed = np.round(np.count_nonzero(np.isfinite(critical), axis=0) * interval, TIME_DECIMALS)
-    return np.where(np.isnan(runs.collision_speed), exposed, np.nan)
+    return without_collision(runs, np.round(np.count_nonzero(np.isfinite(critical), axis=0) * interval, TIME_DECIMALS))
 
 
 def time_integrated(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """TIT* = sum of (TTC* - TTC(t)) dt over the same samples [s^2]; shape (N,), NaN on a collision."""
     critical, interval = _critical(runs, thresholds)
     deficit = np.where(np.isfinite(critical), thresholds.ttc_threshold - critical, 0.0)
-    return np.where(np.isnan(runs.collision_speed), total(deficit) * interval, np.nan)
+    return without_collision(runs, total(deficit) * interval)
 
 
 def _critical(runs: SimulationRuns, thresholds: MetricsTable) -> tuple[FloatArray, float]:

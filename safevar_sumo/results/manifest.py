@@ -19,18 +19,19 @@ READABLE = (2, FORMAT)
 RESULTS = 2
 """Version number of the package's results, raised whenever they change (enforced by tests/golden)."""
 VERSIONED = ("safevar_sumo", "libsumo", "eclipse-sumo", "deap", "numpy")
-FREE = ("title", "published", "repeatability", "fit", "calibration", "spread", "model_error", "variation", "correlations")
-"""Keys of a study that change no result of a campaign."""
-FREE_OF_SEARCH = ("runs", "algorithms", "evaluations", "time_limit")
-"""Keys of its search table that change no evaluation."""
+WITHOUT_EFFECT_ON_RESULTS = ("title", "published", "repeatability", "fit", "calibration", "spread", "model_error", "variation",
+                          "correlations")
+"""Keys of a study that change no result."""
+WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time_limit")
+"""Keys of a study's search table that change no evaluation, but decide which evaluations there are."""
 LAYERS = {
     "resolved": "the same study and options", "network": "the network's file as it was", "sources": "the file as it was",
     "results": "that version", "versions": "those versions", "platform": "such a machine"}
 """Inputs that results depend on. The texts complete "expected: another --out, or ..." where one has changed."""
-OF_FILES = ("network", "sources")
-"""Layers that hold digests by file."""
-LAYERS_BEFORE = ("resolved", "network", "sources", "code", "versions", "platform")
-"""Layers of format 2, with digests of the package's files."""
+LAYERS_OF_FILES = ("network", "sources")
+"""Layers that hold a digest for each file."""
+LAYERS_OF_FORMAT_2 = ("resolved", "network", "sources", "code", "versions", "platform")
+"""Layers in format 2, which had digests of the package's own files in place of `RESULTS`."""
 SIMULATORS = ("libsumo", "eclipse-sumo")
 """Versions on which a single simulation depends."""
 DIGESTS = "digests"
@@ -62,14 +63,14 @@ def evaluation_keys(study: Study) -> dict[str, Any]:
         del everything["rating"]  # results from before ratings existed have no such table
     if study.matrix is not None and not study.matrix.protocol:
         del everything["matrix"]["protocol"]
-    search = {key: value for key, value in everything["search"].items() if key not in FREE_OF_SEARCH}
-    return {**{key: value for key, value in everything.items() if key not in FREE}, "search": search}
+    search = {key: value for key, value in everything["search"].items() if key not in WITHOUT_EFFECT_ON_EVALUATIONS}
+    return {**{key: value for key, value in everything.items() if key not in WITHOUT_EFFECT_ON_RESULTS}, "search": search}
 
 
 def owner_digest(manifest: Mapping[str, Any]) -> str:
     """The digest that identifies a manifest's study in its journals."""
     if "format" in manifest:
-        return _digest({layer: manifest.get(layer) for layer in (LAYERS if manifest["format"] == FORMAT else LAYERS_BEFORE)})
+        return _digest({layer: manifest.get(layer) for layer in (LAYERS if manifest["format"] == FORMAT else LAYERS_OF_FORMAT_2)})
     search = {key: value for key, value in manifest["study"]["search"].items() if key not in ("runs", "algorithms")}
     return _digest([{**manifest["study"], "search": search}, manifest["versions"], manifest.get("network")])
 
@@ -91,9 +92,9 @@ def differences_now(stored: Mapping[str, Any], new: Mapping[str, Any]) -> list[s
     """
     if stored.get("format") != FORMAT:
         return [f"version {stored['versions'].get('safevar_sumo')} wrote them"]
-    texts = [f"{key} was {before!r} and is {now!r} now" for key, before, now in _pairs(stored["resolved"], new["resolved"])
+    texts = [f"{key} was {before!r} and is {now!r} now" for key, before, now in _changed_values(stored["resolved"], new["resolved"])
              if before is not None]  # a new key is ignored: had it changed results, `RESULTS` would have been raised
-    texts += [text for layer in (*OF_FILES, "results") for text in _differences(layer, stored.get(layer, {}), new[layer])]
+    texts += [text for layer in (*LAYERS_OF_FILES, "results") for text in _differences(layer, stored.get(layer, {}), new[layer])]
     before, now = ({name: manifest["versions"].get(name) for name in SIMULATORS} for manifest in (stored, new))
     return [*texts, *_differences("versions", before, now)]
 
@@ -177,19 +178,19 @@ def refuse_edited_table(file: Path, manifest: Mapping[str, Any], way_back: str) 
 
 def _differences(layer: str, stored: Any, new: Any) -> Iterator[str]:
     """All differences between a layer of two manifests, in words."""
-    for key, before, now in _pairs(stored, new):
-        if layer in OF_FILES:
+    for key, before, now in _changed_values(stored, new):
+        if layer in LAYERS_OF_FILES:
             yield f"{key} {'no longer exists' if now is None else 'is new' if before is None else 'has changed since'}"
         else:
             name = f"version of {key}" if layer == "versions" else key or "the version of the package's results"
             yield f"{name} was {before!r} and is {now!r} now"
 
 
-def _pairs(stored: Any, new: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+def _changed_values(stored: Any, new: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
     """The innermost keys at which two values differ, with the first and the second value; 2 and 2.0 are different."""
     if isinstance(stored, dict) and isinstance(new, dict):
         for name in sorted({*stored, *new}):
-            yield from _pairs(stored.get(name), new.get(name), f"{key}.{name}" if key else name)
+            yield from _changed_values(stored.get(name), new.get(name), f"{key}.{name}" if key else name)
     elif json.dumps(stored, sort_keys=True) != json.dumps(new, sort_keys=True):
         yield key, stored, new
 

@@ -187,7 +187,7 @@ def fronts(individuals: Sequence[Individual]) -> list[list[Individual]]:
     return ranked
 
 
-def stand_by_crowding(individuals: Sequence[Individual]) -> list[list[Individual]]:
+def set_standings(individuals: Sequence[Individual]) -> list[list[Individual]]:
     """The fronts of individuals; sets their `standing` to their rank, from 0, and minus their crowding distance."""
     ranked = fronts(individuals)
     for rank, front in enumerate(ranked):

@@ -18,8 +18,8 @@ from safevar_sumo.search.evolution import (
     Variation,
     initial_population,
     result_of,
+    set_standings,
     simulated,
-    stand_by_crowding,
 )
 
 Side = Annotated[int, Meta(ge=1, le=100_000)]
@@ -48,7 +48,7 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     grid
         Rows and columns, whose product is the population; by default as close to a square as possible.
     neighbourhood
-        The 4 (von_neumann) or 8 (moore) cells around a cell.
+        The 4 (von_neumann) or 8 (moore) cells mates_of_cells a cell.
     """
 
     archive: Size | None = None
@@ -76,37 +76,38 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
         variation, size = Variation(self, problem, rng), self.archive or problem.population
         cells = initial_population(problem, rng)
         used = yield from simulated(cells, problem)
-        archive = archived([], cells, size)
+        archive = updated_archive([], cells, size)
         while used < problem.evaluations and archive:
-            alive = [cell for cell in cells if not cell.failed]
-            stand_by_crowding(alive)
-            around = [[cells[i] for i in place if not cells[i].failed] for place in neighbours]
+            valid = [cell for cell in cells if not cell.failed]
+            set_standings(valid)
+            mates_of_cells = [[cells[i] for i in indices if not cells[i].failed] for indices in neighbours]
             with variation.randomness():
-                offspring = [variation.child(mates or archive, archive) for mates in around[:problem.evaluations - used]]
+                offspring = [variation.child(mates or archive, archive) for mates in mates_of_cells[:problem.evaluations - used]]
             used += yield from simulated(offspring, problem)
-            cells[:len(offspring)] = [replaced(cell, child, mates) for cell, child, mates in zip(cells, offspring, around, strict=False)]
-            archive = archived(archive, offspring, size)
+            generation = zip(cells, offspring, mates_of_cells, strict=False)  # the last generation may be incomplete
+            cells[:len(offspring)] = [survivor(cell, child, mates) for cell, child, mates in generation]
+            archive = updated_archive(archive, offspring, size)
         return result_of(archive, problem)
 
     def _neighbours(self, population: int) -> list[list[int]]:
         """Indices of each cell and its neighbours, without repetition."""
         rows, columns = self.sides(population)
-        steps = ((0, 0), *NEIGHBOURHOODS[self.neighbourhood])
-        return [list(dict.fromkeys((row + down) % rows * columns + (column + right) % columns for down, right in steps))
+        offsets = ((0, 0), *NEIGHBOURHOODS[self.neighbourhood])
+        return [list(dict.fromkeys((row + down) % rows * columns + (column + right) % columns for down, right in offsets))
                 for row in range(rows) for column in range(columns)]
 
 
-def replaced(cell: Individual, child: Individual, mates: list[Individual]) -> Individual:
+def survivor(cell: Individual, child: Individual, mates: list[Individual]) -> Individual:
     """The survivor in a cell after its child is evaluated; `mates` are the cell and its neighbours, whose `standing` this may change."""
     if child.failed or (not cell.failed and cell.fitness.dominates(child.fitness)):
         return cell
     if cell.failed or child.fitness.dominates(cell.fitness):
         return child
-    stand_by_crowding([*mates, child])
+    set_standings([*mates, child])
     return cell if all(mate.standing <= child.standing for mate in mates) else child
 
 
-def archived(archive: list[Individual], offspring: list[Individual], size: int) -> list[Individual]:
+def updated_archive(archive: list[Individual], offspring: list[Individual], size: int) -> list[Individual]:
     """The non-dominated individuals of archive and offspring, without duplicates and without the most crowded; sets their `standing`.
 
     Offspring are copied into the archive, because archive and grid each set the `standing` of their own copy.
@@ -115,8 +116,8 @@ def archived(archive: list[Individual], offspring: list[Individual], size: int) 
     for child in offspring:
         if not child.failed and child.fitness.values not in distinct:
             distinct[child.fitness.values] = copy(child)
-    kept = next(iter(stand_by_crowding(list(distinct.values()))), [])
+    kept = next(iter(set_standings(list(distinct.values()))), [])
     while len(kept) > size:
         del kept[max(range(len(kept)), key=lambda i: kept[i].standing)]
-        stand_by_crowding(kept)
+        set_standings(kept)
     return kept

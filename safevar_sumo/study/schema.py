@@ -247,8 +247,8 @@ class Study(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `constraints` are conditions that the characteristics of one vehicle satisfy together.
     """
 
-    # A new key that changes no result of a campaign also belongs in FREE of results/manifest.py. Any other new key becomes part of the
-    # identity of results: let `evaluation_keys` there omit its default, so that older results keep their identity.
+    # A new key that changes no result of a campaign also belongs in WITHOUT_EFFECT_ON_RESULTS of results/manifest.py. Any other new key
+    # becomes part of the identity of results: let `evaluation_keys` there omit its default, so that older results keep their identity.
     name: Annotated[str, Meta(pattern=NAME)]
     title: str
     scenario: ModelTable

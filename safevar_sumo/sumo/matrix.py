@@ -167,14 +167,7 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
     """Run the scenario once for every setting; shape (N, n). `watch` is called with the world at every sample.
 
     In a matrix the result is each setting's run at its worst point; with `watch` or a window, all settings run at the worst point of
-    the last setting.
-
-    Raises
-    ------
-    SimulationError
-        If SUMO fails.
-    InputError
-        If a user's ADS fails.
+    the last setting. Raises as `drive_all`.
     """
     if not system.matrix:
         return drive_all(system, settings, engine, options, watch)

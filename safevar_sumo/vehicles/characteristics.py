@@ -87,9 +87,9 @@ class Characteristic:
             above = " above 0" if self.lower > 0 else ""
             plausible, in_domain = f"a finite number{above}, up to {self.farthest:g}", f"a number in [{self.lower:g}, {self.upper:g}]"
             may_be_beyond = not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
-            any_with = f", or any with {switch}" if may_be_beyond and switch else ""
+            beyond_with = f", or any with {switch}" if may_be_beyond and switch else ""
             raise InputError(source, f"{self.name} = {value}{' is outside its domain' if may_be_beyond else ''}",
-                             f"{plausible if beyond else in_domain}{self.suffix}{otherwise}{any_with}")
+                             f"{plausible if beyond else in_domain}{self.suffix}{otherwise}{beyond_with}")
 
     def is_legal(self, values: Any, *, beyond: bool = False) -> Any:
         """Whether values, a number or an array, are in the domain; with `beyond`, whether they are plausible.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from concurrent.futures import Future
 from io import StringIO
 from typing import Any
 
@@ -27,30 +26,21 @@ from safevar_sumo.analysis.tolerance.compute import find_tolerances
 from safevar_sumo.analysis.tolerance.render import print_tolerance, profiles_figure
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
-from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.report.input import _at_point as at_point
 from safevar_sumo.report.rated import picture
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.workers.evaluation import evaluate_batch
+from tests.in_process import Here
 
 STUDY = load_study("euro_ncap_rating")
 WHOLE = protocol_of(EURO_NCAP_2026)
 
 
-class Here:
-    """A pool in this process."""
+class TwoWorkers(Here):
+    """A pool in this process that splits a rating's cells for two workers."""
 
     workers = 2
-
-    def submit(self, study: bytes, settings: FloatArray) -> Future[Evaluations]:
-        future: Future[Evaluations] = Future()
-        try:
-            future.set_result(evaluate_batch(study, settings))
-        except Exception as error:
-            future.set_exception(error)
-        return future
 
 
 @pytest.fixture(autouse=True)
@@ -69,7 +59,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
-    result = find_tolerances(STUDY, ToleranceOptions(characteristics=("brakeTorque",), unsafe="points=4.0"), pool=Here())
+    result = find_tolerances(STUDY, ToleranceOptions(characteristics=("brakeTorque",), unsafe="points=4.0"), pool=TwoWorkers())
     (scan,) = result.alone
     assert scan.points is not None
     points = dict(scan.points)
@@ -90,7 +80,7 @@ def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
 
 @pytest.mark.slow
 def test_explain_names_the_cells_that_turn_and_the_summary_the_points_that_are_lost() -> None:
-    evaluator = Evaluator(STUDY, Here())
+    evaluator = Evaluator(STUDY, TwoWorkers())
     members = evaluator.characteristics
     settings = np.array([members.setting({"brakeTorque": value, "payload": 200.0}, "it") for value in (0.5, 0.6)])
     original, evaluations = evaluator.original(), evaluator.evaluate(settings, "it")
@@ -99,7 +89,7 @@ def test_explain_names_the_cells_that_turn_and_the_summary_the_points_that_are_l
     points = float(original.column("rating_points")[0])
     lost = points - float(evaluations.column("rating_points")[1])
     assert lost > 0
-    result = explain_failures(case, ExplainOptions(solutions=("nsga2:0:0",), unsafe=f"points={points - 1e-3}"), pool=Here())
+    result = explain_failures(case, ExplainOptions(solutions=("nsga2:0:0",), unsafe=f"points={points - 1e-3}"), pool=TwoWorkers())
     (failure,) = result.explanations
     assert failure.points
     assert all(name.startswith(("CCRs", "CPNA")) for name in failure.points)
@@ -107,14 +97,14 @@ def test_explain_names_the_cells_that_turn_and_the_summary_the_points_that_are_l
     console = Console(record=True, width=120, file=StringIO())
     print_explained(console, "it", result, full=True)
     assert "turn: CCRs" in console.export_text()
-    lines = lead(STUDY, case.solutions, original, Here(), "it")
+    lines = lead(STUDY, case.solutions, original, TwoWorkers(), "it")
     assert f"{points:.2f}" in lines[0]
     assert isinstance(case.solutions, pd.DataFrame)
 
 
 @pytest.mark.slow
 def test_a_rating_prints_draws_and_stands_in_a_page() -> None:
-    result = compute.rate_variant(STUDY, RatingOptions(changes={"brakeTorque": 0.5}), pool=Here())
+    result = compute.rate_variant(STUDY, RatingOptions(changes={"brakeTorque": 0.5}), pool=TwoWorkers())
     assert result.lost > 0
     turned = dict(turned_in_words(result))
     assert set(turned) <= {block.name for block in result.protocol.blocks}
@@ -134,7 +124,7 @@ def test_a_rating_prints_draws_and_stands_in_a_page() -> None:
 @pytest.mark.slow
 def test_at_one_cell_a_collision_is_unsafe_and_points_are_no_column() -> None:
     """One cell has no rating: metres would be compared with points of the whole study."""
-    evaluator = Evaluator(STUDY, Here())
+    evaluator = Evaluator(STUDY, TwoWorkers())
     settings = np.array([evaluator.characteristics.setting({"brakeTorque": value}, "it") for value in (0.5, 0.99)])
     evaluations = evaluator.evaluate(settings, "it")
     solutions = solutions_frame(evaluator.characteristics.names, [(("nsga2", 0), evaluations)])
@@ -143,7 +133,7 @@ def test_at_one_cell_a_collision_is_unsafe_and_points_are_no_column() -> None:
     assert case.unsafe.points is not None
     here = at_point(case, "CCRs, 80 km/h, 100 %, wet")
     stated = RatingOptions(solution="nsga2:0:1", changes={"payload": 200.0})
-    variant = compute.rate_variant(case, stated, pool=Here()).variant
+    variant = compute.rate_variant(case, stated, pool=TwoWorkers()).variant
     assert variant is not None
     assert (variant.name, variant.setting["brakeTorque"], variant.setting["payload"]) == ("nsga2:0:1 changed", 0.99, 200.0)
     assert stated.command_line("it").endswith("rating it --set payload=200.0 --solution nsga2:0:1")
@@ -153,7 +143,7 @@ def test_at_one_cell_a_collision_is_unsafe_and_points_are_no_column() -> None:
 
 
 def test_rare_failures_are_approached_by_points_where_points_are_the_criterion() -> None:
-    evaluator = Evaluator(STUDY, Here())
+    evaluator = Evaluator(STUDY, TwoWorkers())
     evaluations = evaluator.evaluate(evaluator.characteristics.original[np.newaxis], "it")
     points = float(evaluations.column("rating_points")[0])
     response = Response(evaluator, lambda where: where, Unsafe(points=points - 2))

@@ -125,23 +125,23 @@ class Boundary(NamedTuple):
 
 def boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Unsafe) -> list[Boundary]:
     """Shrink causes, all changes by a common factor and each alone, as far as they stay unsafe and above the filter's thresholds."""
-    together = [(cause, cause.columns) for cause in causes]
-    alone = [(cause, (column,)) for cause in causes for column in cause.columns]
-    lines = [Line.moving(evaluator, cause, columns) for cause, columns in [*together, *alone]]
+    all_changes = [(cause, cause.columns) for cause in causes]
+    single_changes = [(cause, (column,)) for cause in causes for column in cause.columns]
+    lines = [Line.moving(evaluator, cause, columns) for cause, columns in [*all_changes, *single_changes]]
     fractions, ends = edges(evaluator, lines, unsafe)
-    single = iter(zip(lines[len(causes):], fractions[len(causes):], strict=True))
+    single_edges = iter(zip(lines[len(causes):], fractions[len(causes):], strict=True))
     shrunk = []
     for i, cause in enumerate(causes):
         if not cause.columns:
             shrunk.append(Boundary(0.0, cause.setting, {}))
             continue
-        group = {}
+        alone = {}
         for column in cause.columns:
-            line, fraction = next(single)
-            group[column] = float(line.at(np.array([fraction]))[0, column])
+            line, fraction = next(single_edges)
+            alone[column] = float(line.at(np.array([fraction]))[0, column])
         setting = lines[i].at(fractions[i:i + 1])[0]
         limiting = lines[i].first_filtered(evaluator.characteristics.threshold) if ends[i] == End.FILTER else None
-        shrunk.append(Boundary(float(fractions[i]), setting, group, ends[i], limiting))
+        shrunk.append(Boundary(float(fractions[i]), setting, alone, ends[i], limiting))
     return shrunk
 
 
@@ -184,7 +184,7 @@ def edges(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, stage: str = 
     A point that cannot be simulated is neither safe nor unsafe: the search passes it, and reports `NOT_SIMULATED` if it ends there.
     """
     lowest = np.array([line.lowest for line in lines])
-    low, high, simulated = lowest, np.ones(len(lines)), np.ones(len(lines), dtype=bool)
+    low, high, low_is_valid = lowest, np.ones(len(lines)), np.ones(len(lines), dtype=bool)
     for parts in (GRID, *(FINER,) * ROUNDS):
         shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(1, parts + 1) / parts
         shares[:, -1] = high
@@ -195,7 +195,7 @@ def edges(evaluator: Evaluator, lines: list[Line], unsafe: Unsafe, stage: str = 
         valid[:, :-1] = evaluations.valid.reshape(len(lines), parts - 1)
         first = np.argmax(is_unsafe, axis=1)
         rows = np.arange(len(lines))
-        simulated = np.where(first > 0, valid[rows, np.maximum(first - 1, 0)], simulated)
+        low_is_valid = np.where(first > 0, valid[rows, np.maximum(first - 1, 0)], low_is_valid)
         low, high = np.where(first > 0, shares[rows, np.maximum(first - 1, 0)], low), shares[rows, first]
-    ends = np.where((low == lowest) & (lowest > 0), End.FILTER, np.where(simulated, End.SAFE, End.NOT_SIMULATED))
+    ends = np.where((low == lowest) & (lowest > 0), End.FILTER, np.where(low_is_valid, End.SAFE, End.NOT_SIMULATED))
     return high, [End(end) for end in ends]

@@ -62,15 +62,15 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
     chosen = {reason: chosen_handle(solutions, criterion, choice, study.name) for choice, reason in REASONS.items()}
     rows = solutions.iloc[[position_of(solutions, handle) for handle in chosen.values()]]
     settings = rows[list(evaluator.characteristics.names)].to_numpy(dtype=float)
-    causes_of, (places, worst) = minimal_causes(evaluator, settings, criterion), _places(study, settings, criterion)
+    causes_of, (failing_points, worst) = minimal_causes(evaluator, settings, criterion), _failing_points(study, settings, criterion)
     counted = f"{int(unsafe.sum())} of {number_of(len(solutions), 'vehicle')} found"
     lines = [_paragraph(evaluator, solutions, unsafe, original, criterion, worst),
              f"{counted} collide." if criterion.below is None else
              f"No collision. {counted} keep less than half of the original's {degree:.2f} m."]
-    for (reason, handle), row, causes, fails in zip(chosen.items(), rows.to_dict("records"), causes_of, places, strict=True):
+    for (reason, handle), row, causes, fails_at in zip(chosen.items(), rows.to_dict("records"), causes_of, failing_points, strict=True):
         size = f"{number_of(int(row['f_num_diff']), 'change')} of up to {row['f_diff']:.0%}"
         end = f"{row['outcome']}, SD {row['f_safe']:.2f}"
-        lines.append(f"{LABELS.get(reason, reason).capitalize()}: {handle}, {end}, {size}. {_in_words(evaluator, causes)}{fails}")
+        lines.append(f"{LABELS.get(reason, reason).capitalize()}: {handle}, {end}, {size}. {_in_words(evaluator, causes)}{fails_at}")
     at_worst = f"at the worst point of the first (without --point: at all {len(assemble(study).points)}, which takes long)"
     return [*lines, f"Why, and how far{f', {at_worst}' if worst else ''}: {question_command('explain', place, worst)}"]
 
@@ -104,7 +104,7 @@ def _paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Seri
     return in_short(system, original, findings[0], findings[1] if len(findings) > 1 else None, preventable)
 
 
-def _places(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple[list[str], str]:
+def _failing_points(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple[list[str], str]:
     """Points of a matrix at which each setting fails, in words, and the first setting's worst point; empty without a matrix."""
     system = assemble(study)
     if not system.matrix:

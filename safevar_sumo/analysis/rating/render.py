@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LETTERS = {colour: colour[0].upper() for colour in COLOURS}
+LEGEND = ", ".join(f"{letter} {colour}" for colour, letter in LETTERS.items())
 ON_TERMINAL = {"green": "black on green", "yellow": "black on bright_yellow", "orange": "black on dark_orange",
                "brown": "white on dark_red", "red": "white on red"}
 DARK = ("green", "brown", "red")
@@ -98,15 +99,15 @@ def _changed(result: Rating, variant: RatedVehicle) -> str:
 
 def _points(result: Rating) -> WholeTable:
     """Points of every test as standard + extended + robustness = total."""
-    names = [one.name for one in result.variants]
+    names = [vehicle.name for vehicle in result.variants]
     table = WholeTable("test", right=[*names, *(["lost"] if result.variant else []), "of"],
                        title="Points: standard + extended + robustness = total")
-    for tests in zip(*(one.tests for one in result.variants), strict=True):
+    for tests in zip(*(vehicle.tests for vehicle in result.variants), strict=True):
         lost = round(tests[0].total - tests[-1].total, 2)
         table.add_row(tests[0].block.name, *(_sum(test.points) for test in tests),
                       *([f"{lost:.2f}" if lost else ""] if result.variant else []), f"{sum(tests[0].block.points):.2f}")
     table.add_section()
-    totals = [[sum(test.points[kind] for test in one.tests) for kind in range(3)] for one in result.variants]
+    totals = [[sum(test.points[kind] for test in vehicle.tests) for kind in range(3)] for vehicle in result.variants]
     table.add_row("all", *map(_sum, totals), *([f"{result.lost:.2f}"] if result.variant else []), f"{possible(result.protocol):g}")
     return table
 
@@ -118,13 +119,13 @@ def _sum(points: Sequence[float]) -> str:
 def _layers(result: Rating) -> WholeTable:
     """The layers that are simulated or claimed; a variant has a row only where it differs from the original."""
     table = WholeTable("test", "vehicle", "robustness layers that hold", "that do not", "that are claimed", title="Robustness layers")
-    for tests in zip(*(one.tests for one in result.variants), strict=True):
+    for tests in zip(*(vehicle.tests for vehicle in result.variants), strict=True):
         claimed = result.original.claims.get(tests[0].block.test, ())
-        for one, test in zip(result.variants, tests, strict=True):
-            if test.block.light != "night" and (one is result.original or test.layers != tests[0].layers):
+        for vehicle, test in zip(result.variants, tests, strict=True):
+            if test.block.light != "night" and (vehicle is result.original or test.layers != tests[0].layers):
                 holding, failing = ([layer for layer, holds in test.layers.items() if holds is expected and layer not in claimed]
                                     for expected in (True, False))
-                table.add_row(test.block.test, one.name, ", ".join(holding), ", ".join(failing), ", ".join(claimed))
+                table.add_row(test.block.test, vehicle.name, ", ".join(holding), ", ".join(failing), ", ".join(claimed))
     return table
 
 
@@ -132,34 +133,33 @@ def print_matrices(console: Console, result: Rating) -> None:
     """Every matrix: a letter and a colour for each cell, the speed of the impact [km/h] or time to collision of the warning [s]."""
     for block in result.protocol.blocks:
         columns = [f"{location:g} %" for location in block.impact_locations] or [f"{speed:g}" for speed in block.target_speeds]
-        of = "impact location" if block.impact_locations else "speed of the target"
+        columns_are = "impact location" if block.impact_locations else "speed of the target"
         heads = ["VUT", *(["target"] if block.impact_locations else [])]
-        table = WholeTable(*heads, right=columns, title=f"{block.name}: speeds [km/h], {of}")
+        table = WholeTable(*heads, right=columns, title=f"{block.name}: speeds [km/h], {columns_are}")
         for k, row in enumerate(block.rows):
             cells = [_cell(result, block, k, column) if letter != "-" else Text("") for column, letter in enumerate(row.ranges)]
             function = " FCW" if block.is_warning(k) else ""
             table.add_row(f"{row.vut:g}{function}", *([] if row.target is None else [f"{row.target:g}"]), *cells)
         console.print(table)
-    names = ", ".join(f"{letter} {colour}" for colour, letter in LETTERS.items())
     compared = "; original>variant where they differ" if result.variant else ""
-    print_text(console, f"{names}; small letters: extended range. The number is the relative speed of the impact [km/h]; in rows with "
+    print_text(console, f"{LEGEND}; small letters: extended range. The number is the relative speed of the impact [km/h]; in rows with "
                         f"FCW it is the time to collision at the warning [s]{compared}.")
 
 
 def _cell(result: Rating, block: Block, row: int, column: int) -> Text:
     number = result.protocol.matrix_of[block.name, row, column]
-    differs = len({one.colour(number) for one in result.variants}) > 1
+    differs = len({vehicle.colour(number) for vehicle in result.variants}) > 1
     text = Text()
-    for k, one in enumerate(result.variants if differs else result.variants[:1]):
+    for k, vehicle in enumerate(result.variants if differs else result.variants[:1]):
         text.append(">" if k else "")
         is_last = k == len(result.variants) - 1 or not differs
-        text.append(_cell_text(one, number, with_value=is_last), style=ON_TERMINAL.get(one.colour(number) or "", ""))
+        text.append(_cell_text(vehicle, number, with_value=is_last), style=ON_TERMINAL.get(vehicle.colour(number) or "", ""))
     return text
 
 
-def _cell_text(one: RatedVehicle, number: int, *, with_value: bool) -> str:
-    cell, colour = one.protocol.cells[number], one.colour(number)
-    record = one.cell(number)
+def _cell_text(vehicle: RatedVehicle, number: int, *, with_value: bool) -> str:
+    cell, colour = vehicle.protocol.cells[number], vehicle.colour(number)
+    record = vehicle.cell(number)
     value = record["warning_ttc"] if cell.judged == "warning" else record["relative_impact_speed"]
     letter = "?" if colour is None else LETTERS[colour]
     letter = letter.lower() if cell.range == "extended" else letter
@@ -170,35 +170,35 @@ def _cell_text(one: RatedVehicle, number: int, *, with_value: bool) -> str:
 def matrices_figure(result: Rating) -> Figure:
     """All matrices, the variant's beside the original's: colours and letters, extended cells hatched, cells that differ framed."""
     blocks = result.protocol.blocks
-    rows = -(-len(blocks) // COLUMNS_OF_PAIRS)
+    rows = math.ceil(len(blocks) / COLUMNS_OF_PAIRS)
     figure, axes = new_figure(verdict_title(result), rows, COLUMNS_OF_PAIRS, (15, 2.6 * rows))
     for axis in axes.flat[len(blocks):]:
         axis.set_axis_off()
     for axis, block in zip(axes.flat, blocks, strict=False):
-        _draw(axis, result, block)
-    names = ", ".join(f"{letter} {colour}" for colour, letter in LETTERS.items())
-    figure.supxlabel(f"impact location [% of the width], or speed of the target [km/h] in CCCscp and CMCscp; {names}; hatched: extended "
+        _draw_matrices(axis, result, block)
+    figure.supxlabel(f"impact location [% of the width], or speed of the target [km/h] in CCCscp and CMCscp; {LEGEND}; hatched: extended "
                      "range; thick frame: another colour than the original's", fontsize=FONT)
     figure.supylabel("speed of the vehicle under test [km/h]", fontsize=FONT)
     return figure
 
 
 def verdict_title(result: Rating) -> str:
-    points = "; ".join(f"{one.name}: {one.points:.2f} points" for one in result.variants)
+    points = "; ".join(f"{vehicle.name}: {vehicle.points:.2f} points" for vehicle in result.variants)
     return f"{result.study.name}: {points} of {possible(result.protocol):g}" + (" (original left, variant right)" if result.variant else "")
 
 
-def _draw(axis: Axes, result: Rating, block: Block) -> None:
+def _draw_matrices(axis: Axes, result: Rating, block: Block) -> None:
+    """Draw a block's matrix of each vehicle, side by side."""
     from matplotlib.patches import Rectangle
 
     wide = max(len(row.ranges) for row in block.rows)
     heads = block.impact_locations or block.target_speeds
     ticks: list[tuple[float, str]] = []
-    for k, one in enumerate(result.variants):
+    for k, vehicle in enumerate(result.variants):
         shift = k * (wide + 0.6)
         ticks += [(shift + column + 0.5, f"{head:g}") for column, head in enumerate(heads)]
         for row, column, number in _cells_of(block, result):
-            colour, is_extended = one.colour(number), result.protocol.cells[number].range == "extended"
+            colour, is_extended = vehicle.colour(number), result.protocol.cells[number].range == "extended"
             turned = k > 0 and colour != result.original.colour(number)
             face = f"#{result.protocol.colours[colour]}" if colour else "#808080"
             ink = "white" if colour in DARK or colour is None else "black"
@@ -218,11 +218,12 @@ def _draw(axis: Axes, result: Rating, block: Block) -> None:
 
 
 def _totals(result: Rating, block: Block) -> str:
-    return " / ".join(f"{test.total:.2f}" for one in result.variants for test in one.tests if test.block is block)
+    return " / ".join(f"{test.total:.2f}" for vehicle in result.variants for test in vehicle.tests if test.block is block)
 
 
 def _cells_of(block: Block, result: Rating) -> Iterator[tuple[int, int, int]]:
-    for row, line in enumerate(block.rows):
-        for column, letter in enumerate(line.ranges):
+    """Row, column and number of each cell of a block's matrix."""
+    for row, speeds in enumerate(block.rows):
+        for column, letter in enumerate(speeds.ranges):
             if letter != "-":
                 yield row, column, result.protocol.matrix_of[block.name, row, column]

@@ -20,14 +20,7 @@ TITLES = {"fewest": "Fewest changes that cost a point", "smallest": "Smallest la
 def rated_lead(study: Study, solutions: pd.DataFrame, original: Evaluations, place: str) -> list[str]:
     """Summarise the solutions of a rated study in lines; the last line has the commands for the next steps.
 
-    Parameters
-    ----------
-    solutions
-        A frame as `safevar_sumo.results.solutions_frame` makes it.
-    original
-        The original vehicle's evaluation.
-    place
-        The directory of the results.
+    Parameters are those of `safevar_sumo.analysis.explain.summary.lead`, which calls this function for rated studies.
     """
     points, name = float(original.column(RATING_POINTS.name)[0]), RATING_POINTS.name
     unsafe = Unsafe.default(record(original, 0), solutions["outcome"])

@@ -83,6 +83,11 @@ class Case:
         present = {*self.solutions["algorithm"], *(algorithm for algorithm, _ in self.finished)}
         return tuple(name for name in dict.fromkeys([*self.study.search.labels, *sorted(present)]) if name in present)
 
+    def require_solutions(self) -> None:
+        """Raise `Unanswerable` if no run is finished."""
+        if not self.algorithms:
+            raise Unanswerable(self.name, "has no finished run", "results with at least one finished run")
+
     def solutions_of(self, algorithm: str) -> pd.DataFrame:
         """Pooled solutions of all finished runs of an algorithm.
 

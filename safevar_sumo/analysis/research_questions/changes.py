@@ -130,8 +130,7 @@ def collisions(case: Case) -> pd.DataFrame:
     Unanswerable
         If no run is finished.
     """
-    if not case.algorithms:
-        raise Unanswerable(case.name, "has no finished run", "results with at least one finished run")
+    case.require_solutions()
     rows = []
     for algorithm in case.algorithms:
         solutions = case.solutions_of(algorithm)

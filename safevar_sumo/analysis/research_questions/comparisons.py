@@ -81,8 +81,7 @@ def rq1(case: Case) -> pd.DataFrame:
     Unanswerable
         If no run is finished.
     """
-    if not case.algorithms:
-        raise Unanswerable(case.name, "has no finished run", "results with at least one finished run")
+    case.require_solutions()
     rows = rq1_rows(case, lambda algorithm, metric: values(case.solutions_of(algorithm), metric),
                     lambda sample, original: compare_samples(sample, np.full(0 if np.isnan(original) else len(sample), original)))
     return pd.DataFrame(rows, columns=RQ1_COLUMNS, dtype=object)
@@ -140,10 +139,10 @@ def rq2_rows(case: Case, sample_of: Sample) -> list[dict[str, Any]]:
     for baseline in (name for name in case.algorithms if name != NSGA2):
         pair = (NSGA2, baseline)
         tests = [(name, not more_is_better, compare_samples(*(
-            [] if quality is None else quality.loc[quality["algorithm"] == one, name] for one in pair)))
+            [] if quality is None else quality.loc[quality["algorithm"] == algorithm, name] for algorithm in pair)))
             for name, more_is_better in MORE_IS_BETTER.items()]
-        tests += [(metric.name, not metric.more_is_unsafe, compare_samples(*(sample_of(one, metric) for one in pair)))
+        tests += [(metric.name, not metric.more_is_unsafe, compare_samples(*(sample_of(algorithm, metric) for algorithm in pair)))
                   for metric in case.scoring.metrics]
-        rows += [{"setting": case.name, "baseline": baseline, "metric": name, **(from_other_side(test) if turn else test)._asdict()}
-                 for name, turn, test in tests]
+        rows += [{"setting": case.name, "baseline": baseline, "metric": name,
+                  **(from_other_side(test) if smaller_is_better else test)._asdict()} for name, smaller_is_better, test in tests]
     return rows

@@ -158,8 +158,7 @@ def _p(value: float) -> str:
 
 def _corrected(case: Case) -> tuple[pd.DataFrame, pd.DataFrame | None]:
     """The frames of RQ1 and RQ2 over runs, with p-values corrected as one family; None for RQ2 if it has no answer."""
-    if not case.algorithms:
-        raise Unanswerable(case.name, "has no finished run", "results with at least one finished run")
+    case.require_solutions()
     means = partial(run_means, case)
     first = rq1_rows(case, means, signed_rank)
     has_rq2 = NSGA2 in case.algorithms and len(case.algorithms) > 1
