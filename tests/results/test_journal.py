@@ -39,7 +39,8 @@ def places(number: int) -> list[int]:
 
 
 def write(path: Path, batches: int = BATCHES, finished: bool = True) -> list[int]:
-    """Write a journal; returns where its frames end."""
+    """Write a journal anew; returns where its frames end."""
+    path.unlink(missing_ok=True)
     ends = []
     journal = Journal(path, "study", "nsga2-00")
     ends.append(path.stat().st_size)
@@ -90,7 +91,6 @@ def test_what_was_written_is_read(tmp_path: Path) -> None:
 @given(st.data())
 def test_any_truncation_loads_what_was_whole_and_goes_on(tmp_path: Path, data: st.DataObject) -> None:
     path = tmp_path / "a.journal"
-    path.unlink(missing_ok=True)
     ends = write(path)
     left = data.draw(st.integers(0, ends[-1] - 1))
     os.truncate(path, left)
@@ -110,7 +110,6 @@ def test_any_truncation_loads_what_was_whole_and_goes_on(tmp_path: Path, data: s
 @given(st.data())
 def test_any_changed_byte_is_a_cut_tail_or_an_error_that_tells_where(tmp_path: Path, data: st.DataObject) -> None:
     path = tmp_path / "a.journal"
-    path.unlink(missing_ok=True)
     ends = write(path)
     content = bytearray(path.read_bytes())
     place, change = data.draw(st.integers(0, len(content) - 1)), data.draw(st.integers(1, 255))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -116,24 +117,26 @@ def _names(answer: Answer) -> dict[str, str]:
 
 def _tests(answer: Answer, group_column: str, sizes: tuple[str, ...], notes: tuple[str, ...]) -> Table:
     """P-values (with Holm's correction too if the answer is over runs) and effect sizes; one block of columns per case."""
-    frame = answer.frame
+    frame, methods = answer.frame, set(answer.frame["method"])
     corrected = "p_holm" in frame
-    exact_marked = not corrected and EXACT in set(frame["method"])
-    parts = (*(("p", "p Holm") if corrected else ("p",)), "A12", "magnitude", *sizes)
+    marks = {} if corrected else {EXACT: "e"}
+    method_notes = [f"p{f' with {marks[method]}' if method in marks else ''}: {method}."
+                    for method in (EXACT_SIGNED, ASYMPTOTIC_SIGNED, ASYMPTOTIC, EXACT) if method in methods]
+    return pivoted(TITLES[answer.name], frame, (group_column, "metric"), lambda row: _test_cells(row, sizes, marks),
+                   ("p", *(("p Holm",) if corrected else ()), "A12", "magnitude", *sizes), names=_names(answer),
+                   notes=(*method_notes, *notes, HOLM_NOTE if corrected else BOLD_NOTE))
 
-    def cells(row: Row) -> tuple[str, ...]:
-        if pd.isna(row["p_value"]):
-            return (UNDEFINED,) * len(parts)
-        significant = row["p_holm" if corrected else "p_value"] < ALPHA
-        p = p_value(row["p_value"]) + ("e" if exact_marked and row["method"] == EXACT else "")
-        effect = _bold(f"{row['effect_size']:.3f}", significant and (corrected or row["magnitude"] in NOTABLE))
-        tests = (p, _bold(p_value(row["p_holm"]), significant)) if corrected else (_bold(p, significant),)
-        return (*tests, effect, row["magnitude"], *(str(row[size]) for size in sizes))
 
-    methods = [f"p{' with e' if exact_marked and method == EXACT else ''}: {method}."
-               for method in (EXACT_SIGNED, ASYMPTOTIC_SIGNED, ASYMPTOTIC, EXACT) if method in set(frame["method"])]
-    return pivoted(TITLES[answer.name], frame, (group_column, "metric"), cells, parts, names=_names(answer),
-                   notes=(*methods, *notes, HOLM_NOTE if corrected else BOLD_NOTE))
+def _test_cells(row: Row, sizes: Sequence[str] = (), marks: Mapping[str, str] = MappingProxyType({})) -> tuple[str, ...]:
+    """P-value, with a mark for its method, and with Holm's correction if the row has it; effect size, magnitude, sizes of the samples."""
+    corrected = "p_holm" in row
+    if pd.isna(row["p_value"]):
+        return (UNDEFINED,) * (3 + corrected + len(sizes))
+    significant = row["p_holm" if corrected else "p_value"] < ALPHA
+    p = p_value(row["p_value"]) + marks.get(row["method"], "")
+    effect = _bold(f"{row['effect_size']:.3f}", significant and (corrected or row["magnitude"] in NOTABLE))
+    tests = (p, _bold(p_value(row["p_holm"]), significant)) if corrected else (_bold(p, significant),)
+    return (*tests, effect, row["magnitude"], *(str(row[size]) for size in sizes))
 
 
 def _rq1(answer: Answer) -> list[Table]:
@@ -172,19 +175,10 @@ def _rq2_runs(answer: Answer) -> list[Table]:
 
 def _rq2_pairs(answer: Answer) -> list[Table]:
     """A table for each pair: its metrics, cases side by side."""
-    frame, names = answer.frame, _names(answer)
-
-    def cells(row: Row) -> tuple[str, ...]:
-        if pd.isna(row["p_value"]):
-            return (UNDEFINED,) * 4
-        significant = row["p_holm"] < ALPHA
-        effect = _bold(f"{row['effect_size']:.3f}", significant)
-        return p_value(row["p_value"]), _bold(p_value(row["p_holm"]), significant), effect, row["magnitude"]
-
     notes = ("One value for each run; A12 above 0.5: the first is better (a better front, more unsafe solutions).",
              non_collision_note(answer.metrics), "Holm's correction is for all pairs and metrics of a setting.")
-    return [pivoted(TITLES["rq2-pairs"], frame, ("algorithm", "other", "metric"), cells, ("p", "p Holm", "A12", "magnitude"), names=names,
-                    notes=notes)]
+    return [pivoted(TITLES["rq2-pairs"], answer.frame, ("algorithm", "other", "metric"), _test_cells, ("p", "p Holm", "A12", "magnitude"),
+                    names=_names(answer), notes=notes)]
 
 
 def _rq2_ranks(answer: Answer) -> list[Table]:
