@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 
 import nbformat
 import pytest
 from nbclient import NotebookClient
 
+import safevar_sumo as sv
+
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 SHOWN = {"quickstart": (1, 2), "rq1": (2, 0), "rq2": (1, 2), "rq3": (4, 3)}
-"""How many cells show tables and how many a picture."""
+"""Number of cells that show a table and of those that show a picture, by notebook."""
 
 
 @pytest.fixture(scope="module")
@@ -35,19 +38,40 @@ def test_a_notebook_is_stored_with_what_it_shows(name: str) -> None:
     assert all(row in file.read_text() for row in rows.get(name, ()))
 
 
+def test_stored_outputs_are_of_todays_vehicle() -> None:
+    """`python -m tests.test_notebooks` stores them anew."""
+    texts = {name: _texts(nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)) for name in (*SHOWN, "answers")}
+    assert str(sv.simulate("sun").metrics["safety_degree"]) in "".join(texts["quickstart"])
+    results = [text for name in SHOWN for text in texts[name] if text.startswith("<Results of sun")]
+    assert len(results) == len(SHOWN)
+    assert len(set(results)) == 1
+    assert "SD is below 1.1 in" in "".join(texts["answers"])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHOWN)
 def test_a_notebook_shows_its_tables_and_pictures(name: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a smaller study than the one that its stored outputs come from."""
     monkeypatch.setenv("SAFEVAR_RUNS", "2")
     monkeypatch.setenv("SAFEVAR_EVALUATIONS", "200")
-    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
-    NotebookClient(notebook, timeout=240, kernel_name="python3", resources={"metadata": {"path": str(place)}}).execute()
+    notebook = _executed(name, place, timeout=240)
     assert _shown(notebook) == SHOWN[name]
 
 
+def _executed(name: str, place: Path, timeout: int) -> nbformat.NotebookNode:
+    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    NotebookClient(notebook, timeout=timeout, kernel_name="python3", resources={"metadata": {"path": str(place)}}).execute()
+    return notebook
+
+
+def _texts(notebook: nbformat.NotebookNode) -> list[str]:
+    """Everything that a notebook's cells print or return, as text."""
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    return [output.get("text") or output.get("data", {}).get("text/plain", "") for output in outputs]
+
+
 def _shown(notebook: nbformat.NotebookNode) -> tuple[int, int]:
-    """How many tables and pictures a notebook shows; nothing may be told on stderr."""
+    """Number of tables and of pictures that a notebook shows; refuses outputs on stderr."""
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert not [output for output in outputs if output.get("name") == "stderr" or output.output_type == "error"]
     tables = [output.data["text/markdown"] for output in outputs if "text/markdown" in output.get("data", {})]
@@ -57,8 +81,7 @@ def _shown(notebook: nbformat.NotebookNode) -> tuple[int, int]:
 
 @pytest.mark.slow
 def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> None:
-    notebook = nbformat.read(NOTEBOOKS / "answers.ipynb", as_version=4)
-    NotebookClient(notebook, timeout=900, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}).execute()
+    notebook = _executed("answers", tmp_path, timeout=900)
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     shown = [output.get("data", {}) for output in outputs]
     assert (sum("text/html" in data for data in shown), sum("image/png" in data for data in shown)) == (3, 4)
@@ -72,10 +95,18 @@ def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> Non
 def test_the_notebook_of_the_rating_tells_where_points_are_lost(tmp_path: Path) -> None:
     file = NOTEBOOKS / "rating.ipynb"
     assert file.stat().st_size < 500_000
-    stored = nbformat.read(file, as_version=4)
-    notebook = nbformat.read(file, as_version=4)
-    NotebookClient(notebook, timeout=1800, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}).execute()
-    for one in (stored, notebook):
-        texts = [output.data["text/plain"] for cell in one.cells if cell.cell_type == "code" for output in cell.outputs if "data" in output]
+    for notebook in (nbformat.read(file, as_version=4), _executed("rating", tmp_path, timeout=1800)):
+        texts = _texts(notebook)
         assert any("the vehicle loses" in text for text in texts)
         assert sum("Axes" in text for text in texts) == 2
+
+
+def main() -> None:
+    """Execute the notebooks and store them with their outputs."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name in (*SHOWN, "answers", "rating"):
+            nbformat.write(_executed(name, Path(folder), timeout=1800), NOTEBOOKS / f"{name}.ipynb")
+
+
+if __name__ == "__main__":
+    main()
