@@ -179,7 +179,7 @@ def replays(data: ReportInput, explained: Explanations | None) -> list[Replay]:
     for place, handle in enumerate(handles):
         row, setting = data.solutions[handle], data.setting_of(handle)
         entry = Replay(handle, data.anchor("replay", handle), row["outcome"], row["f_safe"], row["f_diff"], row["f_num_diff"],
-                       data.changes(setting), open=place == 0 and explained is None)
+                       data.changes(setting), open=place == 0 and not (explained and explained.failures))
         entries.append(entry if data.system is None else entry._replace(
             replay=data.replay(setting), where=data.where(setting),
             differences=differences(data.simulate_again([setting])[0].evaluation, row)))
