@@ -9,10 +9,10 @@ from contextlib import contextmanager
 import msgspec
 import numpy as np
 
-from safevar_sumo.errors import SimulationError
+from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.protocol import part_of
-from safevar_sumo.protocol.rater import rater_of
+from safevar_sumo.protocol.rater import is_rated, rater_of
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
@@ -147,13 +147,20 @@ class Evaluator:
         return evaluations
 
     def criterion(self, stated: str | None, original: Evaluations | None = None) -> Unsafe:
-        """The criterion that an option states, else the default one; raises as `Unsafe.parse` and `Unsafe.default_among`."""
+        """The criterion that an option states, else the default one; raises as `parsed` and `Unsafe.default_among`."""
         if stated is not None:
-            return Unsafe.parse(stated)
+            return self.parsed(stated)
         original = self.original() if original is None else original
         if RATING_POINTS.name in original.metrics:
             return Unsafe.default_among(original, original)
         return Unsafe.default_among(self.evaluate(self.spread(PROBED), "settings over the whole domain"), original)
+
+    def parsed(self, stated: str) -> Unsafe:
+        """The criterion that an option states; raises as `Unsafe.parse`, and where it asks for points of a study that is not rated."""
+        criterion = Unsafe.parse(stated)
+        if criterion.points is not None and not is_rated(self.study):
+            raise InputError("unsafe", f"{stated!r}: study {self.study.name!r} is not rated and has no points", "collision or below=X")
+        return criterion
 
     def with_step(self, step: float) -> Evaluator:
         """An evaluator of the same study with another time step [s]."""

@@ -39,7 +39,7 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     """
     source, search = study.source, study.search
     name, key = search.labels.get(label, label), f"search.{label}"
-    if len(search.labels) < len(set(search.algorithms)):
+    if len(search.labels) < len(search.algorithms):
         raise InputError(source, f"search.algorithms = {search.algorithms}: two have the same name", "algorithms with different names")
     for stray in search.parameters:
         if stray not in ALGORITHMS and stray not in search.labels:

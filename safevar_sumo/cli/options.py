@@ -118,10 +118,12 @@ def _values(change: str, text: str, original: float, legal: str) -> list[float]:
     if share := SHARE.fullmatch(text):
         return [original + abs(original) * float(share[1]) / 100]
     if sweep := SWEEP.fullmatch(text):
-        number = max(1, int(sweep[3] or DEFAULT_SWEEP_LENGTH))
+        number = int(sweep[3] or DEFAULT_SWEEP_LENGTH)
+        if number < 2:
+            raise InputError("--set", f"{change!r}: {number} values from {sweep[1]} to {sweep[2]}", "NUMBER of at least 2")
         return np.linspace(float(sweep[1]), float(sweep[2]), number).tolist()  # type: ignore[no-any-return]
     try:
-        return [float(text)]
+        return [float(text.replace("_", "not a number"))]
     except ValueError:
         raise InputError("--set", repr(change), legal) from None
 

@@ -45,6 +45,8 @@ def rating(place: str, changes: tuple[str, ...], solution: str | None, matrix: b
 
     subject = results_or_study(place)
     options = RatingOptions(changes=_changes(subject if isinstance(subject, Study) else subject.study, changes), solution=solution)
+    if force and xlsx is None and preprocessed is None and plot is None:
+        raise InputError("--force", "there is no file to overwrite", "together with --xlsx, --preprocessed or --plot")
     if plot is not None:
         check_output(plot, "--plot", PICTURES)
         _refuse_existing(plot, "--plot", force)

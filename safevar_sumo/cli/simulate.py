@@ -94,10 +94,9 @@ def _check_outputs(study: str, trace: Path | None, replays: Replays) -> None:
     if trace is not None:
         refuse_inputs(trace, "--trace", study)
         check_writable(trace, "--trace")
-    if replays.requested:
-        replays.check(study)
-        if trace is not None and trace.resolve() in replays.files:
-            raise InputError("--trace", f"{trace} is what --plot or --animate writes", "another file")
+    replays.check(study)
+    if trace is not None and trace.resolve() in replays.files:
+        raise InputError("--trace", f"{trace} is what --plot or --animate writes", "another file")
 
 
 def _sweep(target: Target, system: System, requested: FloatArray, names: tuple[str, ...], filtered: bool, as_json: bool) -> None:
@@ -178,14 +177,14 @@ class Replays(NamedTuple):
 
     def check(self, study: str) -> None:
         """Refuse a file that cannot be written or is an input of `study`, before any simulation; raises InputError."""
-        from safevar_sumo.replay.animation import ANIMATIONS, check_animation
-
         if self.slower != 1 and not self.gui:
             raise InputError("--slower", f"{self.slower:g} without --gui", "together with --gui")
         if self.plot is not None:
             refuse_inputs(self.plot, "--plot", study)
             check_output(self.plot, "--plot", PICTURES)
         if self.animate is not None:
+            from safevar_sumo.replay.animation import ANIMATIONS, check_animation
+
             refuse_inputs(self.animate, "--animate", study)
             check_output(self.animate, "--animate", tuple(ANIMATIONS))
             check_animation(self.animate)

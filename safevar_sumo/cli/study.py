@@ -82,7 +82,7 @@ def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -
     changes: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
     if algorithms is not None:
         names = [name.strip() for name in algorithms.split(",")]
-        changes["algorithms"] = list(dict.fromkeys(study.search.labels.get(name, name) for name in names))
+        changes["algorithms"] = [study.search.labels.get(name, name) for name in names]
     return msgspec.structs.replace(study, search=msgspec.structs.replace(study.search, **changes))
 
 

@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.explain.compute import explain_failures as explain
-from safevar_sumo.analysis.explain.necessity import is_borderline
+from safevar_sumo.analysis.explain.necessity import in_words
 from safevar_sumo.analysis.explain.result import CauseEntry, FailureEntry, SummaryEntry
 from safevar_sumo.analysis.opinion.compute import Cause, opinions_of, second_system
 from safevar_sumo.analysis.research_questions.indicators import nondominated
@@ -58,7 +58,8 @@ class CauseSection(NamedTuple):
     """A cause on the page.
 
     `end` tells how its run ends; scaled to `fraction` all changes are still unsafe, `below` is the state just below. `handle` is that of a
-    failure with this cause, `whole` the anchor of its replay; `because`, `robustness` and `borderline` describe the whole failure.
+    failure with this cause, `whole` the anchor of its replay; `because` and `robustness` describe the whole failure, `alone` is the
+    robustness of the cause by itself, empty if it is not known.
     """
 
     title: str
@@ -72,8 +73,8 @@ class CauseSection(NamedTuple):
     handle: str
     whole: str
     because: str
-    robustness: float
-    borderline: bool
+    robustness: str
+    alone: str
     opinion: SecondOpinion | None
 
 
@@ -168,7 +169,7 @@ def _section(data: ReportInput, place: int, cause: CauseEntry, failure: FailureE
         title=f"Cause {place}: {', '.join(cause.changes)}", anchor=data.anchor("cause", place), rows=table,
         end=comparison.verdict(comparison.rows[-1]), fraction=cause.fraction, below=cause.end, where=data.where(setting),
         replay=data.replay(setting), handle=failure.handle, whole=data.anchor("replay", failure.handle), because=raised(failure.because),
-        robustness=failure.robustness, borderline=is_borderline(failure.robustness), opinion=opinion)
+        robustness=in_words(failure.robustness), alone="" if cause.robustness is None else in_words(cause.robustness), opinion=opinion)
 
 
 def replays(data: ReportInput, explained: Explanations | None) -> list[Replay]:

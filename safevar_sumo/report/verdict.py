@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.analysis.explain.necessity import BORDERLINE, is_borderline
-from safevar_sumo.analysis.explain.result import REASONS, ROBUST, FailureEntry
+from safevar_sumo.analysis.explain.necessity import BORDERLINE, in_words, is_borderline
+from safevar_sumo.analysis.explain.result import REASONS, ROBUST, CauseEntry, FailureEntry
 from safevar_sumo.analysis.model_spread import ModelSpread, model_spreads
 from safevar_sumo.analysis.preventability import PreventedShares
 from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, collided
@@ -103,7 +103,7 @@ UNKNOWN = "–"  # noqa: RUF001
 class Finding(NamedTuple):
     """A selected failure in the verdict; all values are its solution's, not scaled back.
 
-    `share` is the unsafe share of its neighbours, and `needed` the number of changes that suffice; None if it was not explained.
+    `share` is the unsafe share of its neighbours, and `cause` its first minimal cause; None if it was not explained.
     """
 
     title: str
@@ -117,7 +117,12 @@ class Finding(NamedTuple):
     f_safe: float
     where: FailingPlaces | None
     share: float | None
-    needed: int | None
+    cause: CauseEntry | None
+
+    @property
+    def needed(self) -> int | None:
+        """Number of changes that suffice."""
+        return None if self.cause is None else len(self.cause.changes)
 
     @property
     def borderline(self) -> bool:
@@ -196,7 +201,7 @@ def _finding(data: ReportInput, handle: str, reasons: list[str], failure: Failur
         changes=changes, largest=largest, size=f"{len(changes)} of {len(setting)} characteristics changed, by at most {largest:.0%}",
         end=_end(data, handle, setting), f_safe=data.solutions[handle]["f_safe"], where=data.where(setting),
         share=failure.robustness if failure else None,
-        needed=len(failure.minimal_causes[0].changes) if failure and failure.minimal_causes else None)
+        cause=failure.minimal_causes[0] if failure and failure.minimal_causes else None)
 
 
 def _end(data: ReportInput, handle: str, setting: FloatArray) -> str:
@@ -226,7 +231,9 @@ def _changes_lead_to(finding: Finding, outcome: str) -> str:
     number, needed = len(finding.changes), finding.needed
     if number == needed:
         return f"{number_of(number, 'change')} suffice{'s' if number == 1 else ''} for {outcome}"
-    some = "" if needed is None else f" ({needed} of them suffice{'s' if needed == 1 else ''} to be unsafe)"
+    share = finding.cause.robustness if finding.cause else None
+    borderline = "" if share is None or not is_borderline(share) else f", but {in_words(share)}"
+    some = "" if needed is None else f" ({needed} of them suffice{'s' if needed == 1 else ''} to be unsafe{borderline})"
     return f"{number_of(number, 'change')} lead{'s' if number == 1 else ''} to {outcome}{some}"
 
 

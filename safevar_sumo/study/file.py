@@ -143,7 +143,11 @@ def _extended(raw: _Raw, path: Path, seen: tuple[Path, ...]) -> _Raw:
     if "name" not in tables and re.fullmatch(NAME, path.stem):
         tables["name"] = path.stem
     beside = path.parent / base
-    extended = _read(beside if is_file(beside) else study_path(base), (*seen, path))
+    try:
+        base_path = beside if is_file(beside) else study_path(base)
+    except InputError as error:
+        raise InputError(raw.source, f"extends = {base!r}: {error.problem}", error.legal) from None
+    extended = _read(base_path, (*seen, path))
     merged = _overridden(extended, tables, raw.source)
     places = tuple(dict.fromkeys((*raw.origin.places, *extended.origin.places)))
     remarks = () if path.parent == STUDIES else merged.origin.remarks  # shipped studies leave keys out on purpose
@@ -162,8 +166,8 @@ def _overridden(base: _Raw, overrides: Mapping[str, Any], source: object) -> _Ra
         if "vehicle" in other or "ads" in other:  # both are about their parameters
             tables = {key: value for key, value in tables.items() if key in overrides or key not in ("spread", "model_error")}
         if dropped:
-            remarks = (*remarks, f"{source}: has another {' and another '.join(other)} than study {base.tables.get('name')!r}, whose "
-                                 f"{' and '.join(dropped)} it does not inherit")
+            remarks = (*remarks, f"{source}: has another {' and another '.join(other)} than study {base.tables.get('name')!r}, so it does "
+                                 f"not inherit that study's {' and '.join(f'[{key}]' for key in dropped)}")
     return _Raw(source, tables, msgspec.structs.replace(base.origin, remarks=remarks))
 
 

@@ -166,7 +166,7 @@ def _unusable(value: object, where: str) -> tuple[str, str] | None:
     if isinstance(value, float) and not math.isfinite(value):
         return str(value), "a finite number"
     if isinstance(value, int) and not -2**63 <= value < 2**63:
-        return f"an integer of {value.bit_length()} bits", "an integer of 64 bits"
+        return f"{str(value)[:30]}, beyond 64 bits", "an integer from -2^63 to 2^63 - 1"
     if isinstance(value, str) and ".parameters." not in f".{where}" and not value.isprintable():
         return repr(value)[:80], "a text without control characters"
     return None

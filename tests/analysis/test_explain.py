@@ -21,16 +21,19 @@ from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, sentence, summary_of
 from safevar_sumo.analysis.explain.causes import RESOLUTION, End, affordable, boundaries, involved, minimal_causes, necessary
 from safevar_sumo.analysis.explain.compute import explain_failures
-from safevar_sumo.analysis.explain.necessity import distinct_causes, necessity, robustness, smallest_robust
+from safevar_sumo.analysis.explain.necessity import Robustness, distinct_causes, necessity, robustness, smallest_robust
 from safevar_sumo.analysis.explain.render import print_explained
 from safevar_sumo.analysis.explain.result import Explained
-from safevar_sumo.analysis.explain.summary import NUMBERS, lead
+from safevar_sumo.analysis.explain.summary import NUMBERS, Finding, in_short, lead
+from safevar_sumo.analysis.preventability import Preventability
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import BoolArray, Encounter, FloatArray, Outcome, SimulationRuns, Trace
 from safevar_sumo.results import handles
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo import assemble, evaluate
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.analysis.known_regions import ORIGINAL, Plant, box, everywhere, made_up_evaluator, made_up_study, two_islands
 from tests.in_process import Here
@@ -80,7 +83,7 @@ def test_the_records_are_those_of_the_solutions(case: Case, explained: Explained
         assert one["setting"] == row[list(case.characteristics.names)].to_dict()
         assert (one["outcome"], one["safety_degree"]) == (row["outcome"], row["safety_degree"])
         for cause in one["minimal_causes"]:
-            assert list(cause) == ["changes", "boundary", "fraction", "outcome", "safety_degree", "end"]
+            assert list(cause) == ["changes", "boundary", "fraction", "outcome", "safety_degree", "end", "robustness"]
             assert set(cause["changes"]) <= set(one["changed"])
             assert all(one["setting"][name] == value for name, value in cause["changes"].items())
         assert 0 <= one["robustness"] <= 1
@@ -170,7 +173,7 @@ def assert_tells_a_manager(paragraph: str, explained: Explained) -> None:
     assert paragraph.startswith(f"In wet leaves, the original vehicle stops {degree:.2f} m short of the pedestrian. ")
     for one in (fewest, robust):
         word = "borderline: only" if one.robustness.borderline else "robust:"
-        share = f"{word} {100 * one.robustness.share:.0f} % of its neighbours are unsafe too"
+        share = f"{word} {100 * one.robustness.share:.0f} % of the neighbours are unsafe too"
         needed, number = len(one.causes[0].changes), len(one.changed)
         collision = f"a collision at {-3.6 * (one.safety_degree or 0):.0f} km/h ({share})"
         if needed < number:
@@ -381,3 +384,19 @@ def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() ->
     assert few == affordable(settings, evaluator, 2000)
     assert 0 < len(few) < 50
     assert affordable(settings, evaluator, 10**6) == list(range(50))
+
+
+def test_robustness_in_words_says_where_a_time_step_disagrees() -> None:
+    assert str(Robustness({0.05: 1.0, 0.025: 1.0, 0.1: 0.53})) == \
+        "robust: 84 % of the neighbours are unsafe too, but only 53 % with a step of 0.1 s"
+    assert str(Robustness({0.05: 0.5, 0.025: 0.4, 0.1: 0.3})) == "borderline: only 40 % of the neighbours are unsafe too"
+
+
+def test_the_paragraph_says_how_robust_the_changes_that_suffice_are_by_themselves() -> None:
+    system = assemble(load_study("sun"))
+    original = evaluate(system, system.characteristics.original[None])
+    changes = {"tireFric": 1.04, "radius": 32.05, "mass": 2500.0}
+    finding = Finding("rs:0:0", changes, "collision", -1.5, Robustness({0.05: 0.98}), 2, Robustness({0.05: 0.44}))
+    paragraph = in_short(system, original, finding, finding, Preventability(numbers={}, collisions=0))
+    assert "a collision at 5 km/h (robust: 98 % of the neighbours are unsafe too)" in paragraph.lower()
+    assert "; two of them suffice (borderline: only 44 % of the neighbours are unsafe too)." in paragraph

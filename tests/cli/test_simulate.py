@@ -13,6 +13,7 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.in_process import refused
 
 SUN = CharacteristicSet.of(load_study("sun").vehicle.characteristics)
 
@@ -70,3 +71,19 @@ def test_nothing_that_is_read_is_written_over(in_tmp: Path) -> None:
     assert Path("mine.toml").read_text().startswith("extends")
     assert isinstance(simulate("sun", "--set", "mass=2100..2200", "--trace", "x.csv").exception, InputError)
     assert not Path("x.csv").exists()
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (("simulate", "sun", "--set", "tireFric=1..2:1"), ("tireFric=1..2:1", "at least 2")),
+    (("simulate", "sun", "--set", "mass=2_404"), ("mass=2_404",)),
+    (("simulate", "sun", "--slower", "2"), ("--slower", "--gui")),
+    (("study", "smoke", "--algorithms", "rs,rs", "--dry-run"), ("search.algorithms", "same name")),
+    (("tolerance", "sun", "--characteristics", "mass,mass"), ("characteristics", "mass,mass", "once")),
+    (("tolerance", "sun", "--characteristics", "mass", "--pairs"), ("pairs", "at least two")),
+    (("rating", "euro_ncap_rating", "--force"), ("--force", "--xlsx")),
+    (("risk", "sun", "--unsafe", "points=1"), ("unsafe", "points=1", "not rated")),
+    (("rules", "sun", "--unsafe", "points=1"), ("unsafe", "points=1", "not rated")),
+    (("explain", "sun", "--unsafe", "points=1"), ("unsafe", "points=1", "not rated")),
+])
+def test_input_that_would_be_ignored_is_refused(arguments: tuple[str, ...], message: tuple[str, ...]) -> None:
+    refused(*arguments, message=message)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import msgspec
@@ -87,7 +88,7 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
 @pytest.mark.parametrize(("text", "expected"), [
     ("[ads.parameters]\nlatency = 2024-05-01", "ads.parameters.latency = 2024-05-01, a date or time"),
     ("[ads.parameters]\nmodel = { when = [07:30:00] }", "ads.parameters.model.when.0 = 07:30:00"),
-    ("[ads.parameters]\nseed = 18446744073709551616", "ads.parameters.seed = an integer of 65 bits"),
+    ("[ads.parameters]\nseed = 18446744073709551616", "ads.parameters.seed = 18446744073709551616, beyond 64 bits"),
     (f"[ads.parameters]\nseed = 1{'0' * 5000}", "digits"),
     ("[search]\nruns = 1_000_000", "search.runs = 1000000"),
     ("[search]\nevaluations = 9223372036854775807", "search.evaluations"),
@@ -154,3 +155,10 @@ def test_a_written_study_is_called_as_its_file(tmp_path: Path) -> None:
     output = load_study(str(tmp_path / "fitted.toml"))
     assert output.name == "fitted"
     assert output.published == load_study("sun").published
+
+
+@pytest.mark.parametrize("base", ["nope.toml", "."])
+def test_a_base_that_does_not_exist_is_named_with_the_file_and_the_key(tmp_path: Path, base: str) -> None:
+    (tmp_path / "mine.toml").write_text(f'extends = "{base}"\n')
+    with pytest.raises(InputError, match=re.escape(f"{tmp_path / 'mine.toml'}: extends = {base!r}: there is no study")):
+        load_study(tmp_path / "mine.toml")

@@ -11,7 +11,15 @@ from safevar_sumo.analysis.evaluator import Evaluator, Progress, finite_or_none,
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, summary_of
 from safevar_sumo.analysis.explain.causes import MinimalCause, affordable, boundaries, minimal_causes, necessary
-from safevar_sumo.analysis.explain.necessity import STEP_FACTORS, distinct_causes, key_of, necessity, robustness, smallest_robust
+from safevar_sumo.analysis.explain.necessity import (
+    STEP_FACTORS,
+    Robustness,
+    distinct_causes,
+    key_of,
+    necessity,
+    robustness,
+    smallest_robust,
+)
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
 from safevar_sumo.analysis.preventability import preventability, preventable_by
 from safevar_sumo.analysis.research_questions.case import Case
@@ -185,7 +193,7 @@ class Chosen(NamedTuple):
 
 def chosen_failures(source: Study | Case, options: ExplainOptions, evaluator: Evaluator) -> Chosen:
     """Choose failures by name, or those that matter; raises as `explain_failures`."""
-    unsafe = None if options.unsafe is None else Unsafe.parse(options.unsafe)
+    unsafe = None if options.unsafe is None else evaluator.parsed(options.unsafe)
     named = [SolutionId.parse(text, "solutions") for text in options.solutions]
     limit = options.limit // len(assemble(evaluator.study).points)
     original = evaluator.original()
@@ -276,7 +284,9 @@ def _explained(failures: Failures, evaluator: Evaluator, original: Evaluations, 
     else:
         comparisons, step = compare_at_points(assemble(evaluator.study), original.settings, chosen.settings, failures.unsafe)
         robust = robustness(evaluator, chosen.settings, step, failures.unsafe)
-    shrunk = iter(boundaries(evaluator, [cause for row in rows for cause in causes[row]], failures.unsafe))
+    all_causes = [cause for row in rows for cause in causes[row]]
+    shrunk = iter(boundaries(evaluator, all_causes, failures.unsafe))
+    neighbours = iter(_of_causes(evaluator, all_causes, step, failures.unsafe))
     collided = np.flatnonzero(_avoidable(evaluator.study, chosen))
     avoided = dict(zip(collided.tolist(), preventable_by(evaluator, chosen.settings[collided]), strict=True))
     explanations = []
@@ -289,7 +299,7 @@ def _explained(failures: Failures, evaluator: Evaluator, original: Evaluations, 
                 boundary={names[column]: float(boundary.setting[column]) for column in cause.columns}, fraction=boundary.fraction,
                 alone={names[column]: value for column, value in boundary.alone.items()}, outcome=cause.outcome,
                 safety_degree=cause.safety_degree, end=boundary.end,
-                at_threshold=None if boundary.at_threshold is None else names[boundary.at_threshold]))
+                at_threshold=None if boundary.at_threshold is None else names[boundary.at_threshold], neighbours=next(neighbours)))
         changed = evaluator.characteristics.changed(chosen.settings[i])
         explanations.append(Explanation(
             handle=failures.handles[row], reasons=reasons[row], setting=dict(zip(names, chosen.settings[i].tolist(), strict=True)),
@@ -298,3 +308,10 @@ def _explained(failures: Failures, evaluator: Evaluator, original: Evaluations, 
             necessary=tuple(names[column] for column in sorted(necessary(causes[row]))), causes=tuple(group), robustness=robust[i],
             because=comparisons[i].because, preventable=str(avoided.get(i) or ""), points=comparisons[i].points))
     return tuple(explanations)
+
+
+def _of_causes(evaluator: Evaluator, causes: Sequence[MinimalCause], step: float, unsafe: Unsafe) -> Sequence[Robustness | None]:
+    """The robustness of each cause by itself; None in a rated study, where each neighbour is simulated in all cells."""
+    if is_rated(evaluator.study) or not causes:
+        return [None] * len(causes)
+    return robustness(evaluator, np.array([cause.setting for cause in causes]), step, unsafe)

@@ -100,10 +100,21 @@ class Robustness(NamedTuple):
     def borderline(self) -> bool:
         return is_borderline(self.share)
 
+    def __str__(self) -> str:
+        """Such as `robust: 84 % of the neighbours are unsafe too, but only 53 % with a step of 0.1 s`."""
+        step, least = min(self.by_step.items(), key=lambda item: item[1])
+        disagrees = is_borderline(least) and not self.borderline
+        return in_words(self.share) + (f", but only {100 * least:.0f} % with a step of {step:g} s" if disagrees else "")
+
 
 def is_borderline(share: float) -> bool:
     """Whether small perturbations remove a failure: too few of its neighbours are unsafe too."""
     return share < BORDERLINE
+
+
+def in_words(share: float) -> str:
+    """Such as `borderline: only 44 % of the neighbours are unsafe too`."""
+    return f"{'borderline: only' if is_borderline(share) else 'robust:'} {100 * share:.0f} % of the neighbours are unsafe too"
 
 
 def robustness(evaluator: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe,

@@ -82,7 +82,7 @@ def _finding(failure: Explanation | None) -> Finding | None:
         return None
     changes = {name: failure.setting[name] for name in failure.changed}
     return Finding(str(failure.handle or "a sampled setting"), changes, failure.outcome, failure.safety_degree, failure.robustness,
-                   len(failure.causes[0].changes))
+                   len(failure.causes[0].changes), failure.causes[0].neighbours)
 
 
 def _most_necessary(result: Explained, members: CharacteristicSet) -> str:
@@ -154,7 +154,8 @@ def _print_cause(console: Console, command_for: CommandFor, cause: Cause, member
             table.add_row(member.name, member.unit, f"{member.original:g}", *(member.text(value) for value in values))
     console.print(table)
     print_meanings(console, [member for member in members if member.name in cause.changes])
-    print_text(console, f"{cause.limit} {command_for(cause.changes)}")
+    alone = "" if cause.neighbours is None else f"By themselves, these changes are {cause.neighbours}. "
+    print_text(console, f"{cause.limit} {alone}{command_for(cause.changes)}")
 
 
 def _side_by_side(comparison: BrakingComparison) -> WholeTable:

@@ -33,6 +33,7 @@ class CauseEntry(msgspec.Struct, frozen=True, kw_only=True):
     outcome: str
     safety_degree: float | None
     end: End
+    robustness: float | None = None
 
 
 class FailureEntry(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -85,6 +86,8 @@ class Cause:
         Result of `changes` alone [m, or -m/s].
     end, at_threshold
         State just below `fraction`; if that is the filter's threshold, the characteristic whose change the filter undoes.
+    neighbours
+        Robustness of `changes` alone; None in a rated study, where it takes too long.
     """
 
     changes: dict[str, float]
@@ -95,6 +98,12 @@ class Cause:
     safety_degree: float | None
     end: End = End.SAFE
     at_threshold: str | None = None
+    neighbours: Robustness | None = None
+
+    @property
+    def robustness(self) -> float | None:
+        """Share of the neighbours of `changes` that are unsafe too."""
+        return None if self.neighbours is None else self.neighbours.share
 
     @property
     def limit(self) -> str:

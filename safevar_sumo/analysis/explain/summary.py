@@ -96,11 +96,12 @@ def _paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Seri
     rows = [fewest] if robust is None else [fewest, robust]
     findings, chosen = [], failures.take(rows)
     causes, shares = minimal_causes(evaluator, chosen.settings, unsafe), robustness(evaluator, chosen.settings, step, unsafe)
+    alone = robustness(evaluator, np.array([group[0].setting for group in causes]), step, unsafe)
     for i, row in enumerate(rows):
         changed = np.flatnonzero(evaluator.characteristics.changed(chosen.settings[i]))
         changes = {names[column]: float(chosen.settings[i, column]) for column in changed}
         name, degree = str(all_handles[candidates[failing[row]]]), finite_or_none(chosen.f_safe[i])
-        findings.append(Finding(name, changes, str(chosen.outcome[i]), degree, shares[i], len(causes[i][0].columns)))
+        findings.append(Finding(name, changes, str(chosen.outcome[i]), degree, shares[i], len(causes[i][0].columns), alone[i]))
     return in_short(system, original, findings[0], findings[1] if len(findings) > 1 else None, preventable)
 
 
@@ -146,6 +147,8 @@ class Finding(NamedTuple):
         Robustness of the failure.
     needed
         Number of changes that are enough: the size of the failure's minimal causes.
+    cause
+        Robustness of the first minimal cause by itself; None if it is not known.
     """
 
     name: str
@@ -154,6 +157,7 @@ class Finding(NamedTuple):
     safety_degree: float | None
     robustness: Robustness
     needed: int
+    cause: Robustness | None = None
 
 
 def in_short(system: System, original: Evaluations, smallest: Finding | None, robust: Finding | None, preventable: Preventability) -> str:
@@ -211,10 +215,11 @@ def _end(system: System, original: Evaluations) -> str:
 
 def _with_changes(members: CharacteristicSet, failure: Finding) -> str:
     """Such as `a collision at 5 km/h (robust: ...) was found with ten changes: ...; three of them suffice`."""
-    number, needed, effect = len(failure.changes), failure.needed, f"{_outcome(failure)} ({_how_robust(failure)})"
+    number, needed, effect = len(failure.changes), failure.needed, f"{_outcome(failure)} ({failure.robustness})"
     listed = _changes(members, failure.changes)
     if needed < number:
-        return f"{effect} was found with {_count(number)} changes: {listed}; {_count(needed)} of them {_suffice(needed)}."
+        alone = "" if failure.cause is None else f" ({failure.cause})"
+        return f"{effect} was found with {_count(number)} changes: {listed}; {_count(needed)} of them {_suffice(needed)}{alone}."
     return f"{_count(number)} {'change' if number == 1 else 'changes'} {_suffice(number)} for {effect}: {listed}."
 
 
@@ -247,11 +252,6 @@ def _changes(members: CharacteristicSet, values: Mapping[str, float]) -> str:
     largest = sorted(shares, key=lambda name: -abs(shares[name]))
     parts = [f"{name} {100 * shares[name]:+.0f} %" for name in largest[:NAMED]]
     return ", ".join(parts) + (f" and {len(shares) - NAMED} more" if len(shares) > NAMED else "")
-
-
-def _how_robust(failure: Finding) -> str:
-    share = f"{100 * failure.robustness.share:.0f} % of its neighbours are unsafe too"
-    return f"{'borderline: only ' if failure.robustness.borderline else 'robust: '}{share}"
 
 
 def _avoided(preventable: Preventability) -> list[str]:

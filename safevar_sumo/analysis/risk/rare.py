@@ -123,7 +123,8 @@ def openturns() -> Any:
     try:
         import openturns
     except ImportError:
-        raise InputError("--rare", "OpenTURNS is not installed", "pip install 'safevar_sumo[rare]'; or --method monte_carlo") from None
+        legal = "pip install 'safevar_sumo[rare]'; or --method monte_carlo"
+        raise InputError("--rare or --method", "OpenTURNS is not installed", legal) from None
     openturns.Log.Show(openturns.Log.NONE)
     return openturns
 

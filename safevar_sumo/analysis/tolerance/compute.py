@@ -15,7 +15,7 @@ import pandas as pd
 from safevar_sumo.analysis.evaluator import Evaluator, Progress, finite_or_none, open_evaluator, silent
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.joint import Pair, SafeBox, no_box, planes, safe_box
-from safevar_sumo.errors import unknown
+from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
@@ -217,6 +217,8 @@ def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | Non
         If `unsafe` or a name cannot be used, or the study cannot be assembled.
     """
     columns = _columns(study, options.characteristics)
+    if options.pairs and len(columns) < 2:
+        raise InputError("pairs", "one characteristic makes no pair", "at least two characteristics")
     with open_evaluator(study, pool, jobs, progress) as evaluator:
         original = evaluator.original()
         unsafe = evaluator.criterion(options.unsafe, original)
@@ -229,10 +231,12 @@ def find_tolerances(study: Study, options: ToleranceOptions, *, pool: Pool | Non
 
 
 def _columns(study: Study, characteristics: Sequence[str] | None) -> list[int]:
-    names = list(study.vehicle.characteristics)
-    for name in characteristics or ():
+    names, chosen = list(study.vehicle.characteristics), characteristics or ()
+    for name in chosen:
         if name not in names:
             raise unknown("characteristics", f"there is no characteristic {name!r}", name, names)
+    if len(set(chosen)) < len(chosen):
+        raise InputError("characteristics", f"{','.join(chosen)}: one is named twice", "each characteristic once")
     return [column for column, name in enumerate(names) if characteristics is None or name in characteristics]
 
 
