@@ -130,7 +130,8 @@ def test_the_sections_stand_in_their_order_and_tell_what_was_found(page: str, sl
     assert f"stops with {case.original['safety_degree']:.2f} m to spare" in page
     by_reason = {reason: one for one in explained.explanations for reason in one.reasons}
     alone = by_reason["smallest robust"].causes[0].neighbours
-    assert alone is not None and alone.borderline, "or the next line tells nothing"
+    assert alone is not None
+    assert alone.borderline, "or the next line tells nothing"
     assert re.search(r"\d+ changes lead to a collision that is robust \(\d of them suffices? to be unsafe, but borderline: only "
                      rf"{100 * alone.share:.0f} % of the neighbours are unsafe too\): the vehicle collides at", page)
     assert "^2" not in re.sub("<(style|script).*?</(style|script)>", "", page, flags=re.DOTALL)
