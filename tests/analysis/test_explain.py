@@ -196,7 +196,9 @@ def test_the_summary_of_a_study_leads_with_the_answer(case: Case, explained: Exp
     paragraph, first, *others, more = lead(case.study, case.solutions, original, Here(), "my results")
     crashes = int((case.solutions["outcome"] == "collision").sum())
     assert_tells_a_manager(paragraph, explained)
-    assert first == f"{crashes} of {len(case.solutions)} vehicles found collide."
+    different = len({tuple(row) for row in case.solutions[list(case.characteristics.names)].to_numpy().tolist()})
+    repeated = "" if different == len(case.solutions) else f" ({different} different settings)"
+    assert first == f"{crashes} of {len(case.solutions)} solutions{repeated} collide."
     assert [line.partition(":")[0] for line in others] == ["Fewest changes", "Smallest largest change", "Most severe"]
     assert all(" These changes alone cause it: " in line for line in others)
     safe = case.solutions[case.solutions["f_safe"] > 2]

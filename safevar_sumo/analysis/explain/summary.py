@@ -63,7 +63,9 @@ def lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pool: Poo
     rows = solutions.iloc[[position_of(solutions, handle) for handle in chosen.values()]]
     settings = rows[list(evaluator.characteristics.names)].to_numpy(dtype=float)
     causes_of, (failing_points, worst) = minimal_causes(evaluator, settings, criterion), _failing_points(study, settings, criterion)
-    counted = f"{int(unsafe.sum())} of {number_of(len(solutions), 'vehicle')} found"
+    different = len(solutions.drop_duplicates(list(evaluator.characteristics.names)))
+    settings_in_words = "" if different == len(solutions) else f" ({different} different settings)"
+    counted = f"{int(unsafe.sum())} of {number_of(len(solutions), 'solution')}{settings_in_words}"
     lines = [_paragraph(evaluator, solutions, unsafe, original, criterion, worst),
              f"{counted} collide." if criterion.below is None else
              f"No collision. {counted} keep less than half of the original's {degree:.2f} m."]
