@@ -11,15 +11,7 @@ from safevar_sumo.analysis.evaluator import Evaluator, Progress, finite_or_none,
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, summary_of
 from safevar_sumo.analysis.explain.causes import MinimalCause, affordable, boundaries, minimal_causes, necessary
-from safevar_sumo.analysis.explain.necessity import (
-    STEP_FACTORS,
-    Robustness,
-    distinct_causes,
-    key_of,
-    necessity,
-    robustness,
-    smallest_robust,
-)
+from safevar_sumo.analysis.explain.necessity import STEP_FACTORS, distinct_causes, key_of, necessity, robustness, smallest_robust
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
 from safevar_sumo.analysis.preventability import preventability, preventable_by
 from safevar_sumo.analysis.research_questions.case import Case
@@ -278,15 +270,14 @@ def _explained(failures: Failures, evaluator: Evaluator, original: Evaluations, 
         return ()
     rows = list(reasons)
     chosen, names = failures.evaluations.take(rows), evaluator.characteristics.names
-    if is_rated(evaluator.study):
+    all_causes = [cause for row in rows for cause in causes[row]]
+    if is_rated(evaluator.study):  # a neighbour is simulated in all cells: too long for every cause
         comparisons, step = compare_at_cells(evaluator, original.settings, chosen.settings)
         robust = robustness(evaluator, chosen.settings, step, failures.unsafe, STEP_FACTORS[:1])
     else:
         comparisons, step = compare_at_points(assemble(evaluator.study), original.settings, chosen.settings, failures.unsafe)
-        robust = robustness(evaluator, chosen.settings, step, failures.unsafe)
-    all_causes = [cause for row in rows for cause in causes[row]]
-    shrunk = iter(boundaries(evaluator, all_causes, failures.unsafe))
-    neighbours = iter(_of_causes(evaluator, all_causes, step, failures.unsafe))
+        robust = robustness(evaluator, np.array([*chosen.settings, *(cause.setting for cause in all_causes)]), step, failures.unsafe)
+    shrunk, neighbours = iter(boundaries(evaluator, all_causes, failures.unsafe)), iter(robust[len(rows):])
     collided = np.flatnonzero(_avoidable(evaluator.study, chosen))
     avoided = dict(zip(collided.tolist(), preventable_by(evaluator, chosen.settings[collided]), strict=True))
     explanations = []
@@ -299,7 +290,7 @@ def _explained(failures: Failures, evaluator: Evaluator, original: Evaluations, 
                 boundary={names[column]: float(boundary.setting[column]) for column in cause.columns}, fraction=boundary.fraction,
                 alone={names[column]: value for column, value in boundary.alone.items()}, outcome=cause.outcome,
                 safety_degree=cause.safety_degree, end=boundary.end,
-                at_threshold=None if boundary.at_threshold is None else names[boundary.at_threshold], neighbours=next(neighbours)))
+                at_threshold=None if boundary.at_threshold is None else names[boundary.at_threshold], neighbours=next(neighbours, None)))
         changed = evaluator.characteristics.changed(chosen.settings[i])
         explanations.append(Explanation(
             handle=failures.handles[row], reasons=reasons[row], setting=dict(zip(names, chosen.settings[i].tolist(), strict=True)),
@@ -308,10 +299,3 @@ def _explained(failures: Failures, evaluator: Evaluator, original: Evaluations, 
             necessary=tuple(names[column] for column in sorted(necessary(causes[row]))), causes=tuple(group), robustness=robust[i],
             because=comparisons[i].because, preventable=str(avoided.get(i) or ""), points=comparisons[i].points))
     return tuple(explanations)
-
-
-def _of_causes(evaluator: Evaluator, causes: Sequence[MinimalCause], step: float, unsafe: Unsafe) -> Sequence[Robustness | None]:
-    """The robustness of each cause by itself; None in a rated study, where each neighbour is simulated in all cells."""
-    if is_rated(evaluator.study) or not causes:
-        return [None] * len(causes)
-    return robustness(evaluator, np.array([cause.setting for cause in causes]), step, unsafe)

@@ -97,13 +97,13 @@ def _paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Seri
     fewest = int(np.lexsort([getattr(failures, name) for name in reversed(CHOICES["fewest"])])[0])
     rows = [fewest] if robust is None else [fewest, robust]
     findings, chosen = [], failures.take(rows)
-    causes, shares = minimal_causes(evaluator, chosen.settings, unsafe), robustness(evaluator, chosen.settings, step, unsafe)
-    alone = robustness(evaluator, np.array([group[0].setting for group in causes]), step, unsafe)
+    causes = minimal_causes(evaluator, chosen.settings, unsafe)
+    shares = robustness(evaluator, np.array([*chosen.settings, *(group[0].setting for group in causes)]), step, unsafe)
     for i, row in enumerate(rows):
         changed = np.flatnonzero(evaluator.characteristics.changed(chosen.settings[i]))
         changes = {names[column]: float(chosen.settings[i, column]) for column in changed}
         name, degree = str(all_handles[candidates[failing[row]]]), finite_or_none(chosen.f_safe[i])
-        findings.append(Finding(name, changes, str(chosen.outcome[i]), degree, shares[i], len(causes[i][0].columns), alone[i]))
+        findings.append(Finding(name, changes, str(chosen.outcome[i]), degree, shares[i], len(causes[i][0].columns), shares[len(rows) + i]))
     return in_short(system, original, findings[0], findings[1] if len(findings) > 1 else None, preventable)
 
 
