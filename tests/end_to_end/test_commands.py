@@ -134,7 +134,7 @@ def test_an_ads_that_exits_is_a_fault_and_no_success(where: str, in_tmp: Path) -
 def test_a_title_is_no_markup(in_tmp: Path) -> None:
     Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\ntitle = "[red]x[/blue] {$"\n')
     assert "[red]x[/blue]" in run("simulate", "mine.toml").stdout
-    run("study", "mine.toml", "--evaluations", "10", "--runs", "1", "--algorithms", "rs,rs", "--quiet")
+    run("study", "mine.toml", "--evaluations", "10", "--runs", "1", "--algorithms", "rs", "--quiet")
 
 
 @SLOW
