@@ -48,7 +48,7 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
     grid
         Rows and columns, whose product is the population; by default as close to a square as possible.
     neighbourhood
-        The 4 (von_neumann) or 8 (moore) cells mates_of_cells a cell.
+        The 4 (von_neumann) or 8 (moore) cells beside a cell.
     """
 
     archive: Size | None = None
@@ -80,11 +80,11 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
         while used < problem.evaluations and archive:
             valid = [cell for cell in cells if not cell.failed]
             set_standings(valid)
-            mates_of_cells = [[cells[i] for i in indices if not cells[i].failed] for indices in neighbours]
+            neighbourhoods = [[cells[i] for i in indices if not cells[i].failed] for indices in neighbours]
             with variation.randomness():
-                offspring = [variation.child(mates or archive, archive) for mates in mates_of_cells[:problem.evaluations - used]]
+                offspring = [variation.child(mates or archive, archive) for mates in neighbourhoods[:problem.evaluations - used]]
             used += yield from simulated(offspring, problem)
-            generation = zip(cells, offspring, mates_of_cells, strict=False)  # the last generation may be incomplete
+            generation = zip(cells, offspring, neighbourhoods, strict=False)  # the last generation may be incomplete
             cells[:len(offspring)] = [survivor(cell, child, mates) for cell, child, mates in generation]
             archive = updated_archive(archive, offspring, size)
         return result_of(archive, problem)
@@ -116,8 +116,8 @@ def updated_archive(archive: list[Individual], offspring: list[Individual], size
     for child in offspring:
         if not child.failed and child.fitness.values not in distinct:
             distinct[child.fitness.values] = copy(child)
-    kept = next(iter(set_standings(list(distinct.values()))), [])
-    while len(kept) > size:
-        del kept[max(range(len(kept)), key=lambda i: kept[i].standing)]
-        set_standings(kept)
-    return kept
+    members = next(iter(set_standings(list(distinct.values()))), [])
+    while len(members) > size:
+        del members[max(range(len(members)), key=lambda i: members[i].standing)]
+        set_standings(members)
+    return members

@@ -110,22 +110,22 @@ class RecordedScene:
         return self._track(actor).width
 
     def lane(self, lane: str) -> Lane:
-        return lane_through(lane, self._known(self._recording.lanes, lane))
+        return lane_through(lane, self._entry(self._recording.lanes, lane))
 
     def lane_start(self, lane: str) -> tuple[float, float]:
-        return self._known(self._recording.lanes, lane)[0]  # type: ignore[no-any-return]
+        return self._entry(self._recording.lanes, lane)[0]  # type: ignore[no-any-return]
 
     def lane_of(self, vehicle: str) -> Lane:
-        return self.lane(self._known(self._recording.lane_of, vehicle))
+        return self.lane(self._entry(self._recording.lane_of, vehicle))
 
     def _track(self, actor: str) -> Track:
-        track: Track = self._known(self._recording.tracks, actor)
+        track: Track = self._entry(self._recording.tracks, actor)
         return track
 
     @staticmethod
-    def _known(table: dict[str, Any], name: str) -> Any:
+    def _entry(table: dict[str, Any], name: str) -> Any:
         if name not in table:
-            raise UnknownActorError(f"{name!r} is not known")
+            raise UnknownActorError(f"{name!r} is not in the recorded scene")
         return table[name]
 
 
@@ -135,17 +135,17 @@ class RecordedWorld:
     def __init__(self, recordings: Sequence[Recording], n: int) -> None:
         self._recordings, self._size, road = recordings, n, recordings[0]
         self.n, self.step_length, self.sample = n * len(recordings), road.step_length, 0
-        self.scenes = [RecordedScene(self, one, slice(k * n, (k + 1) * n)) for k, one in enumerate(recordings)]
+        self.scenes = [RecordedScene(self, recording, slice(k * n, (k + 1) * n)) for k, recording in enumerate(recordings)]
         self.vehicle_length, self.lane_of = self.scenes[0].vehicle_length, self.scenes[0].lane_of
-        self._speeds = np.repeat([one.speed for one in recordings], n)
-        self._lane, self._place = np.zeros(self.n, dtype=np.intp), np.repeat([one.start for one in recordings], n)
+        self._speeds = np.repeat([recording.speed for recording in recordings], n)
+        self._lane, self._place = np.zeros(self.n, dtype=np.intp), np.repeat([recording.start for recording in recordings], n)
         self._lanes, self._left = road.way.at(self._lane), np.zeros(self.n, dtype=bool)
         self._front: FloatArray | None = None
         self._struck: dict[int, Body] = {}
         self.sensors = Sensors.perfect(self.n)
         self._front_before, self._speeds_before = self.vehicle_positions(VUT), self._speeds
         self._ahead_before = self._front_before @ road.along
-        self._extents, self._others = _joined_extents(recordings), [[*one.tracks.values()] for one in recordings]
+        self._extents, self._others = _joined_extents(recordings), [[*recording.tracks.values()] for recording in recordings]
 
     def set_types(self, *_: object) -> None:
         """Do nothing: everybody has departed, and SUMO obeys every speed that is set, whatever a vehicle's type and decelerations."""
@@ -260,10 +260,10 @@ class RecordedWorld:
 
 def _joined_extents(recordings: Sequence[Recording]) -> FloatArray:
     """Extents of several scenes in one array, shape (2, T, K, A); NaN where nobody is."""
-    _, length, most = np.max([one.extents.shape for one in recordings], axis=0)
+    _, length, most = np.max([recording.extents.shape for recording in recordings], axis=0)
     joined = np.full((2, length, len(recordings), most), np.nan)
-    for k, one in enumerate(recordings):
-        joined[:, :one.extents.shape[1], k, :one.extents.shape[2]] = one.extents
+    for k, recording in enumerate(recordings):
+        joined[:, :recording.extents.shape[1], k, :recording.extents.shape[2]] = recording.extents
     return joined
 
 

@@ -73,13 +73,13 @@ def expected_cost(changes: int) -> int:
 
 
 def affordable(settings: FloatArray, evaluator: Evaluator, limit: int) -> list[int]:
-    """Rows of settings whose minimal causes can be found with about `limit` simulations: all, or a random sample of them."""
+    """Rows of settings whose minimal causes take about `limit` simulations or fewer: all, or a random sample of them."""
     costs = [expected_cost(int(changes)) for changes in evaluator.characteristics.number_changed(settings)]
     if sum(costs) <= limit:
         return list(range(len(settings)))
     order = np.random.default_rng(evaluator.study.search.seed).permutation(len(settings))
-    within = np.cumsum([costs[row] for row in order]) <= limit
-    return sorted(order[within].tolist())
+    is_affordable = np.cumsum([costs[row] for row in order]) <= limit
+    return sorted(order[is_affordable].tolist())
 
 
 def necessary(causes: Sequence[MinimalCause]) -> frozenset[int]:
@@ -127,13 +127,13 @@ def boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Unsafe)
     """Shrink causes, all changes by a common factor and each alone, as far as they stay unsafe and above the filter's thresholds."""
     all_changes = [(cause, cause.columns) for cause in causes]
     single_changes = [(cause, (column,)) for cause in causes for column in cause.columns]
-    lines = [Line.moving(evaluator, cause, columns) for cause, columns in [*all_changes, *single_changes]]
+    lines = [Line.from_original(evaluator, cause, columns) for cause, columns in [*all_changes, *single_changes]]
     fractions, ends = edges(evaluator, lines, unsafe)
     single_edges = iter(zip(lines[len(causes):], fractions[len(causes):], strict=True))
-    shrunk = []
+    result = []
     for i, cause in enumerate(causes):
         if not cause.columns:
-            shrunk.append(Boundary(0.0, cause.setting, {}))
+            result.append(Boundary(0.0, cause.setting, {}))
             continue
         alone = {}
         for column in cause.columns:
@@ -141,7 +141,7 @@ def boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Unsafe)
             alone[column] = float(line.at(np.array([fraction]))[0, column])
         setting = lines[i].at(fractions[i:i + 1])[0]
         limiting = lines[i].first_filtered(evaluator.characteristics.threshold) if ends[i] == End.FILTER else None
-        shrunk.append(Boundary(float(fractions[i]), setting, alone, ends[i], limiting))
+        result.append(Boundary(float(fractions[i]), setting, alone, ends[i], limiting))
     return shrunk
 
 
@@ -153,7 +153,7 @@ class Line(NamedTuple):
     lowest: float
 
     @classmethod
-    def moving(cls, evaluator: Evaluator, cause: MinimalCause, columns: tuple[int, ...]) -> Line:
+    def from_original(cls, evaluator: Evaluator, cause: MinimalCause, columns: tuple[int, ...]) -> Line:
         """The line on which some columns of a cause go from the original to their values."""
         members = evaluator.characteristics
         indices = list(columns)

@@ -128,7 +128,7 @@ def _in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
 
 
 NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
-NAMED = 4
+LISTED = 4
 """Maximum number of changes that are listed, the largest first."""
 CONDITIONS = {"clear": "In clear weather", "wet": "On a wet road", "fog": "In fog", "night": "At night"}
 """Weathers in words; any other weather is named."""
@@ -150,7 +150,7 @@ class Finding(NamedTuple):
     needed
         Number of changes that are enough: the size of the failure's minimal causes.
     cause
-        Robustness of the first minimal cause by itself; None if it is not known.
+        Robustness of the first minimal cause by itself; None if it was not simulated.
     """
 
     name: str
@@ -252,8 +252,8 @@ def _changes(members: CharacteristicSet, values: Mapping[str, float]) -> str:
     shares = {member.short_name: (values[member.name] - member.original) / abs(member.original) for member in members
               if member.name in values}
     largest = sorted(shares, key=lambda name: -abs(shares[name]))
-    parts = [f"{name} {100 * shares[name]:+.0f} %" for name in largest[:NAMED]]
-    return ", ".join(parts) + (f" and {len(shares) - NAMED} more" if len(shares) > NAMED else "")
+    parts = [f"{name} {100 * shares[name]:+.0f} %" for name in largest[:LISTED]]
+    return ", ".join(parts) + (f" and {len(shares) - LISTED} more" if len(shares) > LISTED else "")
 
 
 def _avoided(preventable: Preventability) -> list[str]:
