@@ -142,7 +142,7 @@ def boundaries(evaluator: Evaluator, causes: list[MinimalCause], unsafe: Unsafe)
         setting = lines[i].at(fractions[i:i + 1])[0]
         limiting = lines[i].first_filtered(evaluator.characteristics.threshold) if ends[i] == End.FILTER else None
         result.append(Boundary(float(fractions[i]), setting, alone, ends[i], limiting))
-    return shrunk
+    return result
 
 
 class Line(NamedTuple):
