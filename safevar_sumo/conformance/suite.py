@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.ads import ScalarAds
-from safevar_sumo.conformance.finding import ADVICE, REFUSED, Finding, Report, Source, TakesTooLong, time_limit
+from safevar_sumo.conformance.finding import ADVICE, REFUSED, Finding, Report, TakesTooLong, time_limit
 from safevar_sumo.conformance.measures import PROBES
 from safevar_sumo.conformance.models import StudyProbe
 from safevar_sumo.conformance.probe import Outputs, Probe, Rows, loaded_again, timed
+from safevar_sumo.conformance.source import Source
 from safevar_sumo.conformance.subject import Subject, subject_of, subjects_of, violation
 from safevar_sumo.errors import ForeignError, InputError
 from safevar_sumo.plugins import guard_process_state
