@@ -44,7 +44,7 @@ class DelayLine(NamedTuple):
             with np.errstate(invalid="ignore"):  # a value that appears or vanishes in between keeps its old value
                 between = after + (before - after) * self.fraction
             after = between if np.count_nonzero(finite := np.isfinite(between)) == finite.size else np.where(finite, between, before)
-        return after, self._replace(past=past)
+        return after, DelayLine(self.steps, self.fraction, past)
 
 
 class Trim(NamedTuple):

@@ -77,7 +77,7 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         (gap, lateral), recognised = memory.recognised.delayed(np.array([seen.gap, seen.lateral]))
-        brakes = self._brakes(seen._replace(gap=gap, lateral=lateral), memory.brakes)
+        brakes = self._brakes(seen, gap, lateral, memory.brakes)
         waits = (seen.speed == 0) & (seen.time < self.first_command)
         throttle = np.where(brakes | waits | (seen.speed > SPEED_LIMIT), 0.0, self._throttle(seen.speed))
         command, *under_way = (*memory.under_way, Command(throttle, brakes.astype(float)))
@@ -85,15 +85,16 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         memory = _Memory(brakes, tuple(under_way), recognised, brake_delay_line)
         return Command(command.throttle, np.minimum(command.brake, delayed_brake)), memory
 
-    def _brakes(self, seen: Observation, braked: BoolArray) -> BoolArray:
-        """Whether to brake: an obstacle is near and in the corridor. (Stands for the policy's brake probability exceeding one half.)"""
-        past = seen.lateral - self.brake_place
+    def _brakes(self, seen: Observation, gap: FloatArray, lateral: FloatArray, braked: BoolArray) -> BoolArray:
+        """Whether to brake: the recognised obstacle is near and in the corridor. (The policy's brake probability exceeds one half.)"""
+        past = lateral - self.brake_place
         aside = self.brake_gap_past * np.maximum(past, 0.0) + self.brake_gap_before * np.maximum(-past, 0.0)
         near = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - aside)
-        watched = np.abs(seen.lateral) <= self.corridor
-        begins = watched & (seen.gap <= near) & (seen.gap > PASSED)
-        goes_on = watched & braked & (seen.gap > 2 * PASSED)
-        return np.asarray(begins | goes_on)
+        watched = np.abs(lateral) <= self.corridor
+        begins = watched & (gap <= near) & (gap > PASSED)
+        goes_on = watched & braked & (gap > 2 * PASSED)
+        brakes: BoolArray = begins | goes_on
+        return brakes
 
     def _throttle(self, speed: FloatArray) -> FloatArray:
         low, middle, high = self.throttle

@@ -6,6 +6,7 @@ import json
 import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -178,14 +179,15 @@ def make_report(directories: Iterable[str | Path], only: Sequence[str] = (), job
         return environment(WEB).get_template("rated.html.j2").render(
             title=f"Euro NCAP rating: {', '.join(data.case.name for data in inputs)}", css=_web_file("report.css"),
             studies=[rated_study_page(data, jobs, progress) for data in inputs]) + "\n"
-    studies = [_study(data, wanted, jobs, progress) for data in inputs]
-    progress("tables and figures", 0, 1)
-    cases = [data.case for data in inputs]
-    with_questions = "questions" in wanted
+    cases = [data.case for data in inputs] if "questions" in wanted else []
+    with ThreadPoolExecutor(1) as beside:  # this process only waits while workers simulate, and nothing else in it draws
+        questions = beside.submit(lambda: (tables(cases), figures(cases)) if cases else ([], []))
+        studies = [_study(data, wanted, jobs, progress) for data in inputs]
+        progress("tables and figures", 0, 1)
+        answers, pictures = questions.result()
     page = environment(WEB).get_template("report.html.j2").render(
-        title=f"Safety report: {', '.join(case.name for case in cases)}", sections={name: SECTIONS[name] for name in wanted},
-        studies=studies,
-        tables=tables(cases) if with_questions else [], figures=figures(cases) if with_questions else [],
+        title=f"Safety report: {', '.join(data.case.name for data in inputs)}", sections={name: SECTIONS[name] for name in wanted},
+        studies=studies, tables=answers, figures=pictures,
         commands=reproduce(inputs, [PARTS[name] for name in PARTS if name in wanted]) if "reproduce" in wanted else [],
         takes_simulations=list(PARTS), player=player_parts(), css=_web_file("report.css"), js=_web_file("report.js"))
     progress("tables and figures", 1, 1)

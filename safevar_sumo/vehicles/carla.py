@@ -316,14 +316,16 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """
         slides, relative_to = rim - speed, np.maximum(rim, speed) + p.slip_offset
         left = np.maximum(relative_to - p.slip_stiffness * np.abs(slides), p.nothing) / relative_to
-        return np.asarray(np.copysign(p.grip - p.grip * left * left * left, slides))
+        force: FloatArray = np.copysign(p.grip - p.grip * left * left * left, slides)
+        return force
 
     def _torque(self, p: _Prepared, engine_speed: FloatArray) -> FloatArray:
         """Engine torque at full throttle [N m]: linear between the points of the curve; no engine is faster than its limit."""
         x = engine_speed / p.engine_limit
         rising = TORQUE_IDLE + TORQUE_RISE * x
         falling = TORQUE_PEAK - TORQUE_FALL * (x - PEAK_AT)
-        return np.asarray(p.engine_torque * np.minimum(rising, falling))
+        torque: FloatArray = p.engine_torque * np.minimum(rising, falling)
+        return torque
 
 
 def _follows(commanded: FloatArray, pedal: FloatArray, rates: tuple[FloatArray, FloatArray]) -> FloatArray:
@@ -334,15 +336,18 @@ def _follows(commanded: FloatArray, pedal: FloatArray, rates: tuple[FloatArray, 
 
 def _shift(p: _Prepared, s: CarlaState, throttle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Automatic gearbox: gear, target gear, time since a shift. During a shift, including the first out of neutral, the gear is neutral."""
-    target, since_shift, relative = s.target_gear, s.since_shift + p.step, s.engine_speed / p.engine_limit
+    target, since_shift = s.target_gear, s.since_shift + p.step
     neutral, ready = s.gear <= NEUTRAL, s.since_shift >= p.shift_latency
     any_neutral = np.count_nonzero(neutral)
     # In most steps no vehicle can shift; numpy's calls for those that could are spared.
     sets_off = neutral & (s.gear == target) & (throttle > p.nothing) if any_neutral else neutral
-    automatic = ready & ((relative > p.shift_up) | (relative < p.shift_down)) if np.count_nonzero(ready) else ready
-    if np.count_nonzero(sets_off) or np.count_nonzero(automatic):
-        up = sets_off | automatic & (relative > p.shift_up) & (s.gear > NEUTRAL) & (s.gear < TOP)
-        down = automatic & (relative < p.shift_down) & (s.gear > FIRST)
+    high = low = ready
+    if np.count_nonzero(ready):
+        relative = s.engine_speed / p.engine_limit
+        high, low = ready & (relative > p.shift_up), ready & (relative < p.shift_down)
+    if np.count_nonzero(sets_off) or np.count_nonzero(high) or np.count_nonzero(low):
+        up = sets_off | high & (s.gear > NEUTRAL) & (s.gear < TOP)
+        down = low & (s.gear > FIRST)
         target = target + up - down
         since_shift[up | down] = NEUTRAL
     elif not any_neutral:
