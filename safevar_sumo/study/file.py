@@ -59,8 +59,6 @@ def _raw(study: StudyLike) -> _Raw:
 
 
 def _checked(raw: _Raw) -> Study:
-    if "origin" in raw.tables:
-        raise InputError(raw.source, "origin: there is no such key")
     refuse(unusable(raw.source, raw.tables))
     tables = _with_fmu(raw, of_today(raw.tables))
     remarks = raw.origin.remarks

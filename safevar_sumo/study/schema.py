@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
 from msgspec import Meta, Struct
 
-from safevar_sumo.errors import refuse_other_than_file, unknown
+from safevar_sumo.errors import InputError, refuse_other_than_file, unknown
 from safevar_sumo.shipped import STUDIES
 from safevar_sumo.study.constraints import Constraint
 from safevar_sumo.study.variation import Correlation, Distribution
@@ -305,16 +305,20 @@ def study_path(study: str) -> Path:
     Raises
     ------
     InputError
-        If there is neither such a study nor such a file.
+        If there is neither such a study nor such a file, or the file cannot be read.
     """
     if study in study_names():
         return STUDIES / f"{study}.toml"
     path = Path(study)
     if is_file(path):
         return path
-    with suppress(OSError):
-        if not path.is_dir():
-            refuse_other_than_file(path)
+    try:
+        os.stat(study)
+        refuse_other_than_file(path)
+    except (FileNotFoundError, ValueError):  # not even a path: a null character
+        pass
+    except OSError as error:
+        raise InputError(path, f"cannot be read: {error.strerror}", "the path of a study file (TOML)") from None
     raise unknown("study", f"there is no study or file {study!r}", study, study_names(), ", or the path of a study file (TOML)")
 
 

@@ -14,9 +14,9 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import msgspec
 from msgspec import Struct
 
-from safevar_sumo.errors import InputError, unknown
+from safevar_sumo.errors import InputError, did_you_mean, one_of, unknown
 from safevar_sumo.study.constraints import constraint_mistakes
-from safevar_sumo.study.schema import CharacteristicTable, Study
+from safevar_sumo.study.schema import CharacteristicTable, Origin, Study
 from safevar_sumo.study.variation import variation_mistakes
 
 T = TypeVar("T")
@@ -57,7 +57,7 @@ def mistakes(source: object, raw: Any, kind: Any, where: str = "") -> Iterator[I
         fields = _fields(kind)
         for key in raw:
             if key not in fields and key != kind.__struct_config__.tag_field:
-                yield unknown(source, f"{_inside(where, key)}: there is no such key", key, fields)
+                yield _no_key(source, _inside(where, key), key, fields)
         for name, field in fields.items():
             if name in raw:
                 yield from mistakes(source, raw[name], field.type, _inside(where, name))
@@ -65,7 +65,12 @@ def mistakes(source: object, raw: Any, kind: Any, where: str = "") -> Iterator[I
                 yield InputError(source, f"{_inside(where, name)} is missing")
     elif get_origin(kind) is dict and isinstance(raw, Mapping):
         for key, value in raw.items():
-            yield from mistakes(source, value, get_args(kind)[1], _inside(where, str(key)))
+            inside, missing = _inside(where, str(key)), _missing(value, get_args(kind)[1])
+            hint = did_you_mean(key, [name for name in raw if name != key]) if len(missing) > 1 else ""
+            if hint:  # such a table changes single keys of one that is spelt otherwise
+                yield InputError(source, f"{inside} lacks {', '.join(missing)}{hint}")
+            else:
+                yield from mistakes(source, value, get_args(kind)[1], inside)
     elif get_origin(kind) in (Union, UnionType) and isinstance(raw, Mapping) and (tables := _tables(kind)):
         field = tables[0].__struct_config__.tag_field
         by_tag = {table.__struct_config__.tag: table for table in tables}
@@ -86,14 +91,30 @@ def mistakes(source: object, raw: Any, kind: Any, where: str = "") -> Iterator[I
             yield invalid(source, raw, error, where)
 
 
+def _missing(raw: object, kind: Any) -> list[str]:
+    """The required keys that a table lacks; none if `kind` is no record."""
+    is_table = isinstance(kind, type) and issubclass(kind, Struct) and isinstance(raw, Mapping)
+    return [name for name, field in _fields(kind).items() if field.required and name not in raw] if is_table else []  # type: ignore[operator]
+
+
+def _no_key(source: object, where: str, key: str, fields: Iterable[str]) -> InputError:
+    """The error for an unknown key: it suggests the tables of a study that have this key, else the nearest key of its own table."""
+    tables = {name: _tables(field.type) for name, field in _fields(Study).items()}
+    elsewhere = [f"{name}.{key}" for name, kinds in tables.items() if any(key in _fields(kind) for kind in kinds)]
+    if elsewhere:
+        return InputError(source, f"{where}: there is no such key; did you mean {' or '.join(elsewhere)}?", one_of(fields))
+    return unknown(source, f"{where}: there is no such key", key, fields)
+
+
 @cache
 def _fields(kind: type[Struct]) -> dict[str, msgspec.structs.FieldInfo]:
     """A record's fields by name; cached, as msgspec evaluates their annotations anew each time."""
-    return {field.name: field for field in msgspec.structs.fields(kind)}
+    return {field.name: field for field in msgspec.structs.fields(kind) if field.type is not Origin}
 
 
 def _tables(kind: Any) -> list[Any]:
-    return [option for option in get_args(kind) if isinstance(option, type) and issubclass(option, Struct)]
+    """The records among the alternatives of a type."""
+    return [option for option in get_args(kind) or (kind,) if isinstance(option, type) and issubclass(option, Struct)]
 
 
 def _no_choice(source: object, where: str, value: object, names: Iterable[str]) -> InputError:

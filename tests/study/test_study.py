@@ -99,6 +99,9 @@ def test_a_bad_study_is_refused_with_file_key_and_value(tmp_path: Path, old: str
     ('[calibration."ads.parameters.brake_gap"]\nlow = 1', "calibration.'ads.parameters.brake_gap'.low: there is no such key"),
     ('[published]\ntet = "much"', "published.tet = 'much'"),
     ('title = "a\\u001b[31mred"', "title = "),
+    ("seed = 3", "seed: there is no such key; did you mean search.seed or fit.seed?"),
+    ("[search]\nttc_threshold = 3", "search.ttc_threshold: there is no such key; did you mean metrics.ttc_threshold?"),
+    ("[vehicle.characteristics.masss]\noriginal = 9", "vehicle.characteristics.masss lacks unit, lower, upper; did you mean 'mass'?"),
     ("zzz = 1", "zzz: there is no such key\nexpected: one of ads, calibration"),
     ("[origin]\nplaces = []", "origin"),
     ("[vehicle]\ncharacteristics = 3", "vehicle.characteristics = 3\nexpected: a table"),
@@ -157,8 +160,14 @@ def test_a_written_study_is_called_as_its_file(tmp_path: Path) -> None:
     assert output.published == load_study("sun").published
 
 
-@pytest.mark.parametrize("base", ["nope.toml", "."])
-def test_a_base_that_does_not_exist_is_named_with_the_file_and_the_key(tmp_path: Path, base: str) -> None:
+@pytest.mark.parametrize(("base", "reason"), [
+    ("nope.toml", "there is no study or file 'nope.toml'"), (".", "is no regular file but a directory"),
+    ("LOOP", "cannot be read: Too many levels of symbolic links"),
+])
+def test_a_base_that_cannot_be_read_is_named_with_the_file_and_the_key(tmp_path: Path, base: str, reason: str) -> None:
+    loop = tmp_path / "loop.toml"
+    loop.symlink_to(loop)
+    base = str(loop) if base == "LOOP" else base
     (tmp_path / "mine.toml").write_text(f'extends = "{base}"\n')
-    with pytest.raises(InputError, match=re.escape(f"{tmp_path / 'mine.toml'}: extends = {base!r}: there is no study")):
+    with pytest.raises(InputError, match=re.escape(f"{tmp_path / 'mine.toml'}: extends = {base!r}: {reason}")):
         load_study(tmp_path / "mine.toml")
