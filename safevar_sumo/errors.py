@@ -62,13 +62,18 @@ def warn(message: str) -> None:
     warnings.warn(message, stacklevel=level)
 
 
-def first_line(error: BaseException) -> str:
-    """The class of an error and the first line of its message, even if `str(error)` fails."""
+LONGEST_MESSAGE = 500
+"""Largest number of characters of somebody else's message in an error."""
+
+
+def in_one_line(error: BaseException) -> str:
+    """The class of an error and its message, up to `LONGEST_MESSAGE` characters, even if `str(error)` fails."""
     try:
-        lines = str(error).strip().splitlines()
+        message = " ".join(str(error).split())
     except Exception:
-        lines = []
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+        message = ""
+    cut = message if len(message) <= LONGEST_MESSAGE else f"{message[:LONGEST_MESSAGE]}..."
+    return f"{type(error).__name__}: {cut}" if cut else type(error).__name__
 
 
 def unknown(source: object, problem: str, name: object, names: Iterable[str], otherwise: str = "") -> InputError:

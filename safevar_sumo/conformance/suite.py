@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 import shlex
 import time
 from collections.abc import Iterator
@@ -220,6 +221,8 @@ class _Suite:
     def _of_error(self, error: ForeignError) -> Finding:
         """The finding for an error that a guard raised."""
         text = error.problem.removeprefix(f"{self._subject.key} ")
+        if "returned" in text:  # the finding's own line is that of the return
+            text = re.sub(r" \([^()]*:\d+\)$", "", text)
         no_number = any(f"= {value} from" in text for value in ("nan", "inf", "-inf")) if "returned" in text else any(
             name in text for name in ("ZeroDivisionError", "OverflowError", "FloatingPointError", "math domain"))
         check = "inputs" if "read-only" in text else "finite" if no_number else "contract"

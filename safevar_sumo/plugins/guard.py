@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from safevar_sumo.errors import ForeignError, InputError, first_line
+from safevar_sumo.errors import ForeignError, InputError, in_one_line
 from safevar_sumo.plugins.files import watch
 from safevar_sumo.records import BoolArray, FloatArray
 
@@ -147,11 +147,14 @@ class Guard(NamedTuple):
         The plug-in as the study names it, such as `ads.model = 'my_ads:Careful'`.
     folder
         Folder of the plug-in's sources; an error names the innermost line in it.
+    target
+        The class, function or record; the error for a wrong result names the line where the method begins.
     """
 
     source: str
     name: str
     folder: str = ""
+    target: Any = None
 
     def call(self, method: str, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function and return its result.
@@ -174,17 +177,23 @@ class Guard(NamedTuple):
     def failed(self, method: str, error: BaseException) -> ForeignError:
         """The error for an exception that the plug-in raised."""
         place = self._place(error)
-        problem = f"{self.name} raised in {method}: {first_line(error)}{f' ({place})' if place else ''}"
+        problem = f"{self.name} raised in {method}: {in_one_line(error)}{f' ({place})' if place else ''}"
         return ForeignError(self.source, problem, error.legal if isinstance(error, InputError) else "")
 
     def wrong(self, method: str, part: str, got: object, expected: str) -> ForeignError:
         """The error for a wrong part of a result."""
-        return ForeignError(self.source, f"{self.name} returned {part} = {_short(got)} from {method}", expected)
+        return self._returned(f"{part} = {_short(got)}", method, expected)
+
+    def _returned(self, what: str, method: str, expected: str) -> ForeignError:
+        function = inspect.unwrap(getattr(self.target, method, getattr(self.target, "function", self.target)))
+        code = getattr(function, "__code__", None)  # FMUs and compiled code have none
+        place = f" ({code.co_filename}:{code.co_firstlineno})" if code is not None else ""
+        return ForeignError(self.source, f"{self.name} returned {what} from {method}{place}", expected)
 
     def parts(self, method: str, value: Any, expected: str, number: int = 2) -> tuple[Any, ...]:
         """The parts of a result that must be a tuple or list of `number` parts."""
         if not isinstance(value, tuple | list) or len(value) != number:
-            raise ForeignError(self.source, f"{self.name} returned {_short(value)} from {method}", expected)
+            raise self._returned(_short(value), method, expected)
         return tuple(value)
 
     def field(self, method: str, value: Any, name: str) -> Any:
@@ -192,8 +201,7 @@ class Guard(NamedTuple):
         try:
             return getattr(value, name)
         except AttributeError:
-            problem = f"{self.name} returned {_short(value)} from {method}"
-            raise ForeignError(self.source, problem, f"an object with the attribute {name}") from None
+            raise self._returned(_short(value), method, f"an object with the attribute {name}") from None
 
     def numbers(self, method: str, part: str, value: Any, shape: tuple[int, ...], lowest: float = -INFINITE, highest: float = INFINITE,
                 *, above: bool = False, infinite: bool = False, undefined: bool = False) -> FloatArray:
@@ -234,7 +242,7 @@ class Guard(NamedTuple):
         if array.dtype.kind not in kinds:
             raise self.wrong(method, part, value, expected)
         if array.shape not in (shape, ()):
-            raise ForeignError(self.source, f"{self.name} returned {part} of shape {array.shape} from {method}", expected)
+            raise self._returned(f"{part} of shape {array.shape}", method, expected)
         return np.broadcast_to(array, shape)
 
     def _place(self, error: BaseException) -> str:

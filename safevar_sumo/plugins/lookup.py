@@ -87,7 +87,7 @@ class Lookup(NamedTuple):
         if target is _NOTHING:
             problem = f"{key} = {name!r} cannot be imported: AttributeError: {module.__file__ or module_name} has no {attribute!r}"
             raise InputError(self.source, problem, legal)
-        return Member(target, Guard(self.source, f"{key} = {name!r}", folder), module_name, folder)
+        return Member(target, Guard(self.source, f"{key} = {name!r}", folder, target), module_name, folder)
 
     def class_of(self, members: Mapping[str, Any], name: str, key: str, *contracts: Contract, otherwise: str = "") -> Member:
         """A class by name; a class from outside must meet the first contract that applies to it.

@@ -202,7 +202,7 @@ def assemble(study: Study, source: str = "") -> System:
     InputError
         Naming the study, the key, the value and what is legal.
     """
-    source = source or f"study {study.name!r}"
+    source = source or study.source
     with guard_process_state(source, foreign_names(study)):
         return _assembled(study, source)
 

@@ -139,7 +139,7 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
     InputError
         If a function cannot be loaded, or if the original vehicle or every change is infeasible.
     """
-    source = source or f"study {study.name!r}"
+    source = source or study.source
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     if not study.constraints:
         return FeasibleRegion(characteristics, (), np.zeros((0, len(characteristics))))

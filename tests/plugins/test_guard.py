@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.errors import ForeignError
+from safevar_sumo.errors import ForeignError, InputError
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
@@ -30,7 +30,7 @@ def failing(system: object) -> str:
 
 @pytest.mark.parametrize(("body", "expected"), [
     ("1 / 0", "raised in drive: ZeroDivisionError: division by zero"), ("raise SystemExit(0)", "raised in drive: SystemExit: 0"),
-    ("pass", "returned None from drive"),
+    (r"raise RuntimeError('my\n message')", "raised in drive: RuntimeError: my message ("), ("pass", "returned None from drive"),
     ("return 0.5", "returned 0.5 from drive"), ("return 0.5, 0, 0", "returned (0.5, 0, 0) from drive"),
     ("return '0.5', 0", "returned throttle = '0.5' from drive"), ("return 0, 2", "returned brake = 2.0 from drive"),
     ("return float('nan'), 0", "returned throttle = nan"), ("return [0.1, 0.2], 0", "returned throttle of shape (2,)"),
@@ -38,8 +38,15 @@ def failing(system: object) -> str:
 def test_a_scalar_ads_that_is_wrong(body: str, expected: str, mine: Mine, folder: Path) -> None:
     message = failing(mine(SCALAR + f"    def drive(self, seen):\n        {body}\n"))
     assert f"ads.model = 'mine:Mine' {expected}" in message
-    if "raised" in expected:
-        assert f"{folder / 'mine.py'}:6" in message
+    assert f"({folder / 'mine.py'}:{6 if 'raised' in expected else 5})" in message, "the line that raises, or the method's own"
+
+
+def test_a_wrong_parameter_is_named_with_the_study_s_file(mine: Mine, folder: Path) -> None:
+    with pytest.raises(InputError, match="nothing"):
+        mine("", "[ads.parameters]\nnothing = 3\n")
+    with pytest.raises(InputError) as caught:
+        assemble(load_study(folder / "mine.toml"))
+    assert str(caught.value).startswith(f"{folder / 'mine.toml'}: ads.parameters.nothing: there is no such key")
 
 
 ADS = "class Mine:\n    def start(self, n, nominal, step):\n        return n\n\n    def drive(self, seen, memory):\n"
