@@ -26,6 +26,8 @@ from safevar_sumo.study import SAFETY_DEGREE, refuse_other_than_file
 from safevar_sumo.vehicles import CharacteristicSet
 
 COLUMNS = {SAFETY_DEGREE: "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
+RANGES = {SAFETY_DEGREE: (-300.0, 1e4), "tet": (0.0, 1e4), "tit": (0.0, 1e5), "ave_dece": (-300.0, 300.0)}
+"""Values beyond those of any road vehicle: m or -m/s, s, s^2, m/s^2 of either sign."""
 OPTIONAL = "ave_dece"
 ALIASES = {"dampratezeroce": "dampratezerotce", "dampratezerocd": "dampratezerotcd", "wheelradius": "radius"}
 """Characteristics whose names in the package's files differ from its paper's; in lower case, without underscores."""
@@ -68,7 +70,7 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     Raises
     ------
     InputError
-        If the file cannot be read, lacks a column or a row, or has a cell that is not a number; names file, row and column.
+        If the file cannot be read, lacks a column or a row, or has a cell that is no number or out of range; names file, row and column.
     """
     content = _content(path)
     table = _table(path, content)
@@ -77,7 +79,8 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     missing = [column for column in required if column not in table]
     if missing:
         raise InputError(path, f"lacks the columns {', '.join(missing)}", "the format of the published package")
-    numbers = {column: _numbers(path, table, column) for column in required}
+    ranges = {column: RANGES[name] for name, column in COLUMNS.items()}
+    numbers = {column: _numbers(path, table, column, *ranges.get(column, ())) for column in required}
     settings = np.stack([numbers[column] for column in columns], axis=1)
     inside = np.all((settings >= characteristics.lower) & (settings <= characteristics.upper), axis=1)
     if not inside.any():
@@ -153,13 +156,13 @@ def _characteristic_columns(path: Path, table: pd.DataFrame, characteristics: Ch
     return [by_plain_name[_plain(name)] for name in characteristics.names]
 
 
-def _numbers(path: Path, table: pd.DataFrame, column: str) -> FloatArray:
+def _numbers(path: Path, table: pd.DataFrame, column: str, lowest: float = -np.inf, highest: float = np.inf) -> FloatArray:
     values = pd.to_numeric(table[column], errors="coerce").to_numpy(dtype=float)
-    invalid = np.flatnonzero(~np.isfinite(values))
+    invalid = np.flatnonzero(~(np.isfinite(values) & (values >= lowest) & (values <= highest)))
     if invalid.size:
         cell = table[column].iloc[invalid[0]]
         problem = f"row {table.index[invalid[0]] + 2}, column {column} " + (f"= {cell!r}" if cell.strip() else "is empty")
-        raise InputError(path, problem, "a finite number")
+        raise InputError(path, problem, "a finite number" if lowest == -np.inf else f"a number in [{lowest:g}, {highest:g}]")
     return np.asarray(values)
 
 
@@ -191,8 +194,9 @@ def original_metrics(text: str | None, published: Mapping[str, float]) -> dict[s
             value = float(number)
         except ValueError:
             value = np.nan
-        if name not in SHORT or not np.isfinite(value):
-            raise InputError("original", f"{part!r} in {text!r}", ORIGINAL_FORM)
+        lowest, highest = RANGES.get(SHORT.get(name, ""), (np.inf, -np.inf))
+        if not lowest <= value <= highest:
+            raise InputError("original", f"{part!r} in {text!r}", f"{ORIGINAL_FORM}, each in the metric's range")
         original[SHORT[name]] = value
     if original[SAFETY_DEGREE] is None:
         raise InputError("original", "the study has no published values of the original vehicle", ORIGINAL_FORM)

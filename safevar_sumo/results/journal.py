@@ -258,7 +258,7 @@ class Journal:
             raise InputError(self.path, "is no journal", "another --out")
         if frames and frames[0] != owner:
             if any(isinstance(frame, Batch) for frame in frames):
-                raise InputError(self.path, "belongs to another study, run or version", "another --out")
+                raise _not_of(self.path, frames[0], owner, "another --out")
             frames, end, size = [], 0, 0
             self._cut_at(0)
         if end < size:
@@ -305,9 +305,18 @@ def read_journal(path: Path, study: str, run: str) -> Content:
     frames, torn = _frames_of(path)
     if frames and not (isinstance(frames[0], Owner) and frames[0].format in READABLE):
         raise InputError(path, "is of a format that this version does not read", "the version that wrote it")
-    if frames and frames[0] not in [Owner(format=number, study=study, run=run) for number in READABLE]:
-        raise InputError(path, "belongs to another study, run or version than the manifest beside it", "the journals of this study alone")
+    owner = Owner(format=FORMAT, study=study, run=run)
+    if frames and frames[0] not in [msgspec.structs.replace(owner, format=number) for number in READABLE]:
+        raise _not_of(path, frames[0], owner, "the journals of this study alone")
     return content_of(frames)._replace(torn=torn)
+
+
+def _not_of(path: Path, frame: Frame, owner: Owner, legal: str) -> InputError:
+    """The error for a journal that begins with another frame than its owner."""
+    if isinstance(frame, Owner) and frame.study == owner.study and frame.run != owner.run:
+        problem = f"is the journal of run {frame.run}, not of {owner.run}: was it renamed or swapped?"
+        return InputError(path, problem, f"the journal of {owner.run}")
+    return InputError(path, "belongs to another study or version", legal)
 
 
 def owner_of(path: Path) -> str | None:

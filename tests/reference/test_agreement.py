@@ -145,12 +145,14 @@ def test_a_file_in_another_format_is_refused(tmp_path: Path, text: str, expected
         read_reference(tmp_path / "data.csv", SUN)
 
 
-@pytest.mark.parametrize("cell", ["heavy", "", "nan", "inf"])
-def test_a_cell_that_is_no_number_is_told_with_row_and_column(tmp_path: Path, cell: str) -> None:
+@pytest.mark.parametrize(("column", "cell"), [
+    ("mass", "heavy"), ("mass", ""), ("mass", "nan"), ("mass", "inf"), ("TET", "-5"), ("TIT", "-0.1"), ("SaftyDegree", "1e308"),
+    ("SaftyDegree", "-400"), ("Dece", "1e9")])
+def test_a_cell_that_cannot_be_used_is_told_with_row_and_column(tmp_path: Path, column: str, cell: str) -> None:
     frame = table(SUN, SUN_COLUMNS).astype(object)
-    frame.loc[1, "mass"] = cell
+    frame.loc[1, column] = cell
     frame.to_csv(tmp_path / "data.csv", index=False)
-    with pytest.raises(InputError, match="row 3, column mass"):
+    with pytest.raises(InputError, match=f"row 3, column {column} .*\nexpected: a.* number"):
         read_reference(tmp_path / "data.csv", SUN)
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -128,11 +130,15 @@ def test_any_changed_byte_is_a_cut_tail_or_an_error_that_tells_where(tmp_path: P
         assert path.read_bytes() == content, "a damaged file is left as it is"
 
 
-@pytest.mark.parametrize(("study", "run"), [("other", "nsga2-00"), ("study", "nsga2-01")])
-def test_a_journal_of_another_study_or_run_is_refused(tmp_path: Path, study: str, run: str) -> None:
+@pytest.mark.parametrize(("study", "run", "reason"), [
+    ("other", "nsga2-00", "belongs to another study or version"),
+    ("study", "nsga2-01", "is the journal of run nsga2-00, not of nsga2-01: was it renamed or swapped?")])
+@pytest.mark.parametrize("opened", [Journal, read_journal])
+def test_a_journal_of_another_study_or_run_is_refused(tmp_path: Path, opened: Callable[..., object], study: str, run: str,
+                                                      reason: str) -> None:
     write(tmp_path / "a.journal")
-    with pytest.raises(InputError, match="another study"):
-        Journal(tmp_path / "a.journal", study, run)
+    with pytest.raises(InputError, match=re.escape(reason)):
+        opened(tmp_path / "a.journal", study, run)
 
 
 def test_a_run_has_one_owner_and_a_dead_ones_lock_is_gone(tmp_path: Path) -> None:
