@@ -103,7 +103,7 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False, re
     Raises
     ------
     InputError
-        If `source` is neither, or an input of the results has changed since they were computed.
+        If `source` is neither, an input of the results has changed since they were computed, or a study is given `as_it_is_now`.
     """
     if isinstance(source, str | Path):
         is_directory, is_study = os.path.isdir(source), str(source) in study_names()  # `os.path` accepts any text, unlike paths
@@ -111,7 +111,7 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False, re
             raise InputError(source, "is a study and has no solutions", "a directory that the command study has written")
         if results_only or (is_directory and not is_study):
             source = load(source)
-        elif not (is_study or os.path.exists(source)):
+        elif not (is_study or os.path.lexists(source)):
             expected = f"a directory that the command study has written, {one_of(study_names())}, or the path of a study file (TOML)"
             problem = f"is no results directory, no study and no file{did_you_mean(source, study_names())}"
             raise InputError(source, problem, expected)
@@ -119,6 +119,8 @@ def study_or_case(source: StudyLike | Results, *, as_it_is_now: bool = False, re
         for change in changes_since(source.directory, source.case, as_it_is_now=as_it_is_now):
             warn(f"{source.directory}: {change}")
         return source.case
+    if as_it_is_now:
+        raise InputError("as_it_is_now", "a study is simulated as it is now anyway", "results, which keep the study that they had")
     return load_study(source)
 
 

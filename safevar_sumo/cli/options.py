@@ -122,10 +122,9 @@ def _values(change: str, text: str, original: float, legal: str) -> list[float]:
         if number < 2:
             raise InputError("--set", f"{change!r}: {number} values from {sweep[1]} to {sweep[2]}", "NUMBER of at least 2")
         return np.linspace(float(sweep[1]), float(sweep[2]), number).tolist()  # type: ignore[no-any-return]
-    try:
-        return [float(text.replace("_", "not a number"))]
-    except ValueError:
-        raise InputError("--set", repr(change), legal) from None
+    if re.fullmatch(NUMBER, text):
+        return [float(text)]
+    raise InputError("--set", repr(change), legal)
 
 
 def complete_study(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:

@@ -45,13 +45,21 @@ COMMANDS = {
 
 
 class OneOfEach(click.Command):
-    """A command that refuses an option given twice, and two options that exclude each other, instead of using the last."""
+    """A command that refuses an empty value, an option given twice, and two options that exclude each other, instead of using the last."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         if not ctx.resilient_parsing:
-            values, _, order = self.make_parser(ctx).parse_args(list(args))
+            try:
+                values, _, order = self.make_parser(ctx).parse_args(list(args))
+            except click.UsageError as error:
+                error.ctx = ctx
+                raise
             flags: dict[str, str] = {}
             for option in order:
+                given = values[str(option.name)]
+                if given == "" or (isinstance(given, list | tuple) and "" in given):
+                    raise InputError(option.opts[-1] if isinstance(option, click.Option) else option.human_readable_name,
+                                     "'' is empty", "a value")
                 if not isinstance(option, click.Option) or option.multiple or option.name is None:
                     continue
                 flag, earlier = option.opts[-1], flags.get(option.name)
@@ -119,9 +127,11 @@ def main() -> None:
         sys.stdout.flush()
     except click.exceptions.Abort:
         _fail("interrupted", INTERRUPTED)
-    except click.ClickException as error:
+    except click.exceptions.NoArgsIsHelpError as error:
         error.show()
         _leave(error.exit_code)
+    except click.ClickException as error:
+        _fail(_in_two_lines(error), error.exit_code)
     except SafevarError as error:
         _fail(str(error), error.exit_code)
     except KeyboardInterrupt:
@@ -133,6 +143,13 @@ def main() -> None:
         _drop_output()
         _fail(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}", 1)
     _leave(code if isinstance(code, int) else 0)
+
+
+def _in_two_lines(error: click.ClickException) -> str:
+    """One of click's own errors in the form of this program's errors."""
+    context = error.ctx if isinstance(error, click.UsageError) else None
+    command = context.command_path if context is not None else "safevar-sumo"
+    return f"{' '.join(error.format_message().split())}\nexpected: see {command} --help"
 
 
 def _show_warning(message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None,

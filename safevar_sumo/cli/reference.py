@@ -14,6 +14,7 @@ from rich.console import Console
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
 from safevar_sumo.cli.options import PICTURES, check_output, complete_study, refuse_inputs
 from safevar_sumo.cli.program import OneOfEach, commands, print_remarks
+from safevar_sumo.cli.target import jobs_option
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.progress import counted
@@ -55,7 +56,7 @@ from safevar_sumo.workers.local import available_cores, local_pool
 @commands.command()
 @click.argument("study", shell_complete=complete_study)
 @click.argument("reference", type=click.Path(path_type=Path), metavar="REFERENCE.csv")
-@click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
+@jobs_option
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Plot simulated against reference values.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option("--totals", type=click.Path(path_type=Path), metavar="FILE.toml",
@@ -107,7 +108,7 @@ def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, a
 @click.option("--seed", type=click.IntRange(min=0, max=2**31), help="Seed of the search.  [default: the first study's]")
 @click.option("--starts", type=click.IntRange(min=0, max=1000), help="Additional random starts.  [default: the first study's]")
 @click.option("--from-scratch", is_flag=True, help="Start only from random points, without the studies' own values.")
-@click.option("--jobs", type=click.IntRange(min=1), help="Worker processes.  [default: the cores of this machine]")
+@jobs_option
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw the loss over every parameter.")
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE.toml",
               help="Study file to write; for several studies, the directory for their files.  [default: STUDY-calibrated.toml]")

@@ -21,6 +21,7 @@ from safevar_sumo.api.running import ENGINES, carry_out_runs, engine_for, load_f
 from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
 from safevar_sumo.cli.options import Within, complete_study
 from safevar_sumo.cli.program import commands, print_remarks
+from safevar_sumo.cli.target import jobs_option
 from safevar_sumo.errors import InputError
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations, FloatArray
@@ -45,7 +46,7 @@ from safevar_sumo.workers.evaluation import Pool
               help="What moves the vehicles. recorded: numpy in a scene that SUMO has played once, if no actor reacts to them, verified "
                    "in SUMO; sumo: always SUMO.")
 @click.option("--out", type=click.Path(path_type=Path), help="Directory of the results.  [default: results/STUDY]")
-@click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes.  [default: the cores of this machine]")
+@jobs_option
 @click.option("--cluster", metavar="ADDRESS", help="Compute on the workers of this Dask scheduler instead.")
 @click.option("--only", metavar="ALGORITHM:RUN", help="Only this run; runs count from 0.")
 @click.option("--shard", metavar="K/N", help="Every N-th run, from the K-th (1..N): for job arrays that share --out.")

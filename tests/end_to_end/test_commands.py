@@ -95,6 +95,11 @@ def test_a_users_scalar_ads_is_named_in_a_study(in_tmp: Path) -> None:
     (["simulate", "sun", "--set", "weight=1"], ("weight", "mass")),
     (["simulate", "sun", "--trace", "/proc/nowhere/trace.csv"], ("--trace", "/proc/nowhere/trace.csv")),
     (["simulate", "/"], ("/",)),
+    (["simulate", ""], ("STUDY|DIR: '' is empty",)), (["tables", "out", ""], ("DIR...: '' is empty",)),
+    (["simulate", "sun", "--as-it-is-now"], ("--as-it-is-now: a study is simulated as it is now anyway",)),
+    (["validate", "sun", "none.csv", "--jobs", "1025"], ("--jobs", "1025", "see safevar-sumo validate --help")),
+    (["study", "sun", "--seed"], ("--seed", "see safevar-sumo study --help")), (["study"], ("Missing argument 'STUDY'",)),
+    (["simulate", "sun", "--nothing"], ("No such option '--nothing'",)),
 ])
 def test_bad_input_ends_with_code_2_and_says_what_is_legal(arguments: list[str], expected: tuple[str, ...], in_tmp: Path) -> None:
     refused(*arguments, message=expected)

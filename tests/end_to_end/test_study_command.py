@@ -72,7 +72,7 @@ def test_results_of_another_version_or_seed_are_refused_and_left_alone(copied: P
     (copied / "manifest.json").unlink()
     (copied / "runs" / "original.journal").unlink()
     Path("small.toml").write_text(STUDY + "seed = 2\n")
-    assert "belongs to another study, run or version" in study("--out", "out", expect=2)
+    assert "belongs to another study or version" in study("--out", "out", expect=2)
 
 
 def test_torn_tails_are_cut_off_with_a_warning_and_damage_in_the_middle_names_its_place(copied: Path, whole: Path) -> None:

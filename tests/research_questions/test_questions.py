@@ -209,7 +209,7 @@ def test_the_brief_lines_say_what_the_data_allows() -> None:
     lines = summary_lines(five)
     assert any("NSGA-II: SD 0.00, " in line and line.endswith("too few runs for a test (8 are needed)") for line in lines)
     assert any("RS: IGD " in line and "too few" not in line for line in lines), "five runs against five can differ significantly"
-    assert any("RQ2: has finished runs of nsga2 alone" in line for line in summary_lines(made_up(row())))
+    assert any("RQ2 over runs: has finished runs of nsga2 alone" in line for line in summary_lines(made_up(row())))
 
 
 def test_holms_correction_of_a_worked_example() -> None:

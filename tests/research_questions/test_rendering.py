@@ -105,6 +105,7 @@ def test_markdown_rows_are_as_wide_as_their_heads(cases: list[Case]) -> None:
     ("rq2", {"setting", "baseline", "metric", "p_value", "effect_size", "magnitude", "n1", "n2"}),
     ("rq3.2", {"setting", "characteristic", "j", "percent"}),
     ("rq3.3", {"setting", "characteristic", "direction", "j", "pc", "delta", "n"}),
+    ("rq3.3-safety", {"setting", "quantity", "j", "value", "percent", "n"}),
     ("collisions", {"setting", "algorithm", "solutions", "collisions", "share"})])
 def test_json_records_have_the_promised_keys(question: str, keys: set[str]) -> None:
     records = json.loads(as_json(answer([rich_setting()], question)[:1]))

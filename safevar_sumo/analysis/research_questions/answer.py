@@ -27,7 +27,7 @@ from safevar_sumo.metrics import SAFEVAR, MetricFacts
 
 Frames = dict[str, pd.DataFrame]
 SAFETY = "rq3.3-safety"
-"""Name of the table with the effect on safety, the footer of the paper's table of RQ3.3."""
+"""Name of the table with the effect on safety, the footer of the paper's table of RQ3.3; an answer to that question has both."""
 
 FRAMES_OF_ONE_CASE: Mapping[str, Callable[[Case], Frames]] = {
     "rq1": lambda case: {"rq1": rq1(case)},
@@ -43,7 +43,7 @@ FRAMES_OF_ONE_CASE: Mapping[str, Callable[[Case], Frames]] = {
     "combinations": lambda case: {"combinations": combinations(case)},
 }
 WEATHER = "weather"
-QUESTIONS = (*FRAMES_OF_ONE_CASE, WEATHER)
+QUESTIONS = (*FRAMES_OF_ONE_CASE, SAFETY, WEATHER)
 
 
 class Answer(NamedTuple):
@@ -67,7 +67,8 @@ def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
         raise unknown("question", f"there is no question {question!r}", question, QUESTIONS)
     answers, refusals, names = [], [], [case.name for case in cases]
     metrics = tuple({metric.name: metric for case in cases for metric in case.scoring.metrics}.values())
-    for name in QUESTIONS if question is None else (question,):
+    everything = (*FRAMES_OF_ONE_CASE, WEATHER)
+    for name in everything if question is None else ("rq3.3" if question == SAFETY else question,):
         tables, refused = _ask(name, cases)
         refusals += refused
         notes = [f"{error.source}: {error.problem}." for error in refused]
@@ -80,7 +81,7 @@ def answer(cases: Sequence[Case], question: str | None = None) -> list[Answer]:
             answers.append(Answer(table, frame, tuple(dict.fromkeys([*notes, *case_notes])), metrics))
     if refusals and all(one.frame.empty for one in answers):
         raise refusals[0]
-    return answers
+    return [one for one in answers if one.name == SAFETY] if question == SAFETY else answers
 
 
 def _ask(name: str, cases: Sequence[Case]) -> tuple[dict[str, list[pd.DataFrame]], list[Unanswerable]]:

@@ -131,9 +131,9 @@ def summary_lines(case: Case) -> list[str]:
         try:
             frame = frame_of(case)
         except Unanswerable as error:
-            lines.append(f"{question}: {error.problem}.")
+            lines.append(f"{question} over runs: {error.problem}.")
             continue
-        lines.append(f"{question}: {meaning}; * p < {ALPHA:g} after Holm's correction")
+        lines.append(f"{question} over runs: {meaning}; * p < {ALPHA:g} after Holm's correction")
         for name, group in frame.groupby(group_column, sort=False):
             rows = group.to_dict("records")
             defined = [row for row in rows if row["effect_size"] is not None]
@@ -148,8 +148,8 @@ def summary_lines(case: Case) -> list[str]:
     return [*lines, difference_line(case)] if any_testable else lines
 
 
-SUMMARISED = (("RQ1", rq1_runs, "algorithm", "runs are more unsafe than the original if below 0.5 (A12)"),
-         ("RQ2", rq2_runs, "baseline", "NSGA-II's runs are better than the other's if above 0.5 (A12)"))
+SUMMARISED = (("RQ1", rq1_runs, "algorithm", "A12 below 0.5: the runs are more unsafe than the original vehicle"),
+         ("RQ2", rq2_runs, "baseline", "A12 above 0.5: NSGA-II is better"))
 
 
 def _p(value: float) -> str:
