@@ -266,7 +266,7 @@ class Evaluations:
     """M evaluated settings: what was simulated, how it ended, metrics and objectives.
 
     `settings` has shape (M, n) and holds the filtered values in their table units; all other arrays have shape (M,).
-    `metrics` has the columns of `safevar_sumo.metrics.METRICS`; an undefined value is NaN.
+    `metrics` holds `safevar_sumo.metrics.METRICS` and the study's further ones; an undefined value is NaN.
     `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count. `reasons` says, by the bytes of a
     setting, why it could not be simulated. `files` are digests, by name, of files that user code
     read for the first time in a batch; they belong to the batch, not to its rows. `cells` are a rating's results, None without a rating.

@@ -58,7 +58,7 @@ class Evaluator:
 
     def evaluate(self, settings: FloatArray, stage: str, before: int = 0, total: int | None = None, *,
                  anywhere: bool = False) -> Evaluations:
-        """Evaluate settings, shape (M, n); progress counts them in `stage`, after the first `before` of `total` settings.
+        """Evaluate settings, shape (M, n); progress counts them in `stage`, of whose `total` settings `before` are done already.
 
         Unless `anywhere` is true, settings that violate a constraint of the study get the outcome `infeasible` without a simulation.
         """
@@ -90,22 +90,22 @@ class Evaluator:
             metrics=dict.fromkeys(METRICS, undefined), f_diff=self.characteristics.largest_change(settings),
             f_num_diff=self.characteristics.number_changed(settings))
 
-    def spread(self, number: int, seed: int = 0, *, filtered: bool = False) -> FloatArray:
+    def even_design(self, number: int, seed: int = 0, *, filtered: bool = False) -> FloatArray:
         """Settings that cover the feasible part of the domain evenly; with `filtered` they are feasible after the filter."""
         if not self.region:
-            return spread(self.characteristics, number, seed)
+            return even_design(self.characteristics, number, seed)
         rng, drawn = np.random.default_rng(seed), 0
 
         def next_points(count: int) -> FloatArray:
             """The next points of the sequence."""
             nonlocal drawn
             drawn += count
-            return spread(self.characteristics, drawn, seed)[drawn - count:]
+            return even_design(self.characteristics, drawn, seed)[drawn - count:]
 
         return self.region.sampled(next_points, number, rng, filtered=filtered, rejections=DRAWS_PER_FEASIBLE)
 
     def cells(self, settings: FloatArray, stage: str) -> CellResults:
-        """Results of settings, shape (M, n), in every cell of a rated study; the workers share the cells, not the settings.
+        """Results of settings, shape (M, n), in every cell of a rated study; the cells are divided among the workers.
 
         Raises
         ------
@@ -153,7 +153,7 @@ class Evaluator:
         original = self.original() if original is None else original
         if RATING_POINTS.name in original.metrics:
             return Unsafe.default_among(original, original)
-        return Unsafe.default_among(self.evaluate(self.spread(PROBED), "settings over the whole domain"), original)
+        return Unsafe.default_among(self.evaluate(self.even_design(PROBED), "settings over the whole domain"), original)
 
     def parsed(self, stated: str) -> Unsafe:
         """The criterion that an option states; raises as `Unsafe.parse`, and where it asks for points of a study that is not rated."""
@@ -197,7 +197,7 @@ def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
     return np.asarray(points[:number])
 
 
-def spread(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:
+def even_design(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:
     """Settings that cover the whole domain evenly, shape (number, n)."""
     lower, upper = characteristics.lower, characteristics.upper
     return np.asarray(lower + sobol_points(number, len(characteristics), seed) * (upper - lower))

@@ -60,8 +60,9 @@ def option(default: Any, text: str, **how: Any) -> Any:
 
 
 def unsafe_option() -> Any:
-    usual = "a collision if any evaluated setting collides, else half of the original's safety degree"
-    return option(None, f"What is unsafe: a collision, or a safety degree below X.  [default: {usual}]", metavar="collision|below=X",
+    usual = "a collision if any evaluated setting collides, else half of the original's safety degree; of a rated study, any point lost"
+    return option(None, f"What is unsafe: a collision, a safety degree below X, or at most X points of a rating.  [default: {usual}]",
+                  metavar="collision|below=X|points=X",
                   python="What is unsafe: `\"collision\"`, or a number X for a safety degree below X [m, or minus a collision's speed in "
                          f"m/s], or an `Unsafe`. By default {usual}.")
 

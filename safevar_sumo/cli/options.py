@@ -74,7 +74,7 @@ LEGAL = "NAME=VALUE in the characteristic's unit, NAME=+10% of the original, or 
 
 def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, beyond: bool, *, single: bool = False
                  ) -> dict[str, list[float]]:
-    """The values of each named characteristic; `single`: one value each, for a command without --beyond.
+    """The values of each named characteristic; `single`: no sweeps, and errors do not suggest --beyond.
 
     Raises
     ------
@@ -84,8 +84,8 @@ def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, b
     values_by_name: dict[str, list[float]] = {}
     legal = ONE_VALUE if single else LEGAL
     for change in changes:
-        name, sign, text = (part.strip() for part in change.partition("="))
-        if not sign:
+        name, equals, text = (part.strip() for part in change.partition("="))
+        if not equals:
             raise InputError("--set", repr(change), legal)
         if name in values_by_name:
             raise InputError("--set", f"{name} is set twice", "each characteristic once")
@@ -96,8 +96,8 @@ def read_changes(changes: tuple[str, ...], characteristics: CharacteristicSet, b
         if single and len(values_by_name[name]) > 1:
             raise InputError("--set", f"{change!r} is a sweep", legal)
         for value in values_by_name[name]:
-            share = f", or {name}={text}% of the original" if SIGNED.fullmatch(text) else ""
-            member.check(value, "--set", beyond=beyond, otherwise=share, switch="" if single else "--beyond")
+            hint = f", or {name}={text}% of the original" if SIGNED.fullmatch(text) else ""
+            member.check(value, "--set", beyond=beyond, otherwise=hint, switch="" if single else "--beyond")
     if np.prod([len(values) for values in values_by_name.values()], dtype=float) > MAX_SETTINGS:
         raise InputError("--set", f"{' '.join(changes)}: more than {MAX_SETTINGS} settings", "shorter sweeps, FROM..TO:NUMBER")
     return values_by_name
@@ -135,7 +135,7 @@ def complete_study(ctx: click.Context, param: click.Parameter, incomplete: str) 
 
 def complete_changes(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """`NAME=` for each characteristic of the study named earlier in the command line, with its domain as help."""
-    study = str(ctx.params.get("study") or next(iter(ctx.args), ""))  # click parses no argument after an option that still lacks its value
+    study = str(ctx.params.get("study") or next(iter(ctx.args), ""))  # while --set is incomplete, click has not parsed what follows
     if not study or Path(study).is_dir():
         return []
     try:

@@ -147,10 +147,10 @@ def calibrate_command(study: str, others: tuple[str, ...], trials: int | None, s
               stages(Console(stderr=True)) as show):
             show("trials", 0, count)
 
-            def after_trial(cost: float, so_far: Study | tuple[Study, ...]) -> None:
+            def after_trial(loss: float, so_far: Study | tuple[Study, ...]) -> None:
                 nonlocal done, lowest, best
-                done, lowest, best = done + 1, cost, so_far if isinstance(so_far, tuple) else (so_far,)
-                show(f"trials, lowest cost {cost:.4f}", done, count)
+                done, lowest, best = done + 1, loss, so_far if isinstance(so_far, tuple) else (so_far,)
+                show(f"trials, lowest loss {loss:.4f}", done, count)
 
             if len(chosen) == 1:
                 calibrations = [calibrate(chosen[0], data[0], pool, after_trial, from_scratch=from_scratch)]
@@ -159,7 +159,7 @@ def calibrate_command(study: str, others: tuple[str, ...], trials: int | None, s
                 calibrations = calibrate_together(subjects, pool, after_trial, from_scratch=from_scratch)
     except KeyboardInterrupt:
         if done:
-            comment = f"Best of {done} of {count} trials, then interrupted (seed {chosen[0].fit.seed}). Cost {lowest:.4f}."
+            comment = f"Best of {done} of {count} trials, then interrupted (seed {chosen[0].fit.seed}). Loss {lowest:.4f}."
             for one, fitted, target in zip(chosen, best, targets, strict=True):
                 write_study(target, fitted_as(one, fitted), comment)
             click.echo(f"interrupted: the best of {done} trials is in {', '.join(map(str, targets))}", err=True)

@@ -126,4 +126,4 @@ class Unsafe:
 
 
 Criterion = Unsafe | float | str
-"""Values of an argument `unsafe`: `Unsafe`, a number X for a safety degree below X, "collision" or "below=X"."""
+"""Values of an argument `unsafe`: `Unsafe`, a number X for a safety degree below X, "collision", "below=X" or "points=X"."""

@@ -14,13 +14,12 @@ import numpy as np
 
 from safevar_sumo.analysis.parameters import value_of, with_values
 from safevar_sumo.errors import InputError, SimulationError
-from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.effects import error_beyond_spread
-from safevar_sumo.reference.fit import MAX_COST, Search, Together, original_cost, reference_cost
+from safevar_sumo.reference.fit import MAX_LOSS, Search, Together, original_loss, reference_loss
 from safevar_sumo.reference.parameters import Free, free_parameters
 from safevar_sumo.reference.profiles import Profiles
-from safevar_sumo.reference.rows import ReferenceData
+from safevar_sumo.reference.rows import COLUMNS, ReferenceData
 from safevar_sumo.reference.validation import Agreement, agreement
 from safevar_sumo.study import SAFETY_DEGREE, FitTable, FreeParameter, Study
 from safevar_sumo.sumo import Engine, settings_per_batch
@@ -36,7 +35,7 @@ EDGE = 0.01
 
 
 def calibration_comment(result: Calibration, study: Study, references: Mapping[str, ReferenceData], *, from_scratch: bool) -> str:
-    """A fit in words: data with fingerprints, search, cost, agreement on both parts, shared parameters, values on a bound."""
+    """A fit in words: data with fingerprints, search, loss, agreement on both parts, shared parameters, values on a bound."""
     fit = result.search
     start = "random places only" if from_scratch else f"its own values and {fit.starts} random places" if fit.starts else "its own values"
     parts = [
@@ -54,9 +53,9 @@ def calibration_comment(result: Calibration, study: Study, references: Mapping[s
 
 
 def cost_line(calibration: Calibration) -> str:
-    """The lowest cost, and the lowest cost of each search, if any."""
-    reached = ", ".join(f"{cost:.4f}" for cost in calibration.reached)
-    return f"Cost {calibration.cost:.4f}" + (f"; lowest cost of each search: {reached}" if reached else "")
+    """The lowest loss, and the lowest loss of each search, if any."""
+    reached = ", ".join(f"{loss:.4f}" for loss in calibration.reached)
+    return f"Loss {calibration.loss:.4f}" + (f"; lowest loss of each search: {reached}" if reached else "")
 
 
 def on_a_bound(values: Mapping[str, float], free: Mapping[str, FreeParameter]) -> list[str]:
@@ -97,17 +96,17 @@ class Subject(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """Fitted values and bounds by parameter, the study with these values, their cost, and agreement with both parts of each reference.
+    """Fitted values and bounds by parameter, the study with these values, their loss, and agreement with both parts of each reference.
 
-    `reached` is the lowest cost of each search; the last search starts at the studies' own values, except in a fit from scratch.
+    `reached` is the lowest loss of each search; the last search starts at the studies' own values, except in a fit from scratch.
     `together` names the studies that were fitted with this one, `shared` the parameters that it shares with one of them,
     `search` is the table [fit] that set trials, seed and starts, `intervals` are the least and the greatest value of each
-    parameter that fit as well, `profiles` are the costs of the trials.
+    parameter that fit as well, `profiles` are the losses of the trials.
     """
 
     values: dict[str, float]
     study: Study
-    cost: float
+    loss: float
     reached: list[float]
     used: dict[str, Agreement]
     held_back: dict[str, Agreement]
@@ -120,12 +119,12 @@ class Calibration(NamedTuple):
 
 
 def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
-              done: Callable[[float, Study], None] = lambda cost, best: None, *, from_scratch: bool = False) -> Calibration:
+              done: Callable[[float, Study], None] = lambda loss, best: None, *, from_scratch: bool = False) -> Calibration:
     """Fit one study; see `calibrate_together`."""
-    return calibrate_together([Subject(study, references)], pool, lambda cost, best: done(cost, best[0]), from_scratch=from_scratch)[0]
+    return calibrate_together([Subject(study, references)], pool, lambda loss, best: done(loss, best[0]), from_scratch=from_scratch)[0]
 
 
-def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[float, Together], None] = lambda cost, best: None, *,
+def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[float, Together], None] = lambda loss, best: None, *,
                        from_scratch: bool = False) -> list[Calibration]:
     """Fit by CMA-ES (Hansen 2016), as the studies' tables [fit] say; trials, seed, starts and population are the first study's.
 
@@ -134,7 +133,7 @@ def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[
     subjects
         Studies with their data; without data, only the original vehicle's values count.
     done
-        Called after every trial with the lowest cost so far, and the studies that have it.
+        Called after every trial with the lowest loss so far, and the studies that have it.
     from_scratch
         Ignore the studies' own values of the free parameters: start only at random places.
 
@@ -163,7 +162,7 @@ def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[
         start, trials = _by_stages(subjects, free, used, pool, rng, done)
     trial = _Trial(free, [_Fitted(study, data, pool) for study, data in zip(start, used, strict=True)])
     search = Search(trial, fit.population, trials, done, fit.alike)
-    if not from_scratch and search.try_studies([studies])[0] >= MAX_COST:
+    if not from_scratch and search.try_studies([studies])[0] >= MAX_LOSS:
         names = " and ".join(f"study {study.name!r}" for study in studies)
         raise SimulationError(f"{names} cannot be simulated with {'its' if len(studies) == 1 else 'their'} own values")
     searches = [] if staged else search.from_random_places(_first_of_key(free), fit.starts, fit.screened, fit.width, rng)
@@ -179,7 +178,7 @@ def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[
         beyond = {SAFETY_DEGREE: round(error_beyond_spread(best, used[k]), MILLIMETRES)} if used[k] else {}
         best = msgspec.structs.replace(best, model_error=beyond)
         results.append(Calibration(
-            {one.key: value_of(best, one.key) for one in parameters}, best, search.cost, reached, _agreements(best, used[k], pool),
+            {one.key: value_of(best, one.key) for one in parameters}, best, search.loss, reached, _agreements(best, used[k], pool),
             _agreements(best, held_back[k], pool), {one.key: one.bounds for one in parameters}, fit,
             tuple(study.name for study in studies if study is not studies[k]),
             frozenset(one.key for one in parameters if len(one.studies) > 1),
@@ -220,9 +219,9 @@ def _by_stages(subjects: Sequence[Subject], free: Sequence[Free], used: Sequence
     return studies, trials_left
 
 
-def _done_with_some(done: Callable[[float, Together], None], studies: Together, indices: Sequence[int], cost: float,
+def _done_with_some(done: Callable[[float, Together], None], studies: Together, indices: Sequence[int], loss: float,
                     best: Together) -> None:
-    done(cost, _replaced(studies, indices, best))
+    done(loss, _replaced(studies, indices, best))
 
 
 def _replaced(studies: Together, indices: Sequence[int], replacements: Together) -> Together:
@@ -242,12 +241,12 @@ def _check(subject: Subject) -> None:
     if not subject.references and not subject.study.published:
         raise InputError(source, "has no table [published] and there is no reference file", "something to fit to")
     for name in subject.study.fit.weights:
-        if name not in METRICS:
-            raise InputError(source, f"fit.weights.{name} is no metric", f"some of {', '.join(METRICS)}")
+        if name not in COLUMNS:
+            raise InputError(source, f"fit.weights.{name} is no metric of the reference", f"some of {', '.join(COLUMNS)}")
 
 
 class _Trial:
-    """Costs of studies that differ in free parameters."""
+    """Losses of studies that differ in free parameters."""
 
     def __init__(self, free: Sequence[Free], fitted: Sequence[_Fitted]) -> None:
         self._free, self._fitted = free, fitted
@@ -275,9 +274,9 @@ class _Trial:
         values = np.array([value_of(studies[free.studies[0]], free.key) for free in self._free])
         return np.asarray(np.clip((self._scaled(values) - self._start) / self._width, 0, 1))
 
-    def costs(self, studies: Sequence[Together]) -> list[float]:
+    def losses(self, studies: Sequence[Together]) -> list[float]:
         submitted = [[one.submit(study) for one, study in zip(self._fitted, together, strict=True)] for together in studies]
-        return [float(np.mean([one.cost(parts) for one, parts in zip(self._fitted, batches, strict=True)])) for batches in submitted]
+        return [float(np.mean([one.loss(parts) for one, parts in zip(self._fitted, batches, strict=True)])) for batches in submitted]
 
 
 class _Fitted:
@@ -296,18 +295,18 @@ class _Fitted:
         work, size = packed(study, self._inputs), self._size
         return [self._pool.submit(work, self._settings[start:start + size]) for start in range(0, len(self._settings), size)]
 
-    def cost(self, parts: Sequence[Future[Evaluations]]) -> float:
+    def loss(self, parts: Sequence[Future[Evaluations]]) -> float:
         unique = Evaluations.concatenate([result_of(part) for part in parts])
         if not unique.valid.all():
-            return MAX_COST
+            return MAX_LOSS
         evaluations = unique.take(self._row_of.ravel())
-        cost = original_cost(evaluations.take([0]), self.study.published, self.study.fit)
+        loss = original_loss(evaluations.take([0]), self.study.published, self.study.fit)
         row = 1
         for data in self._references.values():
             here = evaluations.take(np.arange(row, row + len(data.settings)))
-            cost += reference_cost(agreement(data, here, self.study, here), data, here, self.study) / len(self._references)
+            loss += reference_loss(agreement(data, here, self.study, here), data, here, self.study) / len(self._references)
             row += len(data.settings)
-        return cost
+        return loss
 
 
 def _agreements(study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> dict[str, Agreement]:

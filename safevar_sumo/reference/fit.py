@@ -1,4 +1,4 @@
-"""The cost of a study's disagreement with its references (see `FitTable`), and searches for the lowest cost."""
+"""The loss of a study's disagreement with its references (see `FitTable`), and searches for the lowest loss."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from safevar_sumo.reference.validation import Agreement
 from safevar_sumo.study import SAFETY_DEGREE, FitTable, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
-MAX_COST = 1e5
-"""Largest cost of a reference; also the cost of a study that cannot be simulated."""
+MAX_LOSS = 1e5
+"""Largest loss of a reference; also the loss of a study that cannot be simulated."""
 MAX_DEVIATION = 10.0
 """Largest deviation of the original vehicle's values [tolerances]; also that of an undefined value."""
 
 
-def original_cost(original: Evaluations, published: Mapping[str, float], fit: FitTable) -> float:
+def original_loss(original: Evaluations, published: Mapping[str, float], fit: FitTable) -> float:
     """Mean deviation of the original vehicle's values from the published ones, weighted by metric.
 
     Deviations are squared up to the tolerance and linear beyond it (Huber 1964): with squares alone a search would fit this one
@@ -38,25 +38,25 @@ def _huber(deviation: float, tolerance: float) -> float:
     return x * x if x <= 1 else 2 * x - 1
 
 
-def reference_cost(result: Agreement, data: ReferenceData, here: Evaluations, study: Study) -> float:
-    """The cost of lost rank correlation and absolute errors, weighted by metric, of differing effects and of differing collisions.
+def reference_loss(result: Agreement, data: ReferenceData, here: Evaluations, study: Study) -> float:
+    """The loss by missing rank correlation and absolute errors, weighted by metric, of differing effects and of differing collisions.
 
     Errors are in standard deviations of repeats of one setting in the reference, or, if unknown, of the reference's values.
     """
-    fit, cost = study.fit, 0.0
+    fit, loss = study.fit, 0.0
     for name, weight in fit.weights.items():
         values = data.metrics[name][~np.isnan(data.metrics[name])]
         if not values.size or np.ptp(values) == 0:
             continue
         rho, error = result.spearman[name], result.mean_absolute_error[name]
         unit = study.repeatability.get(name) or float(np.std(values))
-        cost += weight * (fit.rank * (1 - (rho or 0.0)) + (np.inf if error is None else error) / unit)
+        loss += weight * (fit.rank * (1 - (rho or 0.0)) + (np.inf if error is None else error) / unit)
         if name == SAFETY_DEGREE and fit.effects:
             differences = effect_differences(data, here, CharacteristicSet.of(study.vehicle.characteristics))
-            cost += fit.effects * float(np.mean(np.abs(differences))) / unit
+            loss += fit.effects * float(np.mean(np.abs(differences))) / unit
     collisions = result.collisions
     differing = collisions["reference"] + collisions["here"] - 2 * collisions["both"]
-    return min(cost, MAX_COST) + fit.collisions * differing / max(result.rows, 1)
+    return min(loss, MAX_LOSS) + fit.collisions * differing / max(result.rows, 1)
 
 
 Together = tuple[Study, ...]
@@ -64,15 +64,15 @@ Together = tuple[Study, ...]
 
 
 class Trial(Protocol):
-    """Studies that are fitted together, by their place in the unit cube of the bounds, and their costs."""
+    """Studies that are fitted together, by their place in the unit cube of the bounds, and their losses."""
 
     def at(self, shares: FloatArray) -> Together: ...
 
-    def costs(self, studies: Sequence[Together]) -> list[float]: ...
+    def losses(self, studies: Sequence[Together]) -> list[float]: ...
 
 
-KEPT_COST = 1.25
-"""Trials up to this multiple of the lowest cost are kept, for profiles and the spread."""
+KEPT_LOSS = 1.25
+"""Trials up to this multiple of the lowest loss are kept, for profiles and the spread."""
 SCREENING = 4
 """Screening takes at most one in this number of trials."""
 
@@ -85,28 +85,28 @@ class Search:
     population
         Trials in a generation of a search that has no population of its own.
     done
-        Called after every trial with the lowest cost so far, and the studies that have it.
+        Called after every trial with the lowest loss so far, and the studies that have it.
     alike
-        Trials whose cost exceeds the lowest by at most this share of it fit as well as the best.
+        Trials whose loss exceeds the lowest by at most this share of it fit as well as the best.
     """
 
     def __init__(self, trial: Trial, population: int, trials: int, done: Callable[[float, Together], None], alike: float = 0.0) -> None:
         self.alike = alike
         self.best: Together | None = None
-        self.cost, self.left = np.inf, trials
+        self.loss, self.left = np.inf, trials
         self.kept: list[tuple[float, FloatArray]] = []
-        """Costs and places of the trials that cost at most `KEPT_COST` times the lowest cost until then."""
+        """Losses and places of the trials whose loss is at most `KEPT_LOSS` times the lowest loss until then."""
         self.trial, self.population, self._done = trial, population, done
 
     def try_studies(self, studies: Sequence[Together]) -> list[float]:
-        """The costs of studies, a trial each."""
-        costs = self.trial.costs(studies)
-        self.left -= len(costs)
-        for together, cost in zip(studies, costs, strict=True):
-            if self.best is None or cost < self.cost:
-                self.best, self.cost = together, cost
-            self._done(self.cost, self.best)
-        return costs
+        """The losses of studies, a trial each."""
+        losses = self.trial.losses(studies)
+        self.left -= len(losses)
+        for together, loss in zip(studies, losses, strict=True):
+            if self.best is None or loss < self.loss:
+                self.best, self.loss = together, loss
+            self._done(self.loss, self.best)
+        return losses
 
     def begin(self, place: FloatArray, spread: float, seed: int, population: int | None = None) -> OneSearch:
         """A search from a place in the unit cube, `spread` wide at first (standard deviation), with a population of its own if given."""
@@ -122,9 +122,9 @@ class Search:
         if screened < max(starts, 1):
             return [self.begin(rng.random(len(same))[same], spread, int(rng.integers(1, 2**31))) for _ in range(starts)]
         places = rng.random((screened, len(same)))[:, same]
-        costs = [cost for k in range(0, screened, self.population)
-                 for cost in self.try_studies([self.trial.at(place) for place in places[k:k + self.population]])]
-        return [self.begin(places[k], spread, int(rng.integers(1, 2**31))) for k in np.argsort(costs, kind="stable")[:starts]]
+        losses = [loss for k in range(0, screened, self.population)
+                 for loss in self.try_studies([self.trial.at(place) for place in places[k:k + self.population]])]
+        return [self.begin(places[k], spread, int(rng.integers(1, 2**31))) for k in np.argsort(losses, kind="stable")[:starts]]
 
     def race(self, searches: Sequence[OneSearch]) -> None:
         """Spend all trials left by successive halving (Jamieson and Talwalkar 2016).
@@ -143,7 +143,7 @@ class Search:
 
 
 class OneSearch:
-    """CMA-ES (Hansen 2016) from one place, with its population; `lowest` is its lowest cost so far."""
+    """CMA-ES (Hansen 2016) from one place, with its population; `lowest` is its lowest loss so far."""
 
     def __init__(self, search: Search, place: FloatArray, spread: float, seed: int, population: int) -> None:
         import cma  # takes longer to load than all the rest
@@ -157,8 +157,8 @@ class OneSearch:
         search = self._search
         for left in range(trials, 0, -self.population):
             shares = self._strategy.ask()
-            costs = search.try_studies([search.trial.at(share) for share in shares[:left]])
-            search.kept += [(cost, share) for cost, share in zip(costs, shares, strict=False) if cost <= KEPT_COST * search.cost]
-            self.lowest = min(self.lowest, min(costs))
-            if len(costs) == len(shares):
-                self._strategy.tell(shares, costs)
+            losses = search.try_studies([search.trial.at(share) for share in shares[:left]])
+            search.kept += [(loss, share) for loss, share in zip(losses, shares, strict=False) if loss <= KEPT_LOSS * search.loss]
+            self.lowest = min(self.lowest, min(losses))
+            if len(losses) == len(shares):
+                self._strategy.tell(shares, losses)

@@ -1,4 +1,4 @@
-"""Uncertainty of fitted parameters: profiles of the loss over a search's trials, and sets of values that fit as well."""
+"""Uncertainty of fitted parameters: profiles of the loss over a search's trials, and sets of values that fit as well as the best."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ DIGITS = 6
 """Significant digits of a spread's values."""
 
 
-class Places(Protocol):
-    """Values at places in the unit cube of the bounds."""
+class Bounds(Protocol):
+    """Maps shares of the bounds, each in [0, 1], to values."""
 
     def values(self, shares: FloatArray) -> FloatArray: ...
 
@@ -33,38 +33,38 @@ class Profiles(NamedTuple):
     ----------
     free
         The parameters.
-    costs, values
-        Costs of the trials near the lowest cost, shape (K,), and their values, shape (K, parameters); the best first.
+    losses, values
+        Losses of the trials near the lowest loss, shape (K,), and their values, shape (K, parameters); the best first.
     sets
         Rows of up to `SETS` trials that fit as well as the best and are as far apart as possible; the best first.
     limit
-        The cost up to which a trial fits as well.
+        The loss up to which a trial fits as well as the best.
     """
 
     free: Sequence[Free]
-    costs: FloatArray
+    losses: FloatArray
     values: FloatArray
     sets: list[int]
     limit: float
 
     @classmethod
-    def of(cls, free: Sequence[Free], places: Places, search: Search, best: FloatArray) -> Profiles:
+    def of(cls, free: Sequence[Free], bounds: Bounds, search: Search, best: FloatArray) -> Profiles:
         """The profiles of a finished search, whose best trial lies at `best`."""
-        limit = search.cost * (1 + search.alike)
-        near = sorted((one for one in search.kept if search.cost < one[0]), key=lambda one: one[0])
-        costs = np.array([search.cost, *(cost for cost, _ in near)])
+        limit = search.loss * (1 + search.alike)
+        near = sorted((one for one in search.kept if search.loss < one[0]), key=lambda one: one[0])
+        losses = np.array([search.loss, *(loss for loss, _ in near)])
         shares = np.array([best, *(share for _, share in near)])
-        return cls(free, costs, places.values(shares), _apart(shares[costs <= limit]), limit)
+        return cls(free, losses, bounds.values(shares), _apart(shares[losses <= limit]), limit)
 
     def spread(self, study: int) -> dict[str, list[float]]:
-        """The sets that fit as well, as a study's table [spread] has them."""
+        """The sets that fit as well as the best, in the form of a study's table [spread]."""
         return {free.key: [float(f"{value:.{DIGITS}g}") for value in self.values[self.sets, k]]
                 for k, free in enumerate(self.free) if study in free.studies}
 
     def interval(self, k: int) -> tuple[float, float]:
         """Least and greatest value of a parameter among all trials that fit as well as the best."""
-        alike = self.values[self.costs <= self.limit, k]
-        return float(alike.min()), float(alike.max())
+        values = self.values[self.losses <= self.limit, k]
+        return float(values.min()), float(values.max())
 
 
 def _apart(shares: FloatArray) -> list[int]:
@@ -78,7 +78,7 @@ def _apart(shares: FloatArray) -> list[int]:
 
 
 def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> None:
-    """Draw cost against every parameter: each trial a dot, those that fit as well as the best in colour, the interval a band.
+    """Draw the loss against every parameter: each trial a dot, those that fit as well as the best in colour, the interval a band.
 
     Raises
     ------
@@ -95,15 +95,15 @@ def plot_profiles(path: Path, profiles: Profiles, studies: Sequence[Study]) -> N
     rows = -(-len(profiles.free) // columns)
     with sns.axes_style("whitegrid"), plt.rc_context({"font.size": 9}):
         figure, axes = plt.subplots(rows, columns, figsize=(11, 1.7 * rows + 0.6), layout="constrained", squeeze=False, sharey=True)
-        alike = profiles.costs <= profiles.limit
+        fits = profiles.losses <= profiles.limit
         for k, axis in enumerate(axes.flat):
             if k >= len(profiles.free):
                 axis.set_axis_off()
                 continue
             free, values = profiles.free[k], profiles.values[:, k]
             axis.axvspan(*profiles.interval(k), color="#0072b2", alpha=0.12, linewidth=0)
-            axis.scatter(values[~alike], profiles.costs[~alike], s=3, alpha=0.25, color="#808080", linewidths=0)
-            axis.scatter(values[alike], profiles.costs[alike], s=5, alpha=0.6, color="#0072b2", linewidths=0)
+            axis.scatter(values[~fits], profiles.losses[~fits], s=3, alpha=0.25, color="#808080", linewidths=0)
+            axis.scatter(values[fits], profiles.losses[fits], s=5, alpha=0.6, color="#0072b2", linewidths=0)
             axis.axvline(values[0], color="black", linewidth=0.8, linestyle="--")
             key = free.label(studies).replace("vehicle.parameters.", "").replace("ads.parameters.", "")
             axis.set_xlabel(key + ("" if free.bounds.unit == "-" else f" [{free.bounds.unit}]"))

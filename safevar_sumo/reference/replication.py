@@ -37,8 +37,8 @@ class Nearness(NamedTuple):
     """Solutions of one algorithm and the published rows nearest to each.
 
     Distances are Euclidean in widths of the domains, medians over the five nearest: `distance` from solutions to
-    published rows, `distance_published` between published rows. Safety degrees are means [m, -m/s]; `also_collide` is the share of
-    collisions among the rows next to solutions that collide.
+    published rows, `distance_published` between published rows. Safety degrees are means [m, -m/s]; `also_collide` is the share
+    of collisions among the rows nearest to solutions that collide.
     """
 
     setting: str
@@ -59,7 +59,7 @@ def nearness(case: Case, references: Sequence[ReferenceData]) -> list[Nearness]:
     rows = np.concatenate([data.settings for data in references]) / width
     safety = np.concatenate([data.metrics[SAFETY_DEGREE] for data in references])
     tree, number = scipy.spatial.cKDTree(rows), min(NEIGHBOURS, len(rows))
-    between = tree.query(rows, number + 1)[0][:, 1:] if len(rows) > number else np.full((1, 1), np.nan)
+    published_distances = tree.query(rows, number + 1)[0][:, 1:] if len(rows) > number else np.full((1, 1), np.nan)
     near = []
     for algorithm in case.algorithms:
         solutions = case.solutions_of(algorithm)
@@ -69,7 +69,7 @@ def nearness(case: Case, references: Sequence[ReferenceData]) -> list[Nearness]:
         distance, nearest = (np.reshape(part, (len(places), number)) for part in tree.query(places, number))
         hit = collided(solutions).to_numpy()
         near.append(Nearness(
-            case.name, algorithm, len(solutions), float(np.median(distance)), float(np.median(between)),
+            case.name, algorithm, len(solutions), float(np.median(distance)), float(np.median(published_distances)),
             float(np.nanmean(solutions[SAFETY_DEGREE])), float(safety[nearest].mean()), int(hit.sum()),
             float((safety[nearest[hit]] <= 0).mean()) if hit.any() else None))
     return near
@@ -83,7 +83,6 @@ TITLES = {
     "rq3.3-safety": "RQ3.3: how the changes affect safety", "collisions": "Collisions", "combinations": "Four changed together",
     "weather": "One weather against another"}
 
-NOT_COMPARED = "; RQ2, RQ3 and the weathers need them and are not compared"
 
 
 def replication(pairs: Pairs, near: Sequence[Nearness]) -> str:
@@ -106,9 +105,10 @@ def _head(pairs: Pairs, verdicts: Sequence[Conclusion]) -> str:
     lines += [f"- {name}: results here, none published given." for name in pairs.only_here]
     lines += [f"- {name}: published results given, none here." for name in pairs.only_published]
     for here, published in zip(pairs.here, pairs.published, strict=True):
-        lines += [f"- {here.study.name}: no solutions of {name} {side}{NOT_COMPARED if name == NSGA2 else ''}."
-                  for side, one, other in ((PUBLISHED, here, published), (HERE, published, here))
-                  for name in one.algorithms if name not in other.algorithms]
+        for side, present, absent in ((PUBLISHED, here, published), (HERE, published, here)):
+            for name in [name for name in present.algorithms if name not in absent.algorithms]:
+                effect = "; RQ2, RQ3 and the weathers need them and are not compared" if name == NSGA2 else ""
+                lines.append(f"- {here.study.name}: no solutions of {name} {side}{effect}.")
     lines += [f"- {note}" for case in pairs.here for note in case.remarks]
     return "\n".join([*lines, ""])
 
@@ -138,7 +138,7 @@ def _nearest_rows(near: Sequence[Nearness]) -> str:
 def _side_by_side(table: ComparedTable) -> str:
     lines = [f"### {TITLES[table.name]}", ""]
     if not table.frame.empty:
-        keys = [column for column in table.frame if column not in _pairs(table.quantities)]
+        keys = [column for column in table.frame if column not in _column_names(table.quantities)]
         heads = [*map(str, keys), *(f"{name} {HERE} / {PUBLISHED}" for name in table.quantities)]
         rows = [(*(row[key] for key in keys),
                  *(" / ".join(_cell(row[f"{name} {side}"]) for side in (HERE, PUBLISHED)) for name in table.quantities))
@@ -147,7 +147,7 @@ def _side_by_side(table: ComparedTable) -> str:
     return "\n".join([*lines, *(f"{note}  " for note in table.notes), ""])
 
 
-def _pairs(quantities: Iterable[str]) -> set[str]:
+def _column_names(quantities: Iterable[str]) -> set[str]:
     return {f"{name} {side}" for name in quantities for side in (HERE, PUBLISHED)}
 
 

@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import Actors, Coordinates, Grade, Roads, World
+from safevar_sumo.scenarios.base import Coordinates, Grade, Roads, World, XmlChanges
 from safevar_sumo.scenarios.euro_ncap import (
     ACROSS_ON,
     AHEAD,
@@ -52,7 +52,7 @@ class TargetAhead(NamedTuple):
     speed: Callable[[float], float]
     direction: Direction = AHEAD
 
-    def lanes(self, roads: Roads) -> Actors:
+    def lanes(self, roads: Roads) -> XmlChanges:
         """The crossing lane turned into the direction of a rotated target: its rear is on the junction, its front on the lane beyond."""
         if not self._is_rotated:
             return {}
@@ -61,7 +61,7 @@ class TargetAhead(NamedTuple):
         entry, exit_ = ((rear[0] + distance * along, rear[1] + distance * left) for distance in (-length, length - BEYOND))
         return lanes_across(frame, entry, exit_, self.direction)
 
-    def actors(self, speed: float, roads: Roads) -> Actors:
+    def actors(self, speed: float, roads: Roads) -> XmlChanges:
         """The vehicle at `speed` [m/s], and the target ahead of it."""
         if self.gap <= 0:
             raise InputError("scenario.parameters", f"the target begins {-self.gap:.2f} m inside the vehicle", "a target ahead")
@@ -72,7 +72,7 @@ class TargetAhead(NamedTuple):
             **target,
         }
 
-    def _in_lane(self) -> tuple[float, Actors]:
+    def _in_lane(self) -> tuple[float, XmlChanges]:
         """The vehicle's start on the straight road [m], and a target in line with the lane."""
         kind = TYPES.get(self.target, self.target)
         renamed = {f"vType[@id='{kind}']": target_type(self.target)} if kind != self.target else {}
@@ -80,7 +80,7 @@ class TargetAhead(NamedTuple):
             "type": self.target, "departPos": repr(START + self.gap + self._body.length), "departPosLat": repr(-self.offset),
             "departSpeed": repr(self.speed(0.0))}}
 
-    def _at_junction(self, roads: Roads) -> tuple[float, Actors]:
+    def _at_junction(self, roads: Roads) -> tuple[float, XmlChanges]:
         """The vehicle's start before the junction [m], and a rotated target on it."""
         along, _ = Frame.of(roads.lane(APPROACH)).place_of(roads.lane(ACROSS_ON).start)
         start = along + BEYOND * self.direction.along - self._depth - self.gap
@@ -177,11 +177,11 @@ class TargetAheadTest(TargetTest, frozen=True, kw_only=True, forbid_unknown_fiel
     vut_width: Annotated[float, Meta(gt=0.5, le=3.5)] = VUT_WIDTH
     grade: Grade = 0.0
 
-    def lanes(self, roads: Roads) -> Actors:
+    def lanes(self, roads: Roads) -> XmlChanges:
         """Changes to the lanes for a rotated target."""
         return self._ahead.lanes(roads)
 
-    def actors(self, roads: Roads) -> Actors:
+    def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle at its speed, and the target."""
         return self._ahead.actors(self.test_speed, roads)
 

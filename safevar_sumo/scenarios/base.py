@@ -26,7 +26,7 @@ Grade = Annotated[float, Meta(ge=-STEEPEST, le=STEEPEST)]
 BEND = 0.05
 """Largest deviation of a lane's centre line from a straight line for which the lane counts as straight [m]."""
 Coordinates = tuple[float, float]
-Actors = Mapping[str, Mapping[str, str] | None]
+XmlChanges = Mapping[str, Mapping[str, str] | None]
 """Changes to a network's traffic or lanes, by the XPath of an element below the file's root: attributes to set, or None to remove it."""
 
 
@@ -122,10 +122,9 @@ class Scenario(Protocol):
 
     Optional: `reactive_actors = False` declares that no actor reacts to the vehicle under test, so that SUMO can play the scene once for
     all vehicles; `grade`, the rise of the road [%] (SUMO's plane is then that road, and gravity acts in the vehicles); `pre_crash`, its
-    type in NHTSA's typology; `lanes(roads) -> Actors`, changes to the built network, and `actors(roads) -> Actors`, changes to the traffic
-    on it; `remarks() -> list[str]` on its parameters for the
-    user; `test_speed` [m/s]: a robot holds the vehicle at that speed until the ADS brakes, a run that leaves the tolerance before that
-    is an invalid test, and only contacts at the vehicle's front are collisions.
+    type in NHTSA's typology; `lanes(roads)` and `actors(roads)`, which return `XmlChanges` to the built network and to the traffic on it;
+    `remarks() -> list[str]` on its parameters for the user; `test_speed` [m/s]: a robot holds the vehicle at that speed until the ADS
+    brakes, a run that leaves the tolerance before that is an invalid test, and only contacts at the vehicle's front are collisions.
     """
 
     network: str
@@ -221,18 +220,18 @@ class GuardedScenario:
         self.reactive_actors = bool(getattr(scenario, "reactive_actors", True))
         self.grade, self.pre_crash = float(grade), str(getattr(scenario, "pre_crash", ""))
 
-    def actors(self, roads: Roads) -> Actors:
+    def actors(self, roads: Roads) -> XmlChanges:
         """Its changes to the network's traffic; none if it has no such method."""
         return self._changes("actors", "the traffic file", roads)
 
-    def _changes(self, method: str, file: str, roads: Roads) -> Actors:
+    def _changes(self, method: str, file: str, roads: Roads) -> XmlChanges:
         changes = self._guard.call(method, getattr(self._scenario, method, lambda roads: {}), roads)
         if not isinstance(changes, Mapping):
             raise self._guard.wrong(method, "changes", changes, f"a mapping from XPaths of {file} to attributes")
         return {str(path): change if change is None else {str(name): str(value) for name, value in change.items()}
                 for path, change in changes.items()}
 
-    def lanes(self, roads: Roads) -> Actors:
+    def lanes(self, roads: Roads) -> XmlChanges:
         """Its changes to the network's lanes; none if it has no such method (a parameter may have that name)."""
         return {} if not callable(getattr(self._scenario, "lanes", None)) else self._changes("lanes", "the network", roads)
 

@@ -11,7 +11,7 @@ from msgspec.structs import force_setattr
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Encounter, FloatArray, Trace
-from safevar_sumo.scenarios.base import Actors, Grade, PreCrash, Roads, World
+from safevar_sumo.scenarios.base import Grade, PreCrash, Roads, World, XmlChanges
 from safevar_sumo.scenarios.crossing_target import NETWORK_ON_FOOT, OnFoot, OnWheels
 from safevar_sumo.scenarios.euro_ncap import (
     APPROACH,
@@ -243,11 +243,11 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         """Remarks on parameters outside the protocol."""
         return TESTS[self.test].range.remarks(self.test, self.speed, self.impact_location, self.grade)
 
-    def lanes(self, roads: Roads) -> Actors:
+    def lanes(self, roads: Roads) -> XmlChanges:
         """Changes to the crossing lane: its direction."""
         return _Start.of(self).mover.lanes(Frame.of(roads.lane(APPROACH)), roads)
 
-    def actors(self, roads: Roads) -> Actors:
+    def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle ahead of the target's path, the target beside the lane, and the parked cars, if any."""
         frame, start = Frame.of(roads.lane(APPROACH)), _Start.of(self)
         path = start.mover.path(frame, roads, start.impact_left)
@@ -261,7 +261,7 @@ class Crossing(TargetTest, frozen=True, kw_only=True, forbid_unknown_fields=True
             **self._parked(frame, path, roads),
         }
 
-    def _parked(self, frame: Frame, path: float, roads: Roads) -> Actors:
+    def _parked(self, frame: Frame, path: float, roads: Roads) -> XmlChanges:
         """The parked cars beside the lane, if any."""
         if not self.parameter("hidden"):
             return {f"vehicle[@id='{car}']": None for car in PARKED_LENGTH}

@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import KMH_PER_MS, FloatArray
-from safevar_sumo.scenarios.base import Actors, Coordinates
+from safevar_sumo.scenarios.base import Coordinates, XmlChanges
 from safevar_sumo.scenarios.frame import Frame
 
 KMH = 1 / KMH_PER_MS
@@ -74,7 +74,7 @@ ACROSS, INSIDE, ACROSS_ON = "across_0", ":junction_0_0", "across_on_0"
 """The target's lanes: before the junction, on it, and beyond."""
 
 
-def lanes_across(frame: Frame, entry: Coordinates, exit_: Coordinates, direction: Direction, length: float = 300.0) -> Actors:
+def lanes_across(frame: Frame, entry: Coordinates, exit_: Coordinates, direction: Direction, length: float = 300.0) -> XmlChanges:
     """The target's lanes, straight in a direction: from `entry` to `exit_` on the junction, and `length` metres before and after it.
 
     Points are given along the vehicle's lane and to its left [m].

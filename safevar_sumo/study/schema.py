@@ -105,7 +105,7 @@ class MetricsTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     `ttc_threshold` is TTC* [s]; `sampling_interval` [s] is the time between two samples that
     TET, TIT and aveDece are computed from (a whole multiple of the simulation's step; by default the step).
-    `also` names further metrics as `package.module:Name`.
+    `also` names further metrics: of the package, such as `max_jerk`, or your own as `package.module:Name`.
     """
 
     ttc_threshold: Positive

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from safevar_sumo.study.schema import CharacteristicTable
 
 WIDEST = 100
-"""Largest standard deviation of a normal law cut off at the domain, in widths of the domain; beyond, the law is uniform to a 20,000th
-and cannot be computed reliably."""
+"""Largest standard deviation of a normal law cut off at the domain, in widths of the domain. A wider law differs from the uniform one by
+less than 1/20,000, and its quantiles lose precision."""
 
 
 class Uniform(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="distribution", tag="uniform"):
@@ -92,10 +92,9 @@ def _law_mistakes(source: object, key: str, row: CharacteristicTable, law: Distr
     elif isinstance(law, Lognormal) and low <= 0:
         yield InputError(source, f"{key}: lognormal, with a domain from {low:g} on", "a domain above 0")
     elif isinstance(law, Normal | Lognormal) and high > low:
-        field, spread, width = ("deviation", law.deviation, high - low) if isinstance(law, Normal) else (
-            "sigma", law.sigma, math.log(high / low))
-        if spread > WIDEST * width:
-            yield InputError(source, f"{key}.{field} = {spread:g}", f"at most {WIDEST * width:g}, {WIDEST} times the domain's width; "
+        field, width = ("deviation", high - low) if isinstance(law, Normal) else ("sigma", math.log(high / low))
+        if (deviation := getattr(law, field)) > WIDEST * width:
+            yield InputError(source, f"{key}.{field} = {deviation:g}", f"at most {WIDEST * width:g}, {WIDEST} times the domain's width; "
                              "for more take distribution = \"uniform\"")
 
 

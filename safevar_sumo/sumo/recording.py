@@ -30,7 +30,7 @@ SCENES = 4000
 """Largest number of recorded scenes that a process keeps; a scene of ten seconds takes some ten kilobytes."""
 KEPT = "scenes.msgpack"
 LEEWAY = 0.01
-"""Added to extents, which exclude distant actors [m]."""
+"""Margin of the extents [m]; an actor outside its extent is not checked for a collision."""
 POSITION_EPS = 0.1
 """Smallest length of a lane's shape (SUMO, utils/common/StdDefs.h) [m]."""
 
@@ -56,7 +56,7 @@ class Track(NamedTuple):
 class Way(NamedTuple):
     """The straight lanes that the vehicle under test follows, in order; shape (L,) or (L, 2) [m].
 
-    `end` is the position on a lane at its end, `stretch` the length of a lane's shape over the lane's length.
+    `end` is the length of a lane as SUMO counts positions on it, `stretch` the length of a lane's shape over the lane's length.
     """
 
     first: FloatArray
@@ -79,8 +79,7 @@ class Way(NamedTuple):
 class Recording:
     """A scene in which the vehicle under test does not drive: `start` and `speed` are those of its departure on its `way` [m, m/s].
 
-    `extents`, shape (2, T, A), hold for each of the A tracks the range of positions along the way of a vehicle's front in which the
-    vehicle is beside that actor [m].
+    `extents`, shape (2, T, A): the vehicle is beside actor A at step T while its front is between the two positions along the way [m].
     """
 
     step_length: float
@@ -111,7 +110,7 @@ def recorded_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> li
     SimulationError
         If SUMO fails.
     """
-    reasons = [_reason_for_copies(scenario) for scenario in scenarios]
+    reasons = [_reason_for_sumo(scenario) for scenario in scenarios]
     recordable = [scenario for scenario, reason in zip(scenarios, reasons, strict=True) if not reason]
     folders = {(scenario, network.fingerprint, tuple(options)): network.folder
                for scenario, network in zip(recordable, all_staged(recordable), strict=True)}
@@ -124,10 +123,10 @@ def recorded_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> li
     return [reason or scenes[scenario] for scenario, reason in zip(scenarios, reasons, strict=True)]
 
 
-def _reason_for_copies(scenario: Scenario) -> str:
+def _reason_for_sumo(scenario: Scenario) -> str:
     if getattr(scenario, "reactive_actors", True):
         return "somebody in the scenario may react to the vehicle under test"
-    if not isinstance(scenario, GuardedScenario) and not is_shipped(scenario.network):  # its claim holds for our networks alone
+    if not isinstance(scenario, GuardedScenario) and not is_shipped(scenario.network):  # a shipped scenario claims it for shipped networks
         return f"the traffic of the network {scenario.network!r} may react to the vehicle under test"
     return ""
 
@@ -155,7 +154,7 @@ def _scenes_of(missing: Mapping[_Key, str]) -> list[Recording | str]:
 
 @cache
 def _code() -> bytes:
-    """Everything but the scenario that determines a scene: SUMO's version, and our code that plays scenes."""
+    """What determines a scene besides the scenario: SUMO's version, and our code that plays scenes."""
     files = sorted(file for folder in ("sumo", "scenarios") for file in (Path(__file__).parents[1] / folder).glob("*.py"))
     return b"".join([netconvert_version().encode(), *(file.read_bytes() for file in files)])
 
@@ -172,7 +171,7 @@ def _unpacked_array(kind: Any, packed: Any) -> FloatArray:
 def _play(scenario: Any, folder: str, options: tuple[str, ...]) -> Recording | str:
     """The scene, or the reason why it cannot be recorded."""
     with open_world(copied_network(folder, 1), 1, Engine.LIBSUMO, options) as world:
-        world.let_depart()
+        world.allow_departure()
         world.depart()
         try:
             return _record(scenario, world)
@@ -211,8 +210,8 @@ def _record(scenario: Scenario, world: SumoWorld) -> Recording:
 
 
 def _extent(track: Track, along: FloatArray, own_length: float) -> FloatArray:
-    """Range of positions along the way of a vehicle's front beside an actor at every step, plus a margin; shape (2, T) [m]."""
-    angle = np.radians(track.angle)
+    """Least and largest position of a vehicle's front beside an actor at every step, with a margin; shape (2, T) [m]."""
+    angle = np.radians(track.angle)  # clockwise from north
     cosine, sine = along @ np.array([np.sin(angle), np.cos(angle)]), along @ np.array([np.cos(angle), -np.sin(angle)])
     middle = track.position @ along - cosine * (track.length / 2)
     half_extent = (np.abs(cosine) * track.length + np.abs(sine) * track.width) / 2 + LEEWAY

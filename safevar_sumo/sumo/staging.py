@@ -1,4 +1,4 @@
-"""A scenario's network with the lanes and traffic of its parameters: a folder like those in `sumo_nets/`, in the user's cache."""
+"""Copies of a network in the user's cache, with lanes and traffic as a scenario's parameters demand."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import platformdirs
 
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.scenarios import GuardedScenario, Lane, Scenario
-from safevar_sumo.scenarios.base import Actors, lane_through
+from safevar_sumo.scenarios.base import XmlChanges, lane_through
 from safevar_sumo.sumo.copies import parsed
 from safevar_sumo.sumo.network import ROADS, built_network, network_fingerprint
 from safevar_sumo.sumo.sources import OPTIONS, TRAFFIC, Sources, options_of, sources_of
@@ -42,8 +42,11 @@ def staged(scenario: Scenario) -> Staged:
 def all_staged(scenarios: Sequence[Scenario]) -> list[Staged]:
     """The networks of several scenarios; each network's files are read once. Raises the errors of `staged`."""
     fingerprints = {name: network_fingerprint(name) for name in {scenario.network for scenario in scenarios}}
-    staging: Any = {True: _staged.__wrapped__, False: _staged}  # the changes of a scenario from outside may vary
-    return [staging[isinstance(scenario, GuardedScenario)](scenario, fingerprints[scenario.network]) for scenario in scenarios]
+    def stage(scenario: Any) -> Staged:
+        may_vary = isinstance(scenario, GuardedScenario)  # a user's own scenario may return other changes every time
+        return (_staged.__wrapped__ if may_vary else _staged)(scenario, fingerprints[scenario.network])
+
+    return [stage(scenario) for scenario in scenarios]
 
 
 @lru_cache(maxsize=10_000)
@@ -84,14 +87,14 @@ def _shapes(network: Path, content: bytes) -> dict[str, Lane]:
     return shapes
 
 
-def _with_lanes(sources: Sources, built: Path, changes: Actors) -> Path:
+def _with_lanes(sources: Sources, built: Path, changes: XmlChanges) -> Path:
     """A copy of a network as it was built, with changes to its lanes."""
     files = {ROADS: ElementTree.tostring(_changed(built, changes)), **_files(sources, TRAFFIC, OPTIONS)}
     return _stored(sources.place.name, tuple(files.items()))
 
 
-def _with_traffic(sources: Sources, changes: Actors) -> Path:
-    """A copy of a network with changes to its traffic."""
+def _with_traffic(sources: Sources, changes: XmlChanges) -> Path:
+    """A copy of a network with changes to its traffic; it is built within its folder where it has sources."""
     files = _files(sources, *sources.files) | {TRAFFIC: ElementTree.tostring(_changed(sources.place / TRAFFIC, changes))}
     return _stored(sources.place.name, tuple(files.items())) / sources.built
 
@@ -102,7 +105,7 @@ def _files(sources: Sources, *names: str) -> dict[str, bytes]:
     return {name: (sources.place / name).read_bytes() for name in (*names, gui_settings) if (sources.place / name).is_file()}
 
 
-def _changed(file: Path, changes: Actors) -> ElementTree.Element:
+def _changed(file: Path, changes: XmlChanges) -> ElementTree.Element:
     root = parsed(file)
     for path, attributes in changes.items():
         elements = root.findall(path)

@@ -88,7 +88,7 @@ class SumoWorld:
             vehicletype.setTau(name, tau)
         self.set_decelerations(types.decel)
 
-    def let_depart(self) -> None:
+    def allow_departure(self) -> None:
         """Set types of the vehicles under test with which SUMO inserts them at any speed."""
         for name in self.ids(VUT):
             self._api.vehicletype.setMaxSpeed(name, FASTEST)

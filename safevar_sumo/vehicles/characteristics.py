@@ -20,8 +20,8 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import CharacteristicTable
 
 FARTHEST = 1000.0
-"""Largest magnitude of a value over that of its domain; beyond it a typo is assumed."""
-# beta of method section 2, by the smallest width of a domain that it applies to.
+"""Values beyond this multiple of the domain's largest magnitude are taken for typos."""
+# Smallest width of a domain, and its beta (method section 2).
 FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
 
 
@@ -64,7 +64,7 @@ class Characteristic:
         return FARTHEST * max(abs(self.lower), abs(self.upper))
 
     def text(self, value: float) -> str:
-        """A value with so many decimals that the last digit is worth between 1/40 and 1/4 of the threshold."""
+        """A value rounded so that one unit of the last digit is at most a quarter of the threshold."""
         return f"{value:.{max(0, math.ceil(-math.log10(self.threshold / 4)))}f}"
 
     @property
@@ -84,12 +84,12 @@ class Characteristic:
             Naming the value and what is expected.
         """
         if not isinstance(value, Real) or not self.is_legal(value, beyond=beyond):
-            above = " above 0" if self.lower > 0 else ""
-            plausible, in_domain = f"a finite number{above}, up to {self.farthest:g}", f"a number in [{self.lower:g}, {self.upper:g}]"
-            may_be_beyond = not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
-            beyond_with = f", or any with {switch}" if may_be_beyond and switch else ""
-            raise InputError(source, f"{self.name} = {value}{' is outside its domain' if may_be_beyond else ''}",
-                             f"{plausible if beyond else in_domain}{self.suffix}{otherwise}{beyond_with}")
+            legal = (f"a finite number{' above 0' if self.lower > 0 else ''}, up to {self.farthest:g}" if beyond else
+                     f"a number in [{self.lower:g}, {self.upper:g}]")
+            only_outside = not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
+            hint = f", or any with {switch}" if only_outside and switch else ""
+            raise InputError(source, f"{self.name} = {value}{' is outside its domain' if only_outside else ''}",
+                             f"{legal}{self.suffix}{otherwise}{hint}")
 
     def is_legal(self, values: Any, *, beyond: bool = False) -> Any:
         """Whether values, a number or an array, are in the domain; with `beyond`, whether they are plausible.
@@ -157,7 +157,7 @@ class CharacteristicSet:
         return np.asarray(filtered != self.original)
 
     def largest_change(self, filtered: FloatArray) -> FloatArray:
-        """f_diff = max_i w_i |v_i - v''_i| / v_i, a fraction, shape (N,) (method section 3, where every weight w is 1)."""
+        """f_diff = max_i w_i |v_i - v''_i| / v_i, a fraction, shape (N,); v'' are filtered (method section 3, with weights w of 1)."""
         return np.asarray(np.max(self.weight * (np.abs(self.original - filtered) / np.abs(self.original)), axis=1))
 
     def number_changed(self, filtered: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.reference import ReferenceData, Subject, agreement, calibrate, calibrate_together, with_values
 from safevar_sumo.reference.calibration import _refining_population, _thinned, _Trial
 from safevar_sumo.reference.effects import covered_by_spread, error_beyond_spread, linear_effects
-from safevar_sumo.reference.fit import Search, original_cost, reference_cost
+from safevar_sumo.reference.fit import Search, original_loss, reference_loss
 from safevar_sumo.reference.parameters import Free, free_parameters, value_of
 from safevar_sumo.reference.profiles import Profiles
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
@@ -46,16 +46,16 @@ def test_a_fit_from_scratch_finds_the_truth_and_forgets_what_the_study_says(data
     truth = load_study("sun").ads.parameters["brake_gap"]
     fits = [calibrate(mine(gap, starts=1, trials=36), {"mine": data}, Here(), from_scratch=True) for gap in (0.4, 1.5)]
     assert fits[0].values == fits[1].values == {GAP: pytest.approx(truth, rel=0.05)}
-    assert fits[0].reached == [fits[0].cost]
+    assert fits[0].reached == [fits[0].loss]
     assert (fits[0].used["mine"].rows, fits[0].held_back["mine"].rows) == (12, 12)
 
 
 def test_what_counts_for_nothing_in_the_study_costs_nothing(data: ReferenceData) -> None:
-    """With all weights zero but that of the original vehicle, the rows have no part in the cost."""
+    """With all weights zero but that of the original vehicle, the rows have no part in the loss."""
     study = mine(1.1, trials=1, rank=0.0, collisions=0.0, weights={"tet": 0.0})
-    assert calibrate(study, {"mine": data}, Here()).cost == 0.0
+    assert calibrate(study, {"mine": data}, Here()).loss == 0.0
     alone = mine(1.1, trials=1, original=2.0)
-    assert calibrate(alone, {}, Here()).cost == pytest.approx(2 * calibrate(mine(1.1, trials=1), {}, Here()).cost)
+    assert calibrate(alone, {}, Here()).loss == pytest.approx(2 * calibrate(mine(1.1, trials=1), {}, Here()).loss)
 
 
 def test_a_fit_is_refused_that_could_not_mean_anything(data: ReferenceData) -> None:
@@ -83,7 +83,7 @@ def test_studies_that_are_fitted_together_share_what_is_not_their_own(data: Refe
     assert wet.values[HESITATION] == pytest.approx(0.2, abs=0.04)
     assert set(dry.values) == {GAP}
     assert (dry.shared, wet.shared) == ({GAP}, {GAP})
-    assert dry.cost == wet.cost
+    assert dry.loss == wet.loss
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_from_scratch_the_first_study_is_fitted_alone_then_what_the_others_have_
     there = dict(evaluate(assemble(with_hesitation(load_study("sun"), 0.2)), data.settings).metrics)
     subjects = [Subject(sun, {"mine": data}), Subject(late, {"theirs": ReferenceData(data.settings, there, 0)})]
     steps = list[tuple[float, float, float]]()
-    dry, wet = calibrate_together(subjects, Here(), lambda cost, best: steps.append(
+    dry, wet = calibrate_together(subjects, Here(), lambda loss, best: steps.append(
         (value_of(best[0], GAP), value_of(best[1], GAP), value_of(best[1], HESITATION))), from_scratch=True)
     assert len(steps) == 100
     assert {(theirs, hesitation) for _, theirs, hesitation in steps[:64]} == {(0.4 * truth, 0.1)}, "nothing of the others"
@@ -139,7 +139,7 @@ def test_errors_count_in_repeats_and_effects_in_the_safety_degrees(data: Referen
     def loss(unit: float, **fit: float) -> float:
         study = msgspec.structs.replace(mine(0.8), repeatability={"safety_degree": unit}, fit=msgspec.structs.replace(only, **fit))
         here = evaluate(assemble(study), data.settings)
-        return reference_cost(agreement(data, here, study, here), data, here, study)
+        return reference_loss(agreement(data, here, study, here), data, here, study)
 
     error = np.abs(evaluate(assemble(mine(0.8)), data.settings).f_safe - data.metrics["safety_degree"]).mean()
     assert loss(1.0) == pytest.approx(error)
@@ -162,23 +162,23 @@ PUBLISHED = {"safety_degree": 2.0, "tet": 1.0}
 FIT = FitTable(tolerance=0.05, original=0.5, weights={"safety_degree": 1.0, "tet": 0.3})
 
 
-def cost(safety_degree: float, tet: float) -> float:
+def loss(safety_degree: float, tet: float) -> float:
     one = np.ones(1)
     original = Evaluations(settings=np.ones((1, 2)), outcome=np.array([Outcome.STOPPED.value]), collision_speed=one * np.nan,
                            metrics={"safety_degree": one * safety_degree, "tet": one * tet}, f_diff=0 * one, f_num_diff=0 * one)
-    return original_cost(original, PUBLISHED, FIT)
+    return original_loss(original, PUBLISHED, FIT)
 
 
 def test_a_miss_is_squared_within_the_tolerance_and_in_proportion_beyond() -> None:
-    assert cost(2.0, 1.0) == 0.0
-    assert cost(2.05, 1.0) == pytest.approx(0.5 * 0.5 ** 2 / 2), "half a tolerance; the mean of two metrics counts half"
-    assert cost(2.0, 0.95) == pytest.approx(0.5 * 0.3 * 1 / 2), "one tolerance"
-    assert cost(2.3, 1.0) == pytest.approx(0.5 * (2 * 3 - 1) / 2), "three tolerances"
-    assert cost(20.0, 1.0) == cost(np.nan, 1.0) == pytest.approx(0.5 * (2 * 10 - 1) / 2), "farther than ten is as far as that"
+    assert loss(2.0, 1.0) == 0.0
+    assert loss(2.05, 1.0) == pytest.approx(0.5 * 0.5 ** 2 / 2), "half a tolerance; the mean of two metrics counts half"
+    assert loss(2.0, 0.95) == pytest.approx(0.5 * 0.3 * 1 / 2), "one tolerance"
+    assert loss(2.3, 1.0) == pytest.approx(0.5 * (2 * 3 - 1) / 2), "three tolerances"
+    assert loss(20.0, 1.0) == loss(np.nan, 1.0) == pytest.approx(0.5 * (2 * 10 - 1) / 2), "farther than ten is as far as that"
 
 
 class Bowl:
-    """Studies are their places; what they cost is how far they are from a place squared, and whether they are in the wrong half."""
+    """Studies are their places; their loss is the squared distance from a place, and more in the wrong half."""
 
     def __init__(self) -> None:
         self.tried = 0
@@ -186,7 +186,7 @@ class Bowl:
     def at(self, shares: FloatArray) -> Any:
         return shares
 
-    def costs(self, studies: Sequence[Any]) -> list[float]:
+    def losses(self, studies: Sequence[Any]) -> list[float]:
         self.tried += len(studies)
         return [float(((place - 0.2) ** 2).sum() + (place[0] > 0.5)) for place in studies]
 
@@ -201,7 +201,7 @@ class Runner:
         self.rounds.append(trials)
 
 
-def silent(cost: float, best: Any) -> None:
+def silent(loss: float, best: Any) -> None:
     pass
 
 
@@ -214,9 +214,9 @@ def test_the_worse_half_gives_up_after_every_round() -> None:
 
 def test_a_search_around_known_values_has_smaller_generations() -> None:
     class Counted(Bowl):
-        def costs(self, studies: Sequence[Any]) -> list[float]:
+        def losses(self, studies: Sequence[Any]) -> list[float]:
             generations.append(len(studies))
-            return super().costs(studies)
+            return super().losses(studies)
 
     generations = list[int]()
     search = Search(Counted(), 12, 100, silent)
@@ -232,9 +232,9 @@ def test_searches_begin_at_the_best_of_many_places_with_what_is_the_same_at_one_
             super().__init__()
             self.places: list[FloatArray] = []
 
-        def costs(self, studies: Sequence[Any]) -> list[float]:
+        def losses(self, studies: Sequence[Any]) -> list[float]:
             self.places.extend(studies)
-            return super().costs(studies)
+            return super().losses(studies)
 
     bowl = Noted()
     search = Search(bowl, 7, 200, silent)
@@ -263,13 +263,13 @@ def test_the_models_error_covers_nine_tenths_of_rows_each_file_counted_alike(dat
 
 @pytest.mark.parametrize(("starts", "trials"), [(1, 7), (3, 100), (6, 500), (40, 30)])
 def test_no_trial_is_lost_and_none_too_many(starts: int, trials: int) -> None:
-    bowl, costs = Bowl(), list[float]()
-    search = Search(bowl, 6, trials, lambda cost, best: costs.append(cost))
+    bowl, losses = Bowl(), list[float]()
+    search = Search(bowl, 6, trials, lambda loss, best: losses.append(loss))
     searches = [search.begin(np.full(2, 0.9), 0.3, seed) for seed in range(1, starts + 1)]
     search.race(searches)
-    assert bowl.tried == trials == len(costs)
+    assert bowl.tried == trials == len(losses)
     assert search.left == 0
-    assert costs == sorted(costs, reverse=True)
+    assert losses == sorted(losses, reverse=True)
 
 
 def test_a_race_finds_the_bottom_from_whatever_half() -> None:
@@ -281,8 +281,8 @@ def test_a_race_finds_the_bottom_from_whatever_half() -> None:
 class Basin(Bowl):
     """A bowl whose bottom is at one, on [0, 1] x [0, 10]: within 4 % of it is what is 0.2 from the bottom."""
 
-    def costs(self, studies: Sequence[Any]) -> list[float]:
-        return [1 + cost for cost in super().costs(studies)]
+    def losses(self, studies: Sequence[Any]) -> list[float]:
+        return [1 + loss for loss in super().losses(studies)]
 
     def values(self, shares: FloatArray) -> FloatArray:
         return np.asarray(shares * np.array([1.0, 10.0]))

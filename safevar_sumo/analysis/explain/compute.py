@@ -75,7 +75,7 @@ def failures_of(source: Study | Case, evaluator: Evaluator, original: Evaluation
         if named:
             raise InputError("solutions", f"{source.name!r} is a study and has no solutions", "a results directory")
         number = SEARCHED_IF_RATED if is_rated(source) else SEARCHED
-        settings = evaluator.characteristics.filter(evaluator.spread(number, source.search.seed, filtered=True))
+        settings = evaluator.characteristics.filter(evaluator.even_design(number, source.search.seed, filtered=True))
         solution_handles: list[SolutionId | None] = [None] * len(settings)
         recorded = None
         rows = None

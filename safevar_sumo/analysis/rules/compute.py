@@ -145,7 +145,7 @@ def find_rules(study: Study, options: RulesOptions, *, pool: Pool | None = None,
 
 def _design(evaluator: Evaluator, number: int, seed: int) -> Evaluations:
     """Evaluated settings over the whole domain, without those that could not be simulated."""
-    evaluations = evaluator.evaluate(evaluator.spread(number, seed), "settings over the whole domain")
+    evaluations = evaluator.evaluate(evaluator.even_design(number, seed), "settings over the whole domain")
     return evaluations.take(evaluations.valid)
 
 
