@@ -80,7 +80,7 @@ class Command(NamedTuple):
     brake: FloatArray
 
 
-class Tables(NamedTuple):
+class PedalTables(NamedTuple):
     """How the original vehicle's pedals act on a dry road, at `speeds` [m/s].
 
     Acceleration at `full_throttle` and deceleration when `coasting` [m/s^2]; `braking` is the deceleration that the brake adds per
@@ -106,7 +106,7 @@ class Nominal(NamedTuple):
     decel: float
     max_speed: float
     actuator_lag: float
-    tables: Callable[[], Tables]
+    tables: Callable[[], PedalTables]
 
     @property
     def tau(self) -> float:

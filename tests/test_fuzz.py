@@ -23,7 +23,7 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import ForeignError, InputError, SafevarError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins import Guard
-from safevar_sumo.records import Evaluations, FloatArray, Nominal, Observation, Tables
+from safevar_sumo.records import Evaluations, FloatArray, Nominal, Observation, PedalTables
 from safevar_sumo.study import Study, load_study, tables_of
 from safevar_sumo.study.file import without_nulls
 from safevar_sumo.sumo.system import assemble
@@ -69,7 +69,7 @@ def test_a_study_with_anything_in_one_place_is_read_or_refused(path: tuple[str, 
 
 NOTHING = np.zeros(2)
 SEEN = Observation(0.0, NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, 1.0)
-KNOWN = Nominal(1.0, 1.0, 1.0, 1.0, 1.0, lambda: Tables(NOTHING, NOTHING, NOTHING, 1.0))
+KNOWN = Nominal(1.0, 1.0, 1.0, 1.0, 1.0, lambda: PedalTables(NOTHING, NOTHING, NOTHING, 1.0))
 COMMANDS = st.one_of(ANYTHING, st.none(), st.tuples(ANYTHING, ANYTHING), st.tuples(st.floats(), st.floats()),
                      st.tuples(st.floats(0, 1), st.sampled_from([0, True, np.float32(0.5), np.array(0.5), np.array([0.5])])))
 

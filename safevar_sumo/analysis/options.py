@@ -134,12 +134,12 @@ InputError
     If an argument is wrong, or inputs have changed since the results were computed.
 SimulationError
     If the original vehicle cannot be simulated."""
-Function = TypeVar("Function", bound=Callable[..., Any])
+QuestionFunction = TypeVar("QuestionFunction", bound=Callable[..., Any])
 
 
-def documented(options: type[Options]) -> Callable[[Function], Function]:
+def documented(options: type[Options]) -> Callable[[QuestionFunction], QuestionFunction]:
     """Append the options, and the arguments common to all questions, to a function's docstring, which ends with its first argument."""
-    def complete(function: Function) -> Function:
+    def complete(function: QuestionFunction) -> QuestionFunction:
         arguments = [f"{name}\n{indent(described.argument, '    ')}" for name, described in options.described().items()]
         function.__doc__ = "\n".join([cleandoc(function.__doc__ or ""), *arguments, EVERY_QUESTION])
         return function

@@ -19,7 +19,7 @@ from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.cli.options import PICTURES, check_output
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import (
-    Command,
+    CommandFunction,
     jobs_option,
     json_option,
     now_option,
@@ -33,10 +33,11 @@ from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.terminal import stages
 
 
-def question(options: type[Options], metavar: str, *extra: Callable[[Command], Command]) -> Callable[[Command], click.Command]:
+def question(options: type[Options], metavar: str, *extra: Callable[[CommandFunction], CommandFunction]
+             ) -> Callable[[CommandFunction], click.Command]:
     """Decorator for the command of a question: flags of its options, flags that all questions share, and `extra` decorators."""
-    def add(command: Command) -> click.Command:
-        decorators: list[Callable[[Command], Command]] = [
+    def add(command: CommandFunction) -> click.Command:
+        decorators: list[Callable[[CommandFunction], CommandFunction]] = [
             click.argument("place", metavar=metavar), options_of(options), point_option, now_option, jobs_option, json_option, *extra]
         for decorator in reversed(decorators):
             command = decorator(command)
@@ -55,7 +56,7 @@ def _json(result: Any) -> str:
     return json.dumps(result.to_dict(), indent=2, allow_nan=False)
 
 
-def _plot_option(help_text: str) -> Callable[[Command], Command]:
+def _plot_option(help_text: str) -> Callable[[CommandFunction], CommandFunction]:
     return click.option("--plot", type=click.Path(path_type=Path), metavar="FILE", help=help_text)
 
 

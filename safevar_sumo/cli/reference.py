@@ -23,8 +23,8 @@ from safevar_sumo.reference import (
     Agreement,
     Calibration,
     Effect,
+    FitSubject,
     ReferenceData,
-    Subject,
     agreement,
     calibrate,
     calibrate_together,
@@ -155,7 +155,7 @@ def calibrate_command(study: str, others: tuple[str, ...], trials: int | None, s
             if len(chosen) == 1:
                 calibrations = [calibrate(chosen[0], data[0], pool, after_trial, from_scratch=from_scratch)]
             else:
-                subjects = [Subject(one, references) for one, references in zip(chosen, data, strict=True)]
+                subjects = [FitSubject(one, references) for one, references in zip(chosen, data, strict=True)]
                 calibrations = calibrate_together(subjects, pool, after_trial, from_scratch=from_scratch)
     except KeyboardInterrupt:
         if done:

@@ -26,7 +26,7 @@ from safevar_sumo.cli.options import (
     settings_of,
 )
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import Target, now_option, replay_options, target_of
+from safevar_sumo.cli.target import CommandTarget, now_option, replay_options, target_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
@@ -99,7 +99,7 @@ def _check_outputs(study: str, trace: Path | None, replays: Replays) -> None:
         raise InputError("--trace", f"{trace} is what --plot or --animate writes", "another file")
 
 
-def _sweep(target: Target, system: System, requested: FloatArray, names: tuple[str, ...], filtered: bool, as_json: bool) -> None:
+def _sweep(target: CommandTarget, system: System, requested: FloatArray, names: tuple[str, ...], filtered: bool, as_json: bool) -> None:
     settings = system.characteristics.filter(requested) if filtered else requested
     evaluations = evaluate_settings(target.study, np.concatenate([system.characteristics.original[np.newaxis], settings]))
     original, rows = evaluations.take([0]), evaluations.take(np.arange(1, len(evaluations)))
@@ -115,7 +115,7 @@ def _sweep(target: Target, system: System, requested: FloatArray, names: tuple[s
                    err=True)
 
 
-def _print_results(target: Target, system: System, simulation: Simulation, spreads: Sequence[ModelSpread], as_json: bool) -> None:
+def _print_results(target: CommandTarget, system: System, simulation: Simulation, spreads: Sequence[ModelSpread], as_json: bool) -> None:
     points = at_every_point(system, simulation.evaluation.settings) if system.matrix and (as_json or system.rater is None) else []
     if as_json:
         replayed = {} if target.handle is None else {"solution": str(target.handle)}
@@ -140,7 +140,7 @@ def _print_results(target: Target, system: System, simulation: Simulation, sprea
                    "--no-filter keeps it", err=True)
 
 
-def _warn_of_differences(target: Target, simulation: Simulation) -> None:
+def _warn_of_differences(target: CommandTarget, simulation: Simulation) -> None:
     """Warn where a replay differs from the recorded solution."""
     from safevar_sumo.replay.comparison import differences
 

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from safevar_sumo.analysis.research_questions.case import Case
 
 
-Command = Callable[..., Any]
+CommandFunction = Callable[..., Any]
 
 
-class Target(NamedTuple):
+class CommandTarget(NamedTuple):
     """A study, its name in errors, and the solution of its results to replay, if any: handle, setting, row."""
 
     study: Study
@@ -33,7 +33,7 @@ class Target(NamedTuple):
     recorded: dict[str, Any] | None = None
 
 
-def replay_options(command: Command) -> Command:
+def replay_options(command: CommandFunction) -> CommandFunction:
     """The options that choose a solution of a results directory."""
     for option in (
             click.option("--smallest", "choice", flag_value="smallest", help="Replay the unsafe solution with the smallest changes."),
@@ -44,7 +44,7 @@ def replay_options(command: Command) -> Command:
     return command
 
 
-def target_of(place: str, solution: str | None, choice: str | None) -> Target:
+def target_of(place: str, solution: str | None, choice: str | None) -> CommandTarget:
     """Load the subject of a command: a study by name or path, or a results directory.
 
     Raises
@@ -55,14 +55,14 @@ def target_of(place: str, solution: str | None, choice: str | None) -> Target:
     if solution is not None and choice is not None:
         raise InputError("--solution", f"{solution!r} and --{choice.replace('_', '-')} both choose a solution", "one of them")
     if solution is None and choice is None:
-        return Target(study_at_point(place), place)
+        return CommandTarget(study_at_point(place), place)
     case = results_or_study(place, results_only=True)
     assert not isinstance(case, Study)
     named = None if solution is None else SolutionId.parse(solution)
     handle = named or chosen_handle(case.solutions, case.unsafe, str(choice), place)
     row = case.solutions.iloc[position_of(case.solutions, handle)]
     setting = row[list(case.characteristics.names)].to_numpy(dtype=float)
-    return Target(case.study, place, handle, setting, {str(name): value for name, value in row.items()})
+    return CommandTarget(case.study, place, handle, setting, {str(name): value for name, value in row.items()})
 
 
 jobs_option = click.option("--jobs", type=click.IntRange(1, 1024), help="Worker processes.  [default: the cores of this machine]")
@@ -86,9 +86,9 @@ def as_it_is_now() -> bool:
     return bool(click.get_current_context().meta.get(AS_IT_IS_NOW))
 
 
-def options_of(question: type[Options]) -> Callable[[Command], Command]:
+def options_of(question: type[Options]) -> Callable[[CommandFunction], CommandFunction]:
     """Add the flags of a question's options; `question(**keywords)` makes the record from the command's keywords."""
-    def add(command: Command) -> Command:
+    def add(command: CommandFunction) -> CommandFunction:
         for field in reversed(fields(question)):
             command = _flag(question.flags()[field.name], field.name, field.default, question.described()[field.name])(command)
         return command
@@ -96,7 +96,7 @@ def options_of(question: type[Options]) -> Callable[[Command], Command]:
     return add
 
 
-def _flag(flag: str, name: str, default: Any, option: Option) -> Callable[[Command], Command]:
+def _flag(flag: str, name: str, default: Any, option: Option) -> Callable[[CommandFunction], CommandFunction]:
     if option.kind is bool:
         return click.option(flag, name, is_flag=True, default=default, help=option.help)
     if option.form != "one":

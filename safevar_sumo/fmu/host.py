@@ -47,11 +47,11 @@ class Setting(NamedTuple):
     limit: float
 
 
-class Failure(Exception):
+class InstanceFailure(Exception):
     """An FMU could not carry out a request."""
 
 
-class Instances:
+class HostedInstances:
     """All instances in this process, by numbers that the requests give them."""
 
     def __init__(self, setting: Setting, folder: str) -> None:
@@ -96,7 +96,7 @@ class Instances:
                 results.append(work(place, instance))
             except Exception as error:  # any error of FMPy about an FMU
                 self._drop(number)
-                raise Failure(f"{self._reason(error)} while it {doing}") from error
+                raise InstanceFailure(f"{self._reason(error)} while it {doing}") from error
             finally:
                 self.busy = None
         return np.array(results, dtype=float)
@@ -131,9 +131,9 @@ class Instances:
             return
         _, terminated, early, reached = result
         if terminated:
-            raise Failure("it requests the end of the simulation")
+            raise InstanceFailure("it requests the end of the simulation")
         if early:
-            raise Failure(f"it returned early, at {reached:g} s")
+            raise InstanceFailure(f"it returned early, at {reached:g} s")
 
     def _set(self, instance: Any, groups: list[tuple[str, list[int], list[int]]], values: list[Any]) -> None:
         for kind, references, columns in groups:
@@ -190,14 +190,14 @@ def unpack(setting: Setting) -> str:
     """Unpack the FMU into a new folder."""
     content = Path(setting.path).read_bytes()
     if sha256(content).hexdigest() != setting.digest:
-        raise Failure("its file was changed meanwhile")
+        raise InstanceFailure("its file was changed meanwhile")
     folder = mkdtemp(prefix="safevar_sumo_fmu_")
     with ZipFile(BytesIO(content)) as archive:
         archive.extractall(folder)
     return folder
 
 
-def watch(instances: Instances, limit: float, folder: str, parent: int, answers: BinaryIO) -> None:
+def watch(instances: HostedInstances, limit: float, folder: str, parent: int, answers: BinaryIO) -> None:
     """End the process when an instance takes too long, or when the parent process has ended."""
     while os.getppid() == parent:
         time.sleep(CHECK_INTERVAL)
@@ -238,12 +238,12 @@ def main() -> None:
                 setting = Setting(*arguments)
                 folder = unpack(setting)
                 send(answers, ("done", folder))
-                instances = Instances(setting, folder)
+                instances = HostedInstances(setting, folder)
                 threading.Thread(target=watch, args=(instances, setting.limit, folder, parent, answers), daemon=True).start()
                 send(answers, ("done", None))
             else:
                 send(answers, ("done", getattr(instances, name)(*arguments)))
-        except Failure as failure:
+        except InstanceFailure as failure:
             send(answers, ("failed", str(failure)))
         except Exception as error:  # the parent process reports it
             send(answers, ("failed", f"{type(error).__name__}: {error}"))

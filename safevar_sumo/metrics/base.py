@@ -41,7 +41,7 @@ def total(samples: FloatArray) -> FloatArray:
 
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
 Text = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]{1,200}\Z")]
-Function = Callable[[SimulationRuns, MetricsTable], FloatArray]
+MetricFunction = Callable[[SimulationRuns, MetricsTable], FloatArray]
 
 
 class MetricFacts(Struct, frozen=True, kw_only=True):
@@ -83,7 +83,7 @@ class Metric(MetricFacts, frozen=True, kw_only=True):
     Element i depends on run i alone, to the bit.
     """
 
-    function: Function
+    function: MetricFunction
 
     def __call__(self, runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
         return self.function(runs, thresholds)

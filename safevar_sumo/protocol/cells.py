@@ -28,7 +28,7 @@ BRAKING, HEADWAY_AT_START = 4.0, 1.0
 """Deceleration and headway of the target in CCRb and CMRb, which the layers vary [m/s^2, s]."""
 
 
-class Row(Struct, frozen=True, forbid_unknown_fields=True):
+class CellRow(Struct, frozen=True, forbid_unknown_fields=True):
     """A row of a matrix: speeds [km/h], and for every column S (standard), E (extended) or - (no cell)."""
 
     vut: float
@@ -49,7 +49,7 @@ class Block(Struct, frozen=True, forbid_unknown_fields=True):
     label: str
     first: str
     points: tuple[float, float, float]
-    rows: tuple[Row, ...]
+    rows: tuple[CellRow, ...]
     light: Literal["day", "night"] | None = None
     function: str = ""
     impact_locations: tuple[float, ...] = ()

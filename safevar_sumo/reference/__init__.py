@@ -3,7 +3,7 @@
 from safevar_sumo.analysis.parameters import with_values
 from safevar_sumo.reference.calibration import (
     Calibration,
-    Subject,
+    FitSubject,
     calibrate,
     calibrate_together,
     calibration_comment,
@@ -16,6 +16,28 @@ from safevar_sumo.reference.rows import ReferenceData, evaluations_of, original_
 from safevar_sumo.reference.validation import Agreement, Totals, agreement, keep_totals, plot_agreement, quoted
 
 __all__ = [
-    "Agreement", "Calibration", "Coverage", "Effect", "ReferenceData", "Subject", "Totals", "agreement", "calibrate", "calibrate_together",
-    "calibration_comment", "cost_line", "covered_by_spread", "effects_of", "evaluations_of", "fitted_as", "keep_totals", "on_a_bound",
-    "original_metrics", "package_filter", "plot_agreement", "quoted", "read_reference", "with_values"]
+    "Agreement",
+    "Calibration",
+    "Coverage",
+    "Effect",
+    "FitSubject",
+    "ReferenceData",
+    "Totals",
+    "agreement",
+    "calibrate",
+    "calibrate_together",
+    "calibration_comment",
+    "cost_line",
+    "covered_by_spread",
+    "effects_of",
+    "evaluations_of",
+    "fitted_as",
+    "keep_totals",
+    "on_a_bound",
+    "original_metrics",
+    "package_filter",
+    "plot_agreement",
+    "quoted",
+    "read_reference",
+    "with_values",
+]

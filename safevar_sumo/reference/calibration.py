@@ -16,7 +16,7 @@ from safevar_sumo.analysis.parameters import value_of, with_values
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.effects import error_beyond_spread
-from safevar_sumo.reference.fit import MAX_LOSS, Search, Together, original_loss, reference_loss
+from safevar_sumo.reference.fit import MAX_LOSS, Together, TrialSearch, original_loss, reference_loss
 from safevar_sumo.reference.parameters import Free, free_parameters
 from safevar_sumo.reference.profiles import Profiles
 from safevar_sumo.reference.rows import COLUMNS, ReferenceData
@@ -88,7 +88,7 @@ MILLIMETRES = 3
 """Decimals of a study's model error [m]."""
 
 
-class Subject(NamedTuple):
+class FitSubject(NamedTuple):
     """A study and the data that it is fitted to, by name."""
 
     study: Study
@@ -121,10 +121,10 @@ class Calibration(NamedTuple):
 def calibrate(study: Study, references: Mapping[str, ReferenceData], pool: Pool,
               done: Callable[[float, Study], None] = lambda loss, best: None, *, from_scratch: bool = False) -> Calibration:
     """Fit one study; see `calibrate_together`."""
-    return calibrate_together([Subject(study, references)], pool, lambda loss, best: done(loss, best[0]), from_scratch=from_scratch)[0]
+    return calibrate_together([FitSubject(study, references)], pool, lambda loss, best: done(loss, best[0]), from_scratch=from_scratch)[0]
 
 
-def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[float, Together], None] = lambda loss, best: None, *,
+def calibrate_together(subjects: Sequence[FitSubject], pool: Pool, done: Callable[[float, Together], None] = lambda loss, best: None, *,
                        from_scratch: bool = False) -> list[Calibration]:
     """Fit by CMA-ES (Hansen 2016), as the studies' tables [fit] say; trials, seed, starts and population are the first study's.
 
@@ -161,7 +161,7 @@ def calibrate_together(subjects: Sequence[Subject], pool: Pool, done: Callable[[
     if staged := from_scratch and (len(studies) > 1 or fit.thinning > 1):
         start, trials = _by_stages(subjects, free, used, pool, rng, done)
     trial = _Trial(free, [_Fitted(study, data, pool) for study, data in zip(start, used, strict=True)])
-    search = Search(trial, fit.population, trials, done, fit.alike)
+    search = TrialSearch(trial, fit.population, trials, done, fit.alike)
     if not from_scratch and search.try_studies([studies])[0] >= MAX_LOSS:
         names = " and ".join(f"study {study.name!r}" for study in studies)
         raise SimulationError(f"{names} cannot be simulated with {'its' if len(studies) == 1 else 'their'} own values")
@@ -197,7 +197,7 @@ def _first_of_key(free: Sequence[Free]) -> list[int]:
     return [keys.index(key) for key in keys]
 
 
-def _by_stages(subjects: Sequence[Subject], free: Sequence[Free], used: Sequence[Mapping[str, ReferenceData]], pool: Pool,
+def _by_stages(subjects: Sequence[FitSubject], free: Sequence[Free], used: Sequence[Mapping[str, ReferenceData]], pool: Pool,
                rng: np.random.Generator, done: Callable[[float, Together], None]) -> tuple[Together, int]:
     """Fit, on thinned rows, the first study from random places, then the others' own parameters; also returns the trials left."""
     studies = tuple(subject.study for subject in subjects)
@@ -209,7 +209,7 @@ def _by_stages(subjects: Sequence[Subject], free: Sequence[Free], used: Sequence
         if parameters and trials:
             thinned = [{name: _thinned(data, fit.thinning) for name, data in used[k].items()} for k in indices]
             trial = _Trial(parameters, [_Fitted(studies[k], data, pool) for k, data in zip(indices, thinned, strict=True)])
-            search = Search(trial, fit.population, trials, partial(_done_with_some, done, studies, indices))
+            search = TrialSearch(trial, fit.population, trials, partial(_done_with_some, done, studies, indices))
             search.race(search.from_random_places(_first_of_key(parameters), fit.starts, fit.screened, fit.width, rng))
             assert search.best is not None, "there is at least one trial"
             studies, trials_left = _replaced(studies, indices, search.best), trials_left - trials
@@ -236,7 +236,7 @@ def _thinned(data: ReferenceData, thinning: int) -> ReferenceData:
     return data.take(rows)
 
 
-def _check(subject: Subject) -> None:
+def _check(subject: FitSubject) -> None:
     source = subject.study.source
     if not subject.references and not subject.study.published:
         raise InputError(source, "has no table [published] and there is no reference file", "something to fit to")

@@ -77,7 +77,7 @@ SCREENING = 4
 """Screening takes at most one in this number of trials."""
 
 
-class Search:
+class TrialSearch:
     """Keeps the best studies of all trials, and counts the trials left.
 
     Parameters
@@ -145,7 +145,7 @@ class Search:
 class OneSearch:
     """CMA-ES (Hansen 2016) from one place, with its population; `lowest` is its lowest loss so far."""
 
-    def __init__(self, search: Search, place: FloatArray, spread: float, seed: int, population: int) -> None:
+    def __init__(self, search: TrialSearch, place: FloatArray, spread: float, seed: int, population: int) -> None:
         import cma  # takes longer to load than all the rest
 
         self._search, self.lowest, self.population = search, np.inf, population

@@ -10,7 +10,7 @@ import numpy as np
 
 from safevar_sumo.analysis.figures import save
 from safevar_sumo.records import FloatArray
-from safevar_sumo.reference.fit import Search
+from safevar_sumo.reference.fit import TrialSearch
 from safevar_sumo.reference.parameters import Free
 from safevar_sumo.study import Study
 
@@ -20,7 +20,7 @@ DIGITS = 6
 """Significant digits of a spread's values."""
 
 
-class Bounds(Protocol):
+class ParameterSpace(Protocol):
     """Maps shares of the bounds, each in [0, 1], to values."""
 
     def values(self, shares: FloatArray) -> FloatArray: ...
@@ -48,7 +48,7 @@ class Profiles(NamedTuple):
     limit: float
 
     @classmethod
-    def of(cls, free: Sequence[Free], bounds: Bounds, search: Search, best: FloatArray) -> Profiles:
+    def of(cls, free: Sequence[Free], bounds: ParameterSpace, search: TrialSearch, best: FloatArray) -> Profiles:
         """The profiles of a finished search, whose best trial lies at `best`."""
         limit = search.loss * (1 + search.alike)
         near = sorted((one for one in search.kept if search.loss < one[0]), key=lambda one: one[0])

@@ -15,7 +15,7 @@ import numpy as np
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison
-from safevar_sumo.replay.film import Lane
+from safevar_sumo.replay.film import LaneLine
 from safevar_sumo.replay.scene import SEAM_WIDTH, FlatBody, FlatScene, scene_of
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class _Canvas:
             draw.line((x, y - 12 * OVERSAMPLING, x, y), fill=FAINT, width=OVERSAMPLING)
             self._word(draw, (round(x / OVERSAMPLING) + 4, round(y / OVERSAMPLING) - 16), f"{mark:g} m", FAINT, 12)
 
-    def _lane(self, draw: ImageDraw, lane: Lane, sample: int) -> None:
+    def _lane(self, draw: ImageDraw, lane: LaneLine, sample: int) -> None:
         if lane.kind == "area":
             draw.polygon(self._pixels(lane.line, sample), fill=PATH)
             return
@@ -158,7 +158,7 @@ def quad(start: FloatArray, end: FloatArray, width: float) -> FloatArray:
     return np.array([start + side, end + side, end - side, start - side])
 
 
-def stripes(lane: Lane) -> Iterator[FloatArray]:
+def stripes(lane: LaneLine) -> Iterator[FloatArray]:
     """The stripes of a crossing, each of shape (4, 2)."""
     for start, end in pairwise(lane.line):
         along = (end - start) / (np.hypot(*(end - start)) or 1.0)

@@ -18,7 +18,7 @@ from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.world import SumoWorld
 
 
-class Lane(NamedTuple):
+class LaneLine(NamedTuple):
     """A lane of SUMO: its middle line, shape (P, 2), and width [m]; an area's `line` is its outline, its width 0.
 
     `kind` is road, path (only for persons), crossing or area (for persons, between paths).
@@ -29,7 +29,7 @@ class Lane(NamedTuple):
     width: float
 
 
-class Track(NamedTuple):
+class ActorTrack(NamedTuple):
     """Where one actor was: front bumper of a vehicle or middle of a person [m], heading clockwise from north [degrees].
 
     Arrays of shape (T, N), NaN while the actor was absent; `length` and `width` in m.
@@ -52,8 +52,8 @@ class Film:
     """
 
     runs: SimulationRuns
-    tracks: Mapping[str, Track]
-    road: tuple[Lane, ...]
+    tracks: Mapping[str, ActorTrack]
+    road: tuple[LaneLine, ...]
 
     @property
     def last(self) -> np.ndarray:
@@ -90,13 +90,13 @@ class _Camera:
             self._measures[name] = world.measures(name)
         self._frames.append(frame)
 
-    def tracks(self) -> dict[str, Track]:
+    def tracks(self) -> dict[str, ActorTrack]:
         """The recorded tracks, in alphabetical order."""
-        by_name: dict[str, Track] = {}
+        by_name: dict[str, ActorTrack] = {}
         for actor in sorted(self._measures):
             copy, name = copy_and_name(actor)
             if name not in by_name:
-                by_name[name] = Track(*self._measures[actor], *(np.full((len(self._frames), self._n), np.nan) for _ in range(3)))
+                by_name[name] = ActorTrack(*self._measures[actor], *(np.full((len(self._frames), self._n), np.nan) for _ in range(3)))
             for sample, frame in enumerate(self._frames):
                 if actor in frame:
                     for row, value in zip(by_name[name][3:], frame[actor], strict=True):
@@ -104,16 +104,16 @@ class _Camera:
         return by_name
 
 
-def road_of(network: str) -> tuple[Lane, ...]:
+def road_of(network: str) -> tuple[LaneLine, ...]:
     """The lanes of one copy of a network, as netconvert built it."""
     root = ElementTree.parse(built_network(network)).getroot()
     return tuple(_lane(edge.get("function", ""), lane) for edge in root.iter("edge") for lane in edge.iter("lane"))
 
 
-def _lane(function: str, lane: ElementTree.Element) -> Lane:
+def _lane(function: str, lane: ElementTree.Element) -> LaneLine:
     line = np.array([[float(number) for number in point.split(",")[:2]] for point in lane.attrib["shape"].split()])
     if function == "walkingarea":
-        return Lane("area", line, 0.0)
+        return LaneLine("area", line, 0.0)
     for_persons = lane.get("allow", "").split() == ["pedestrian"]
     kind = "crossing" if function == "crossing" else "path" if for_persons else "road"
-    return Lane(kind, line, float(lane.get("width", 3.2)))  # SUMO's default width
+    return LaneLine(kind, line, float(lane.get("width", 3.2)))  # SUMO's default width

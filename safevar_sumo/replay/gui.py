@@ -10,7 +10,7 @@ import numpy as np
 
 from safevar_sumo.replay.animation import OTHER, PERSON, VEHICLES, quad, stripes
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison
-from safevar_sumo.replay.film import Lane
+from safevar_sumo.replay.film import LaneLine
 from safevar_sumo.replay.scene import FlatScene, scene_of
 from safevar_sumo.replay.window import Colour, Place, Window, open_window
 from safevar_sumo.scenarios import VUT
@@ -122,7 +122,7 @@ def _frame(scene: FlatScene, sample: int) -> np.ndarray:
                      for y in (view.bottom, view.bottom + view.height)])
 
 
-def _areas(lane: Lane) -> Sequence[np.ndarray]:
+def _areas(lane: LaneLine) -> Sequence[np.ndarray]:
     if lane.kind == "area":
         return [lane.line]
     if lane.kind == "crossing":
@@ -130,7 +130,7 @@ def _areas(lane: Lane) -> Sequence[np.ndarray]:
     return [quad(start, end, lane.width - 0.1) for start, end in zip(lane.line[:-1], lane.line[1:], strict=True)]
 
 
-def _colour_of(lane: Lane) -> Colour:
+def _colour_of(lane: LaneLine) -> Colour:
     return {"road": ROAD, "crossing": WHITE}.get(lane.kind, PATH)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import CHANGED, Comparison, Moments, moments
-from safevar_sumo.replay.film import Film, Lane, Track
+from safevar_sumo.replay.film import ActorTrack, Film, LaneLine
 from safevar_sumo.scenarios import VUT
 
 SEAM_WIDTH = 0.12
@@ -68,7 +68,7 @@ class FlatScene:
     comparison: Comparison
     step: float
     length: int
-    road: tuple[Lane, ...]
+    road: tuple[LaneLine, ...]
     bodies: tuple[FlatBody, ...]
     moments: tuple[Moments, ...]
     view: View
@@ -102,7 +102,7 @@ def scene_of(comparison: Comparison) -> FlatScene:
                  view=_view(bodies, length))
 
 
-def _body(name: str, track: Track, row: int, end: int, length: int, to_scene: FloatArray, start: FloatArray, turn: float) -> FlatBody:
+def _body(name: str, track: ActorTrack, row: int, end: int, length: int, to_scene: FloatArray, start: FloatArray, turn: float) -> FlatBody:
     """An actor until its simulation ends; afterwards it stays where it is."""
     until = np.minimum(np.arange(length), end)
     x, y = to_scene @ (np.stack([track.x[until, row], track.y[until, row]]) - start[:, np.newaxis])

@@ -13,11 +13,11 @@ from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.explain.compute import explain_failures as explain
 from safevar_sumo.analysis.explain.necessity import in_words
 from safevar_sumo.analysis.explain.result import CauseEntry, FailureEntry, SummaryEntry
-from safevar_sumo.analysis.opinion.compute import Cause, opinions_of, second_system
+from safevar_sumo.analysis.opinion.compute import JudgedCause, opinions_of, second_system
 from safevar_sumo.analysis.research_questions.indicators import nondominated
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.comparison import differences, number, raised, spaced
-from safevar_sumo.report.input import Change, FailingPlaces, ReportInput, stored_answer
+from safevar_sumo.report.input import ChangeRow, FailingPlaces, ReportInput, stored_answer
 from safevar_sumo.report.svg import Bar, rows
 
 CAUSES = 6
@@ -87,7 +87,7 @@ class Replay(NamedTuple):
     f_safe: float
     f_diff: float
     f_num_diff: int
-    changes: list[Change]
+    changes: list[ChangeRow]
     open: bool
     where: FailingPlaces | None = None
     replay: dict[str, Any] | None = None
@@ -147,7 +147,7 @@ def no_opinion(data: ReportInput) -> str:
 
 def _opinions(data: ReportInput, ordered: Sequence[tuple[CauseEntry, FailureEntry]]) -> list[SecondOpinion]:
     """The second vehicle model's opinion on each cause, computed once for these results."""
-    causes = [Cause(failure.handle or None, cause.changes, cause.fraction) for cause, failure in ordered]
+    causes = [JudgedCause(failure.handle or None, cause.changes, cause.fraction) for cause, failure in ordered]
     opinions = stored_answer(data, "opinion", lambda: opinions_of(data.case.study, causes, data.case.unsafe).to_dict())
     return msgspec.convert(opinions, list[SecondOpinion])
 

@@ -43,7 +43,7 @@ class FailingPlaces(NamedTuple):
     rows: list[tuple[str, list[str]]]
 
 
-class Change(NamedTuple):
+class ChangeRow(NamedTuple):
     """A change from the original: both values in a text, and the short and the long description of the characteristic, if any."""
 
     text: str
@@ -146,11 +146,11 @@ class ReportInput:
             setting[self.case.characteristics.names.index(name)] = value
         return setting
 
-    def changes(self, setting: FloatArray) -> list[Change]:
+    def changes(self, setting: FloatArray) -> list[ChangeRow]:
         """The changes from the original."""
         members = [member for member, value in zip(self.case.characteristics, setting.tolist(), strict=True) if value != member.original]
         texts = changes_in_words(self.case.characteristics, setting)
-        return [Change(text, member.short_name, member.words) for member, text in zip(members, texts, strict=True)]
+        return [ChangeRow(text, member.short_name, member.words) for member, text in zip(members, texts, strict=True)]
 
     def compared(self, setting: FloatArray) -> Comparison:
         """The comparison of a setting with the original vehicle, simulated once."""

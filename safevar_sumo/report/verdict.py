@@ -22,7 +22,7 @@ from safevar_sumo.records import KMH_PER_MS, FloatArray, Outcome
 from safevar_sumo.reference import Totals, quoted
 from safevar_sumo.replay.comparison import number, raised
 from safevar_sumo.report.findings import FIRST, Explanations
-from safevar_sumo.report.input import Change, FailingPlaces, ReportInput, stored_answer
+from safevar_sumo.report.input import ChangeRow, FailingPlaces, ReportInput, stored_answer
 from safevar_sumo.scenarios import SCENARIOS, Point, tags
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.sumo.matrix import vehicle_remarks
@@ -100,7 +100,7 @@ TITLES = {ROBUST: "Smallest robust failure", REASONS["fewest"]: "Fewest changes"
 UNKNOWN = "–"  # noqa: RUF001
 
 
-class Finding(NamedTuple):
+class SelectedFailure(NamedTuple):
     """A selected failure in the verdict; all values are its solution's, not scaled back.
 
     `share` is the unsafe share of its neighbours, and `cause` its first minimal cause; None if it was not explained.
@@ -110,7 +110,7 @@ class Finding(NamedTuple):
     handle: str
     reasons: list[str]
     anchor: str
-    changes: list[Change]
+    changes: list[ChangeRow]
     largest: float
     size: str
     end: str
@@ -137,7 +137,7 @@ class KeyFigure(NamedTuple):
     note: str
 
 
-class Agreement(NamedTuple):
+class AgreementRows(NamedTuple):
     """How well a study agrees with published data: a sentence, and a row of texts for each file; no rows without such data."""
 
     sentence: str
@@ -152,8 +152,8 @@ class Verdict(NamedTuple):
     solutions: int
     rule: str
     original: str
-    agreement: Agreement
-    findings: list[Finding]
+    agreement: AgreementRows
+    findings: list[SelectedFailure]
     figures: list[KeyFigure]
 
 
@@ -180,7 +180,7 @@ def _original(data: ReportInput) -> str:
     return f"The original vehicle {data.compared(data.case.characteristics.original).verdict(0)}."
 
 
-def _findings(data: ReportInput, explained: Explanations | None) -> list[Finding]:
+def _findings(data: ReportInput, explained: Explanations | None) -> list[SelectedFailure]:
     """The selected failures with the reasons for their selection; without explanations, selected only among the solutions."""
     failures = {failure.handle: failure for failure in explained.failures if failure.handle} if explained else {}
     reasons = {handle: chosen for handle, failure in failures.items() if (chosen := [name for name in failure.reasons if name in TITLES])}
@@ -192,11 +192,11 @@ def _findings(data: ReportInput, explained: Explanations | None) -> list[Finding
     return [_finding(data, handle, reasons[handle], failures.get(handle)) for handle in ordered]
 
 
-def _finding(data: ReportInput, handle: str, reasons: list[str], failure: FailureEntry | None) -> Finding:
+def _finding(data: ReportInput, handle: str, reasons: list[str], failure: FailureEntry | None) -> SelectedFailure:
     setting = data.setting_of(handle)
     changes, largest = data.changes(setting), float(data.case.characteristics.largest_change(setting[np.newaxis])[0])
     first, *others = [TITLES[reason] for reason in TITLES if reason in reasons]
-    return Finding(
+    return SelectedFailure(
         title="; ".join([first, *map(str.lower, others)]), handle=handle, reasons=reasons, anchor=data.anchor("replay", handle),
         changes=changes, largest=largest, size=f"{len(changes)} of {len(setting)} characteristics changed, by at most {largest:.0%}",
         end=_end(data, handle, setting), f_safe=data.solutions[handle]["f_safe"], where=data.where(setting),
@@ -211,7 +211,7 @@ def _end(data: ReportInput, handle: str, setting: FloatArray) -> str:
     return comparison.verdict(comparison.rows[-1])
 
 
-def _headline(data: ReportInput, findings: Sequence[Finding], explained: Explanations | None) -> str:
+def _headline(data: ReportInput, findings: Sequence[SelectedFailure], explained: Explanations | None) -> str:
     if not any(data.unsafe_solutions):
         return f"None of {len(data.case.solutions)} solutions is unsafe; the nearest miss is shown below."
     if data.original_fails:
@@ -226,7 +226,7 @@ def _headline(data: ReportInput, findings: Sequence[Finding], explained: Explana
     return f"{borderline}{_changes_lead_to(first, robust)}: {now}the vehicle {first.end}."
 
 
-def _changes_lead_to(finding: Finding, outcome: str) -> str:
+def _changes_lead_to(finding: SelectedFailure, outcome: str) -> str:
     """Such as `10 changes lead to a collision (3 of them suffice)`; only for an explained failure is it known how many suffice."""
     number, needed = len(finding.changes), finding.needed
     if number == needed:
@@ -237,7 +237,7 @@ def _changes_lead_to(finding: Finding, outcome: str) -> str:
     return f"{number_of(number, 'change')} lead{'s' if number == 1 else ''} to {outcome}{some}"
 
 
-def _figures(data: ReportInput, findings: Sequence[Finding], explained: Explanations | None,
+def _figures(data: ReportInput, findings: Sequence[SelectedFailure], explained: Explanations | None,
              tolerance: Mapping[str, Any] | None) -> list[KeyFigure]:
     """The four key figures."""
     by_reason = {reason: finding for finding in findings for reason in finding.reasons}
@@ -245,7 +245,7 @@ def _figures(data: ReportInput, findings: Sequence[Finding], explained: Explanat
             _avoided(explained.summary.preventable if explained else None, data), _together(tolerance)]
 
 
-def _smallest(robust: Finding | None, explained: Explanations | None, data: ReportInput) -> KeyFigure:
+def _smallest(robust: SelectedFailure | None, explained: Explanations | None, data: ReportInput) -> KeyFigure:
     if robust is None:
         reason = "every failure analysed is borderline" if explained else "not computed"
         return KeyFigure(TITLES[ROBUST], UNKNOWN, reason if any(data.unsafe_solutions) else "no solution is unsafe")
@@ -253,7 +253,7 @@ def _smallest(robust: Finding | None, explained: Explanations | None, data: Repo
                      f"{robust.share:.0%} of its neighbours are unsafe too")
 
 
-def _severity(worst: Finding | None, data: ReportInput) -> KeyFigure:
+def _severity(worst: SelectedFailure | None, data: ReportInput) -> KeyFigure:
     degree = float(data.case.solutions["f_safe"].min()) if worst is None else worst.f_safe
     if degree < 0:
         return KeyFigure("Most severe", f"collision at {-degree:.1f} m/s", f"{-KMH_PER_MS * degree:.0f} km/h")
@@ -282,11 +282,11 @@ def _together(tolerance: Mapping[str, Any] | None) -> KeyFigure:
                      f"from the original to the ends of their domains; none of {samples} vehicles sampled there is unsafe")
 
 
-def agreement_with_published(data: ReportInput) -> Agreement:
+def agreement_with_published(data: ReportInput) -> AgreementRows:
     """How well the study agrees with published data."""
     totals = quoted(data.case.study)
     if not totals:
-        return Agreement("This study was not compared with published data: how far another simulator or a real vehicle does the same "
+        return AgreementRows("This study was not compared with published data: how far another simulator or a real vehicle does the same "
                          "is unknown.", [])
     first = max(totals, key=lambda one: (one.reference, one.rows))
     shares = "no published collision is among them" if first.recall is None else (
@@ -295,7 +295,7 @@ def agreement_with_published(data: ReportInput) -> Agreement:
         shares += f", and {first.both} of the {first.here} collisions here are published ones (precision {first.precision:.2f})"
     rho = first.spearman.get(SAFETY_DEGREE)
     order = "" if rho is None else f" safety degrees are in the same order with a rank correlation of {rho:.2f} (1 is perfect);"
-    return Agreement(f"Agreement with published data, {first.rows} vehicles simulated again:{order} {shares}.", list(map(_row, totals)))
+    return AgreementRows(f"Agreement with published data, {first.rows} vehicles simulated again:{order} {shares}.", list(map(_row, totals)))
 
 
 def _row(totals: Totals) -> list[str]:

@@ -69,7 +69,7 @@ class Retry(msgspec.Struct, frozen=True, tag="retry"):
     """Discards the failed evaluations so far; evaluations after the first failed one become spare."""
 
 
-Frame = Owner | Batch | Result | Retry
+JournalFrame = Owner | Batch | Result | Retry
 
 
 class Content(NamedTuple):
@@ -100,7 +100,7 @@ class Content(NamedTuple):
 NOTHING = Content([], None, {})
 
 
-def encoded(frame: Frame) -> bytes:
+def encoded(frame: JournalFrame) -> bytes:
     """A frame's bytes."""
     payload = msgspec.msgpack.encode(frame)
     return HEAD.pack(MAGIC, len(payload), zlib.crc32(payload)) + payload
@@ -117,7 +117,7 @@ def batch_of(positions: list[int], evaluations: Evaluations) -> Batch:
         numbers={name: values.astype("<f8").tobytes() for name, values in numbers.items()}, reasons=reasons)
 
 
-def read_frames(data: bytes, path: Path) -> tuple[list[Frame], int]:
+def read_frames(data: bytes, path: Path) -> tuple[list[JournalFrame], int]:
     """All intact frames, and the end of the last one.
 
     Raises
@@ -125,7 +125,7 @@ def read_frames(data: bytes, path: Path) -> tuple[list[Frame], int]:
     InputError
         If a frame is damaged and intact ones follow it.
     """
-    frames: list[Frame] = []
+    frames: list[JournalFrame] = []
     offset = 0
     while offset < len(data):
         frame, end = _frame_at(data, offset, path)
@@ -139,7 +139,7 @@ def read_frames(data: bytes, path: Path) -> tuple[list[Frame], int]:
     return frames, offset
 
 
-def content_of(frames: list[Frame]) -> Content:
+def content_of(frames: list[JournalFrame]) -> Content:
     """The contents of a journal from its frames in order."""
     positions: list[int] = []
     batches: list[Evaluations] = []
@@ -164,7 +164,7 @@ def _without_failures(positions: list[int], evaluations: Evaluations) -> tuple[l
     return kept, evaluations.take(simulated)
 
 
-def _frame_at(data: bytes, offset: int, path: Path) -> tuple[Frame | None, int]:
+def _frame_at(data: bytes, offset: int, path: Path) -> tuple[JournalFrame | None, int]:
     if offset + HEAD.size > len(data):
         return None, offset
     magic, length, checksum = HEAD.unpack_from(data, offset)
@@ -172,7 +172,7 @@ def _frame_at(data: bytes, offset: int, path: Path) -> tuple[Frame | None, int]:
     if magic != MAGIC or len(payload) != length or zlib.crc32(payload) != checksum:
         return None, offset
     try:
-        return msgspec.msgpack.decode(payload, type=Frame), offset + HEAD.size + length
+        return msgspec.msgpack.decode(payload, type=JournalFrame), offset + HEAD.size + length
     except msgspec.DecodeError as error:
         raise InputError(path, f"holds at byte {offset} a frame of another version: {error}", "the version that wrote it") from None
 
@@ -269,7 +269,7 @@ class Journal:
             sync_directory(self.path.parent)
         return content_of(frames)
 
-    def _write(self, frame: Frame) -> None:
+    def _write(self, frame: JournalFrame) -> None:
         start = self._file.tell()
         try:
             rest = memoryview(encoded(frame))
@@ -311,7 +311,7 @@ def read_journal(path: Path, study: str, run: str) -> Content:
     return content_of(frames)._replace(torn=torn)
 
 
-def _not_of(path: Path, frame: Frame, owner: Owner, legal: str) -> InputError:
+def _not_of(path: Path, frame: JournalFrame, owner: Owner, legal: str) -> InputError:
     """The error for a journal that begins with another frame than its owner."""
     if isinstance(frame, Owner) and frame.study == owner.study and frame.run != owner.run:
         problem = f"is the journal of run {frame.run}, not of {owner.run}: was it renamed or swapped?"
@@ -325,7 +325,7 @@ def owner_of(path: Path) -> str | None:
     return frames[0].study if frames and isinstance(frames[0], Owner) else None
 
 
-def _frames_of(path: Path) -> tuple[list[Frame], int]:
+def _frames_of(path: Path) -> tuple[list[JournalFrame], int]:
     """The frames of a journal, and the number of bytes of a torn tail after them."""
     try:
         refuse_other_than_file(path)

@@ -22,7 +22,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     TARGET,
     VUT_LENGTH,
     VUT_WIDTH,
-    Body,
+    BodySize,
     Direction,
     ImpactLocation,
     lanes_across,
@@ -46,7 +46,7 @@ class TargetAhead(NamedTuple):
     """
 
     target: str
-    vut: Body
+    vut: BodySize
     gap: float
     offset: float
     speed: Callable[[float], float]
@@ -99,7 +99,7 @@ class TargetAhead(NamedTuple):
         return self.direction != AHEAD
 
     @property
-    def _body(self) -> Body:
+    def _body(self) -> BodySize:
         return BODIES[self.target]
 
     @property
@@ -200,7 +200,7 @@ class TargetAheadTest(TargetTest, frozen=True, kw_only=True, forbid_unknown_fiel
 
     def _ahead_of(self, target: str, gap: float, speed: Callable[[float], float], direction: Direction = AHEAD) -> TargetAhead:
         """A target at the impact location."""
-        vut = Body(self.vut_length, self.vut_width)
+        vut = BodySize(self.vut_length, self.vut_width)
         return TargetAhead(target, vut, gap, lateral_of(self.impact_location, self.vut_width), speed, direction)
 
     @property

@@ -22,7 +22,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     KMH,
     VUT_LENGTH,
     VUT_WIDTH,
-    Body,
+    BodySize,
     Direction,
     Heading,
     ImpactLocation,
@@ -89,7 +89,7 @@ class _Start(NamedTuple):
 
     mover: OnFoot | OnWheels
     direction: Direction
-    extent: Body
+    extent: BodySize
     impact_left: float
     distance: float
     time: float

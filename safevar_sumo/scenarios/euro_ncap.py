@@ -28,15 +28,15 @@ Heading = Annotated[float, Meta(ge=-30, le=30)]
 """Rotation of a target's path, counterclockwise seen from above [degrees]."""
 
 
-class Body(NamedTuple):
+class BodySize(NamedTuple):
     """Size of a target: length in its direction of motion, width across [m]."""
 
     length: float
     width: float
 
 
-BODIES = {"adult": Body(0.6, 0.5), "child": Body(0.711, 0.298), "cyclist": Body(1.9, 0.5), "motorcyclist": Body(2.1, 0.8),
-          "car": Body(4.023, 1.712)}
+BODIES = {"adult": BodySize(0.6, 0.5), "child": BodySize(0.711, 0.298), "cyclist": BodySize(1.9, 0.5), "motorcyclist": BodySize(2.1, 0.8),
+          "car": BodySize(4.023, 1.712)}
 """Bounding boxes of Euro NCAP's targets, including riders."""
 SHAPES = {"adult": "pedestrian", "child": "pedestrian", "cyclist": "bicycle", "motorcyclist": "motorcycle", "car": "evehicle"}
 """Shapes that sumo-gui draws for the targets; SUMO does not cut off the corners of these shapes."""
@@ -57,10 +57,10 @@ class Direction(NamedTuple):
         cosine, sine = (round(part(math.radians(heading)), 12) for part in (math.cos, math.sin))
         return Direction(self.along * cosine - self.left * sine, self.left * cosine + self.along * sine)
 
-    def extent(self, body: Body) -> Body:
+    def extent(self, body: BodySize) -> BodySize:
         """Extent of a body along the lane and across it [m]."""
         along, left = abs(self.along), abs(self.left)
-        return Body(body.length * along + body.width * left, body.length * left + body.width * along)
+        return BodySize(body.length * along + body.width * left, body.length * left + body.width * along)
 
 
 AHEAD, FROM_RIGHT, FROM_LEFT = Direction(1.0, 0.0), Direction(0.0, 1.0), Direction(0.0, -1.0)

@@ -114,7 +114,7 @@ def _simulated(system: System, settings: FloatArray, world: Any, watch: Watcher 
     driver = system.ads.start(n, system.nominal, step)
     batch = PointBatch(system.points, world, n)
     log = _Log(n, int(batch.last.max()) + 1, frame)
-    verdict, robot = _Verdict(n), DrivingRobot(system.points, vehicle, prepared, state, step)
+    verdict, robot = _Outcomes(n), DrivingRobot(system.points, vehicle, prepared, state, step)
     contacts, warnings = Contacts(n, robot.tested), _Warnings(system.ads, n)
     for sample in range(log.length):
         if watch is not None:
@@ -221,7 +221,7 @@ class _Log:
         return Trace(step=step, vehicle_length=vehicle_length, time=np.round(np.arange(length) * step, TIME_DECIMALS), **rows)
 
 
-class _Verdict:
+class _Outcomes:
     """Outcomes of N simulations (method section 4); `open` where the outcome can still change, `ended` those that ended in this step."""
 
     def __init__(self, n: int) -> None:

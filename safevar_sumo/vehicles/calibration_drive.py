@@ -6,7 +6,7 @@ from functools import cache, lru_cache, partial
 
 import numpy as np
 
-from safevar_sumo.records import Command, FloatArray, Nominal, Tables
+from safevar_sumo.records import Command, FloatArray, Nominal, PedalTables
 from safevar_sumo.vehicles.base import Vehicle
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
@@ -29,7 +29,7 @@ def _original(characteristics: CharacteristicSet) -> dict[str, FloatArray]:
 
 
 @lru_cache(maxsize=4)
-def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> Tables:
+def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> PedalTables:
     """Accelerate at full throttle, then from the speed reached coast, and from it again brake lightly."""
     prepared = vehicle.prepare(_original(characteristics), 1.0, STEP)
     rest = vehicle.at_rest(prepared)
@@ -48,7 +48,7 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> T
     speeding_up, fast = drive(rest, 1.0, 0.0)
     coasting = _accelerations(drive(fast, 0.0, 0.0)[0][::-1])
     braking = _accelerations(drive(fast, 0.0, LIGHT_BRAKE)[0][::-1])
-    tables = Tables(speeds=SPEEDS, full_throttle=_accelerations(speeding_up), coasting=coasting,
+    tables = PedalTables(speeds=SPEEDS, full_throttle=_accelerations(speeding_up), coasting=coasting,
                     braking=float(np.median(braking - coasting)) / LIGHT_BRAKE)
     for table in tables[:3]:
         table.flags.writeable = False  # many ADSs read them

@@ -186,7 +186,7 @@ class CharacteristicSet:
         return setting
 
 
-Function = Callable[[FloatArray, CharacteristicSet], FloatArray]
+ChangeFunction = Callable[[FloatArray, CharacteristicSet], FloatArray]
 
 
 class Change(Struct, frozen=True, kw_only=True):
@@ -195,7 +195,7 @@ class Change(Struct, frozen=True, kw_only=True):
     name: str
     title: str
     unit: str
-    function: Function
+    function: ChangeFunction
 
 
 def _largest_change(settings: FloatArray, characteristics: CharacteristicSet) -> FloatArray:

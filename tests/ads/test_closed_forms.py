@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from safevar_sumo.ads.apollo import Apollo
 from safevar_sumo.ads.krauss import Krauss
 from safevar_sumo.ads.world_on_rails import WorldOnRails
-from safevar_sumo.records import Nominal, Observation, Tables
+from safevar_sumo.records import Nominal, Observation, PedalTables
 
 STEP = 0.05
 FAR = 1e6
 COASTING, FULL, BRAKING = 0.1, 2.0, 10.0
 SPEEDS = np.arange(0.0, 20.5, 0.5)
-KNOWN = Nominal(mass=1500.0, accel=3.0, decel=8.0, max_speed=50.0, actuator_lag=0.2, tables=lambda: Tables(
+KNOWN = Nominal(mass=1500.0, accel=3.0, decel=8.0, max_speed=50.0, actuator_lag=0.2, tables=lambda: PedalTables(
     speeds=SPEEDS, full_throttle=np.full(len(SPEEDS), FULL), coasting=np.full(len(SPEEDS), COASTING), braking=BRAKING))
 
 

@@ -16,14 +16,14 @@ from safevar_sumo.ads.idm import Idm
 from safevar_sumo.ads.krauss import Krauss
 from safevar_sumo.ads.r157 import R157
 from safevar_sumo.ads.rss import Rss
-from safevar_sumo.records import Nominal, Observation, Tables
+from safevar_sumo.records import Nominal, Observation, PedalTables
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.network import CopiedNetwork
 
 STEP = 0.05
 TABLE = np.arange(0.0, 20.5, 0.5)
-KNOWN = Nominal(mass=1500.0, accel=3.0, decel=10.0, max_speed=50.0, actuator_lag=0.1, tables=lambda: Tables(
+KNOWN = Nominal(mass=1500.0, accel=3.0, decel=10.0, max_speed=50.0, actuator_lag=0.1, tables=lambda: PedalTables(
     speeds=TABLE, full_throttle=np.full(len(TABLE), 3.0), coasting=np.zeros(len(TABLE)), braking=10.0))
 """Its brake pedal is the deceleration over 10 m/s^2."""
 GAPS, SPEEDS, LEADERS = (values.ravel() for values in np.meshgrid([1.0, 4.0, 12.0, 30.0, 80.0, 150.0], [2.0, 8.0, 13.0], [0.0, 5.0, 12.5]))

@@ -14,10 +14,10 @@ from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
 from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
 from safevar_sumo.analysis.opinion import OpinionOptions
-from safevar_sumo.analysis.opinion.compute import Cause, opinions_of, second_system
+from safevar_sumo.analysis.opinion.compute import JudgedCause, opinions_of, second_system
 from safevar_sumo.analysis.opinion.mapping import TABLES
-from safevar_sumo.analysis.opinion.multi_body import Body, Plant, advance, at_speed, plant_of, rates, tyre_forces
-from safevar_sumo.analysis.opinion.result import Verdict
+from safevar_sumo.analysis.opinion.multi_body import MultiBody, Plant, advance, at_speed, plant_of, rates, tyre_forces
+from safevar_sumo.analysis.opinion.result import OpinionVerdict
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
@@ -52,7 +52,7 @@ def test_the_right_hand_side_is_the_packages(seed: int) -> None:
     acceleration = rng.uniform(-9, 3)
     theirs = vehicle_dynamics_mb(list(x), [0.0, acceleration], p)
     torque, share = p.m * p.R_w * acceleration * ONE, p.T_sb if acceleration < 0 else p.T_se
-    body = Body(*(value * ONE for value in (x[3], x[8], x[9], x[11], x[12])), *(np.array([pair]).T for pair in (
+    body = MultiBody(*(value * ONE for value in (x[3], x[8], x[9], x[11], x[12])), *(np.array([pair]).T for pair in (
         (x[16], x[21]), (x[17], x[22]), (front, rear), (1.0, 1.0))))
     ours = rates(bmw(), body, np.stack([share * torque, (1 - share) * torque]), tyre_forces(bmw(), body))
     flat = [ours.speed, ours.pitch_rate, ours.heave_rate, *ours.height_rates, *ours.wheels]
@@ -182,13 +182,13 @@ def test_a_failure_that_our_model_alone_has_is_contradicted(made: str, tmp_path:
             for name, row in load_study("wear").vehicle.characteristics.items()}
     study = load_study({"extends": "wear", "name": "glitch", "matrix": ONE_TEST,
                         "vehicle": {"model": f"glitch_{made.lower()}:{made}", "characteristics": rows}})
-    causes = [Cause("nsga2:0:0", {"payload": 300.0}, 0.9), Cause("nsga2:0:1", {"brakeResponse": 0.4}, 0.9)]
+    causes = [JudgedCause("nsga2:0:0", {"payload": 300.0}, 0.9), JudgedCause("nsga2:0:1", {"brakeResponse": 0.4}, 0.9)]
     planted, true = opinions_of(study, causes, Unsafe()).opinions
     assert planted.to_dict() | {"because": ""} == {
         "solution": "nsga2:0:0", "changes": {"payload": 300.0},
         "here": {"outcome": "collision", "safety_degree": planted.here.safety_degree},
         "there": {"outcome": "passed", "safety_degree": planted.there.safety_degree}, "opinion": "contradicted", "because": ""}
-    assert true.opinion == Verdict.CONFIRMED
+    assert true.opinion == OpinionVerdict.CONFIRMED
     assert opinions_of(study, causes, Unsafe()).opinions == (planted, true)
 
 
@@ -207,7 +207,7 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
     """Changes of the engine are outside, with their names."""
     done = CliRunner().invoke(commands, ["opinion", str(slippery), "--json"])
     every = json.loads(done.stdout)
-    assert {one["opinion"] for one in every} <= {str(verdict) for verdict in Verdict}
+    assert {one["opinion"] for one in every} <= {str(verdict) for verdict in OpinionVerdict}
     assert all(list(one) == ["solution", "changes", "here", "there", "opinion", "because"] for one in every)
     outside = set(TABLES["carla"].outside)
     for one in every:
@@ -224,8 +224,8 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
 def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = make_report([slippery], only=["causes", "reproduce"], jobs=1)
     verdicts = re.findall(r"second vehicle model: (\w+)", page)
-    assert len(verdicts) == len(re.findall(r"<h4[^>]*>Cause \d", page)) > 0
-    assert set(verdicts) <= {str(verdict) for verdict in Verdict}
+    assert len(verdicts) == len(re.findall(r"<h4[^>]*>JudgedCause \d", page)) > 0
+    assert set(verdicts) <= {str(verdict) for verdict in OpinionVerdict}
     assert f"opinion {slippery}" in page
     monkeypatch.setitem(sys.modules, "vehiclemodels.parameters_vehicle2", None)
     without = make_report([slippery], only=["causes"], jobs=1)

@@ -18,9 +18,9 @@ import numpy as np
 from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real
 
 from safevar_sumo.ads.aeb import Aeb
-from safevar_sumo.records import Nominal, Observation, Tables
+from safevar_sumo.records import Nominal, Observation, PedalTables
 
-FACTS, TABLES = {facts}, Tables(*(np.array(table) for table in {tables}), {braking})
+FACTS, TABLES = {facts}, PedalTables(*(np.array(table) for table in {tables}), {braking})
 SEEN = {seen}
 
 

@@ -11,10 +11,10 @@ import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.reference import ReferenceData, Subject, agreement, calibrate, calibrate_together, with_values
+from safevar_sumo.reference import FitSubject, ReferenceData, agreement, calibrate, calibrate_together, with_values
 from safevar_sumo.reference.calibration import _refining_population, _thinned, _Trial
 from safevar_sumo.reference.effects import covered_by_spread, error_beyond_spread, linear_effects
-from safevar_sumo.reference.fit import Search, original_loss, reference_loss
+from safevar_sumo.reference.fit import TrialSearch, original_loss, reference_loss
 from safevar_sumo.reference.parameters import Free, free_parameters, value_of
 from safevar_sumo.reference.profiles import Profiles
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
@@ -77,7 +77,7 @@ def test_studies_that_are_fitted_together_share_what_is_not_their_own(data: Refe
     late = msgspec.structs.replace(late, name="late", calibration={HESITATION: own})
     settings = data.settings
     there = dict(evaluate(assemble(with_hesitation(load_study("sun"), 0.2)), settings).metrics)
-    subjects = [Subject(sun, {"mine": data}), Subject(late, {"theirs": ReferenceData(settings, there, 0)})]
+    subjects = [FitSubject(sun, {"mine": data}), FitSubject(late, {"theirs": ReferenceData(settings, there, 0)})]
     dry, wet = calibrate_together(subjects, Here())
     assert dry.values[GAP] == wet.values[GAP] == pytest.approx(truth, rel=0.05)
     assert wet.values[HESITATION] == pytest.approx(0.2, abs=0.04)
@@ -93,7 +93,7 @@ def test_from_scratch_the_first_study_is_fitted_alone_then_what_the_others_have_
     sun = mine(0.4, trials=100, starts=1, thinning=3)
     late = msgspec.structs.replace(with_hesitation(mine(0.4), 0.1), name="late", calibration={HESITATION: own})
     there = dict(evaluate(assemble(with_hesitation(load_study("sun"), 0.2)), data.settings).metrics)
-    subjects = [Subject(sun, {"mine": data}), Subject(late, {"theirs": ReferenceData(data.settings, there, 0)})]
+    subjects = [FitSubject(sun, {"mine": data}), FitSubject(late, {"theirs": ReferenceData(data.settings, there, 0)})]
     steps = list[tuple[float, float, float]]()
     dry, wet = calibrate_together(subjects, Here(), lambda loss, best: steps.append(
         (value_of(best[0], GAP), value_of(best[1], GAP), value_of(best[1], HESITATION))), from_scratch=True)
@@ -207,7 +207,7 @@ def silent(loss: float, best: Any) -> None:
 
 def test_the_worse_half_gives_up_after_every_round() -> None:
     runners = [Runner(lowest) for lowest in (5.0, 1.0, 4.0, 2.0, 3.0)]
-    Search(Bowl(), 1, 300, silent).race(runners)  # type: ignore[arg-type]
+    TrialSearch(Bowl(), 1, 300, silent).race(runners)  # type: ignore[arg-type]
     # Rounds of 5, 3, 2 and 1 searches with 75 trials each; the winner gets what remains, which these runners never take.
     assert [runner.rounds for runner in runners] == [[15], [15, 25, 37, 75, 300], [15], [15, 25, 37], [15, 25]]
 
@@ -219,7 +219,7 @@ def test_a_search_around_known_values_has_smaller_generations() -> None:
             return super().losses(studies)
 
     generations = list[int]()
-    search = Search(Counted(), 12, 100, silent)
+    search = TrialSearch(Counted(), 12, 100, silent)
     search.race([search.begin(np.full(3, 0.5), 0.1, 1, _refining_population(12, 3))])
     # 4 + 3 ln 3 = 7.3, the usual population, is more than a third of 12.
     assert generations == [7] * 14 + [2]
@@ -237,7 +237,7 @@ def test_searches_begin_at_the_best_of_many_places_with_what_is_the_same_at_one_
             return super().losses(studies)
 
     bowl = Noted()
-    search = Search(bowl, 7, 200, silent)
+    search = TrialSearch(bowl, 7, 200, silent)
     search.from_random_places([0, 1, 0], 2, 80, 1e-9, np.random.default_rng(4))[1].advance(1)
     screened = bowl.places[:-1]
     assert len(screened) == 50, "a quarter of the trials at most"
@@ -264,7 +264,7 @@ def test_the_models_error_covers_nine_tenths_of_rows_each_file_counted_alike(dat
 @pytest.mark.parametrize(("starts", "trials"), [(1, 7), (3, 100), (6, 500), (40, 30)])
 def test_no_trial_is_lost_and_none_too_many(starts: int, trials: int) -> None:
     bowl, losses = Bowl(), list[float]()
-    search = Search(bowl, 6, trials, lambda loss, best: losses.append(loss))
+    search = TrialSearch(bowl, 6, trials, lambda loss, best: losses.append(loss))
     searches = [search.begin(np.full(2, 0.9), 0.3, seed) for seed in range(1, starts + 1)]
     search.race(searches)
     assert bowl.tried == trials == len(losses)
@@ -273,7 +273,7 @@ def test_no_trial_is_lost_and_none_too_many(starts: int, trials: int) -> None:
 
 
 def test_a_race_finds_the_bottom_from_whatever_half() -> None:
-    search = Search(Bowl(), 8, 1200, silent)
+    search = TrialSearch(Bowl(), 8, 1200, silent)
     search.race([search.begin(np.array([place, 0.9]), 0.1, 3) for place in (0.9, 0.8, 0.1, 0.7)])
     assert search.best == pytest.approx([0.2, 0.2], abs=0.01)
 
@@ -290,7 +290,7 @@ class Basin(Bowl):
 
 def test_what_fits_as_well_is_an_interval_and_sets_that_are_far_apart() -> None:
     basin = Basin()
-    search = Search(basin, 8, 800, silent, alike=0.04)
+    search = TrialSearch(basin, 8, 800, silent, alike=0.04)
     search.race([search.begin(np.array([place, 0.6]), 0.3, 3) for place in (0.3, 0.5)])
     assert search.best is not None
     bounds = FreeParameter(lower=0, upper=1, unit="-", meaning="place")

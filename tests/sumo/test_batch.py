@@ -15,7 +15,7 @@ from safevar_sumo.ads.driver import DelayLine
 from safevar_sumo.records import Command, Evaluations, Nominal, Observation, Outcome, SimulationRuns, Trace
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather, load_study
-from safevar_sumo.sumo.batch import _Verdict
+from safevar_sumo.sumo.batch import _Outcomes
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.perception import Perception
@@ -74,7 +74,7 @@ def test_sumo_moves_the_vehicle_as_the_plant_says(any_system: System) -> None:
 
 def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool], float]:
     """Outcome, which samples are active, and the collision's speed of one vehicle: (speed, encounter over, speed of a collision)."""
-    verdict, active = _Verdict(1), []
+    verdict, active = _Outcomes(1), []
     for i, (speed, over, crash) in enumerate(samples):
         collisions = {} if crash is None else {0: crash}
         verdicts = verdict.judge(np.array([speed]), np.array([over]), collisions, last=i == len(samples) - 1)

@@ -13,7 +13,7 @@ from safevar_sumo.analysis.evaluator import CONFIDENCE
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, sentence
 from safevar_sumo.analysis.explain.compute import points_in_words
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
-from safevar_sumo.analysis.explain.summary import LABELS, Finding, in_short
+from safevar_sumo.analysis.explain.summary import LABELS, DescribedFailure, in_short
 from safevar_sumo.analysis.figures import CHANGED, FONT, INVOLVED, NECESSARY, literal, new_figure
 from safevar_sumo.analysis.words import changes, decimal, number_of, question_command, simulate_command
 from safevar_sumo.protocol.rater import is_rated
@@ -76,12 +76,12 @@ def _print_answer(console: Console, command_for: CommandFor, result: Explained, 
                       f"{', '.join(common['cause']) or 'none'} ({common['share']:.0%} of the failures).")
 
 
-def _finding(failure: Explanation | None) -> Finding | None:
+def _finding(failure: Explanation | None) -> DescribedFailure | None:
     """The record of a failure for the paragraph; None for a setting that is not unsafe."""
     if failure is None or not failure.causes:
         return None
     changes = {name: failure.setting[name] for name in failure.changed}
-    return Finding(str(failure.handle or "a sampled setting"), changes, failure.outcome, failure.safety_degree, failure.robustness,
+    return DescribedFailure(str(failure.handle or "a sampled setting"), changes, failure.outcome, failure.safety_degree, failure.robustness,
                    len(failure.causes[0].changes), failure.causes[0].neighbours)
 
 

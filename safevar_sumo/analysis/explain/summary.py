@@ -103,7 +103,8 @@ def _paragraph(evaluator: Evaluator, solutions: pd.DataFrame, is_unsafe: pd.Seri
         changed = np.flatnonzero(evaluator.characteristics.changed(chosen.settings[i]))
         changes = {names[column]: float(chosen.settings[i, column]) for column in changed}
         name, degree = str(all_handles[candidates[failing[row]]]), finite_or_none(chosen.f_safe[i])
-        findings.append(Finding(name, changes, str(chosen.outcome[i]), degree, shares[i], len(causes[i][0].columns), shares[len(rows) + i]))
+        findings.append(DescribedFailure(
+            name, changes, str(chosen.outcome[i]), degree, shares[i], len(causes[i][0].columns), shares[len(rows) + i]))
     return in_short(system, original, findings[0], findings[1] if len(findings) > 1 else None, preventable)
 
 
@@ -134,7 +135,7 @@ CONDITIONS = {"clear": "In clear weather", "wet": "On a wet road", "fog": "In fo
 """Weathers in words; any other weather is named."""
 
 
-class Finding(NamedTuple):
+class DescribedFailure(NamedTuple):
     """A failure as the paragraph describes it.
 
     Attributes
@@ -162,7 +163,8 @@ class Finding(NamedTuple):
     cause: Robustness | None = None
 
 
-def in_short(system: System, original: Evaluations, smallest: Finding | None, robust: Finding | None, preventable: Preventability) -> str:
+def in_short(system: System, original: Evaluations, smallest: DescribedFailure | None, robust: DescribedFailure | None,
+             preventable: Preventability) -> str:
     """The paragraph about a study's failures.
 
     Parameters
@@ -215,7 +217,7 @@ def _end(system: System, original: Evaluations) -> str:
     return f"{ENDS.get(outcome, outcome)}" + ("" if degree != degree else f" with a safety degree of {degree:.2f} m")
 
 
-def _with_changes(members: CharacteristicSet, failure: Finding) -> str:
+def _with_changes(members: CharacteristicSet, failure: DescribedFailure) -> str:
     """Such as `a collision at 5 km/h (robust: ...) was found with ten changes: ...; three of them suffice`."""
     number, needed, effect = len(failure.changes), failure.needed, f"{_outcome(failure)} ({failure.robustness})"
     listed = _changes(members, failure.changes)
@@ -233,7 +235,7 @@ def _count(number: int) -> str:
     return NUMBERS[number] if number < len(NUMBERS) else str(number)
 
 
-def _outcome(failure: Finding) -> str:
+def _outcome(failure: DescribedFailure) -> str:
     if failure.safety_degree is None:
         return failure.outcome
     if failure.outcome == Outcome.COLLISION:

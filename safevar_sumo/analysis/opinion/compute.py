@@ -15,7 +15,7 @@ from safevar_sumo.analysis.explain.compute import chosen_failures
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.opinion.mapping import Declared, declared_of
 from safevar_sumo.analysis.opinion.multi_body import commonroad
-from safevar_sumo.analysis.opinion.result import End, Opinion, Opinions, Verdict
+from safevar_sumo.analysis.opinion.result import Opinion, Opinions, OpinionVerdict, RunEnd
 from safevar_sumo.analysis.opinion.second_vehicle import SecondVehicle
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
@@ -35,7 +35,7 @@ LADDER = np.arange(1, 10) / 10
 """Shares of a cause's changes at which the second model is tried, to find where it begins to be unsafe."""
 
 
-class Cause(NamedTuple):
+class JudgedCause(NamedTuple):
     """A minimal cause for the second model to judge: its values, and its boundary as a share of its changes."""
 
     solution: str | None
@@ -85,13 +85,13 @@ def ask_for_opinions(source: Study | Case, options: OpinionOptions, *, pool: Poo
         minimal = [(str(chosen.failures.handles[row]), cause) for row in chosen.reasons for cause in chosen.causes[row]]
         limits = boundaries(evaluator, [cause for _, cause in minimal], chosen.failures.unsafe)
     names = evaluator.characteristics.names
-    causes = [Cause(handle, {names[column]: float(cause.setting[column]) for column in cause.columns}, limit.fraction)
+    causes = [JudgedCause(handle, {names[column]: float(cause.setting[column]) for column in cause.columns}, limit.fraction)
               for (handle, cause), limit in zip(minimal, limits, strict=True)]
     opinions = opinions_of(source.study, causes, chosen.failures.unsafe, progress)
     return replace(opinions, without_cause=tuple(str(chosen.failures.handles[row]) for row in chosen.reasons if not chosen.causes[row]))
 
 
-def opinions_of(study: Study, causes: Sequence[Cause], unsafe: Unsafe, progress: Progress = silent) -> Opinions:
+def opinions_of(study: Study, causes: Sequence[JudgedCause], unsafe: Unsafe, progress: Progress = silent) -> Opinions:
     """The second model's opinions on minimal causes; raises as `second_system`."""
     system, second, declared = second_system(study)
     members = system.characteristics
@@ -129,31 +129,33 @@ def _first_unsafe_step(fails: BoolArray) -> str:
 class _Original(NamedTuple):
     """How the original vehicle's run ends with both models, and whether it is unsafe."""
 
-    here: End
-    there: End
+    here: RunEnd
+    there: RunEnd
     fails_here: bool
     fails_there: bool
 
 
-def _opinion(cause: Cause, declared: Declared, original: _Original, here: End, there: End, fails: bool | None, neighbour: str) -> Opinion:
+def _opinion(cause: JudgedCause, declared: Declared, original: _Original, here: RunEnd, there: RunEnd, fails: bool | None,
+             neighbour: str) -> Opinion:
     """The opinion on a cause; `fails` states whether it is unsafe with the second model, None if it could not be simulated."""
-    def says(verdict: Verdict, because: str, there: End = there) -> Opinion:
+    def says(verdict: OpinionVerdict, because: str, there: RunEnd = there) -> Opinion:
         return Opinion(solution=cause.solution, changes=dict(cause.changes), here=here, there=there, opinion=verdict, because=because)
 
     if outside := declared.outside(cause.changes):
-        return says(Verdict.OUTSIDE, "; ".join(outside), End())
+        return says(OpinionVerdict.OUTSIDE, "; ".join(outside), RunEnd())
     if original.fails_here:
-        return says(Verdict.OUTSIDE, "the original vehicle itself is unsafe: no change causes anything")
+        return says(OpinionVerdict.OUTSIDE, "the original vehicle itself is unsafe: no change causes anything")
     if original.fails_there:
-        return says(Verdict.OUTSIDE, f"the original vehicle itself is not safe with the second model: {original.there}")
+        return says(OpinionVerdict.OUTSIDE, f"the original vehicle itself is not safe with the second model: {original.there}")
     if fails is None:
-        return says(Verdict.OUTSIDE, f"it could not be simulated with the second model: {there}")
+        return says(OpinionVerdict.OUTSIDE, f"it could not be simulated with the second model: {there}")
     if fails:
-        return says(Verdict.CONFIRMED, f"also unsafe with the second: {there}; its original vehicle is safe: {original.there}. {neighbour}")
-    return says(Verdict.CONTRADICTED, f"safe with the second: {there}; its original vehicle: {original.there}")
+        return says(OpinionVerdict.CONFIRMED,
+                    f"also unsafe with the second: {there}; its original vehicle is safe: {original.there}. {neighbour}")
+    return says(OpinionVerdict.CONTRADICTED, f"safe with the second: {there}; its original vehicle: {original.there}")
 
 
-def _neighbours(system: System, causes: Sequence[Cause], settings: FloatArray, unsafe: Unsafe) -> list[Neighbour]:
+def _neighbours(system: System, causes: Sequence[JudgedCause], settings: FloatArray, unsafe: Unsafe) -> list[Neighbour]:
     """For each cause, the first setting below its boundary that is safe with our model; the original if no other is."""
     if not causes:
         return []
@@ -167,5 +169,5 @@ def _neighbours(system: System, causes: Sequence[Cause], settings: FloatArray, u
     return [Neighbour(candidates[k, at], float(shares[k, at])) for k, at in enumerate(first.tolist())]
 
 
-def _end(evaluations: Evaluations, row: int) -> End:
-    return End(str(evaluations.outcome[row]), finite_or_none(evaluations.f_safe[row]))
+def _end(evaluations: Evaluations, row: int) -> RunEnd:
+    return RunEnd(str(evaluations.outcome[row]), finite_or_none(evaluations.f_safe[row]))

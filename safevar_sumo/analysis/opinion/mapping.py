@@ -26,7 +26,7 @@ CM = 0.01  # m
 SENSORS, SAME = "the same sensors before the driving system", "as here"
 
 
-class Row(NamedTuple):
+class MapRow(NamedTuple):
     """A characteristic, the parameter of the second model that represents it, and the equation between them."""
 
     characteristic: str
@@ -116,7 +116,7 @@ def _sumo(vehicle: SumoVehicle, c: Characteristics, original: Mapping[str, float
         brake_delay=c["brakeDelay"], brake_lag=c["tau"], drive=c["accel"] / original["accel"])
 
 
-class Table(NamedTuple):
+class MappingTable(NamedTuple):
     """The declared table of a shipped vehicle.
 
     Attributes
@@ -132,7 +132,7 @@ class Table(NamedTuple):
     """
 
     study: str
-    rows: tuple[Row, ...]
+    rows: tuple[MapRow, ...]
     outside: Mapping[str, str]
     represent: Callable[[Any, Characteristics, Mapping[str, float], Surface], Represented]
 
@@ -144,42 +144,42 @@ class Table(NamedTuple):
 
 ENGINE = "the model takes a torque at the wheels: it has no engine, clutch or gearbox"
 DELAY = "dead time from command to brake torque"
-TABLES: Mapping[str, Table] = {
-    "worn": Table("wear", (
-        Row("treadDepth", "mm", "p_dx1", "-", "p_dx1 = mu, our friction coefficient of tyre, road and tread"),
-        Row("brakeTorque", "-", "T_B", "N m", "T_B = brakeTorque brake_force R_w (1 + 4 I_y_w / (m_0 R_w^2)), m_0 the original's m"),
-        Row("brakeResponse", "s", DELAY, "s", SAME),
-        Row("payload", "kg", "m, m_s", "kg", "m = kerb_mass + payload; m_s = m - m_uf - m_ur"),
-        Row("payloadCentre", "m", "a, b", "m", "a = (m x - m_ur L) / m_s, b = L - a; x common centre behind the front axle, L wheelbase"),
-        Row("sensorRange", "m", SENSORS, "m", SAME),
-        Row("sensorLatency", "s", SENSORS, "s", SAME)), {}, _worn),
-    "carla": Table("sun", (
-        Row("mass", "kg", "m, m_s", "kg", "m = mass; m_s = m - m_uf - m_ur"),
-        Row("tireFric", "-", "p_dx1", "-", "p_dx1 = tireFric tyre_friction f, f the road's factor"),
-        Row("radius", "cm", "R_w, I_y_w", "m, kg m^2", "R_w = radius / 100; I_y_w = 20 kg R_w^2 / 2; and the camera's height as here"),
-        Row("maxBrakeTorque", "N m", "T_B", "N m", "T_B = 4 maxBrakeTorque, T_sb = 0.5"),
-        Row("dampRate", "kg m^2/s", "torque on the wheels", "N m", "-4 (dampRate - original) omega"),
-        Row("dragCoeff", "-", "torque on the wheels", "N m", "-R_w (dragCoeff - original) rho A v^2 / 2, rho 1.2 kg/m^3, A 2.2 m^2")),
+TABLES: Mapping[str, MappingTable] = {
+    "worn": MappingTable("wear", (
+        MapRow("treadDepth", "mm", "p_dx1", "-", "p_dx1 = mu, our friction coefficient of tyre, road and tread"),
+        MapRow("brakeTorque", "-", "T_B", "N m", "T_B = brakeTorque brake_force R_w (1 + 4 I_y_w / (m_0 R_w^2)), m_0 the original's m"),
+        MapRow("brakeResponse", "s", DELAY, "s", SAME),
+        MapRow("payload", "kg", "m, m_s", "kg", "m = kerb_mass + payload; m_s = m - m_uf - m_ur"),
+        MapRow("payloadCentre", "m", "a, b", "m", "a = (m x - m_ur L) / m_s, b = L - a; x common centre from the front axle, L wheelbase"),
+        MapRow("sensorRange", "m", SENSORS, "m", SAME),
+        MapRow("sensorLatency", "s", SENSORS, "s", SAME)), {}, _worn),
+    "carla": MappingTable("sun", (
+        MapRow("mass", "kg", "m, m_s", "kg", "m = mass; m_s = m - m_uf - m_ur"),
+        MapRow("tireFric", "-", "p_dx1", "-", "p_dx1 = tireFric tyre_friction f, f the road's factor"),
+        MapRow("radius", "cm", "R_w, I_y_w", "m, kg m^2", "R_w = radius / 100; I_y_w = 20 kg R_w^2 / 2; and the camera's height as here"),
+        MapRow("maxBrakeTorque", "N m", "T_B", "N m", "T_B = 4 maxBrakeTorque, T_sb = 0.5"),
+        MapRow("dampRate", "kg m^2/s", "torque on the wheels", "N m", "-4 (dampRate - original) omega"),
+        MapRow("dragCoeff", "-", "torque on the wheels", "N m", "-R_w (dragCoeff - original) rho A v^2 / 2, rho 1.2 kg/m^3, A 2.2 m^2")),
         dict.fromkeys(("max_rpm", "dampRateFullT", "dampRateZeroT_CE", "dampRateZeroT_CD", "gearSwitchTime", "clutchStrength"), ENGINE),
         _carla),
-    "lgsvl": Table("lgsvl", (
-        Row("mass", "kg", "m, m_s", "kg", "m = mass + 4 wheel_mass_share wheelMass; m_s = m - m_uf - m_ur"),
-        Row("wheelMass", "kg", "I_y_w, m", "kg m^2, kg", "I_y_w = wheelMass R_w^2 / 2; m as above"),
-        Row("radius", "m", "R_w, I_y_w", "m, kg m^2", "R_w = radius"),
-        Row("maxBrakeTorque", "N m", "T_B", "N m", "T_B = 4 maxBrakeTorque, T_sb = 0.5"),
-        Row("tireDragCoeff", "-", "torque on the wheels", "N m", "-R_w (tireDragCoeff - original) v"),
-        Row("wheelDamping", "kg m^2/s", "torque on the wheels", "N m", "-4 wheel_damping_share (wheelDamping - original) omega")),
+    "lgsvl": MappingTable("lgsvl", (
+        MapRow("mass", "kg", "m, m_s", "kg", "m = mass + 4 wheel_mass_share wheelMass; m_s = m - m_uf - m_ur"),
+        MapRow("wheelMass", "kg", "I_y_w, m", "kg m^2, kg", "I_y_w = wheelMass R_w^2 / 2; m as above"),
+        MapRow("radius", "m", "R_w, I_y_w", "m, kg m^2", "R_w = radius"),
+        MapRow("maxBrakeTorque", "N m", "T_B", "N m", "T_B = 4 maxBrakeTorque, T_sb = 0.5"),
+        MapRow("tireDragCoeff", "-", "torque on the wheels", "N m", "-R_w (tireDragCoeff - original) v"),
+        MapRow("wheelDamping", "kg m^2/s", "torque on the wheels", "N m", "-4 wheel_damping_share (wheelDamping - original) omega")),
         {**dict.fromkeys(("maxRpm", "minRpm", "maxMotorTorque", "shiftTime", "tractionControlSlipLimit"), ENGINE),
          "maxSteeringAngle": "the model drives straight here"}, _lgsvl),
-    "sumo": Table("native", (
-        Row("mass", "kg", "m, m_s", "kg", "m = mass; m_s = m - m_uf - m_ur"),
-        Row("accel", "m/s^2", "T_E", "N m", "T_E = the original's accel / original"),
-        Row("decel", "m/s^2", "T_B", "N m", "T_B = brakeGain decel reference_mass R_w (1 + 4 I_y_w / (m_0 R_w^2)), m_0 as above"),
-        Row("brakeGain", "-", "T_B", "N m", "as decel"),
-        Row("brakeDelay", "s", DELAY, "s", SAME),
-        Row("tau", "s", "first-order lag of the brake torque", "s", SAME),
-        Row("sensorRange", "m", SENSORS, "m", SAME),
-        Row("reactionTime", "s", SENSORS, "s", SAME)),
+    "sumo": MappingTable("native", (
+        MapRow("mass", "kg", "m, m_s", "kg", "m = mass; m_s = m - m_uf - m_ur"),
+        MapRow("accel", "m/s^2", "T_E", "N m", "T_E = the original's accel / original"),
+        MapRow("decel", "m/s^2", "T_B", "N m", "T_B = brakeGain decel reference_mass R_w (1 + 4 I_y_w / (m_0 R_w^2)), m_0 as above"),
+        MapRow("brakeGain", "-", "T_B", "N m", "as decel"),
+        MapRow("brakeDelay", "s", DELAY, "s", SAME),
+        MapRow("tau", "s", "first-order lag of the brake torque", "s", SAME),
+        MapRow("sensorRange", "m", SENSORS, "m", SAME),
+        MapRow("reactionTime", "s", SENSORS, "s", SAME)),
         {"maxSpeed": "the model has no governor"}, _sumo),
 }
 """Tables by the names of shipped vehicles."""
@@ -190,7 +190,7 @@ class Declared(NamedTuple):
 
     name: str
     vehicle: Any
-    table: Table
+    table: MappingTable
     foreign: tuple[str, ...]
 
     def outside(self, changes: Mapping[str, float]) -> list[str]:

@@ -111,7 +111,7 @@ def plant_of(mass: FloatArray, empty: float, slope: Slope, *, brake_front: float
     return plant._replace(height=plant.height + at_speed(plant, ones).heave)  # the body's heights count from unloaded tyres
 
 
-class Body(NamedTuple):
+class MultiBody(NamedTuple):
     """State of N vehicles, SI: speed, pitch and heave of the body with their rates, shape (N,); of the axles, front before rear, height,
     its rate and the wheels' speed, and the share of full pressure that the anti-lock controller allows, shape (2, N).
 
@@ -129,13 +129,13 @@ class Body(NamedTuple):
     allowed: FloatArray
 
 
-def at_speed(plant: Plant, speed: FloatArray) -> Body:
+def at_speed(plant: Plant, speed: FloatArray) -> MultiBody:
     """The body in static balance on its springs, with rolling wheels."""
     zeros, axle_zeros = np.zeros_like(plant.mass), np.zeros_like(plant.arms)
     heights = (plant.sprung * plant.static + plant.unsprung) * plant.down / (2 * plant.tyre_spring)
     # The springs carry the static load without deflection if, above each axle, the body is as high as the axle.
     heave, pitch = (heights * plant.static).sum(axis=0), (heights[1] - heights[0]) / (plant.arms[0] - plant.arms[1])
-    return Body(speed, pitch, zeros, heave, zeros, heights, axle_zeros, axle_zeros + speed / plant.radius, axle_zeros + 1)
+    return MultiBody(speed, pitch, zeros, heave, zeros, heights, axle_zeros, axle_zeros + speed / plant.radius, axle_zeros + 1)
 
 
 class Forces(NamedTuple):
@@ -148,7 +148,7 @@ class Forces(NamedTuple):
     slip: FloatArray
 
 
-def tyre_forces(plant: Plant, body: Body) -> Forces:
+def tyre_forces(plant: Plant, body: MultiBody) -> Forces:
     """Pacejka's formula for pure longitudinal slip, as in the package's `formula_longitudinal`, and its derivative."""
     tyre, relative_to = _tyre(), np.maximum(body.speed, LEAST_SPEED)
     load = np.maximum(body.heights * plant.tyre_spring, 1.0)
@@ -162,7 +162,7 @@ def tyre_forces(plant: Plant, body: Body) -> Forces:
 
 
 class Rates(NamedTuple):
-    """Time derivatives of a body's speed, rates and wheel speeds, SI; shapes as in `Body`."""
+    """Time derivatives of a body's speed, rates and wheel speeds, SI; shapes as in `MultiBody`."""
 
     speed: FloatArray
     pitch_rate: FloatArray
@@ -171,7 +171,7 @@ class Rates(NamedTuple):
     wheels: FloatArray
 
 
-def rates(plant: Plant, body: Body, torques: FloatArray, forces: Forces) -> Rates:
+def rates(plant: Plant, body: MultiBody, torques: FloatArray, forces: Forces) -> Rates:
     """The package's right-hand side; `torques`, shape (2, N), turn both wheels of an axle forward [N m]."""
     p, along = plant, 2 * (forces.force[0] + forces.force[1])
     bend = body.heights - body.heave + p.arms * body.pitch
@@ -186,7 +186,7 @@ def rates(plant: Plant, body: Body, torques: FloatArray, forces: Forces) -> Rate
         wheels=(torques / 2 - p.radius * forces.force) / p.wheel_inertia)
 
 
-def advance(plant: Plant, body: Body, pedal: FloatArray, driving: FloatArray, step: float) -> Body:
+def advance(plant: Plant, body: MultiBody, pedal: FloatArray, driving: FloatArray, step: float) -> MultiBody:
     """A step of the integration under a brake pedal and a torque of engine and drags on all wheels [N m].
 
     Wheel speeds, which are stiff, are integrated implicitly (linearised); all others explicitly, rates before heights.
@@ -201,13 +201,13 @@ def advance(plant: Plant, body: Body, pedal: FloatArray, driving: FloatArray, st
     stands = (body.speed <= 0) & (driving <= 0) & (p.back >= 0)  # Pacejka's tyres push a little even without any slip
     pitch_rate, heave_rate = body.pitch_rate + step * change.pitch_rate, body.heave_rate + step * change.heave_rate
     height_rates = body.height_rates + step * change.height_rates
-    return Body(
+    return MultiBody(
         speed=np.where(stands, 0.0, speed), pitch=body.pitch + step * pitch_rate, pitch_rate=pitch_rate,
         heave=body.heave + step * heave_rate, heave_rate=heave_rate, heights=body.heights + step * height_rates, height_rates=height_rates,
         wheels=wheels, allowed=allowed)
 
 
-def _anti_lock(body: Body, slip: FloatArray, pedal: FloatArray, step: float) -> FloatArray:
+def _anti_lock(body: MultiBody, slip: FloatArray, pedal: FloatArray, step: float) -> FloatArray:
     """The share of full pressure that each axle may have: less while its slip is too large, then more again, up to any pedal."""
     locks = (slip > SLIP) & (body.speed > LEAST_CONTROLLED)
     less = np.maximum(np.minimum(body.allowed, pedal) - RELEASE * step, 0.0)

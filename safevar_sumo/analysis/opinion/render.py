@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from safevar_sumo.analysis.opinion.result import Opinions, Verdict
+from safevar_sumo.analysis.opinion.result import Opinions, OpinionVerdict
 from safevar_sumo.analysis.words import changes, joined, number_of
 from safevar_sumo.terminal import plain, print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 MODEL = "Driven again with CommonRoad's multi-body vehicle, Pacejka's tyres and anti-lock brakes"
-STYLES = {Verdict.CONFIRMED: "green", Verdict.CONTRADICTED: "red", Verdict.OUTSIDE: "yellow"}
+STYLES = {OpinionVerdict.CONFIRMED: "green", OpinionVerdict.CONTRADICTED: "red", OpinionVerdict.OUTSIDE: "yellow"}
 
 
 def print_opinions(console: Console, result: Opinions) -> None:
@@ -31,5 +31,5 @@ def verdict(result: Opinions) -> str:
     """A sentence on the number of causes with each verdict."""
     if not result.opinions:
         return "there is no cause to judge."
-    parts = [f"{result.count(one)} {one}" for one in Verdict if result.count(one)]
+    parts = [f"{result.count(one)} {one}" for one in OpinionVerdict if result.count(one)]
     return f"of {number_of(len(result.opinions), 'minimal cause')} {joined(parts)}."

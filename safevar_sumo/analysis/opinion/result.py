@@ -14,7 +14,7 @@ from safevar_sumo.records import Outcome
 from safevar_sumo.study import SAFETY_DEGREE, Study
 
 
-class Verdict(StrEnum):
+class OpinionVerdict(StrEnum):
     """The second model's verdict on a cause."""
 
     CONFIRMED = "confirmed"
@@ -22,7 +22,7 @@ class Verdict(StrEnum):
     OUTSIDE = "outside"
 
 
-class End(NamedTuple):
+class RunEnd(NamedTuple):
     """How a run ends: outcome and safety degree [m, or -m/s]; None if it was not driven, or has no safety degree."""
 
     outcome: str | None = None
@@ -57,9 +57,9 @@ class Opinion:
 
     solution: str | None
     changes: dict[str, float]
-    here: End
-    there: End
-    opinion: Verdict
+    here: RunEnd
+    there: RunEnd
+    opinion: OpinionVerdict
     because: str
 
     def to_dict(self) -> dict[str, Any]:
@@ -85,11 +85,11 @@ class Opinions:
     study: Study
     unsafe: Unsafe
     opinions: tuple[Opinion, ...]
-    original_here: End
-    original_there: End
+    original_here: RunEnd
+    original_there: RunEnd
     without_cause: tuple[str, ...] = ()
 
-    def count(self, verdict: Verdict) -> int:
+    def count(self, verdict: OpinionVerdict) -> int:
         """Number of causes with this verdict."""
         return sum(one.opinion == verdict for one in self.opinions)
 
@@ -104,5 +104,5 @@ class Opinions:
                                            "safety_degree_there", "opinion", "because"])
 
     def __repr__(self) -> str:
-        numbers = ", ".join(f"{self.count(verdict)} {verdict}" for verdict in Verdict)
+        numbers = ", ".join(f"{self.count(verdict)} {verdict}" for verdict in OpinionVerdict)
         return f"<Opinions on {self.study.name}, unsafe {self.unsafe}: {numbers}>"

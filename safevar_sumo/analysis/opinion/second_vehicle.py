@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.analysis.opinion.mapping import Declared, Represented
-from safevar_sumo.analysis.opinion.multi_body import STEP, WHEELS, Body, advance, at_speed
+from safevar_sumo.analysis.opinion.multi_body import STEP, WHEELS, MultiBody, advance, at_speed
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, Slope, SumoType, Vehicle
@@ -47,7 +47,7 @@ class SecondState(NamedTuple):
     gear: FloatArray
     own: Any
     original: Any
-    body: Body
+    body: MultiBody
     brake_commands: FloatArray
 
 
