@@ -131,7 +131,7 @@ class _Tally:
 
 
 @contextmanager
-def counted(console: Console, what: str, total: int) -> Iterator[Callable[[int], None]]:
+def counting_bar(console: Console, what: str, total: int) -> Iterator[Callable[[int], None]]:
     """Show a bar that counts up to `total`; yields the function that adds to the count."""
     done = 0
     with stages(console) as show:

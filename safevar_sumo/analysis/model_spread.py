@@ -77,11 +77,11 @@ def model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[M
 
 def band_of(study: Study, evaluations: Sequence[Evaluations]) -> tuple[FloatArray, FloatArray]:
     """Ends of the band of the sets' predictions for settings, including repeats and the model's error; each of shape (M,)."""
-    error = study.model_error.get(SAFETY_DEGREE, 0.0) * distance(study, evaluations[0].settings)
+    error = study.model_error.get(SAFETY_DEGREE, 0.0) * distance_from_original(study, evaluations[0].settings)
     return band(np.stack([one.f_safe for one in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0), error)
 
 
-def distance(study: Study, settings: FloatArray) -> FloatArray:
+def distance_from_original(study: Study, settings: FloatArray) -> FloatArray:
     """Euclidean distance of settings from the original vehicle, each characteristic in widths of its domain; shape (M,)."""
     characteristics = CharacteristicSet.of(study.vehicle.characteristics)
     return np.asarray(np.linalg.norm((settings - characteristics.original) / (characteristics.upper - characteristics.lower), axis=1))

@@ -17,7 +17,7 @@ ENDS = {
 """How a run ended, as the verb of a sentence; a collision is described by its speed instead."""
 
 
-def changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
+def changes_in_words(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
     """The changed ones of some values, in the study's order, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
     changed = [(member, values[member.name]) for member in characteristics if values.get(member.name, member.original) != member.original]
     return ", ".join(f"{member.name} {member.original:g} -> {member.text(value)}{member.suffix} "

@@ -19,7 +19,7 @@ from safevar_sumo.results import ResultsDirectory
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.system import System
-from safevar_sumo.workers.batches import sources_of
+from safevar_sumo.workers.batches import digests_of_sources
 from safevar_sumo.workers.cluster import cluster_pool
 from safevar_sumo.workers.evaluation import Pool
 from safevar_sumo.workers.identity import identity_of
@@ -100,7 +100,7 @@ def carry_out_runs(study: Study, system: System, keys: list[RunKey], directory: 
     SafevarError
         If another process works on one of the runs, or as `run_campaign`.
     """
-    sources = {**sources_of(study, pool), **read_by_algorithms(study)}
+    sources = {**digests_of_sources(study, pool), **read_by_algorithms(study)}
     results = ResultsDirectory(directory, study, identity_of(study, system, sources), system.measuring.scoring)
     used, reason = engine_for(system, engine)
     results.manifest["engine"] = {"name": ENGINES[used], "reason": reason}

@@ -24,7 +24,7 @@ from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.matrix import LARGEST_WORLD
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from safevar_sumo.workers.evaluation import Pool, packed
-from safevar_sumo.workers.interrupts import first_of, result_of
+from safevar_sumo.workers.interrupts import awaited, first_of
 from safevar_sumo.workers.isolation import check_code
 from safevar_sumo.workers.retrying import RetryingPool
 
@@ -148,7 +148,7 @@ def _original(study: Study, work: bytes, characteristics: CharacteristicSet, res
               observer: Observer) -> Evaluations:
     """The original vehicle's evaluation, simulated once; raises if that fails, or if models mix settings up."""
     def simulated() -> Evaluations:
-        return result_of(pool.submit(work, characteristics.original[np.newaxis], must_succeed=True))
+        return awaited(pool.submit(work, characteristics.original[np.newaxis], must_succeed=True))
 
     try:
         journal = results.journal(ORIGINAL)

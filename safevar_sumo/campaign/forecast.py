@@ -13,7 +13,7 @@ from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.matrix import LARGEST_WORLD
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
-from safevar_sumo.workers.interrupts import result_of
+from safevar_sumo.workers.interrupts import awaited
 from safevar_sumo.workers.retrying import RetryingPool
 
 PROBE_BATCHES = 4
@@ -42,10 +42,10 @@ def forecast(study: Study, runs: int, pool: Pool, batch: int = LARGEST_WORLD, en
         drawn = [characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (size, len(characteristics))))
                  for _ in range(number * pool.workers)]
         for future in [retrying.submit(work, settings) for settings in drawn]:
-            result_of(future)
+            awaited(future)
         return time.perf_counter() - start
 
-    result_of(retrying.submit(work, characteristics.original[np.newaxis], must_succeed=True))
+    awaited(retrying.submit(work, characteristics.original[np.newaxis], must_succeed=True))
     probe(1)  # starts the workers and builds the network
     rate = PROBE_BATCHES * pool.workers * size / probe(PROBE_BATCHES)
     evaluations = runs * study.search.evaluations

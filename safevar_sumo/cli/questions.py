@@ -20,10 +20,10 @@ from safevar_sumo.cli.options import PICTURES, check_output
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import (
     CommandFunction,
+    flags_of,
     jobs_option,
     json_option,
     now_option,
-    options_of,
     point_option,
     results_or_study,
     study_at_point,
@@ -38,7 +38,7 @@ def question(options: type[Options], metavar: str, *extra: Callable[[CommandFunc
     """Decorator for the command of a question: flags of its options, flags that all questions share, and `extra` decorators."""
     def add(command: CommandFunction) -> click.Command:
         decorators: list[Callable[[CommandFunction], CommandFunction]] = [
-            click.argument("place", metavar=metavar), options_of(options), point_option, now_option, jobs_option, json_option, *extra]
+            click.argument("place", metavar=metavar), flags_of(options), point_option, now_option, jobs_option, json_option, *extra]
         for decorator in reversed(decorators):
             command = decorator(command)
         return commands.command(name=options.question)(command)

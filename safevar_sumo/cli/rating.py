@@ -12,7 +12,7 @@ from rich.console import Console
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.cli.options import PICTURES, check_output, read_changes
 from safevar_sumo.cli.program import commands
-from safevar_sumo.cli.target import jobs_option, json_option, now_option, options_of, results_or_study
+from safevar_sumo.cli.target import flags_of, jobs_option, json_option, now_option, results_or_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study
 from safevar_sumo.terminal import stages
@@ -24,7 +24,7 @@ FILE = click.Path(path_type=Path)
 
 @commands.command(name="rating")
 @click.argument("place", metavar="STUDY|DIR")
-@options_of(RatingOptions)
+@flags_of(RatingOptions)
 @click.option("--matrix", is_flag=True, help="Print every matrix: speed by impact location, with the colours of the cells.")
 @click.option("--plot", type=FILE, metavar="FILE", help="Draw the matrices to this file: png, pdf or svg.")
 @click.option("--xlsx", type=FILE, metavar="FILE", help="Write the official spreadsheet with the predictions of the variant, else of the "

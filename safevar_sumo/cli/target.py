@@ -86,7 +86,7 @@ def as_it_is_now() -> bool:
     return bool(click.get_current_context().meta.get(AS_IT_IS_NOW))
 
 
-def options_of(question: type[Options]) -> Callable[[CommandFunction], CommandFunction]:
+def flags_of(question: type[Options]) -> Callable[[CommandFunction], CommandFunction]:
     """Add the flags of a question's options; `question(**keywords)` makes the record from the command's keywords."""
     def add(command: CommandFunction) -> CommandFunction:
         for field in reversed(fields(question)):

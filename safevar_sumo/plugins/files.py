@@ -210,7 +210,7 @@ def located(name: str, places: Sequence[str]) -> str:
     return next((str(path) for root in (*places, *_roots()) if (path := Path(root, name)).is_file()), "")
 
 
-def changes(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+def changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     """Names of files with different digests."""
     return [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
 

@@ -27,7 +27,7 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.batches import evaluate_all, inputs_of
 from safevar_sumo.workers.evaluation import Pool, packed
-from safevar_sumo.workers.interrupts import result_of
+from safevar_sumo.workers.interrupts import awaited
 from safevar_sumo.workers.retrying import RetryingPool
 
 EDGE = 0.01
@@ -296,7 +296,7 @@ class _Fitted:
         return [self._pool.submit(work, self._settings[start:start + size]) for start in range(0, len(self._settings), size)]
 
     def loss(self, parts: Sequence[Future[Evaluations]]) -> float:
-        unique = Evaluations.concatenate([result_of(part) for part in parts])
+        unique = Evaluations.concatenate([awaited(part) for part in parts])
         if not unique.valid.all():
             return MAX_LOSS
         evaluations = unique.take(self._row_of.ravel())

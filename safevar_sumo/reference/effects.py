@@ -8,7 +8,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.analysis.model_spread import BAND, band_of, distance, evaluations_of_sets
+from safevar_sumo.analysis.model_spread import BAND, band_of, distance_from_original, evaluations_of_sets
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.study import SAFETY_DEGREE, Study
@@ -121,7 +121,7 @@ def error_beyond_spread(study: Study, references: Mapping[str, ReferenceData]) -
     bare = msgspec.structs.replace(study, model_error={})
     scores, weights = [], []
     for data in references.values():
-        distances, published = distance(study, data.settings), data.metrics[SAFETY_DEGREE]
+        distances, published = distance_from_original(study, data.settings), data.metrics[SAFETY_DEGREE]
         used = (distances > 0) & np.isfinite(published)
         if used.any():
             lower, upper = band_of(bare, evaluations_of_sets(bare, data.settings[used]))

@@ -16,7 +16,7 @@ from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison
 from safevar_sumo.replay.film import LaneLine
-from safevar_sumo.replay.scene import SEAM_WIDTH, FlatBody, FlatScene, scene_of
+from safevar_sumo.replay.scene import SEAM_WIDTH, FlatBody, FlatScene, flat_scene_of
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -187,7 +187,7 @@ def animate(comparison: Comparison, path: Path) -> None:
     if ending not in ANIMATIONS:
         raise InputError("animate", str(path), f"a file that ends in {', '.join(ANIMATIONS)}")
     try:
-        ANIMATIONS[ending](scene_of(comparison), path)
+        ANIMATIONS[ending](flat_scene_of(comparison), path)
     except OSError as error:
         raise InputError("animate", f"cannot write {path}: {error.strerror or error}", "a file in a directory that exists") from None
 

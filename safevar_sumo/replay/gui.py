@@ -11,7 +11,7 @@ import numpy as np
 from safevar_sumo.replay.animation import OTHER, PERSON, VEHICLES, quad, stripes
 from safevar_sumo.replay.comparison import CHANGED, ORIGINAL, Comparison
 from safevar_sumo.replay.film import LaneLine
-from safevar_sumo.replay.scene import FlatScene, scene_of
+from safevar_sumo.replay.scene import FlatScene, flat_scene_of
 from safevar_sumo.replay.window import Colour, Place, Window, open_window
 from safevar_sumo.scenarios import VUT
 
@@ -45,7 +45,7 @@ def show_in_gui(comparison: Comparison, network: str | None = None, *, slower: f
     InputError, SimulationError
         As `replay.window.open_window`.
     """
-    scene = scene_of(comparison)
+    scene = flat_scene_of(comparison)
     layout = _Layout(scene)
     with open_window(network or comparison.network, scene.step) as window:
         for row in comparison.rows:

@@ -85,7 +85,7 @@ class FlatScene:
         return list(range(math.ceil(left / MARK_DISTANCE) * MARK_DISTANCE, math.floor(left + self.view.width) + 1, MARK_DISTANCE))
 
 
-def scene_of(comparison: Comparison) -> FlatScene:
+def flat_scene_of(comparison: Comparison) -> FlatScene:
     """Lay a comparison out as a scene."""
     film = comparison.film
     vut = film.tracks[VUT]

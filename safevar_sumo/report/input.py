@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.analysis.explain import ExplainOptions
-from safevar_sumo.analysis.explain.compute import points_of
+from safevar_sumo.analysis.explain.compute import unsafe_points_of
 from safevar_sumo.analysis.opinion import OpinionOptions
 from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
@@ -26,7 +26,7 @@ from safevar_sumo.errors import InputError, SafevarError, warn
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.replay.comparison import Comparison, changes_in_words, compare_setting
 from safevar_sumo.replay.page import player_data
-from safevar_sumo.replay.scene import scene_of
+from safevar_sumo.replay.scene import flat_scene_of
 from safevar_sumo.results import ANSWERS, MANIFEST, RESULTS, SOLUTIONS, chosen_handle, handles, read_manifest, write_whole
 from safevar_sumo.scenarios import Point
 from safevar_sumo.shipped import PACKAGE
@@ -166,7 +166,7 @@ class ReportInput:
         new = {setting.tobytes(): setting for setting in settings if setting.tobytes() not in self._simulated_again}
         if new:
             at_points = at_every_point(self.system, np.stack(list(new.values())))
-            evaluations, points = aggregated(at_points), points_of(self.system, at_points, self.case.unsafe)
+            evaluations, points = aggregated(at_points), unsafe_points_of(self.system, at_points, self.case.unsafe)
             for row, key in enumerate(new):
                 self._simulated_again[key] = Resimulation(evaluations.take([row]), points[row])
         return [self._simulated_again[setting.tobytes()] for setting in settings]
@@ -193,7 +193,7 @@ class ReportInput:
 
     def replay(self, setting: FloatArray) -> dict[str, Any]:
         """A setting's animation, as the template `player` takes it."""
-        return player_data(scene_of(self.compared(setting)))
+        return player_data(flat_scene_of(self.compared(setting)))
 
     def anchor(self, *parts: object) -> str:
         """The anchor of a part of the page that belongs to this study."""

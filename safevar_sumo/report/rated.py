@@ -12,7 +12,14 @@ from markupsafe import Markup
 from safevar_sumo.analysis.evaluator import Progress
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.rating.compute import Rating, rate, remarks
-from safevar_sumo.analysis.rating.render import lost_by_test, matrices_figure, not_simulated, test_in_words, turned_in_words, verdict
+from safevar_sumo.analysis.rating.render import (
+    lost_by_test,
+    matrices_figure,
+    not_simulated,
+    rating_in_words,
+    test_in_words,
+    turned_in_words,
+)
 from safevar_sumo.analysis.words import question_command
 from safevar_sumo.report.input import ReportInput
 from safevar_sumo.results import chosen_handle, position_of
@@ -32,7 +39,7 @@ def rated_study_page(data: ReportInput, jobs: int | None, progress: Progress) ->
         variants[str(handle)] = row[list(names)].to_numpy(dtype=float)
     rating = rate(case.study, variants, jobs=jobs, progress=progress)
     rating_command = RatingOptions(solution=None if handle is None else str(handle)).command_line(str(data.directory))
-    return {"title": case.study.title, "sentence": verdict(rating), "notes": remarks(rating), "points": _points(rating),
+    return {"title": case.study.title, "sentence": rating_in_words(rating), "notes": remarks(rating), "points": _points(rating),
             "lost": [(test_in_words(test), f"{lost:.2f}") for test, lost in lost_by_test(rating)], "turned": turned_in_words(rating),
             "picture": picture(rating), "names": [variant.name for variant in rating.variants], "open": not_simulated(rating),
             "commands": [rating_command, *(question_command(question, str(data.directory)) for question in ("tolerance", "explain"))]}

@@ -3,7 +3,7 @@
 from safevar_sumo.results.files import ANSWERS, FILES, MANIFEST, ORIGINAL, SOLUTIONS, later_files, make_directory, places_of, write_whole
 from safevar_sumo.results.imported import UNKNOWN, write_imported
 from safevar_sumo.results.journal import SPARE, Journal, JournalBusy
-from safevar_sumo.results.load import Failure, RunStatus, Status, StoredResults, failure_lines, load, status
+from safevar_sumo.results.load import Failure, RunStatus, Status, StoredResults, failure_lines, load_runs, status
 from safevar_sumo.results.manifest import RESULTS, comparable_inputs, differences_now, evaluation_keys, manifest_of, read_manifest
 from safevar_sumo.results.solution_id import CHOICES, SolutionId, chosen_handle, handles, position_of
 from safevar_sumo.results.store import ResultsDirectory, evaluations_frame, record, solutions_frame
@@ -34,7 +34,7 @@ __all__ = [
     "failure_lines",
     "handles",
     "later_files",
-    "load",
+    "load_runs",
     "make_directory",
     "manifest_of",
     "places_of",

@@ -140,7 +140,7 @@ def _journals(place: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str
         yield algorithm, run, read_journal(path, study, path.stem) if path.exists() else None
 
 
-def load(directory: str | Path) -> StoredResults:
+def load_runs(directory: str | Path) -> StoredResults:
     """Read the runs and evaluations of a results directory's study, which may be unfinished; warns of torn runs.
 
     Raises

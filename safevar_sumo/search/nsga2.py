@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from safevar_sumo.search.base import Problem, Search
-from safevar_sumo.search.evolution import Individual, Operators, Variation, fronts, initial_population, result_of, simulated, stand_in_front
+from safevar_sumo.search.evolution import (
+    Individual,
+    Operators,
+    Variation,
+    evaluations_of,
+    fronts,
+    initial_population,
+    simulated,
+    stand_in_front,
+)
 
 
 class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -23,7 +32,7 @@ class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
             used += yield from simulated(offspring, problem)
             population = survivors(population + [individual for individual in offspring if not individual.failed], problem.population)
             offspring = variation.offspring(population, min(problem.population, problem.evaluations - used))
-        return result_of([best for best in population if best.standing[0] == 0], problem)
+        return evaluations_of([best for best in population if best.standing[0] == 0], problem)
 
 
 def survivors(individuals: list[Individual], number: int) -> list[Individual]:

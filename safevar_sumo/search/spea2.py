@@ -6,7 +6,16 @@ import numpy as np
 
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.search.base import Problem, Search
-from safevar_sumo.search.evolution import Individual, Operators, Size, Variation, initial_population, objectives_of, result_of, simulated
+from safevar_sumo.search.evolution import (
+    Individual,
+    Operators,
+    Size,
+    Variation,
+    evaluations_of,
+    initial_population,
+    objectives_of,
+    simulated,
+)
 
 
 class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -39,12 +48,12 @@ class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
         while offspring:
             used += yield from simulated(offspring, problem)
             good = [individual for individual in offspring if not individual.failed]
-            archive = survivors(archive + good, size, normalised=self.normalised)
+            archive = environmental_selection(archive + good, size, normalised=self.normalised)
             offspring = variation.distinct_offspring(archive, min(problem.population, problem.evaluations - used))
-        return result_of([best for best in archive if best.standing[0] < 1], problem)
+        return evaluations_of([best for best in archive if best.standing[0] < 1], problem)
 
 
-def survivors(individuals: list[Individual], number: int, *, normalised: bool = False) -> list[Individual]:
+def environmental_selection(individuals: list[Individual], number: int, *, normalised: bool = False) -> list[Individual]:
     """Environmental selection; sets `standing` to the fitness, which is below 1 for non-dominated individuals."""
     if not individuals:
         return []

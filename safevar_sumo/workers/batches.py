@@ -18,7 +18,7 @@ from safevar_sumo.sumo import Engine, assemble, reason_for_sumo, settings_per_ba
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import Pool, packed
 from safevar_sumo.workers.identity import Inputs, networks_of
-from safevar_sumo.workers.interrupts import first_of, result_of
+from safevar_sumo.workers.interrupts import awaited, first_of
 from safevar_sumo.workers.isolation import check_code, refuse_unlike_sumo
 from safevar_sumo.workers.retrying import RetryingPool
 
@@ -73,18 +73,18 @@ def evaluate_all(study: Study, settings: FloatArray, pool: Pool, done: Callable[
             done(len(parts[futures[future]]))
     evaluations = Evaluations.concatenate([parts[start] for start in starts])
     if in_sumo is not None:
-        expected = evaluations.take(sample) if in_scenes is None else result_of(in_scenes)
-        refuse_unlike_sumo(study, expected.take(~expected.failed), result_of(in_sumo).take(~expected.failed))
+        expected = evaluations.take(sample) if in_scenes is None else awaited(in_scenes)
+        refuse_unlike_sumo(study, expected.take(~expected.failed), awaited(in_sumo).take(~expected.failed))
         _verified[work] = _verified.get(work, 0) + len(sample)
     return evaluations.take(row_of.ravel())
 
 
 def inputs_of(study: Study, pool: Pool) -> Inputs:
     """Digests of the files that must be the same on every worker, by layer and name; raises as `sources_of`."""
-    return {"network": networks_of(assemble(study)), "sources": sources_of(study, pool)}
+    return {"network": networks_of(assemble(study)), "sources": digests_of_sources(study, pool)}
 
 
-def sources_of(study: Study, pool: Pool) -> Files:
+def digests_of_sources(study: Study, pool: Pool) -> Files:
     """Digests, by name, of the files that models from outside read in one run of the original vehicle, and of files that parameters name.
 
     The run takes place in a worker that loads everything anew.
@@ -100,7 +100,7 @@ def sources_of(study: Study, pool: Pool) -> Files:
         key = work, os.getcwd()
         if any(digest_of(located(name, study.origin.places)) != digest for name, digest in _read.get(key, {"": "never read"}).items()):
             original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
-            _read[key] = dict(result_of(RetryingPool(pool, study).submit(work, original, must_succeed=True)).files)
+            _read[key] = dict(awaited(RetryingPool(pool, study).submit(work, original, must_succeed=True)).files)
         files |= _read[key]
     return dict(sorted(files.items()))
 

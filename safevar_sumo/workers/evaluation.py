@@ -12,7 +12,7 @@ import msgspec
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.plugins import Files, changes, digests, forget_foreign, noted_reading
+from safevar_sumo.plugins import Files, changed_files, digests, forget_foreign, noted_reading
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, foreign_packages
 from safevar_sumo.sumo.engine import Engine
@@ -131,7 +131,7 @@ def _assembled(work: bytes) -> tuple[_Work, System]:
 
 def _refuse_changes(expected: Inputs, system: System) -> None:
     if "network" in expected:
-        _refuse(changes(expected["network"], networks_of(system)))
+        _refuse(changed_files(expected["network"], networks_of(system)))
 
 
 def _unknown(task: _Work, files: Files) -> Files:

@@ -44,7 +44,7 @@ def first_of(futures: Iterable[Future[Evaluations]]) -> set[Future[Evaluations]]
             return done
 
 
-def result_of(future: Future[Evaluations]) -> Evaluations:
+def awaited(future: Future[Evaluations]) -> Evaluations:
     """Wait for a future's result; raises its error."""
     first_of([future])
     return future.result()

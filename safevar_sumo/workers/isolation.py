@@ -17,7 +17,7 @@ from safevar_sumo.study import Study, foreign_names, tables_of
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import packed
 from safevar_sumo.workers.identity import Inputs
-from safevar_sumo.workers.interrupts import result_of
+from safevar_sumo.workers.interrupts import awaited
 from safevar_sumo.workers.retrying import RetryingPool
 
 LEGAL = ("results of a vehicle that depend on this vehicle alone: nothing kept in a class, a module or the model itself from one call or "
@@ -47,7 +47,7 @@ def check_code(study: Study, inputs: Inputs, pool: RetryingPool) -> list[str]:
     if name in _passed or passed.exists():
         return []
     original = CharacteristicSet.of(study.vehicle.characteristics).original[np.newaxis]
-    remarks = list(result_of(pool.submit(packed(study, inputs, check=True), original, must_succeed=True)).reasons.values())
+    remarks = list(awaited(pool.submit(packed(study, inputs, check=True), original, must_succeed=True)).reasons.values())
     _passed.add(name)
     with suppress(OSError):  # it is checked again then
         passed.parent.mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,7 @@ from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.progress import CampaignProgress
 from safevar_sumo.records import Evaluations
-from safevar_sumo.results import Journal, ResultsDirectory, load, status
+from safevar_sumo.results import Journal, ResultsDirectory, load_runs, status
 from safevar_sumo.results.journal import read_journal
 from safevar_sumo.search import Search
 from safevar_sumo.study import Study, tables_of
@@ -34,7 +34,7 @@ def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches(study: St
                               ("d", FormulaPool(workers=2, shuffled=True), 1)):
         carried_out(study, tmp_path / name, pool, batch=batch)
         assert solutions(tmp_path / name) == solutions(tmp_path / "a")
-        pd.testing.assert_frame_equal(load(tmp_path / name).evaluations, load(tmp_path / "a").evaluations)
+        pd.testing.assert_frame_equal(load_runs(tmp_path / name).evaluations, load_runs(tmp_path / "a").evaluations)
 
 
 def test_bar_status_and_campaign_count_the_same_collisions(study: Study, tmp_path: Path) -> None:
@@ -44,7 +44,7 @@ def test_bar_status_and_campaign_count_the_same_collisions(study: Study, tmp_pat
         with CampaignProgress(console, study, all_runs(study), quiet=False) as progress:
             campaign = run_campaign(study, all_runs(study), results, FormulaPool(), progress)
         results.finish(campaign.solutions)
-        evaluations = load(tmp_path).evaluations
+        evaluations = load_runs(tmp_path).evaluations
         expected = len(evaluations[evaluations["outcome"] == "collision"].drop_duplicates(["algorithm", "run", *SUN.names]))
         assert expected > 0
         assert sum(campaign.collisions.values()) == sum(run.collisions for run in status(tmp_path).runs) == expected
@@ -70,7 +70,7 @@ def test_runs_share_batches_and_one_run_is_shared_out(study: Study, tmp_path: Pa
     carried_out(large, tmp_path / "alone", alone, keys=[RunKey("rs", 3)])
     assert np.mean(together.sizes[1:]) > 3 * large.search.population
     assert alone.sizes[1:3] == [20, 20]
-    one, other = (load(tmp_path / name).evaluations.query("algorithm == 'rs' and run == 3") for name in ("together", "alone"))
+    one, other = (load_runs(tmp_path / name).evaluations.query("algorithm == 'rs' and run == 3") for name in ("together", "alone"))
     pd.testing.assert_frame_equal(one.reset_index(drop=True), other.reset_index(drop=True))
 
 
@@ -155,7 +155,7 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
     carried_out(second, tmp_path / "out", pools[1])
     carried_out(second, tmp_path / "fresh", pools[2])
     assert solutions(tmp_path / "out") == solutions(tmp_path / "fresh")
-    results, fresh = load(tmp_path / "out"), load(tmp_path / "fresh")
+    results, fresh = load_runs(tmp_path / "out"), load_runs(tmp_path / "fresh")
     pd.testing.assert_frame_equal(results.evaluations, fresh.evaluations)
     pd.testing.assert_frame_equal(results.solutions, fresh.solutions)
     assert len(set(pools[0].simulated)) + len(set(pools[1].simulated)) == len(set(pools[0].simulated) | set(pools[1].simulated))
@@ -164,7 +164,7 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
 
 def test_every_evaluation_is_read_in_the_order_in_which_it_was_asked_for(study: Study, tmp_path: Path) -> None:
     carried_out(study, tmp_path, FormulaPool(workers=4, shuffled=True), batch=3)
-    results = load(tmp_path)
+    results = load_runs(tmp_path)
     frame = results.evaluations
     assert list(frame.columns[:3]) == ["algorithm", "run", "evaluation"]
     for key in all_runs(study):
@@ -235,11 +235,11 @@ def test_failures_are_counted_kept_out_and_not_met_again(study: Study, tmp_path:
             return super().submit(work, settings)
 
     campaign, _ = carried_out(study, tmp_path, Deadly())
-    frame = load(tmp_path).evaluations
+    frame = load_runs(tmp_path).evaluations
     failed = frame["outcome"] == "simulator-error"
     assert failed.sum() == len(campaign.failures) > 0
     assert np.array_equal(failed, frame["tireFric"] < 1.3)
-    assert not (load(tmp_path).solutions["tireFric"] < 1.3).any()
+    assert not (load_runs(tmp_path).solutions["tireFric"] < 1.3).any()
     before = solutions(tmp_path)
     again, _ = carried_out(study, tmp_path, FormulaPool(lasts=0))
     assert again.failures == campaign.failures
@@ -264,7 +264,7 @@ def test_failed_settings_are_tried_again_when_that_is_asked_for(study: Study, tm
             return super().submit(work, settings)
 
     failed, _ = carried_out(study, tmp_path / "out", Outage())
-    results = load(tmp_path / "out")
+    results = load_runs(tmp_path / "out")
     assert list(results.failures) == failed.failures != []
     assert {one.reason for one in failed.failures} == {"SUMO failed: it has its day off"}
     with pytest.raises(PoolLostError):  # a retry that breaks down is gone on with
@@ -275,4 +275,4 @@ def test_failed_settings_are_tried_again_when_that_is_asked_for(study: Study, tm
     carried_out(study, tmp_path / "whole")
     assert campaign.failures == []
     assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")
-    pd.testing.assert_frame_equal(load(tmp_path / "out").evaluations, load(tmp_path / "whole").evaluations)
+    pd.testing.assert_frame_equal(load_runs(tmp_path / "out").evaluations, load_runs(tmp_path / "whole").evaluations)

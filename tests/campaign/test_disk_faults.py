@@ -13,7 +13,7 @@ import pytest
 
 from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.errors import SafevarError
-from safevar_sumo.results import ResultsDirectory, files, journal, load
+from safevar_sumo.results import ResultsDirectory, files, journal, load_runs
 from safevar_sumo.study import Study, load_study
 from tests.campaign.formulas import FormulaPool, Told
 
@@ -111,7 +111,7 @@ def test_every_step_on_the_disk_may_fail(kinds: tuple[int, ...], stays: bool, ti
         failed = broken(tiny, out, disk)
         errors += failed
         if (out / "manifest.json").exists():
-            load(out)
+            load_runs(out)
         if not failed:
             assert (out / "solutions.csv").read_bytes() == expected
         assert carried_out(tiny, out) == expected

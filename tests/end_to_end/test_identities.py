@@ -13,7 +13,7 @@ from click.testing import CliRunner
 import safevar_sumo as sv
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
-from safevar_sumo.results import FILES, load
+from safevar_sumo.results import FILES, load_runs
 from safevar_sumo.shipped import NETWORKS
 from tests.in_process import run
 
@@ -171,4 +171,4 @@ def test_a_table_that_was_edited_is_refused_until_the_study_writes_it_again() ->
         assert "was edited" in refused(*words.split())
     study()
     assert Path("out/solutions.csv").read_text() == before
-    assert len(load("out").solutions)
+    assert len(load_runs("out").solutions)

@@ -17,7 +17,7 @@ import psutil
 import pytest
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.results import load
+from safevar_sumo.results import load_runs
 from safevar_sumo.workers import cluster
 from tests.end_to_end.processes import STUDY, ended, killed, left_of_group, solutions, started, study, until, workers_of, written
 from tests.in_process import refused, run
@@ -69,7 +69,7 @@ def test_two_workers_that_are_killed_leave_the_same_bytes(whole: Path) -> None:
     ended(process, 0)
     assert kills == 2
     assert solutions(OUT) == solutions(whole)
-    assert (load(OUT).evaluations["outcome"] != "simulator-error").all()
+    assert (load_runs(OUT).evaluations["outcome"] != "simulator-error").all()
 
 
 @pytest.mark.parametrize("when", ["mid-run", *(pytest.param(moment, marks=SLOW) for moment in ("loading", 0.0, 0.15, 0.4, "twice"))])
@@ -150,7 +150,7 @@ def test_settings_that_sumo_dies_of_are_recorded_and_left_out(end: str, number: 
         'extends = "smoke"\nname = "deadly"\n[search]\nalgorithms = ["rs"]\nevaluations = 40\nruns = 1\n'
         + ("time_limit = 8.0\n" if end == "hang" else ""))
     run("study", "deadly.toml", "--out", "healthy")
-    healthy = load("healthy").evaluations  # in a recorded scene, where nobody sets masses
+    healthy = load_runs("healthy").evaluations  # in a recorded scene, where nobody sets masses
     masses = np.sort(healthy["mass"].unique())
     heavy = float(masses[-number - 1] + masses[-number]) / 2
     Path("patch").mkdir()
@@ -163,7 +163,7 @@ def test_settings_that_sumo_dies_of_are_recorded_and_left_out(end: str, number: 
     failed = healthy["mass"] > heavy
     assert f"{failed.sum()} settings could not be simulated" in output
     assert why in output
-    results = load("out")
+    results = load_runs("out")
     assert np.array_equal(results.evaluations["outcome"] == "simulator-error", failed)
     assert {one.reason for one in results.failures} == {why}
     pd.testing.assert_frame_equal(results.evaluations[~failed], healthy[~failed])
@@ -179,7 +179,7 @@ def test_settings_that_sumo_dies_of_are_recorded_and_left_out(end: str, number: 
     monkeypatch.delenv("PYTHONPATH")
     run("study", "deadly.toml", "--out", "out", "--retry-failed")
     assert solutions("out") == solutions("healthy")
-    pd.testing.assert_frame_equal(load("out").evaluations, healthy)
+    pd.testing.assert_frame_equal(load_runs("out").evaluations, healthy)
 
 
 Start = Callable[..., subprocess.Popen[str]]
@@ -235,7 +235,7 @@ def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(
     ended(process, 0)
     assert workers[1].poll() is None
     assert solutions("out") == solutions(whole)
-    assert (load("out").evaluations["outcome"] != "simulator-error").all()
+    assert (load_runs("out").evaluations["outcome"] != "simulator-error").all()
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from safevar_sumo.results import ResultsDirectory, load
+from safevar_sumo.results import ResultsDirectory, load_runs
 from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
@@ -25,7 +25,7 @@ def test_shards_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
     for k in (1, 2):
         study("--out", "out", "--shard", f"{k}/2")
     assert not Path("out/solutions.csv").exists()
-    assert len(load("out").solutions.groupby(["algorithm", "run"])) == 6
+    assert len(load_runs("out").solutions.groupby(["algorithm", "run"])) == 6
     before = written(Path("out"))
     study("--out", "out", "--batch", "7")
     assert written(Path("out")) == before, "nothing was left to simulate"
@@ -33,8 +33,8 @@ def test_shards_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
     assert "No solution." in run("study", "small.toml", "--out", "none", "--shard", "9/9").stdout
     study("--out", "alone", "--only", "nsga2:1")
     assert [path.name for path in Path("alone/runs").glob("*-*")] == ["nsga2-01.journal"]
-    expected = load(whole).solutions.query("algorithm == 'nsga2' and run == 1").reset_index(drop=True)
-    pd.testing.assert_frame_equal(load("alone").solutions, expected)
+    expected = load_runs(whole).solutions.query("algorithm == 'nsga2' and run == 1").reset_index(drop=True)
+    pd.testing.assert_frame_equal(load_runs("alone").solutions, expected)
 
 
 @pytest.mark.slow
@@ -46,8 +46,8 @@ def test_more_runs_extend_what_is_there(copied: Path) -> None:
     assert set(pd.read_csv("out/solutions.csv")["run"]) == {0, 1, 2}
     assert fewer.stat().st_mtime_ns == stamp
     study("--out", "alone", "--runs", "3", "--only", "rs:2")
-    extended = load("out").solutions.query("algorithm == 'rs' and run == 2").reset_index(drop=True)
-    pd.testing.assert_frame_equal(extended, load("alone").solutions)
+    extended = load_runs("out").solutions.query("algorithm == 'rs' and run == 2").reset_index(drop=True)
+    pd.testing.assert_frame_equal(extended, load_runs("alone").solutions)
 
 
 @pytest.mark.slow
@@ -55,7 +55,7 @@ def test_a_run_in_the_hands_of_another_process_is_not_started_twice(whole: Path)
     chosen = load_study("small.toml")
     theirs = ResultsDirectory(Path("out"), chosen, identity_of(chosen, assemble(chosen))).journal("rs-00")
     assert "another process works on rs-00" in study("--out", "out", expect=1)
-    assert len(load("out").solutions.groupby(["algorithm", "run"])) == 5
+    assert len(load_runs("out").solutions.groupby(["algorithm", "run"])) == 5
     theirs.close()
     study("--out", "out")
     assert solutions("out") == solutions(whole)

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import pandas as pd
 
-from safevar_sumo.results import CHOICES, RESULTS, load
+from safevar_sumo.results import CHOICES, RESULTS, load_runs
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.workers.identity import identity_of
@@ -41,7 +41,7 @@ def computed(name: str) -> dict[str, Any]:
     """The entry of a study: the original vehicle, and every algorithm's solutions."""
     study = small(name)
     with tempfile.TemporaryDirectory() as folder:
-        results = load(searched(study, Path(folder)))
+        results = load_runs(searched(study, Path(folder)))
     original = results.manifest["original"]
     changed = {member: row.original for member, row in study.vehicle.characteristics.items()}
     solutions = {str(algorithm): _of_algorithm(rows, changed) for algorithm, rows in results.solutions.groupby("algorithm")}

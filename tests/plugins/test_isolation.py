@@ -13,7 +13,7 @@ from safevar_sumo.api.running import NullObserver, carry_out_runs
 from safevar_sumo.campaign import all_runs
 from safevar_sumo.conformance import refuse_defects
 from safevar_sumo.errors import ForeignError, InputError
-from safevar_sumo.results import load
+from safevar_sumo.results import load_runs
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
@@ -212,7 +212,7 @@ def test_members_from_outside_are_simulated_and_scored(six: None) -> None:
 @pytest.mark.slow
 def test_members_from_outside_are_searched_and_tabulated(six: None) -> None:
     run("study", "six/mine.toml", "--out", "out", "--runs", "1", "--evaluations", "20", "--quiet")
-    solutions = load("out").solutions
+    solutions = load_runs("out").solutions
     assert set(solutions["algorithm"]) == {"nsga2", "Halving"}
     assert np.isfinite(solutions[["jerk", "mean_change"]].to_numpy()).all()
     assert solutions["f_diff"].max() <= 1 / 2 + 1e-9, "the weight of mass halves its changes"

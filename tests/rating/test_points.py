@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from safevar_sumo.analysis.rating.compute import RatedVehicle, Rating
-from safevar_sumo.analysis.rating.render import verdict
+from safevar_sumo.analysis.rating.render import rating_in_words
 from safevar_sumo.analysis.rating.workbook import Preprocessed, Template
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
@@ -155,13 +155,13 @@ def test_the_verdict_names_what_is_lost_and_where() -> None:
     result = Rating(study=load_study("euro_ncap_rating"), protocol=PROTOCOL, variants=[rated(results()), rated(results(impact), "variant")])
     result.variants[0].__dict__["setting"] = {name: row.original for name, row in result.study.vehicle.characteristics.items()}
     result.variants[1].__dict__["setting"] = {**result.variants[0].setting, "treadDepth": 3.0}
-    assert verdict(result).startswith("With tread depth of the tyres 3 mm the vehicle loses 1.")
-    assert verdict(result).endswith("all of them in CPNCO by night.")
+    assert rating_in_words(result).startswith("With tread depth of the tyres 3 mm the vehicle loses 1.")
+    assert rating_in_words(result).endswith("all of them in CPNCO by night.")
     elsewhere = np.full(N, np.nan)
     elsewhere[numbers("CPNCO", "standard", "day")[:3]] = 40.0
     gains = replace(result, variants=[rated(results(elsewhere)), result.variants[1]])
     gains.original.__dict__["setting"] = result.original.setting
-    assert verdict(gains).endswith("most of them in CPNCO by night."), "in another test the variant gains"
+    assert rating_in_words(gains).endswith("most of them in CPNCO by night."), "in another test the variant gains"
     record = json.loads(json.dumps(result.to_dict(), allow_nan=False))
     assert set(record) == {"study", "variants", "not_simulated"}
     assert set(record["variants"][0]) == {"name", "setting", "points", "possible", "tests"}

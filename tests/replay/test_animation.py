@@ -17,7 +17,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.replay.animation import PANEL, VEHICLES, WIDTH, animate, check_animation, frames_of
 from safevar_sumo.replay.comparison import Comparison, compare_setting
 from safevar_sumo.replay.page import animation_page
-from safevar_sumo.replay.scene import scene_of
+from safevar_sumo.replay.scene import flat_scene_of
 from safevar_sumo.sumo.system import assemble
 
 
@@ -35,7 +35,7 @@ def where(picture: Image.Image, colour: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_both_vehicles_are_where_they_were_to_scale(crash: Comparison) -> None:
-    scene = scene_of(crash)
+    scene = flat_scene_of(crash)
     picture = next(frames_of(scene, scene.length))  # the start: the changed vehicle stands on the original's place
     scale = WIDTH / scene.view.width
     rows, columns = where(picture, VEHICLES[0])
@@ -58,7 +58,7 @@ def test_a_road_in_any_direction_looks_the_same(angle: float, crash: Comparison)
         return track._replace(x=x.reshape(track.x.shape), y=y.reshape(track.y.shape), angle=track.angle + angle)
 
     film = dataclasses.replace(crash.film, tracks={name: turned(track) for name, track in crash.film.tracks.items()})
-    straight, rotated = scene_of(crash), scene_of(dataclasses.replace(crash, film=film))
+    straight, rotated = flat_scene_of(crash), flat_scene_of(dataclasses.replace(crash, film=film))
     for one, other in zip(straight.bodies, rotated.bodies, strict=True):
         assert np.allclose(one.x, other.x)
         assert np.allclose(one.y, other.y)
@@ -78,14 +78,14 @@ def test_the_same_bytes_twice(kind: str, crash: Comparison, tmp_path: Path) -> N
             for frame in range(image.n_frames):
                 image.seek(frame)
                 durations.append(image.info["duration"])
-        seconds = scene_of(crash).length * crash.film.runs.trace.step
+        seconds = flat_scene_of(crash).length * crash.film.runs.trace.step
         assert sum(durations[:-1]) / 1000 == pytest.approx(seconds, abs=0.3), "it lasts as long as the drive"
     if kind == "mp4":
         assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
 
 
 def test_the_page_holds_every_place_to_the_centimetre(crash: Comparison) -> None:
-    page, scene = animation_page(scene_of(crash)), scene_of(crash)
+    page, scene = animation_page(flat_scene_of(crash)), flat_scene_of(crash)
     data = json.loads(re.search(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)[1])  # type: ignore[index]
     assert data["step"] == scene.step
     vuts = [body for body in data["bodies"] if body["drive"] is not None]
@@ -95,7 +95,7 @@ def test_the_page_holds_every_place_to_the_centimetre(crash: Comparison) -> None
 
 
 def test_text_of_a_study_stays_text(crash: Comparison) -> None:
-    page = animation_page(scene_of(dataclasses.replace(crash, title="<script>alert(1)</script></title>")))
+    page = animation_page(flat_scene_of(dataclasses.replace(crash, title="<script>alert(1)</script></title>")))
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert "http" not in page.replace("http-equiv", ""), "nothing is fetched from elsewhere"

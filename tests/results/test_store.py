@@ -25,7 +25,7 @@ from safevar_sumo.results import (
     SolutionId,
     chosen_handle,
     handles,
-    load,
+    load_runs,
     position_of,
     record,
     solutions_frame,
@@ -238,14 +238,14 @@ STORED = Path(__file__).with_name("stored")
 
 @pytest.mark.parametrize("stored", ["format-1", "format-2", "format-3"])
 def test_stored_results_are_read_as_they_were_written(stored: str) -> None:
-    result = load(STORED / stored)
+    result = load_runs(STORED / stored)
     assert result.finished == (("nsga2", 0), ("rs", 0))
     assert len(result.evaluations) == 20
     assert result.solutions.to_csv(index=False, lineterminator="\n").encode() == (STORED / stored / "solutions.csv").read_bytes()
     keys = ["algorithm", "run", *list(result.solutions.columns[2:14])]
     assert len(result.solutions.merge(result.evaluations, on=keys)) == len(result.solutions), "what is solved was evaluated"
     if stored == "format-2":
-        pd.testing.assert_frame_equal(result.evaluations, load(STORED / "format-1").evaluations)
+        pd.testing.assert_frame_equal(result.evaluations, load_runs(STORED / "format-1").evaluations)
 
 
 def test_the_format_that_is_written_now_is_stored_here() -> None:
@@ -267,7 +267,7 @@ def test_a_format_of_the_future_is_refused(tmp_path: Path) -> None:
     manifest = tmp_path / "out" / "manifest.json"
     manifest.write_text(manifest.read_text().replace(f'"format": {FORMAT}', f'"format": {FORMAT + 1}'))
     with pytest.raises(InputError, match="is not a manifest of this version of the program"):
-        load(tmp_path / "out")
+        load_runs(tmp_path / "out")
 
 
 def test_a_torn_manifest_is_called_torn(tmp_path: Path) -> None:
@@ -275,7 +275,7 @@ def test_a_torn_manifest_is_called_torn(tmp_path: Path) -> None:
     manifest = tmp_path / "out" / "manifest.json"
     manifest.write_text(text := manifest.read_text()[:300])
     with pytest.raises(InputError, match=rf"manifest\.json: is torn or was edited, line {len(text.splitlines())} is no JSON"):
-        load(tmp_path / "out")
+        load_runs(tmp_path / "out")
 
 
 def test_an_edited_manifest_is_refused_until_it_is_removed(tmp_path: Path, study: Study) -> None:

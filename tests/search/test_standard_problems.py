@@ -28,7 +28,7 @@ from safevar_sumo.metrics import SAFEVAR
 from safevar_sumo.records import Evaluations
 from safevar_sumo.search import ALGORITHMS, Problem
 from safevar_sumo.search.evolution import Individual, fitness_of
-from safevar_sumo.search.spea2 import survivors
+from safevar_sumo.search.spea2 import environmental_selection
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.search.problems import evaluated
 
@@ -183,7 +183,7 @@ def test_survivors_of_spea2_are_those_of_pymoo_on_random_fronts(hundred: int) ->
         objectives = random_front(seed)
         number = int(np.random.default_rng(seed + 10_000).integers(1, len(objectives) + 1))
         ours = individuals(objectives)
-        mine = sorted(one.fitness.values for one in survivors(ours, number))
+        mine = sorted(one.fitness.values for one in environmental_selection(ours, number))
         population = Population.new(F=objectives)
         others = SPEA2Survival().do(PymooProblem(n_obj=objectives.shape[1]), population, n_survive=number)
         assert [one.standing[0] for one in ours] == population.get("SPEA_F").tolist(), seed

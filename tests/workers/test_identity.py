@@ -10,13 +10,13 @@ import msgspec
 import pytest
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import changes, digest_of
+from safevar_sumo.plugins import changed_files, digest_of
 from safevar_sumo.results.manifest import LAYERS
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from safevar_sumo.workers.batches import sources_of
+from safevar_sumo.workers.batches import digests_of_sources
 from safevar_sumo.workers.evaluation import evaluate_batch, packed
 from safevar_sumo.workers.identity import identity_of, networks_of, powers_digest
 from tests.in_process import Here
@@ -44,7 +44,7 @@ def test_every_file_of_a_network_that_results_hang_on_counts(file: str, tmp_path
     text = (tmp_path / "mine" / file).read_text()
     (tmp_path / "mine" / file).write_text(text + "<!-- -->")
     after = networks_of(assemble(study))
-    assert changes(before, after) == [file]
+    assert changed_files(before, after) == [file]
 
 
 def test_a_network_that_changes_between_two_batches_is_noticed(tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def place(in_tmp: Path) -> Path:
 
 
 def read(place: Path) -> dict[str, str]:
-    return sources_of(load_study(place / "mine.toml"), Here())
+    return digests_of_sources(load_study(place / "mine.toml"), Here())
 
 
 def test_what_is_read_while_models_are_loaded_made_and_first_run_counts_wherever_the_command_is_started(

@@ -20,7 +20,7 @@ from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.study import ModelTable, Origin, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 from safevar_sumo.workers.evaluation import PoolLostError, WorkerLostError, packed
-from safevar_sumo.workers.interrupts import first_of, interrupts_noted, result_of
+from safevar_sumo.workers.interrupts import awaited, first_of, interrupts_noted
 from safevar_sumo.workers.local import LocalPool, local_pool
 from safevar_sumo.workers.retrying import ATTEMPTS, RetryingPool
 
@@ -99,7 +99,7 @@ def test_ctrl_c_is_raised_where_a_result_is_waited_for_and_nowhere_else() -> Non
         press()
         press()
         with pytest.raises(KeyboardInterrupt):
-            result_of(Future())
+            awaited(Future())
         press()  # while the pool is closed, say
     assert signal.getsignal(signal.SIGINT) is before
     with interrupts_noted():

@@ -122,7 +122,7 @@ class PointComparison(NamedTuple):
 def compare_at_points(system: System, original: FloatArray, settings: FloatArray, unsafe: Unsafe) -> tuple[list[PointComparison], float]:
     """Compare settings, shape (M, n), with the original, shape (1, n); also returns the time step of the simulations [s]."""
     at_points = at_every_point(system, np.concatenate([original, settings]))
-    names, worst = points_of(system, at_points, unsafe)[1:], worst_points(at_points)[1:]
+    names, worst = unsafe_points_of(system, at_points, unsafe)[1:], worst_points(at_points)[1:]
     comparisons = []
     for row, (failing, k) in enumerate(zip(names, worst.tolist(), strict=True), 1):
         at_point = at_points[k]
@@ -148,7 +148,7 @@ def compare_at_cells(evaluator: Evaluator, original: FloatArray, settings: Float
     return comparisons, step
 
 
-def points_of(system: System, at_points: list[AtPoint], unsafe: Unsafe) -> list[tuple[str, ...]]:
+def unsafe_points_of(system: System, at_points: list[AtPoint], unsafe: Unsafe) -> list[tuple[str, ...]]:
     """For every setting the names of the matrix's points at which it is unsafe; empty without a matrix."""
     if not system.matrix:
         return [() for _ in at_points[0].evaluations.settings]

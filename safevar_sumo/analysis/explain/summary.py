@@ -10,12 +10,12 @@ import pandas as pd
 
 from safevar_sumo.analysis.evaluator import Evaluator, finite_or_none
 from safevar_sumo.analysis.explain.causes import MinimalCause, minimal_causes
-from safevar_sumo.analysis.explain.compute import compare_at_points, points_in_words, points_of
+from safevar_sumo.analysis.explain.compute import compare_at_points, points_in_words, unsafe_points_of
 from safevar_sumo.analysis.explain.necessity import Robustness, robustness, smallest_robust
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, preventability
 from safevar_sumo.analysis.rating.summary import rated_lead
-from safevar_sumo.analysis.words import ENDS, changes, joined, number_of, question_command
+from safevar_sumo.analysis.words import ENDS, changes_in_words, joined, number_of, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, record
@@ -114,7 +114,7 @@ def _failing_points(study: Study, settings: FloatArray, unsafe: Unsafe) -> tuple
     if not system.matrix:
         return [""] * len(settings), ""
     at_points = at_every_point(system, settings)
-    words = [f" {points_in_words(points, len(system.matrix), limit=3)}" for points in points_of(system, at_points, unsafe)]
+    words = [f" {points_in_words(points, len(system.matrix), limit=3)}" for points in unsafe_points_of(system, at_points, unsafe)]
     return words, at_points[worst_points(at_points)[0]].point.name
 
 
@@ -125,7 +125,7 @@ def _in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
     values = {evaluator.characteristics.names[column]: float(causes[0].setting[column]) for column in causes[0].columns}
     more = len(causes) - 1
     others = f" ({number_of(more, 'alternative set')} of the same size; see explain)" if more else ""
-    return f"These changes alone cause it: {changes(evaluator.characteristics, values)}{others}."
+    return f"These changes alone cause it: {changes_in_words(evaluator.characteristics, values)}{others}."
 
 
 NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")

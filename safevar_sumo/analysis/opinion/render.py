@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 
 from safevar_sumo.analysis.opinion.result import Opinions, OpinionVerdict
-from safevar_sumo.analysis.words import changes, joined, number_of
+from safevar_sumo.analysis.words import changes_in_words, joined, number_of
 from safevar_sumo.terminal import plain, print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -17,17 +17,17 @@ def print_opinions(console: Console, result: Opinions) -> None:
     """Print how many causes are confirmed, then every cause with the reason."""
     members = CharacteristicSet.of(result.study.vehicle.characteristics)
     print_text(console, result.study.title)
-    print_text(console, f"Unsafe: {result.unsafe}. {MODEL}: {verdict(result)}")
+    print_text(console, f"Unsafe: {result.unsafe}. {MODEL}: {opinion_in_words(result)}")
     print_text(console, f"The original vehicle with our model: {result.original_here}; with the second: {result.original_there}.")
     for handle in result.without_cause:
         print_text(console, f"note: {handle} is not unsafe: it has no cause")
     for one in result.opinions:
         line = plain(f"{one.solution}: " if one.solution else "").append(str(one.opinion), STYLES[one.opinion])
-        console.print(line.append(plain(f": {changes(members, one.changes)}")), soft_wrap=True, highlight=False)
+        console.print(line.append(plain(f": {changes_in_words(members, one.changes)}")), soft_wrap=True, highlight=False)
         print_text(console, f"  with our model {one.here}; {one.because}")
 
 
-def verdict(result: Opinions) -> str:
+def opinion_in_words(result: Opinions) -> str:
     """A sentence on the number of causes with each verdict."""
     if not result.opinions:
         return "there is no cause to judge."

@@ -33,13 +33,13 @@ COLUMNS_OF_PAIRS = 4
 def print_rating(console: Console, result: Rating) -> None:
     """Print the verdict, the points of every test, the robustness layers that hold, and the tests not simulated."""
     print_text(console, result.study.title)
-    print_text(console, verdict(result))
+    print_text(console, rating_in_words(result))
     console.print(_points(result))
     console.print(_layers(result))
     print_text(console, not_simulated(result))
 
 
-def verdict(result: Rating) -> str:
+def rating_in_words(result: Rating) -> str:
     """The rating in a sentence: the points that a variant loses and in which test, or the points of the original vehicle."""
     maximum, variant = possible(result.protocol), result.variant
     if variant is None:

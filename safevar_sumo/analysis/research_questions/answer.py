@@ -8,7 +8,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from safevar_sumo.analysis.research_questions.algorithms import pairs, ranks
-from safevar_sumo.analysis.research_questions.case import NSGA2, Case, Unanswerable, counted
+from safevar_sumo.analysis.research_questions.case import NSGA2, Case, Unanswerable, solutions_counted
 from safevar_sumo.analysis.research_questions.changes import (
     collisions,
     combinations,
@@ -106,7 +106,7 @@ def _notes(question: str, case: Case) -> list[str]:
     notes = case.remarks
     if question in ("rq1", "rq2"):
         for metric in case.scoring.metrics:
-            rows = counted(case.solutions, metric)
+            rows = solutions_counted(case.solutions, metric)
             undefined = int(rows[metric.name].isna().sum())
             if undefined:
                 notes.append(f"{case.name}: {metric.name} is undefined in {undefined} of {len(rows)} solutions and omits them.")

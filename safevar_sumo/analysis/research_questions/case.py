@@ -15,7 +15,7 @@ import pandas as pd
 from safevar_sumo.errors import InputError, in_one_line
 from safevar_sumo.metrics import SAFEVAR, MetricFacts, Scoring, Unsafe
 from safevar_sumo.records import FloatArray, Outcome
-from safevar_sumo.results import MANIFEST, Failure, failure_lines, load, places_of
+from safevar_sumo.results import MANIFEST, Failure, failure_lines, load_runs, places_of
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Origin, Study, Weather, invalid, of_today
 from safevar_sumo.vehicles import CharacteristicSet
@@ -131,14 +131,14 @@ class Case:
         return lines
 
 
-def counted(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
+def solutions_counted(solutions: pd.DataFrame, metric: MetricFacts) -> pd.DataFrame:
     """The solutions that count for a metric: for TET and TIT only those without collision (method section 4)."""
     return solutions if metric.over_collisions else solutions[~collided(solutions)]
 
 
 def values(solutions: pd.DataFrame, metric: MetricFacts) -> FloatArray:
     """A metric's defined values over the solutions that count for it."""
-    column = counted(solutions, metric)[metric.name].to_numpy(dtype=float)
+    column = solutions_counted(solutions, metric)[metric.name].to_numpy(dtype=float)
     return np.asarray(column[~np.isnan(column)])
 
 
@@ -173,7 +173,7 @@ def _loaded(place: Path) -> Case:
 
 def load_case(directory: Path) -> Case:
     """Read one results directory."""
-    manifest, evaluations, solutions, finished, failures = load(directory)
+    manifest, evaluations, solutions, finished, failures = load_runs(directory)
     try:
         study = msgspec.structs.replace(msgspec.convert(of_today(manifest["study"]), Study), origin=Origin(places=places_of(directory)))
     except msgspec.ValidationError as error:

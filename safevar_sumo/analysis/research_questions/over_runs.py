@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, NSGA2, Case, Unanswerable, counted
+from safevar_sumo.analysis.research_questions.case import ALGORITHM_TITLES, NSGA2, Case, Unanswerable, solutions_counted
 from safevar_sumo.analysis.research_questions.comparisons import ALPHA, TwoSampleTest, magnitude, rq1, rq1_rows, rq2, rq2_rows
 from safevar_sumo.analysis.research_questions.indicators import titles_of
 from safevar_sumo.metrics import MetricFacts
@@ -182,7 +182,7 @@ def run_means(case: Case, algorithm: str, metric: MetricFacts) -> FloatArray:
 
 def series_of_means(case: Case, algorithm: str, metric: MetricFacts) -> pd.Series[float]:
     """The means of `run_means`, indexed by the number of the run."""
-    numbers, solutions = case.runs_of(algorithm), counted(case.solutions_of(algorithm), metric)
+    numbers, solutions = case.runs_of(algorithm), solutions_counted(case.solutions_of(algorithm), metric)
     runs, column = solutions["run"].to_numpy(), solutions[metric.name].to_numpy(dtype=float)
     defined = ~np.isnan(column)
     samples = {run: column[defined & (runs == run)] for run in numbers}
