@@ -43,7 +43,7 @@ class SolutionId(NamedTuple):
 
 
 def handles(solutions: pd.DataFrame) -> list[SolutionId]:
-    """The handle of every row of a frame of solutions, as `safevar_sumo.results.load` gives it."""
+    """The handle of every row of a frame of solutions, as `safevar_sumo.results.load_runs` gives it."""
     import pandas as pd
 
     run = solutions["run"] if "run" in solutions else pd.Series(0, index=solutions.index)

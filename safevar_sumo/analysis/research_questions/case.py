@@ -43,7 +43,7 @@ class Case:
     original
         The original vehicle's metrics by name; NaN where undefined.
     solutions, evaluations
-        Frames as `safevar_sumo.results.load` gives them.
+        Frames as `safevar_sumo.results.load_runs` gives them.
     finished
         Algorithm and number of every finished run.
     scoring
