@@ -51,6 +51,11 @@ for _constant in (ZERO, EVERYWHERE):
     _constant.flags.writeable = False
 
 
+def finite_or_none(value: float) -> float | None:
+    """A value as JSON holds it: undefined (NaN) is None."""
+    return None if np.isnan(value) else float(value)
+
+
 class Observation(NamedTuple):
     """Sensor values of N vehicles; every array has shape (N,).
 

@@ -209,8 +209,3 @@ def clopper_pearson(count: int, total: int, confidence: float = CONFIDENCE) -> t
 
     interval = scipy.stats.binomtest(count, total).proportion_ci(confidence, method="exact")
     return float(interval.low), float(interval.high)
-
-
-def finite_or_none(value: float) -> float | None:
-    """A value as JSON holds it: undefined (NaN) is None."""
-    return None if np.isnan(value) else float(value)

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import finite_or_none
 from safevar_sumo.analysis.parameters import value_of, with_values
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.matrix import evaluate, named_point
 from safevar_sumo.sumo.system import assemble

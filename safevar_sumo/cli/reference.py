@@ -40,10 +40,11 @@ from safevar_sumo.reference import (
     plot_agreement,
     read_reference,
 )
+from safevar_sumo.reference.conclusions import pair_cases
 from safevar_sumo.reference.effects import LEAST as LEAST_EFFECT
 from safevar_sumo.reference.effects import SHARE as EFFECT_SHARE
 from safevar_sumo.reference.profiles import plot_profiles
-from safevar_sumo.reference.replication import Nearness, nearness, pair_cases, replication
+from safevar_sumo.reference.replication import Nearness, nearness, replication
 from safevar_sumo.results import MANIFEST, write_imported, write_whole
 from safevar_sumo.study import SAFETY_DEGREE, Study, check_writable, load_study, study_names, write_study
 from safevar_sumo.sumo.system import assemble

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.analysis.model_spread import BAND, band_of, distance_from_original, evaluations_of_sets
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -62,7 +62,7 @@ def effect_differences(data: ReferenceData, here: Evaluations, characteristics: 
 def effects_of(data: ReferenceData, here: Evaluations, characteristics: CharacteristicSet) -> list[Effect]:
     """The effects of all characteristics, in the study's order."""
     effects = (linear_effects(data.settings, values, characteristics) for values in (data.metrics[SAFETY_DEGREE], here.f_safe))
-    return [Effect(name, *(None if np.isnan(value) else float(value) for value in pair))
+    return [Effect(name, *(finite_or_none(value) for value in pair))
             for name, *pair in zip(characteristics.names, *effects, strict=True)]
 
 

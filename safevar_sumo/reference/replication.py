@@ -25,7 +25,6 @@ from safevar_sumo.reference.conclusions import (
     Pairs,
     compared_tables,
     conclusions,
-    pair_cases,
 )
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.study import SAFETY_DEGREE
@@ -160,6 +159,3 @@ def _cell(value: object) -> str:
     if value is None or (isinstance(value, float) and pd.isna(value)):
         return "-"
     return f"{value:.3g}" if isinstance(value, float) else str(value).replace("|", r"\|").replace("\n", " ")
-
-
-__all__ = ["pair_cases", "replication"]

@@ -13,11 +13,10 @@ import numpy.typing as npt
 import scipy
 import tomli_w
 
-from safevar_sumo.analysis.evaluator import finite_or_none
 from safevar_sumo.analysis.figures import FONT, as_formula, new_figure, save
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.results import evaluation_keys, write_whole
 from safevar_sumo.study import SAFETY_DEGREE, Study, load_study, refuse_other_than_file, study_names

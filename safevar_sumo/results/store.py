@@ -13,7 +13,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import METRICS, SAFEVAR, Scoring
-from safevar_sumo.records import Evaluations
+from safevar_sumo.records import Evaluations, finite_or_none
 from safevar_sumo.results.files import (
     MANIFEST,
     RUNS,
@@ -196,5 +196,5 @@ def record(evaluations: Evaluations, row: int) -> dict[str, Any]:
         "f_safe": evaluations.f_safe[row], "f_diff": evaluations.f_diff[row]}
     return {
         "outcome": str(evaluations.outcome[row]), "collision": bool(evaluations.collided[row]),
-        **{name: None if np.isnan(value) else float(value) for name, value in numbers.items()},
+        **{name: finite_or_none(value) for name, value in numbers.items()},
         "f_num_diff": int(evaluations.f_num_diff[row])}

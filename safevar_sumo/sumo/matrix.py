@@ -15,7 +15,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.protocol import part_of
 from safevar_sumo.protocol.rater import cell_columns, in_some_cells, joined_cells
-from safevar_sumo.records import CellResults, Contact, Encounter, Evaluations, FloatArray, Outcome, SimulationRuns, Trace
+from safevar_sumo.records import CellResults, Contact, Encounter, Evaluations, FloatArray, Outcome, SimulationRuns, Trace, finite_or_none
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.euro_ncap import KMH
 from safevar_sumo.study import SAFETY_DEGREE, Study
@@ -62,7 +62,7 @@ def point_record(result: AtPoint, row: int = 0) -> dict[str, Any]:
                "warning_ttc": np.broadcast_to(result.runs.warning_ttc, relative.shape)[row]}
     side, place = (np.broadcast_to(values, relative.shape)[row] for values in result.runs.contact)
     return {"point": result.point.name, **dict(result.point.place), "outcome": str(evaluations.outcome[row]),
-            **{name: None if np.isnan(value) else float(value) for name, value in numbers.items()},
+            **{name: finite_or_none(value) for name, value in numbers.items()},
             **({"contact": {"side": str(side), "place": float(place)}} if side else {})}
 
 

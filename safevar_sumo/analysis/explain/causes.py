@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import Evaluator, finite_or_none
+from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, finite_or_none
 
 CHUNK = 20_000
 """Maximum number of subsets in memory at the same time."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import Evaluator, Progress, finite_or_none, open_evaluator, silent
+from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, silent
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.braking_comparison import BrakingComparison, compare_braking, summary_of
 from safevar_sumo.analysis.explain.causes import MinimalCause, affordable, boundaries, minimal_causes, necessary
@@ -18,7 +18,7 @@ from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles, position_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import AtPoint, at_every_point, worst_points

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Evaluator, finite_or_none
+from safevar_sumo.analysis.evaluator import Evaluator
 from safevar_sumo.analysis.explain.causes import MinimalCause, minimal_causes
 from safevar_sumo.analysis.explain.compute import compare_at_points, points_in_words, unsafe_points_of
 from safevar_sumo.analysis.explain.necessity import Robustness, robustness, smallest_robust
@@ -17,7 +17,7 @@ from safevar_sumo.analysis.preventability import Preventability, PreventableBy, 
 from safevar_sumo.analysis.rating.summary import rated_lead
 from safevar_sumo.analysis.words import ENDS, changes_in_words, joined, number_of, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
-from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome
+from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome, finite_or_none
 from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, record
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.base import pre_crash_of

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.analysis.evaluator import Progress, finite_or_none, open_evaluator, silent
+from safevar_sumo.analysis.evaluator import Progress, open_evaluator, silent
 from safevar_sumo.analysis.explain import ExplainOptions
 from safevar_sumo.analysis.explain.causes import RESOLUTION, boundaries
 from safevar_sumo.analysis.explain.compute import chosen_failures
@@ -20,7 +20,7 @@ from safevar_sumo.analysis.opinion.second_vehicle import SecondVehicle
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, finite_or_none
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble

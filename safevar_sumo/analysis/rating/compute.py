@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Evaluator, Progress, finite_or_none, open_evaluator, silent
+from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, silent
 from safevar_sumo.analysis.rating import RatingOptions
 from safevar_sumo.analysis.research_questions.case import Case
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, NOT_RED, RED, Block, Cell, Points, Protocol, points_of
 from safevar_sumo.protocol.rater import by_night, rated_study, rater_of
-from safevar_sumo.records import CellResults, FloatArray
+from safevar_sumo.records import CellResults, FloatArray, finite_or_none
 from safevar_sumo.results import SolutionId, position_of
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import Study

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from safevar_sumo.analysis.evaluator import Evaluator, Progress, clopper_pearson, finite_or_none, open_evaluator, silent
+from safevar_sumo.analysis.evaluator import Evaluator, Progress, clopper_pearson, open_evaluator, silent
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.risk.rare import (
     ENOUGH,
@@ -26,7 +26,7 @@ from safevar_sumo.analysis.risk.rare import (
 )
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, finite_or_none
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.study.variation import Correlation, Distribution, Fixed, Lognormal, Normal, Triangular, Uniform
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet

@@ -12,13 +12,13 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from safevar_sumo.analysis.evaluator import Evaluator, Progress, finite_or_none, open_evaluator, silent
+from safevar_sumo.analysis.evaluator import Evaluator, Progress, open_evaluator, silent
 from safevar_sumo.analysis.tolerance import ToleranceOptions
 from safevar_sumo.analysis.tolerance.joint import Pair, SafeBox, no_box, planes, safe_box
 from safevar_sumo.errors import InputError, unknown
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.records import Evaluations, FloatArray, Outcome, finite_or_none
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import Characteristic
 from safevar_sumo.workers.evaluation import Pool
