@@ -63,7 +63,7 @@ from safevar_sumo.workers.local import available_cores, local_pool
 @click.option("--totals", type=click.Path(path_type=Path), metavar="FILE.toml",
               help="Also save rank correlations, errors and counts of collisions there, without any row of the data.")
 @click.option("--effects", "with_effects", is_flag=True, help="Compare the characteristics' linear effects with the reference's.")
-@click.option("--spread", "with_spread", is_flag=True, help="Count the rows within the model's own uncertainty and that of repeats.")
+@click.option("--spread", "with_spread", is_flag=True, help="Count the published values within the spread of the model and of repeats.")
 def validate(study: str, reference: Path, jobs: int | None, plot: Path | None, as_json: bool, totals: Path | None,
              with_effects: bool, with_spread: bool) -> None:
     """Compare STUDY with settings and metrics in the published package's CSV format."""
@@ -118,7 +118,7 @@ def calibrate_command(study: str, others: tuple[str, ...], trials: int | None, s
     """Fit the parameters that STUDY declares under [calibration] to published values and to rows of reference files, as [fit] says.
 
     Several studies are fitted together: they share each parameter to which they give the same value, unless [calibration] marks it as
-    a study's own. A reference file belongs to the study in STUDY=FILE.csv, or else to the study whose name its own name begins with.
+    a study's own. STUDY=FILE.csv assigns a reference file to a study; otherwise the file's name must begin with the study's.
     """
     names = [study, *(word for word in others if _is_study(word))]
     files = [word for word in others if not _is_study(word)]
@@ -303,7 +303,7 @@ def _nearness(cases: Sequence[Case], references: Sequence[str]) -> list[Nearness
 
 
 def _rows_by_case(path: Path, cases: Sequence[Case]) -> dict[str, ReferenceData]:
-    """The rows of a file, for every case whose vehicle is the file's."""
+    """The rows of a file, for every case whose characteristics the file has."""
     rows: dict[str, ReferenceData] = {}
     for case in cases:
         try:
@@ -316,7 +316,7 @@ def _rows_by_case(path: Path, cases: Sequence[Case]) -> dict[str, ReferenceData]
 
 def print_agreement(console: Console, study: Study, result: Agreement) -> None:
     """Print the comparison with reference data, metric by metric."""
-    table = WholeTable("", right=("Spearman's rho", "mean abs. error", "error / repeats", "bias", "original, reference", "original, here"),
+    table = WholeTable("", right=("Spearman's rho", "mean abs. error", "error / scatter", "bias", "original, reference", "original, here"),
                        title=f"{study.title}: {result.rows} rows")
     for name in result.spearman:
         head = METRICS[name].heading
@@ -331,7 +331,7 @@ def print_agreement(console: Console, study: Study, result: Agreement) -> None:
                   f"{_number(result.collision_speed['here'])} m/s here.")
     if result.undecided["within_repeats"] is not None:
         console.print(f"Of {result.undecided['differ']} settings that collide only in the reference or only here, "
-                      f"{result.undecided['within_repeats']} may do either: their repeats differ by as much.")
+                      f"{result.undecided['within_repeats']} may do either within the scatter of repeats.")
     bins = ", ".join(f"{part['lowest']:.2f} to {part['highest']:.2f}: {part['bias']:+.2f}" for part in result.by_predicted)
     console.print(f"Mean error by the safety degree here: {bins}.", markup=False)
 
@@ -352,7 +352,7 @@ def _number(value: float | None) -> str:
 
 def print_calibration(console: Console, study: Study, result: Calibration) -> None:
     """Print the fitted values, and how well they agree with the rows used and with the rows held back."""
-    table = WholeTable("parameter", "unit", right=("fitted", "fits as well from", "to", "lower", "upper"), title=study.title)
+    table = WholeTable("parameter", "unit", right=("fitted", "equal fit from", "equal fit to", "lower", "upper"), title=study.title)
     for name, value in result.values.items():
         row = result.bounds[name]
         shared = f" (shared with {', '.join(result.together)})" if name in result.shared else ""

@@ -80,8 +80,8 @@ def subject_of(name: str, study: str | None = None) -> Subject:
     name = OBJECTIVES[name].name if name in OBJECTIVES else name
     kinds = [kind for kind, members in KINDS.items() if name in members]
     if kinds:
-        shipped = chosen or next((one for one in map(load_study, study_names()) if _named(one, kinds[0], name)), load_study("smoke"))
-        return _in_study(Subject(name, kinds[0], Member(KINDS[kinds[0]][name]), shipped))
+        study_to_try = chosen or next((one for one in map(load_study, study_names()) if _named(one, kinds[0], name)), load_study("smoke"))
+        return _in_study(Subject(name, kinds[0], Member(KINDS[kinds[0]][name]), study_to_try))
     if name.endswith(".fmu"):
         return _fmu_of(name, chosen)
     if ":" not in name:
@@ -124,7 +124,7 @@ def subjects_of(study: Study) -> Iterator[Subject]:
             if (f"{kind}.model", name) in fmus_of(study):
                 yield _fmu(study, kind, name)
                 continue
-            of_a_metric = kind == "objective" and ":" not in name and name not in CHANGES  # by the name of a metric's column
+            of_a_metric = kind == "objective" and ":" not in name and name not in CHANGES  # it names a metric, not a change
             if name in seen or of_a_metric:
                 continue
             seen.add(name)
@@ -179,7 +179,8 @@ def violation(subject: Subject) -> tuple[str, str]:
     return contract.violation(what), str(contract)
 
 
-def _refused_arguments(function: Callable[..., Any], number: int, more: int) -> str:
+def _refused_arguments(function: Callable[..., Any], passed: int, named: int) -> str:
+    """What is wrong with a step's arguments, of which `passed` come by position and `named` by name; empty if nothing is."""
     try:
         parameters = list(inspect.signature(function).parameters.values())
     except (TypeError, ValueError):
@@ -188,7 +189,7 @@ def _refused_arguments(function: Callable[..., Any], number: int, more: int) -> 
     positional = [one for one in parameters if one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD)]
     names = ", ".join(one.name for one in parameters)
     required = [one for one in positional if one.default is one.empty]
-    if many or len(positional) >= number >= len(required) - more:
+    if many or len(positional) >= passed >= len(required) - named:
         return ""
     return f"has a step that takes ({names}), not (traci, vehicle_id)"
 
@@ -241,17 +242,17 @@ def _guess(what: Any) -> tuple[dict[str, Any], str]:
 
 
 def _characteristics(units: Mapping[str, str], study: Study) -> tuple[dict[str, CharacteristicTable], str]:
-    """A domain for every characteristic, from the study or a shipped one if it has it in the same unit, else by unit; and a remark."""
+    """A domain for every characteristic, from the study, or a shipped one, if name and unit match, else by unit; and a remark."""
     rows: dict[str, CharacteristicTable] = {}
     guessed = []
-    shipped = [study, *map(load_study, study_names())]
+    studies = [study, *map(load_study, study_names())]
     for name, unit in units.items():
-        shipped_row = next((one.vehicle.characteristics[name] for one in shipped
-                            if name in one.vehicle.characteristics and one.vehicle.characteristics[name].unit == unit), None)
-        if shipped_row is None:
+        row = next((one.vehicle.characteristics[name] for one in studies
+                    if name in one.vehicle.characteristics and one.vehicle.characteristics[name].unit == unit), None)
+        if row is None:
             original, lower, upper = BY_UNIT.get(str(unit), (1.0, 0.8, 1.2))
             guessed.append(f"{name} {lower:g} to {upper:g} {unit}")
-        rows[str(name)] = shipped_row or CharacteristicTable(unit=str(unit), original=original, lower=lower, upper=upper)
+        rows[str(name)] = row or CharacteristicTable(unit=str(unit), original=original, lower=lower, upper=upper)
     note = f"no study gives domains: tried with {', '.join(guessed)}; --study STUDY names a study that does" if guessed else ""
     return rows, note
 

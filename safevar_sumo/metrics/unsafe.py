@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 EXPECTED = "collision, points=X with X points of a rating, or below=X with a safety degree X [m, or minus a collision's speed in m/s]"
 COLLISION = str(Outcome.COLLISION)
 HALF, DIGITS = 0.5, 6
-"""If nothing collides, a vehicle is unsafe below this share of the original's safety degree; significant digits of that limit."""
+"""Share of the original's safety degree below which a vehicle is unsafe if nothing collides, and significant digits of that limit."""
 LOSS, DECIMALS = 1.0, 6
 """Loss of points from which on a vehicle is unsafe in a rated study, and decimals of points."""
 
@@ -90,8 +90,8 @@ class Unsafe:
     def default(cls, original: Mapping[str, Any], outcomes: Any) -> Unsafe:
         """The criterion if none is stated.
 
-        In a rated study a vehicle is unsafe that has lost at least one of the original's points. Otherwise a collision is unsafe if any
-        vehicle collides or the original has no safety degree to halve; else a safety degree below half of the original's.
+        In a rated study a vehicle is unsafe that has lost at least one of the original's points. Otherwise the criterion is a
+        collision if any vehicle collides or the original has no safety degree to halve; else a safety degree below half of the original's.
 
         Parameters
         ----------

@@ -48,7 +48,7 @@ class StoredResults(NamedTuple):
     manifest
         The study as run, versions, seed, the original vehicle's evaluation.
     evaluations
-        One row per simulated setting of every run, in the order of the run's first requests; columns of
+        One row per simulated setting of every run, in the order first requested; columns of
         `safevar_sumo.results.evaluations_frame`, and `evaluation`, the place in that order from 0.
     solutions
         One row per solution of every finished run; the same columns except `evaluation`. Imported solutions belong to no run.
@@ -134,10 +134,10 @@ def _search_of(place: Path, manifest: Mapping[str, Any]) -> _Search:
 
 def _journals(place: Path, manifest: Mapping[str, Any], runs: Sequence[tuple[str, int]]) -> Iterator[tuple[str, int, Content | None]]:
     """Algorithm, run and journal of every run; None for a run without a journal."""
-    study = owner_digest(manifest)
+    owner = owner_digest(manifest)
     for algorithm, run in runs:
         path = journal_file(place, f"{algorithm}-{run:02d}")
-        yield algorithm, run, read_journal(path, study, path.stem) if path.exists() else None
+        yield algorithm, run, read_journal(path, owner, path.stem) if path.exists() else None
 
 
 def load_runs(directory: str | Path) -> StoredResults:

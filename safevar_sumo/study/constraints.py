@@ -20,8 +20,8 @@ LONGEST = 400
 class Constraint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A quantity of several characteristics with its bounds `at_least` and `at_most`.
 
-    The quantity is either `sum`, the characteristics in their units times these weights, or `function`, a `package.module:Name` of a
-    function from names with arrays of shape (N,) to such an array. `unit` is the unit of the quantity and its bounds: one of the
+    The quantity is either `sum`, the characteristics in their units times these weights, or `function`, `package.module:Name` of a
+    function that takes {name: array of shape (N,)} and returns such an array. `unit` is the unit of the quantity and its bounds: one of the
     characteristics', or "-"; optional if all characteristics of the sum have the same one. `meaning` explains the constraint, with its
     source.
     """
@@ -77,7 +77,7 @@ def _unit_mistakes(source: object, key: str, one: Constraint, rows: Mapping[str,
     legal = list(dict.fromkeys(["-", *(row.unit for row in rows.values())]))
     if one.unit is None and len(units) > 1:
         members = ", ".join(f"{name} [{rows[name].unit}]" for name in one.sum if name in rows)
-        yield InputError(source, f"{key}.sum adds {members}", "characteristics of one unit; or weights that convert, and the sum's unit: "
+        yield InputError(source, f"{key}.sum adds {members}", "characteristics of one unit; or converting weights, with unit = "
                          f"{one_of(legal)}")
     elif one.unit is not None and len(units) == 1 and one.unit not in (*units, "-"):
         yield InputError(source, f"{key}.unit = {one.unit!r}", f"{next(iter(units))!r}, the unit of {' and '.join(one.sum)}, or '-'")

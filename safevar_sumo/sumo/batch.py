@@ -113,7 +113,7 @@ def _simulated(system: System, settings: FloatArray, world: Any, watch: Watcher 
         world.sensors = _sensors(system, prepared, n)
     driver = system.ads.start(n, system.nominal, step)
     batch = PointBatch(system.points, world, n)
-    log = _Log(n, int(batch.last.max()) + 1, frame)
+    log = _Log(n, int(batch.last_step.max()) + 1, frame)
     verdict, robot = _Outcomes(n), DrivingRobot(system.points, vehicle, prepared, state, step)
     contacts, warnings = Contacts(n, robot.tested), _Warnings(system.ads, n)
     for sample in range(log.length):
@@ -121,7 +121,7 @@ def _simulated(system: System, settings: FloatArray, world: Any, watch: Watcher 
             watch(world)
         speed = world.speeds()
         scene = batch.scene(verdict.open)
-        active = verdict.judge(speed, scene.over, contacts.collisions(world, verdict.open, scene), last=sample >= batch.last)
+        active = verdict.judge(speed, scene.over, contacts.collisions(world, verdict.open, scene), last=sample >= batch.last_step)
         seen = batch.observe(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
         seen, state = vehicle.sense(prepared, state, seen)
         command, driver = system.ads.drive(seen, driver)

@@ -24,7 +24,7 @@ class Perception:
     """Observations of N vehicles in one weather, one step after the other."""
 
     def __init__(self, weather: Weather, step: float) -> None:
-        self._visibility, self._scenes = weather.visibility, DelayLine.by(weather.recognition_delay, step)
+        self._visibility, self._delay_line = weather.visibility, DelayLine.by(weather.recognition_delay, step)
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
         """The observation at this step; must be called in every step. An occluded obstacle is infinitely far away and still."""
@@ -32,7 +32,7 @@ class Perception:
         now[0], now[1], now[2], now[3], now[4] = scene.gap, scene.lateral, scene.lateral_speed, scene.obstacle_speed, speed
         if scene.visible is not EVERYWHERE:
             now[:-1] = np.where(scene.visible, now[:-1], HIDDEN)
-        (gap, lateral, lateral_speed, obstacle_speed, own), self._scenes = self._scenes.delayed(now)
+        (gap, lateral, lateral_speed, obstacle_speed, own), self._delay_line = self._delay_line.delayed(now)
         return Observation(time, speed, gap, own - obstacle_speed, lateral, lateral_speed, self._visibility, obstacle_speed)
 
 
@@ -40,7 +40,7 @@ R = TypeVar("R", Scene, Observation)
 
 
 class PointBatch:
-    """A batch of vehicles in equal parts, of which the k-th part is at the k-th point."""
+    """A batch of vehicles in equal parts, the k-th with the scenario and weather of the k-th point."""
 
     def __init__(self, points: Sequence[Point], world: Any, n: int) -> None:
         self._size = size = n // len(points)
@@ -52,13 +52,13 @@ class PointBatch:
         self._perceptions = [(Perception(weather, self._step), np.repeat([other == weather for other in weathers], size).nonzero()[0])
                              for k, weather in enumerate(weathers) if weather not in weathers[:k]]
         self._order = np.argsort(np.concatenate([rows for _, rows in self._perceptions]))
-        self.last = np.repeat([round(point.scenario.duration / self._step) for point in points], size)
+        self.last_step = np.repeat([round(point.scenario.duration / self._step) for point in points], size)
         self._meetings = Meetings.of([point.scenario for point in points], world, size) if self._recorded else None
         if self._meetings is None:
             self._memories = [begin(point.scenario, one) for point, one in zip(points, self._worlds, strict=True)]
 
     def scene(self, open_: BoolArray) -> Scene:
-        """The scene of all vehicles now; a recorded scene without open runs keeps its last state."""
+        """The scene of all vehicles now; a recorded scene whose vehicles have all ended stays as it is."""
         if self._meetings is not None:
             return self._meetings.scene(open_)
         for k, (point, world) in enumerate(zip(self._points, self._worlds, strict=True)):

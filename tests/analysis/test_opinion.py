@@ -224,7 +224,7 @@ def test_the_command_asks_about_the_failures_or_about_those_named(slippery: Path
 def test_a_report_has_a_badge_for_each_cause_or_says_how_to_install(slippery: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = make_report([slippery], only=["causes", "reproduce"], jobs=1)
     verdicts = re.findall(r"second vehicle model: (\w+)", page)
-    assert len(verdicts) == len(re.findall(r"<h4[^>]*>JudgedCause \d", page)) > 0
+    assert len(verdicts) == len(re.findall(r"<h4[^>]*>Cause \d", page)) > 0
     assert set(verdicts) <= {str(verdict) for verdict in OpinionVerdict}
     assert f"opinion {slippery}" in page
     monkeypatch.setitem(sys.modules, "vehiclemodels.parameters_vehicle2", None)

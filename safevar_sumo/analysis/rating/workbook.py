@@ -108,7 +108,7 @@ class Template(_Book):
                 yield test, str(sheet.cell(row, 6).value).strip(), sheet.cell(row, 7)
 
     def fill(self, rated: RatedVehicle) -> None:
-        """Fill in a vehicle's colours, the function of each row, the layers that hold or are claimed, and the predicted tests."""
+        """Fill in a vehicle's colours, the function of each row, whether layers hold (simulated or claimed), and the predicted tests."""
         for number, cell in enumerate(self.protocol.cells):
             if not cell.is_varied:
                 top, left = coordinate_to_tuple(cell.block.first)
@@ -162,7 +162,7 @@ class Preprocessed(_Book):
             if number is None:
                 raise InputError(self.source, f"sheet {name!r}, row {row}: {scenario} has no test point {point!r}", self._expected_file)
             drawn.append((sheet, columns, row, number))
-        if not columns and sheet["A2"].value != "General requirements":  # no cell is drawn for a vehicle that is red everywhere
+        if not columns and sheet["A2"].value != "General requirements":  # held by a sheet without drawn cells (all red)
             raise InputError(self.source, f"sheet {name!r} has no column 'Test point'", self._expected_file)
         return drawn
 

@@ -21,8 +21,8 @@ from safevar_sumo.vehicles import Characteristic
 SIDE = 21
 """Number of values of each of the two characteristics, evenly spaced over its domain, ends included."""
 PARTS, ROUNDS, SQUARES = 4, 4, 12
-"""Search for the nearest unsafe setting: parts into which a square's side is divided, number of such divisions (down to a 5120th of the
-domain), and maximum number of squares of a plane in each."""
+"""Search for the nearest unsafe setting: parts of a divided square's side, rounds of division (down to a 5120th of the domain), and maximum
+number of squares divided per plane and round."""
 
 _WEIGHT = np.outer(*[np.where(np.isin(np.arange(SIDE), (0, SIDE - 1)), 0.5, 1.0)] * 2)
 
@@ -36,11 +36,11 @@ class Pair:
     values
         Values of both characteristics, shape (2, SIDE), each in its unit.
     safety_degree, unsafe, valid
-        On the grid, shape (SIDE, SIDE): the first characteristic down, the second across [m, or -m/s]. A setting that is not valid could
+        On the grid [m, or -m/s], shape (SIDE, SIDE), with the first characteristic on axis 0. A setting that is not valid could
         not be simulated, or is `infeasible`, and is neither safe nor unsafe.
     nearest
-        The two values of the unsafe setting that is nearest to the original, in widths of the domains, to a 5120th of each; None if the
-        grid has none. Unsafe settings that lie only between safe values of the grid are not found.
+        The two values of the unsafe setting that is nearest to the original by distance in domain widths, exact to a 5120th of them; None
+        if the grid has none. Unsafe settings that lie only between safe values of the grid are not found.
     """
 
     characteristics: tuple[Characteristic, Characteristic]
@@ -108,27 +108,27 @@ def _nearest(evaluator: Evaluator, chosen: Sequence[tuple[int, int]], is_unsafe:
 
     plane, i, j = np.nonzero(is_unsafe)
     improve(plane, lower[plane] + np.stack([i, j], axis=1) * size[plane])
-    square_of, i, j = np.nonzero(_with_unsafe_corner(is_unsafe))  # the plane of every square, shape (K,)
-    corner = lower[square_of] + np.stack([i, j], axis=1) * size[square_of]  # its lower corner, shape (K, 2)
+    plane_of, i, j = np.nonzero(_with_unsafe_corner(is_unsafe))  # the plane of every square, shape (K,)
+    corner = lower[plane_of] + np.stack([i, j], axis=1) * size[plane_of]  # its lower corner, shape (K, 2)
     steps = np.stack(np.meshgrid(np.arange(PARTS + 1), np.arange(PARTS + 1), indexing="ij"), axis=-1).reshape(-1, 2)
     for _ in range(ROUNDS):
-        beyond = corner - original[square_of]
-        gap = np.maximum(np.maximum(beyond, -beyond - size[square_of]), 0.0)
-        bound = np.sqrt(np.sum((gap / width[square_of]) ** 2, axis=1))
-        rows = np.flatnonzero(bound < best[square_of])
-        groups = [rows[square_of[rows] == k] for k in np.unique(square_of[rows])]
+        beyond = corner - original[plane_of]
+        gap = np.maximum(np.maximum(beyond, -beyond - size[plane_of]), 0.0)
+        bound = np.sqrt(np.sum((gap / width[plane_of]) ** 2, axis=1))
+        rows = np.flatnonzero(bound < best[plane_of])
+        groups = [rows[plane_of[rows] == k] for k in np.unique(plane_of[rows])]
         kept = np.array([row for group in groups for row in group[np.argsort(bound[group], kind="stable")[:SQUARES]]], dtype=np.intp)
         if not len(kept):
             break
-        square_of, corner, size = square_of[kept], corner[kept], size / PARTS
-        plane = np.repeat(square_of, len(steps))
+        plane_of, corner, size = plane_of[kept], corner[kept], size / PARTS
+        plane = np.repeat(plane_of, len(steps))
         values = np.minimum(np.repeat(corner, len(steps), axis=0) + np.tile(steps, (len(kept), 1)) * size[plane], (lower + width)[plane])
         settings = np.tile(members.original, (len(values), 1))
         np.put_along_axis(settings, columns[plane], values, axis=1)
         hits = unsafe.of(evaluator.evaluate(settings, "nearest unsafe settings"))
         improve(plane[hits], values[hits])
         square, i, j = np.nonzero(_with_unsafe_corner(hits.reshape(len(kept), PARTS + 1, PARTS + 1)))
-        square_of, corner = square_of[square], corner[square] + np.stack([i, j], axis=1) * size[square_of[square]]
+        plane_of, corner = plane_of[square], corner[square] + np.stack([i, j], axis=1) * size[plane_of[square]]
     return {int(k): (float(place[k, 0]), float(place[k, 1])) for k in np.flatnonzero(np.isfinite(best))}
 
 
@@ -140,7 +140,7 @@ def _with_unsafe_corner(grids: BoolArray) -> BoolArray:
 UNSAFE_AT_MOST = 0.003
 """Share of a box that may be unsafe, with 95 % confidence, if every sampled setting is safe."""
 PROBE, SEARCHED = 256, 1024
-"""Number of Sobol points, and of corners, that search a box for unsafe settings: at first, and again if the first search finds none."""
+"""Number of Sobol points, and of corners, in the first search of a box, and in the second if the first has nothing unsafe."""
 FOLLOWED = 16
 """Number of unsafe settings, the nearest ones, that are followed back towards the original."""
 STEP_BACK = 0.999

@@ -47,12 +47,12 @@ def print_tolerance(console: Console, result: Tolerance) -> None:
 
 def first_losses(scan: OneAtATimeScan) -> str:
     """A sentence on the values at which a characteristic alone costs points."""
-    member, anything, point = scan.characteristic, scan.first_loss(), scan.first_loss(ALMOST_ONE)
-    if anything is None:
+    member, any_loss, whole_point = scan.characteristic, scan.first_loss(), scan.first_loss(ALMOST_ONE)
+    if any_loss is None:
         return f"{member.name}: costs no points anywhere in its domain."
     least = min(kept for _, kept in scan.points or [])
-    first = "; it never costs a whole point" if point is None else f"; the first point is lost at {point:.5g}{member.suffix}"
-    return f"{member.name}: points are lost from {anything:.5g}{member.suffix} on{first}; the fewest are {least:.2f}."
+    first = "; it never costs a whole point" if whole_point is None else f"; the first point is lost at {whole_point:.5g}{member.suffix}"
+    return f"{member.name}: points are lost from {any_loss:.5g}{member.suffix} on{first}; the fewest are {least:.2f}."
 
 
 def _together(result: Tolerance) -> str:
