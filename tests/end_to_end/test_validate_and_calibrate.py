@@ -77,7 +77,7 @@ def test_calibrate_finds_back_what_was_changed(data: Path, in_tmp: Path) -> None
     assert abs(result["ads"]["parameters"]["brake_gap"] - truth) < 0.5 * abs(8.0 - truth)
     assert "held back" in done.stdout
     head = Path("found.toml").read_text().split("\n\n")[0]
-    for word in ("CMA-ES", "seed 3", "mine.csv, SHA-256", "Cost"):
+    for word in ("CMA-ES", "seed 3", "mine.csv, SHA-256", "Loss"):
         assert word in head
     assert load_study("found.toml").vehicle.characteristics == load_study("mine.toml").vehicle.characteristics
     contents = set()
