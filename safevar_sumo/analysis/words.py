@@ -17,8 +17,8 @@ ENDS = {
 """How a run ended, as the verb of a sentence; a collision is described by its speed instead."""
 
 
-def changes_in_words(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
-    """The changed ones of some values, in the study's order, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
+def list_of_changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
+    """The values that differ from the original, in the study's order, such as `mass 2404 -> 2600 kg (+8.2 %)`."""
     changed = [(member, values[member.name]) for member in characteristics if values.get(member.name, member.original) != member.original]
     return ", ".join(f"{member.name} {member.original:g} -> {member.text(value)}{member.suffix} "
                      f"({(value - member.original) / abs(member.original):+.1%})" for member, value in changed) or "no change at all"

@@ -195,7 +195,7 @@ def _fail(message: str, code: int) -> None:
 
 
 def _leave(code: int) -> NoReturn:
-    """End the program even if user code has left threads running; the interpreter ends those of executors by itself."""
+    """End the program even if user code has left threads running. Threads of executors end after their task, for which Python waits."""
     running = [thread.name for thread in threading.enumerate()
                if thread is not threading.current_thread() and not thread.daemon and thread not in _threads_queues]
     if running:

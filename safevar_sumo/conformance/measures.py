@@ -11,7 +11,7 @@ import numpy as np
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.conformance.models import AdsProbe, StudyProbe, VehicleProbe
-from safevar_sumo.conformance.probe import Outputs, Probe, Response, Rows, corners, cost_of, guard_of, loaded_again, timed
+from safevar_sumo.conformance.probe import NoReaction, Outputs, Probe, Rows, corners, cost_of, guard_of, loaded_again, timed
 from safevar_sumo.conformance.subject import Subject
 from safevar_sumo.metrics import METRICS, foreign_metric
 from safevar_sumo.plugins import Lookup, forget_foreign, instance_of
@@ -45,12 +45,12 @@ class MetricProbe(Probe):
         with np.errstate(all="ignore"):
             return {"values": model(runs, self.subject.study.metrics)}
 
-    def reactions(self, model: Any, outputs: Outputs) -> Iterator[Response]:
+    def reactions(self, model: Any, outputs: Outputs) -> Iterator[NoReaction]:
         values = outputs["values"]
         if np.isnan(values).all():
-            yield Response((), "a number for some drive", f"NaN for all of {self.number} drives")
+            yield NoReaction((), "a number for some drive", f"NaN for all of {self.number} drives")
         elif not np.isnan(values).any() and np.ptp(values) == 0 and values[0] != 0:
-            yield Response((), "other values for other drives", f"{values[0]:g} for all of {self.number} drives")
+            yield NoReaction((), "other values for other drives", f"{values[0]:g} for all of {self.number} drives")
 
     def cost(self, model: Any, seconds: float) -> tuple[float, str]:
         ours = timed(lambda: METRICS["tet"](self._runs, self.subject.study.metrics))
@@ -101,10 +101,10 @@ class ObjectiveProbe(Probe):
     def run(self, model: Any, rows: Rows) -> Outputs:
         return {"values": model.function(self._settings[rows], self._members)}
 
-    def reactions(self, model: Any, outputs: Outputs) -> Iterator[Response]:
+    def reactions(self, model: Any, outputs: Outputs) -> Iterator[NoReaction]:
         values = outputs["values"]
         if np.ptp(values) == 0:
-            yield Response((), "other values at the corners of the domains than at the original", f"{values[0]:g} everywhere")
+            yield NoReaction((), "other values at the corners of the domains than at the original", f"{values[0]:g} everywhere")
 
 
 class AlgorithmProbe(Probe):
@@ -168,12 +168,12 @@ class AlgorithmProbe(Probe):
             collision_speed=np.where(collided, -degree, np.nan), f_diff=members.largest_change(settings),
             f_num_diff=members.number_changed(settings))
 
-    def reactions(self, model: Any, outputs: Outputs) -> Iterator[Response]:
+    def reactions(self, model: Any, outputs: Outputs) -> Iterator[NoReaction]:
         other = self.run(model, np.arange(1), seed=2)
         if np.array_equal(outputs["settings requested"], other["settings requested"]):
-            yield Response(("search",), "other settings with other random numbers `rng`", "the same settings in every run")
+            yield NoReaction(("search",), "other settings with other random numbers `rng`", "the same settings in every run")
         if not outputs["settings returned"].size:
-            yield Response(("search",), "a result: settings that the run was sent evaluations of",
+            yield NoReaction(("search",), "a result: settings that the run was sent evaluations of",
                            f"nothing, after {len(outputs['settings requested'])} evaluations")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from safevar_sumo.ads import Ads, GuardedAds
 from safevar_sumo.ads.aeb import Aeb
-from safevar_sumo.conformance.probe import Outputs, Probe, Response, Rows, corners, cost_of, guard_of, timed
+from safevar_sumo.conformance.probe import NoReaction, Outputs, Probe, Rows, corners, cost_of, guard_of, timed
 from safevar_sumo.conformance.subject import Subject
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 from safevar_sumo.sumo import Engine, reason_for_sumo
@@ -87,13 +87,13 @@ class AdsProbe(Probe):
             pedals[:, step] = command.throttle, command.brake
         return {"throttle": pedals[0], "brake": pedals[1]}
 
-    def reactions(self, model: Ads, outputs: Outputs) -> Iterator[Response]:
+    def reactions(self, model: Ads, outputs: Outputs) -> Iterator[NoReaction]:
         brake, throttle = outputs["brake"], outputs["throttle"]
         if not brake[:, COURSE].any():
-            yield Response(("drive",), "a brake pedal above 0 at some time before an obstacle that stands in its way",
+            yield NoReaction(("drive",), "a brake pedal above 0 at some time before an obstacle that stands in its way",
                            f"never brakes, at 5 to 25 m/s with {STEPS * STEP:g} s to look on")
         elif np.ptp(brake[:, 1]) == 0 and all(np.array_equal(pedal[:, 1], pedal[:, FREE]) for pedal in (throttle, brake)):
-            yield Response(("drive",), "other pedals before an obstacle than on a free road", "the same with an obstacle and without")
+            yield NoReaction(("drive",), "other pedals before an obstacle than on a free road", "the same with an obstacle and without")
 
     def cost(self, model: Ads, seconds: float) -> tuple[float, str]:
         return cost_of(seconds, timed(lambda: self.run(Aeb(), np.arange(self.number))), "aeb", self.number, STEPS)
@@ -149,18 +149,18 @@ class VehicleProbe(Probe):
                 outputs.setdefault(f"{name} sensed", []).append(getattr(sensed, name))
         return state
 
-    def reactions(self, model: Any, outputs: Outputs) -> Iterator[Response]:
+    def reactions(self, model: Any, outputs: Outputs) -> Iterator[NoReaction]:
         start = 5 if model.can_start_moving else 0
         speed, braked = outputs["speed"][start:, 0], start + sum(steps for *_, steps in self.PHASES[:5])
         fastest = outputs["speed"][start + self.PHASES[0][2] - 1, 0]
         if not fastest > 0:
-            yield Response(("advance",), "a speed above 0 after 4 s of full throttle", f"the original vehicle goes {fastest:g} m/s")
+            yield NoReaction(("advance",), "a speed above 0 after 4 s of full throttle", f"the original vehicle goes {fastest:g} m/s")
         elif not speed[braked - start + self.PHASES[5][2] - 1] < speed[braked - start - 1]:
-            yield Response(("advance",), "a lower speed after 3 s of full brake", "the original vehicle does not slow down")
+            yield NoReaction(("advance",), "a lower speed after 3 s of full brake", "the original vehicle does not slow down")
         for column, name in enumerate(self._members.names):
             lower, upper = 5 + 2 * column, 6 + 2 * column
             if all(np.array_equal(values[..., lower], values[..., upper]) for values in outputs.values()):
-                yield Response(("prepare", "advance"), f"another drive, type or observation at the two ends of {name}",
+                yield NoReaction(("prepare", "advance"), f"another drive, type or observation at the two ends of {name}",
                                f"{name} = {self.settings[lower, column]:g} and {self.settings[upper, column]:g} are the same to the bit")
 
     def cost(self, model: Any, seconds: float) -> tuple[float, str]:
@@ -200,7 +200,7 @@ class StudyProbe(Probe):
         evaluations = evaluate(model, self.settings[rows])
         return {"outcome": evaluations.outcome, "collision_speed": evaluations.collision_speed, **evaluations.metrics}
 
-    def reactions(self, model: System, outputs: Outputs) -> Iterator[Response]:
+    def reactions(self, model: System, outputs: Outputs) -> Iterator[NoReaction]:
         if self.subject.kind not in ("scenario", "traci"):
             return
         runs = drive_all(replace(model, matrix=()), self.settings[:1])
@@ -208,26 +208,26 @@ class StudyProbe(Probe):
         near = np.isfinite(gap)
         if self.subject.kind == "traci":
             if outputs["outcome"][0] == "never-moved":
-                yield Response(("step",), "a command to move: setSpeed, slowDown or setAcceleration", "the vehicle never moves")
+                yield NoReaction(("step",), "a command to move: setSpeed, slowDown or setAcceleration", "the vehicle never moves")
             elif outputs["outcome"][0] == "collision" and not runs.trace.brake.any():
-                yield Response(("step",), "a brake pedal above 0 at some time before somebody in its way", "never brakes, and collides")
+                yield NoReaction(("step",), "a brake pedal above 0 at some time before somebody in its way", "never brakes, and collides")
             return
         if not near.any():
-            yield Response(("observe",), "a finite gap to somebody at some time", "a gap that is infinite all the time")
+            yield NoReaction(("observe",), "a finite gap to somebody at some time", "a gap that is infinite all the time")
         elif speed.max() > 1 and np.ptp(gap[near]) == 0:
-            yield Response(("observe",), "a gap that shrinks as the vehicle drives", f"a gap of {gap[near][0]:g} m all the time")
+            yield NoReaction(("observe",), "a gap that shrinks as the vehicle drives", f"a gap of {gap[near][0]:g} m all the time")
         elif not (runs.encounter.in_conflict & runs.trace.active).any():
-            yield Response(("encounter",), "in_conflict true at some time, so that metrics are defined", "in_conflict is always false")
+            yield NoReaction(("encounter",), "in_conflict true at some time, so that metrics are defined", "in_conflict is always false")
         if not reason_for_sumo(model) and not self.subject.is_ours:
             yield from self._reacting_actors(model, outputs)
 
-    def _reacting_actors(self, model: System, outputs: Outputs) -> Iterator[Response]:
+    def _reacting_actors(self, model: System, outputs: Outputs) -> Iterator[NoReaction]:
         """Actors that react although the scenario says that they do not: SUMO itself then gives other results."""
         in_sumo = evaluate(model, self.settings, Engine.LIBSUMO)
         for name, values in {"outcome": in_sumo.outcome, **in_sumo.metrics}.items():
             if not (np.array_equal(outputs[name], values) if values.dtype.kind == "U" else
                     np.allclose(outputs[name], values, rtol=0, atol=1e-9, equal_nan=True)):
-                yield Response(("observe",), "reactive_actors = True where somebody reacts to the vehicle under test",
+                yield NoReaction(("observe",), "reactive_actors = True where somebody reacts to the vehicle under test",
                                f"{name} is {outputs[name][0]} in the recorded scene and {values[0]} in SUMO")
                 return
 

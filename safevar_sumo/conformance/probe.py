@@ -26,7 +26,7 @@ POINTS = 2
 """Number of points of a matrix at which a study is tried."""
 
 
-class Response(NamedTuple):
+class NoReaction(NamedTuple):
     """A missing reaction of a subject; `methods` are those that should react."""
 
     methods: tuple[str, ...]
@@ -61,7 +61,7 @@ class Probe(ABC):
         """The same results again, from a subject that has run before."""
         return self.run(model, rows)
 
-    def reactions(self, model: Any, outputs: Outputs) -> Iterator[Response]:
+    def reactions(self, model: Any, outputs: Outputs) -> Iterator[NoReaction]:
         """The reactions that are missing."""
         yield from ()
 

@@ -213,7 +213,7 @@ def tournament(population: list[Individual], size: int = 2) -> Individual:
     return best
 
 
-def evaluations_of(individuals: Sequence[Individual], problem: Problem) -> Evaluations:
+def joined_evaluations(individuals: Sequence[Individual], problem: Problem) -> Evaluations:
     """The evaluations of individuals."""
     rows = [evaluations.take([row]) for evaluations, row in (individual.evaluation for individual in individuals)]
     return Evaluations.concatenate(rows) if rows else problem.original.take([])

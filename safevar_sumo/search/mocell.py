@@ -16,8 +16,8 @@ from safevar_sumo.search.evolution import (
     Operators,
     Size,
     Variation,
-    evaluations_of,
     initial_population,
+    joined_evaluations,
     set_standings,
     simulated,
 )
@@ -87,7 +87,7 @@ class MoCell(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
             generation = zip(cells, offspring, neighbourhoods, strict=False)  # the last generation may be incomplete
             cells[:len(offspring)] = [survivor(cell, child, mates) for cell, child, mates in generation]
             archive = updated_archive(archive, offspring, size)
-        return evaluations_of(archive, problem)
+        return joined_evaluations(archive, problem)
 
     def _neighbours(self, population: int) -> list[list[int]]:
         """Indices of each cell and its neighbours, without repetition."""

@@ -9,9 +9,9 @@ from safevar_sumo.search.evolution import (
     Individual,
     Operators,
     Variation,
-    evaluations_of,
     fronts,
     initial_population,
+    joined_evaluations,
     simulated,
     stand_in_front,
 )
@@ -32,7 +32,7 @@ class Nsga2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
             used += yield from simulated(offspring, problem)
             population = survivors(population + [individual for individual in offspring if not individual.failed], problem.population)
             offspring = variation.offspring(population, min(problem.population, problem.evaluations - used))
-        return evaluations_of([best for best in population if best.standing[0] == 0], problem)
+        return joined_evaluations([best for best in population if best.standing[0] == 0], problem)
 
 
 def survivors(individuals: list[Individual], number: int) -> list[Individual]:

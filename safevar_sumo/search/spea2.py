@@ -11,8 +11,8 @@ from safevar_sumo.search.evolution import (
     Operators,
     Size,
     Variation,
-    evaluations_of,
     initial_population,
+    joined_evaluations,
     objectives_of,
     simulated,
 )
@@ -50,7 +50,7 @@ class Spea2(Operators, frozen=True, kw_only=True, forbid_unknown_fields=True):
             good = [individual for individual in offspring if not individual.failed]
             archive = environmental_selection(archive + good, size, normalised=self.normalised)
             offspring = variation.distinct_offspring(archive, min(problem.population, problem.evaluations - used))
-        return evaluations_of([best for best in archive if best.standing[0] < 1], problem)
+        return joined_evaluations([best for best in archive if best.standing[0] < 1], problem)
 
 
 def environmental_selection(individuals: list[Individual], number: int, *, normalised: bool = False) -> list[Individual]:

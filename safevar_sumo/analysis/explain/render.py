@@ -15,7 +15,7 @@ from safevar_sumo.analysis.explain.compute import points_in_words
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST, Cause, Explained, Explanation
 from safevar_sumo.analysis.explain.summary import LABELS, DescribedFailure, in_short
 from safevar_sumo.analysis.figures import CHANGED, FONT, INVOLVED, NECESSARY, literal, new_figure
-from safevar_sumo.analysis.words import changes_in_words, decimal, number_of, question_command, simulate_command
+from safevar_sumo.analysis.words import decimal, list_of_changes, number_of, question_command, simulate_command
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import WholeTable, print_constraints, print_meanings, print_text
@@ -117,7 +117,7 @@ def _print_one(console: Console, command_for: CommandFor, failure: Explanation, 
     title = f"{', '.join(LABELS.get(reason, reason) for reason in failure.reasons)}: {failure.handle or 'a sampled setting'}"
     console.rule(escape(title), align="left")
     ends = f"{failure.outcome}, SD {decimal(failure.safety_degree)} with {number_of(len(failure.changed), 'change')}"
-    print_text(console, f"{ends}: {changes_in_words(members, failure.setting)}")
+    print_text(console, f"{ends}: {list_of_changes(members, failure.setting)}")
     if not failure.causes:
         print_text(console, "It is not unsafe.")
     for cause in failure.causes[:CAUSES_SHOWN]:
@@ -146,7 +146,7 @@ def _print_cause(console: Console, command_for: CommandFor, cause: Cause, member
     if not cause.changes:
         print_text(console, "No change is needed: the original vehicle itself is unsafe.")
         return
-    print_text(console, f"Minimal cause: {changes_in_words(members, cause.changes)}: {cause.outcome}, SD {decimal(cause.safety_degree)}")
+    print_text(console, f"Minimal cause: {list_of_changes(members, cause.changes)}: {cause.outcome}, SD {decimal(cause.safety_degree)}")
     table = WholeTable("characteristic", "unit", right=("original", "here", "limit (all scaled)", "limit (this one only)"))
     for member in members:
         if member.name in cause.changes:

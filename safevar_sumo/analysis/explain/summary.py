@@ -15,7 +15,7 @@ from safevar_sumo.analysis.explain.necessity import Robustness, robustness, smal
 from safevar_sumo.analysis.explain.result import REASONS, ROBUST
 from safevar_sumo.analysis.preventability import Preventability, PreventableBy, preventability
 from safevar_sumo.analysis.rating.summary import rated_lead
-from safevar_sumo.analysis.words import ENDS, changes_in_words, joined, number_of, question_command
+from safevar_sumo.analysis.words import ENDS, joined, list_of_changes, number_of, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, Outcome, finite_or_none
 from safevar_sumo.results import CHOICES, chosen_handle, handles, position_of, record
@@ -125,7 +125,7 @@ def _in_words(evaluator: Evaluator, causes: list[MinimalCause]) -> str:
     values = {evaluator.characteristics.names[column]: float(causes[0].setting[column]) for column in causes[0].columns}
     more = len(causes) - 1
     others = f" ({number_of(more, 'alternative set')} of the same size; see explain)" if more else ""
-    return f"These changes alone cause it: {changes_in_words(evaluator.characteristics, values)}{others}."
+    return f"These changes alone cause it: {list_of_changes(evaluator.characteristics, values)}{others}."
 
 
 NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")

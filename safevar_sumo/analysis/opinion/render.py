@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 
 from safevar_sumo.analysis.opinion.result import Opinions, OpinionVerdict
-from safevar_sumo.analysis.words import changes_in_words, joined, number_of
+from safevar_sumo.analysis.words import joined, list_of_changes, number_of
 from safevar_sumo.terminal import plain, print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -23,7 +23,7 @@ def print_opinions(console: Console, result: Opinions) -> None:
         print_text(console, f"note: {handle} is not unsafe: it has no cause")
     for one in result.opinions:
         line = plain(f"{one.solution}: " if one.solution else "").append(str(one.opinion), STYLES[one.opinion])
-        console.print(line.append(plain(f": {changes_in_words(members, one.changes)}")), soft_wrap=True, highlight=False)
+        console.print(line.append(plain(f": {list_of_changes(members, one.changes)}")), soft_wrap=True, highlight=False)
         print_text(console, f"  with our model {one.here}; {one.because}")
 
 

@@ -6,7 +6,7 @@ from shlex import quote
 
 import pandas as pd
 
-from safevar_sumo.analysis.words import changes_in_words, number_of, question_command
+from safevar_sumo.analysis.words import list_of_changes, number_of, question_command
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import chosen_handle, position_of, record
@@ -36,6 +36,6 @@ def rated_lead(study: Study, solutions: pd.DataFrame, original: Evaluations, pla
         handle = chosen_handle(solutions, unsafe, choice, study.name)
         row = solutions.iloc[position_of(solutions, handle)]
         setting = {one: float(row[one]) for one in characteristics.names}
-        lines.append(f"{title}: {handle} loses {points - row[name]:.2f} points with {changes_in_words(characteristics, setting)}.")
+        lines.append(f"{title}: {handle} loses {points - row[name]:.2f} points with {list_of_changes(characteristics, setting)}.")
     return [*lines, f"Which cells turn: {question_command('rating', place)} --solution {quote(str(handle))} --matrix; which changes do it: "
                     f"{question_command('explain', place)}"]
