@@ -16,7 +16,7 @@ from safevar_sumo.analysis.parameters import value_of, with_values
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.effects import error_beyond_spread
-from safevar_sumo.reference.fit import MAX_LOSS, Together, TrialSearch, original_loss, reference_loss
+from safevar_sumo.reference.fit import MAX_LOSS, ReferenceLoss, Together, TrialSearch, original_loss
 from safevar_sumo.reference.parameters import Free, free_parameters
 from safevar_sumo.reference.profiles import Profiles
 from safevar_sumo.reference.rows import COLUMNS, ReferenceData
@@ -283,7 +283,8 @@ class _Fitted:
     """A study to fit, and the data to fit it to."""
 
     def __init__(self, study: Study, references: Mapping[str, ReferenceData], pool: Pool) -> None:
-        self.study, self._references = study, references
+        self.study = study
+        self._references = [(len(data.settings), ReferenceLoss(data, study)) for data in references.values()]
         self._characteristics = CharacteristicSet.of(study.vehicle.characteristics)
         self._inputs, self._pool = inputs_of(study, pool), RetryingPool(pool, study)
         settings = [self._characteristics.original[np.newaxis], *(data.settings for data in references.values())]
@@ -302,10 +303,9 @@ class _Fitted:
         evaluations = unique.take(self._row_of.ravel())
         loss = original_loss(evaluations.take([0]), self.study.published, self.study.fit)
         row = 1
-        for data in self._references.values():
-            here = evaluations.take(np.arange(row, row + len(data.settings)))
-            loss += reference_loss(agreement(data, here, self.study, here), data, here, self.study) / len(self._references)
-            row += len(data.settings)
+        for rows, reference_loss in self._references:
+            loss += reference_loss.of(evaluations.take(np.arange(row, row + rows))) / len(self._references)
+            row += rows
         return loss
 
 

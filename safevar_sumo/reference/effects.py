@@ -35,33 +35,44 @@ class Effect(NamedTuple):
         return abs(self.here - self.reference) <= max(LEAST, SHARE * abs(self.reference))
 
 
-def linear_effects(settings: FloatArray, safety_degree: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
-    """Slopes of a linear regression on all characteristics, times the widths of their domains; shape (n,) [m]; NaN if undefined."""
-    width = characteristics.upper - characteristics.lower
-    defined = np.isfinite(safety_degree)
-    shares = (settings[defined] - characteristics.original) / width
-    varies = _varies(shares)
-    design = np.column_stack([np.ones(len(shares)), shares[:, varies]])
-    effects = np.full(len(characteristics), np.nan)
-    if len(shares) >= ROWS_EACH * design.shape[1]:
-        effects[varies] = np.linalg.lstsq(design, safety_degree[defined], rcond=None)[0][1:]
-    return effects
+class Regression(NamedTuple):
+    """Linear regression of values on all characteristics, for the same settings each time.
 
+    `shares` are the settings' differences from the original in widths of the domains, shape (rows, n); `varies` tells which
+    characteristics vary, shape (n,); `slopes_of` maps values to the slopes of those, shape (k, rows), None for too few rows.
+    """
 
-def _varies(shares: FloatArray) -> BoolArray:
-    return np.asarray(np.ptp(shares, axis=0) > 0) if len(shares) else np.zeros(shares.shape[1], dtype=bool)
+    shares: FloatArray
+    varies: BoolArray
+    slopes_of: FloatArray | None
 
+    @classmethod
+    def over(cls, settings: FloatArray, characteristics: CharacteristicSet) -> Regression:
+        """The regression for settings, shape (rows, n)."""
+        return cls._on((settings - characteristics.original) / (characteristics.upper - characteristics.lower))
 
-def effect_differences(data: ReferenceData, here: Evaluations, characteristics: CharacteristicSet) -> FloatArray:
-    """Effects here minus those in the reference [m]; zero where they are undefined."""
-    published, simulated = (linear_effects(data.settings, values, characteristics)
-                            for values in (data.metrics[SAFETY_DEGREE], here.f_safe))
-    return np.nan_to_num(simulated - published)
+    @classmethod
+    def _on(cls, shares: FloatArray) -> Regression:
+        varies = np.asarray(np.ptp(shares, axis=0) > 0) if len(shares) else np.zeros(shares.shape[1], dtype=bool)
+        design = np.column_stack([np.ones(len(shares)), shares[:, varies]])
+        enough = len(shares) >= ROWS_EACH * design.shape[1]
+        return cls(shares, varies, np.linalg.pinv(design)[1:] if enough else None)
+
+    def effects(self, values: FloatArray) -> FloatArray:
+        """Slopes over the whole domains, shape (n,), in the unit of `values`, shape (rows,); NaN if undefined."""
+        defined = np.isfinite(values)
+        if not defined.all():
+            return Regression._on(self.shares[defined]).effects(values[defined])
+        effects = np.full(len(self.varies), np.nan)
+        if self.slopes_of is not None:
+            effects[self.varies] = self.slopes_of @ values
+        return effects
 
 
 def effects_of(data: ReferenceData, here: Evaluations, characteristics: CharacteristicSet) -> list[Effect]:
     """The effects of all characteristics, in the study's order."""
-    effects = (linear_effects(data.settings, values, characteristics) for values in (data.metrics[SAFETY_DEGREE], here.f_safe))
+    regression = Regression.over(data.settings, characteristics)
+    effects = (regression.effects(values) for values in (data.metrics[SAFETY_DEGREE], here.f_safe))
     return [Effect(name, *(finite_or_none(value) for value in pair))
             for name, *pair in zip(characteristics.names, *effects, strict=True)]
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.reference.effects import effect_differences
+from safevar_sumo.reference.effects import Regression
 from safevar_sumo.reference.rows import ReferenceData
-from safevar_sumo.reference.validation import Agreement
+from safevar_sumo.reference.validation import agreement
 from safevar_sumo.study import SAFETY_DEGREE, FitTable, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -38,25 +38,34 @@ def _huber(deviation: float, tolerance: float) -> float:
     return x * x if x <= 1 else 2 * x - 1
 
 
-def reference_loss(result: Agreement, data: ReferenceData, here: Evaluations, study: Study) -> float:
-    """The loss by missing rank correlation and absolute errors, weighted by metric, of differing effects and of differing collisions.
+class ReferenceLoss:
+    """The loss of a study beside one reference: missing rank correlation and absolute errors, weighted by metric, differing effects, and
+    differing collisions.
 
     Errors are in standard deviations of repeats of one setting in the reference, or, if unknown, of the reference's values.
     """
-    fit, loss = study.fit, 0.0
-    for name, weight in fit.weights.items():
-        values = data.metrics[name][~np.isnan(data.metrics[name])]
-        if not values.size or np.ptp(values) == 0:
-            continue
-        rho, error = result.spearman[name], result.mean_absolute_error[name]
-        unit = study.repeatability.get(name) or float(np.std(values))
-        loss += weight * (fit.rank * (1 - (rho or 0.0)) + (np.inf if error is None else error) / unit)
-        if name == SAFETY_DEGREE and fit.effects:
-            differences = effect_differences(data, here, CharacteristicSet.of(study.vehicle.characteristics))
-            loss += fit.effects * float(np.mean(np.abs(differences))) / unit
-    collisions = result.collisions
-    differing = collisions["reference"] + collisions["here"] - 2 * collisions["both"]
-    return min(loss, MAX_LOSS) + fit.collisions * differing / max(result.rows, 1)
+
+    def __init__(self, data: ReferenceData, study: Study) -> None:
+        self._data, self._study, self._units = data, study, dict[str, float]()
+        for name in study.fit.weights:
+            values = data.metrics[name][~np.isnan(data.metrics[name])]
+            if values.size and np.ptp(values) > 0:
+                self._units[name] = study.repeatability.get(name) or float(np.std(values))
+        self._regression = Regression.over(data.settings, CharacteristicSet.of(study.vehicle.characteristics))
+        self._effects = self._regression.effects(data.metrics[SAFETY_DEGREE])
+
+    def of(self, here: Evaluations) -> float:
+        """The loss of evaluations of the reference's settings."""
+        fit, loss, result = self._study.fit, 0.0, agreement(self._data, here, self._study, here)
+        for name, unit in self._units.items():
+            rho, error = result.spearman[name], result.mean_absolute_error[name]
+            loss += fit.weights[name] * (fit.rank * (1 - (rho or 0.0)) + (np.inf if error is None else error) / unit)
+            if name == SAFETY_DEGREE and fit.effects:
+                differences = np.nan_to_num(self._regression.effects(here.f_safe) - self._effects)
+                loss += fit.effects * float(np.mean(np.abs(differences))) / unit
+        collisions = result.collisions
+        differing = collisions["reference"] + collisions["here"] - 2 * collisions["both"]
+        return min(loss, MAX_LOSS) + fit.collisions * differing / max(result.rows, 1)
 
 
 Together = tuple[Study, ...]

@@ -138,7 +138,7 @@ def rank_correlation(one: FloatArray, other: FloatArray) -> float | None:
     """Spearman's rho; None for fewer than two rows or where one side is constant."""
     if len(one) < 2 or np.ptp(one) == 0 or np.ptp(other) == 0:
         return None
-    return float(scipy.stats.spearmanr(one, other).statistic)
+    return float(np.corrcoef(scipy.stats.rankdata(one), scipy.stats.rankdata(other))[0, 1])
 
 
 def _both(reference: ReferenceData, here: Evaluations, metric: str) -> BoolArray:

@@ -11,10 +11,10 @@ import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.reference import FitSubject, ReferenceData, agreement, calibrate, calibrate_together, with_values
+from safevar_sumo.reference import FitSubject, ReferenceData, calibrate, calibrate_together, with_values
 from safevar_sumo.reference.calibration import _refining_population, _thinned, _Trial
-from safevar_sumo.reference.effects import covered_by_spread, error_beyond_spread, linear_effects
-from safevar_sumo.reference.fit import TrialSearch, original_loss, reference_loss
+from safevar_sumo.reference.effects import Regression, covered_by_spread, error_beyond_spread
+from safevar_sumo.reference.fit import ReferenceLoss, TrialSearch, original_loss
 from safevar_sumo.reference.parameters import Free, free_parameters, value_of
 from safevar_sumo.reference.profiles import Profiles
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
@@ -139,7 +139,7 @@ def test_errors_count_in_repeats_and_effects_in_the_safety_degrees(data: Referen
     def loss(unit: float, **fit: float) -> float:
         study = msgspec.structs.replace(mine(0.8), repeatability={"safety_degree": unit}, fit=msgspec.structs.replace(only, **fit))
         here = evaluate(assemble(study), data.settings)
-        return reference_loss(agreement(data, here, study, here), data, here, study)
+        return ReferenceLoss(data, study).of(here)
 
     error = np.abs(evaluate(assemble(mine(0.8)), data.settings).f_safe - data.metrics["safety_degree"]).mean()
     assert loss(1.0) == pytest.approx(error)
@@ -152,10 +152,10 @@ def test_a_linear_response_has_the_effects_that_it_was_made_with() -> None:
     settings = rng.uniform(characteristics.lower, characteristics.upper, (200, 12))
     settings[:, 3] = characteristics.original[3]
     slopes = np.arange(12) - 5.0
-    effects = linear_effects(settings, 1.0 + ((settings - characteristics.original) / width) @ slopes, characteristics)
+    effects = Regression.over(settings, characteristics).effects(1.0 + ((settings - characteristics.original) / width) @ slopes)
     assert np.delete(effects, 3) == pytest.approx(np.delete(slopes, 3))
     assert np.isnan(effects[3]), "it does not vary"
-    assert np.isnan(linear_effects(settings[:20], np.ones(20), characteristics)).all(), "too few rows"
+    assert np.isnan(Regression.over(settings[:20], characteristics).effects(np.ones(20))).all(), "too few rows"
 
 
 PUBLISHED = {"safety_degree": 2.0, "tet": 1.0}
