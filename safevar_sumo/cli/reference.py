@@ -28,14 +28,10 @@ from safevar_sumo.reference import (
     agreement,
     calibrate,
     calibrate_together,
-    calibration_comment,
-    cost_line,
     covered_by_spread,
     effects_of,
     evaluations_of,
-    fitted_as,
     keep_totals,
-    on_a_bound,
     original_metrics,
     plot_agreement,
     read_reference,
@@ -43,6 +39,7 @@ from safevar_sumo.reference import (
 from safevar_sumo.reference.conclusions import pair_cases
 from safevar_sumo.reference.effects import LEAST as LEAST_EFFECT
 from safevar_sumo.reference.effects import SHARE as EFFECT_SHARE
+from safevar_sumo.reference.fit_result import fitted_as
 from safevar_sumo.reference.profiles import plot_profiles
 from safevar_sumo.reference.replication import Nearness, nearness, replication
 from safevar_sumo.results import MANIFEST, write_imported, write_whole
@@ -169,7 +166,7 @@ def calibrate_command(study: str, others: tuple[str, ...], trials: int | None, s
         plot_profiles(plot, calibrations[0].profiles, chosen)
     for one, calibration, references, target in zip(chosen, calibrations, data, targets, strict=True):
         print_calibration(Console(), one, calibration)
-        write_study(target, fitted_as(one, calibration.study), calibration_comment(calibration, one, references, from_scratch=from_scratch))
+        write_study(target, fitted_as(one, calibration.study), calibration.comment(one, references, from_scratch=from_scratch))
         Console().print(f"Study file: {target}", soft_wrap=True)
 
 
@@ -367,6 +364,6 @@ def print_calibration(console: Console, study: Study, result: Calibration) -> No
                 " / ".join("-" if number is None else f"{number:.3f}" for number in (getattr(one, quantity)[metric] for one in agreements))
                 for quantity in ("spearman", "mean_absolute_error", "bias")))
         console.print(comparison)
-    for name in on_a_bound(result.values, result.bounds):
+    for name in result.on_a_bound:
         console.print(f"{name} lies on its bound: a wider bound may fit better.", markup=False)
-    console.print(cost_line(result))
+    console.print(result.loss_line)

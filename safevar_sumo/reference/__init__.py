@@ -1,17 +1,9 @@
 """Reference data: reading, comparison with a study, calibration, import as results."""
 
 from safevar_sumo.analysis.parameters import with_values
-from safevar_sumo.reference.calibration import (
-    Calibration,
-    FitSubject,
-    calibrate,
-    calibrate_together,
-    calibration_comment,
-    cost_line,
-    fitted_as,
-    on_a_bound,
-)
+from safevar_sumo.reference.calibration import FitSubject, calibrate, calibrate_together
 from safevar_sumo.reference.effects import Coverage, Effect, covered_by_spread, effects_of
+from safevar_sumo.reference.fit_result import Calibration
 from safevar_sumo.reference.rows import ReferenceData, evaluations_of, original_metrics, package_filter, read_reference
 from safevar_sumo.reference.validation import Agreement, Totals, agreement, keep_totals, plot_agreement, quoted
 
@@ -26,14 +18,10 @@ __all__ = [
     "agreement",
     "calibrate",
     "calibrate_together",
-    "calibration_comment",
-    "cost_line",
     "covered_by_spread",
     "effects_of",
     "evaluations_of",
-    "fitted_as",
     "keep_totals",
-    "on_a_bound",
     "original_metrics",
     "package_filter",
     "plot_agreement",

@@ -10,8 +10,8 @@ import numpy as np
 
 from safevar_sumo.analysis.figures import save
 from safevar_sumo.records import FloatArray
-from safevar_sumo.reference.fit import TrialSearch
 from safevar_sumo.reference.parameters import Free
+from safevar_sumo.reference.search import TrialSearch
 from safevar_sumo.study import Study
 
 SETS = 20

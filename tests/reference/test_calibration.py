@@ -12,11 +12,13 @@ import pytest
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.reference import FitSubject, ReferenceData, calibrate, calibrate_together, with_values
-from safevar_sumo.reference.calibration import _refining_population, _thinned, _Trial
+from safevar_sumo.reference.calibration import _refining_population, _thinned
 from safevar_sumo.reference.effects import Regression, covered_by_spread, error_beyond_spread
-from safevar_sumo.reference.fit import ReferenceLoss, TrialSearch, original_loss
+from safevar_sumo.reference.fit_space import FitSpace
+from safevar_sumo.reference.loss import ReferenceLoss, original_loss
 from safevar_sumo.reference.parameters import Free, free_parameters, value_of
 from safevar_sumo.reference.profiles import Profiles
+from safevar_sumo.reference.search import TrialSearch
 from safevar_sumo.study import FitTable, FreeParameter, Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
@@ -107,7 +109,7 @@ def test_from_scratch_the_first_study_is_fitted_alone_then_what_the_others_have_
 
 def test_a_search_by_logarithm_has_the_geometric_mean_in_the_middle_and_stays_in_its_bounds() -> None:
     bounds = FreeParameter(lower=0.3, upper=30.0, unit="m", meaning="gap", log=True)
-    trial = _Trial([Free(GAP, (0,), bounds), Free(HESITATION, (0,), msgspec.structs.replace(bounds, log=False))], [])
+    trial = FitSpace([Free(GAP, (0,), bounds), Free(HESITATION, (0,), msgspec.structs.replace(bounds, log=False))], [])
     assert trial.values(np.array([[0.5, 0.5], [0.75, 0.0]])) == pytest.approx(np.array([[3.0, 15.15], [3 * 10**0.5, 0.3]]))
     assert trial.values(np.ones(2)).max() <= 30.0
     study = msgspec.structs.replace(mine(1.0), calibration={GAP: msgspec.structs.replace(bounds, lower=0.0)})
