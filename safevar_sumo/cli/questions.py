@@ -16,7 +16,7 @@ from safevar_sumo.analysis.options import Options
 from safevar_sumo.analysis.risk import RiskOptions
 from safevar_sumo.analysis.rules import RulesOptions
 from safevar_sumo.analysis.tolerance import ToleranceOptions
-from safevar_sumo.cli.options import PICTURES, check_output
+from safevar_sumo.cli.arguments import PICTURES, check_output
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import (
     CommandFunction,

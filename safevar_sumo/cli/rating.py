@@ -10,7 +10,7 @@ import click
 from rich.console import Console
 
 from safevar_sumo.analysis.rating import RatingOptions
-from safevar_sumo.cli.options import PICTURES, check_output, read_changes
+from safevar_sumo.cli.arguments import PICTURES, check_output, read_changes
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import flags_of, jobs_option, json_option, now_option, results_or_study
 from safevar_sumo.errors import InputError

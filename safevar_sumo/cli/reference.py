@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from safevar_sumo.analysis.research_questions.case import Case, load_cases
-from safevar_sumo.cli.options import PICTURES, check_output, complete_study, refuse_inputs
+from safevar_sumo.cli.arguments import PICTURES, check_output, complete_study, refuse_inputs
 from safevar_sumo.cli.program import OneOfEach, commands, print_remarks
 from safevar_sumo.cli.target import jobs_option
 from safevar_sumo.errors import InputError, SimulationError

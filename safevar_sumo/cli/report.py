@@ -14,7 +14,7 @@ from safevar_sumo.analysis.research_questions.case import load_cases
 from safevar_sumo.analysis.research_questions.gallery import FORMATS as PICTURES
 from safevar_sumo.analysis.research_questions.gallery import draw_all
 from safevar_sumo.analysis.research_questions.tables import ENDINGS, FORMATS, FORMATS_WITH_LAYOUT, LAYOUTS_BY_NAME
-from safevar_sumo.cli.options import check_output
+from safevar_sumo.cli.arguments import check_output
 from safevar_sumo.cli.program import commands
 from safevar_sumo.cli.target import as_it_is_now, jobs_option, now_option, point_option
 from safevar_sumo.errors import InputError

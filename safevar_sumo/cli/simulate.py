@@ -15,7 +15,7 @@ from rich.text import Text
 from safevar_sumo.analysis.model_spread import ModelSpread, model_spreads, studies_of_sets
 from safevar_sumo.analysis.words import question_command
 from safevar_sumo.api.simulation import Simulation, evaluate_settings, simulate_with_original
-from safevar_sumo.cli.options import (
+from safevar_sumo.cli.arguments import (
     PICTURES,
     Within,
     check_output,

@@ -19,7 +19,7 @@ from rich.text import Text
 from safevar_sumo.analysis.research_questions.indicators import nondominated
 from safevar_sumo.api.running import ENGINES, carry_out_runs, engine_for, load_for_search, open_pool
 from safevar_sumo.campaign import Campaign, Forecast, RunKey, all_runs, forecast
-from safevar_sumo.cli.options import Within, complete_study
+from safevar_sumo.cli.arguments import Within, complete_study
 from safevar_sumo.cli.program import commands, print_remarks
 from safevar_sumo.cli.target import jobs_option
 from safevar_sumo.errors import InputError

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from safevar_sumo.analysis.options import Option, Options
-from safevar_sumo.cli.options import Within
+from safevar_sumo.cli.arguments import Within
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import UNKNOWN, SolutionId, chosen_handle, position_of

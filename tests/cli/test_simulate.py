@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from safevar_sumo.cli.options import read_changes
+from safevar_sumo.cli.arguments import read_changes
 from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import load_study

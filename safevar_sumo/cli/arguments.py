@@ -1,4 +1,4 @@
-"""Checks of output files, values of --set, and shell completion."""
+"""Values that people type: checks of output files, changes of characteristics, numbers in a range; and shell completion."""
 
 from __future__ import annotations
 
