@@ -21,20 +21,20 @@ MAX_DEVIATION = 10.0
 
 
 def original_loss(original: Evaluations, published: Mapping[str, float], fit: FitTable) -> float:
-    """Mean deviation of the original vehicle's values from the published ones, weighted by metric.
+    """Mean deviation of the original vehicle's values from the published ones beyond the tolerance, weighted by metric.
 
-    Deviations are squared up to the tolerance and linear beyond it (Huber 1964): with squares alone a search would fit this one
-    vehicle first, and the rows only as far as that allows.
+    Deviations within the tolerance cost nothing (Vapnik 1995): this is one vehicle, simulated once, and the rows of similar vehicles
+    tell more about it.
     """
-    deviations = [fit.weights.get(name, 0.0) * _huber(original.metrics[name][0] / value - 1, fit.tolerance)
+    deviations = [fit.weights.get(name, 0.0) * _beyond(original.metrics[name][0] / value - 1, fit.tolerance)
                   for name, value in published.items() if name in METRICS]
     return fit.original * float(np.mean(deviations)) if deviations else 0.0
 
 
-def _huber(deviation: float, tolerance: float) -> float:
-    """Huber's loss of a relative deviation, x tolerances large: x^2 up to 1, 2 x - 1 beyond."""
-    x = min(abs(deviation) / tolerance, MAX_DEVIATION) if np.isfinite(deviation) else MAX_DEVIATION
-    return x * x if x <= 1 else 2 * x - 1
+def _beyond(deviation: float, tolerance: float) -> float:
+    """How far a relative deviation lies beyond the tolerance [half tolerances]."""
+    in_tolerances = min(abs(deviation) / tolerance, MAX_DEVIATION) if np.isfinite(deviation) else MAX_DEVIATION
+    return 2 * max(in_tolerances - 1, 0.0)
 
 
 class ReferenceLoss:

@@ -200,10 +200,10 @@ class Origin(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class FitTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How free parameters are fitted: the weights in the loss, the rows used, and the starts of the search.
 
-    The loss is `original` * mean_m(w_m h(miss / (`tolerance` * published))) of the original vehicle, h being x^2 to 1 and 2 x - 1 beyond,
-    + mean over the files of sum_m(w_m (`rank` (1 - rho) + mean |error| / unit)) + `effects` * mean_c |difference of the safety degree's
-    linear effects over the domain of characteristic c| / unit + `collisions` * share of rows that collide on one side alone. w_m are
-    `weights` by metric; a unit is the study's repeatability or, where it is not known, the standard deviation of the data. Studies that
+    The loss is `original` * mean_m(w_m 2 max(miss / (`tolerance` * published) - 1, 0)) of the original vehicle + mean over the files of
+    sum_m(w_m (`rank` (1 - rho) + mean |error| / unit)) + `effects` * mean_c |difference of the safety degree's linear effects over the
+    domain of characteristic c| / unit + `collisions` * share of rows that collide on one side alone. w_m are `weights` by metric; a unit
+    is the study's repeatability or, where it is not known, the standard deviation of the data. Studies that
     are fitted together have the mean of their losses. One of every `hold_out` rows is not used for the fit, only reported.
     Sets of parameters whose loss is within the share `alike` of the lowest one fit equally well: they become the study's `spread`.
     `trials` sets of parameters are tried, in generations of `population`: in a race of searches from the study's own values and from

@@ -171,12 +171,11 @@ def loss(safety_degree: float, tet: float) -> float:
     return original_loss(original, PUBLISHED, FIT)
 
 
-def test_a_miss_is_squared_within_the_tolerance_and_in_proportion_beyond() -> None:
-    assert loss(2.0, 1.0) == 0.0
-    assert loss(2.05, 1.0) == pytest.approx(0.5 * 0.5 ** 2 / 2), "half a tolerance; the mean of two metrics counts half"
-    assert loss(2.0, 0.95) == pytest.approx(0.5 * 0.3 * 1 / 2), "one tolerance"
-    assert loss(2.3, 1.0) == pytest.approx(0.5 * (2 * 3 - 1) / 2), "three tolerances"
-    assert loss(20.0, 1.0) == loss(np.nan, 1.0) == pytest.approx(0.5 * (2 * 10 - 1) / 2), "farther than ten is as far as that"
+def test_a_miss_costs_nothing_within_the_tolerance_and_in_proportion_beyond() -> None:
+    assert loss(2.0, 1.0) == loss(2.09, 0.96) == 0.0
+    assert loss(2.3, 1.0) == pytest.approx(0.5 * 2 * (3 - 1) / 2), "three tolerances; the mean of two metrics counts half"
+    assert loss(2.0, 0.85) == pytest.approx(0.5 * 0.3 * 2 * (3 - 1) / 2), "on the other side, with that metric's weight"
+    assert loss(20.0, 1.0) == loss(np.nan, 1.0) == pytest.approx(0.5 * 2 * (10 - 1) / 2), "farther than ten is as far as that"
 
 
 class Bowl:
