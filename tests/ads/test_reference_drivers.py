@@ -104,6 +104,26 @@ def test_the_competent_driver_brakes_three_quarters_of_a_second_after_two_second
     assert asked[-1] == pytest.approx(0.774 * 9.81)
 
 
+def test_the_competent_driver_lets_go_of_the_accelerator_while_it_reacts() -> None:
+    """From 30 m on, 2 s before a collision, it slows down by 0.4 m/s^2 for its 0.75 s; before that it holds its speed."""
+    driver, one, asked = CompetentDriver(), np.ones(1), []
+    memory = driver.start(1, KNOWN, STEP)
+    for k in range(20):
+        seen = Observation(k * STEP, 15 * one, (33.3 - 15 * k * STEP) * one, 15 * one, 0 * one, 0 * one, 1.0, 0 * one, 0 * one)
+        command, memory = driver.drive(seen, memory)
+        asked.append(float(command.brake[0]) * 10)
+    assert asked == pytest.approx([0.0] * 5 + [0.4] * 15)
+
+
+def test_the_competent_driver_keeps_its_headway_with_the_accelerator_alone() -> None:
+    """Behind somebody 1 m/s slower: 0.07 (u - v) + 0.23 (gap - 2 v), above what a released accelerator does."""
+    for gap, acceleration in ((30.0, -0.07), (29.0, -0.3), (20.0, -0.4)):
+        driver, one = CompetentDriver(), np.ones(1)
+        seen = Observation(0.0, 15 * one, gap * one, one, 0 * one, 0 * one, 1.0, 14 * one, 0 * one)
+        command, _ = driver.drive(seen, driver.start(1, KNOWN, STEP))
+        assert command.brake[0] * 10 == pytest.approx(-acceleration)
+
+
 def test_the_competent_driver_perceives_a_crossing_pedestrian_after_a_stray_of_three_eighths_of_a_metre() -> None:
     """Starts 2 m aside at 1 m/s, seen at once: strays at 0.375 s, perceived at 0.775 s, then TTC is below 2 s, 0.75 s to the brake."""
     begun, _ = braking(CompetentDriver(), 10.0, 20.0, lateral=-2.0, lateral_speed=1.0)
@@ -122,6 +142,12 @@ def test_rss_brakes_a_reaction_time_after_its_safe_distance() -> None:
     assert Rss().safe_distance(np.array([12.0]), np.array([5.0]))[0] == pytest.approx(safe)
     begun, _ = braking(Rss(), 12.0, 60.0, leader=5.0)
     assert begun == pytest.approx(safe - 7 * 0.75, abs=2 * 7 * STEP)
+
+
+def test_the_safe_distance_of_rss_allows_for_what_is_gained_while_reacting() -> None:
+    """rt = 1 s at 2 m/s^2: from 20 to 22 m/s within 21 m; then 22^2 / 8 m to a stop, less the leader's 10^2 / 16 m."""
+    driver = Rss(reaction_time=1.0, acceleration=2.0, deceleration=4.0, leader_deceleration=8.0)
+    assert driver.safe_distance(np.array([20.0]), np.array([10.0]))[0] == pytest.approx(21 + 60.5 - 6.25)
 
 
 def test_fuzzy_metrics_are_those_worked_out_by_hand() -> None:

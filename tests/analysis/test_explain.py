@@ -384,6 +384,8 @@ def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() ->
     assert few == affordable(settings, evaluator, 2000)
     assert 0 < len(few) < 50
     assert affordable(settings, evaluator, 10**6) == list(range(50))
+    settings[:, 3:] = ORIGINAL
+    assert len(affordable(settings, evaluator, 70)) == 10, "of three changes no, one and two of them: 1 + 3 + 3 simulations"
 
 
 def test_robustness_in_words_says_where_a_time_step_disagrees() -> None:

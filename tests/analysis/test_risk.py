@@ -37,6 +37,11 @@ def test_the_interval_holds_the_analytic_volume(region: Region, volume: float) -
     assert result.probability == result.failures / 8000
 
 
+@pytest.mark.parametrize(("region", "share"), [(box, 0.09), (lambda rows: rows[:, 0] < 5, 0.5), (everywhere, 1.0)])
+def test_the_coefficient_of_variation_is_that_of_a_binomial_share(region: Region, share: float) -> None:
+    assert of(region, samples=8000).coefficient_of_variation == pytest.approx(math.sqrt((1 - share) / (8000 * share)), rel=0.05)
+
+
 def test_it_stops_as_soon_as_it_is_sure_enough() -> None:
     result = of(box, samples=50_000, width=0.02)
     assert 1000 < result.samples < 10_000

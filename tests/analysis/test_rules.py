@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo import rules
-from safevar_sumo.analysis.rules.compute import Rules, rule_in_words
+from safevar_sumo.analysis.rules.compute import Rule, Rules, rule_in_words
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.analysis.known_regions import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
 
@@ -64,6 +64,13 @@ def test_nothing_everything_and_too_little() -> None:
     few = of(lambda settings: (settings > 9.5).all(axis=1), n=2, samples=400)
     assert few.rules == []
     assert "--samples" in few.remark
+
+
+def test_a_rule_is_denser_than_a_share_below_its_interval() -> None:
+    """8 of 10: Clopper and Pearson have 44.4 to 97.5 %."""
+    rule = Rule({"a": (7.0, None)}, inside=10, unsafe_inside=8, unsafe_everywhere=20, confidence=0.95)
+    assert rule.density_interval == pytest.approx((0.444, 0.975), abs=5e-4)
+    assert [rule.is_denser_than(share) for share in (0.4, 0.5, 0.9)] == [True, False, False]
 
 
 def test_the_promised_record_the_same_again_and_in_words() -> None:

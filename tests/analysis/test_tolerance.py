@@ -32,6 +32,7 @@ def test_islands_and_the_safe_interval_around_the_original() -> None:
     first, second = of(2, two_islands).alone
     assert first.safe == (0.0, pytest.approx(6.5, abs=1e-4))
     assert first.safe[1] <= 6.5
+    assert first.unsafe[0][0] - first.safe[1] <= 1.001 * 0.05 / 4096, "a 4096th of the distance of two values"
     assert [pytest.approx(interval, abs=1e-4) for interval in [(6.5, 7.0), (9.0, 10.0)]] == first.unsafe
     assert first.margins == (pytest.approx(3.0), pytest.approx(6.5, abs=1e-3))
     assert (second.safe, second.unsafe) == ((0.0, 10.0), [])

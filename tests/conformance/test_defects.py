@@ -120,6 +120,8 @@ DEFECTS = {
                                    "self.top_speed *= 0.999"),
     "vehicle uses no mass": planted("vehicle", "reaction", VEHICLE.replace("SumoType(prepared[\"mass\"]", "SumoType(1000 * n"),
                                     "1000 / prepared[\"mass\"]", "1", "def prepare(self, characteristics, road_friction, step):"),
+    "vehicle uses no power": planted("vehicle", "reaction", VEHICLE.replace("prepared[\"power\"], ", "3 * n, "),
+                                     "prepared[\"power\"] *", "3 *", "def prepare(self, characteristics, road_friction, step):"),
     "vehicle maximum over vehicles": planted("vehicle", "batch", VEHICLE, "* command.throttle -",
                                              "* np.max(state.speed + 1) -", "np.max(state.speed"),
     "scenario truth values": planted("scenario", "contract", SCENARIO, "gap < -100)", "gap)", "return Scene(gap, nothing, nothing, gap)"),

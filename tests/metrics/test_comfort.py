@@ -73,6 +73,11 @@ def test_rms_is_that_of_scipys_filters() -> None:
     assert comfort("rms_acceleration", speed) == pytest.approx(np.sqrt((expected**2).mean(axis=0)), rel=1e-9)
 
 
+def test_rms_is_over_the_run_and_not_over_what_follows_its_end() -> None:
+    speed = np.cumsum(np.random.default_rng(3).normal(size=(200, 2)), axis=0)
+    assert comfort("rms_acceleration", speed, until=99 * STEP + STEP / 2) == pytest.approx(comfort("rms_acceleration", speed[:100]))
+
+
 @pytest.mark.parametrize("name", FURTHER)
 def test_each_vehicle_counts_for_itself_to_the_bit_and_not_on_a_collision(name: str) -> None:
     speed = np.cumsum(np.random.default_rng(2).normal(size=(150, 7)), axis=0)

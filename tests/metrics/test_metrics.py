@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import F_DIFF, F_SAFE, METRICS, Objective, Scoring, time_to_collision
+from safevar_sumo.metrics import F_DIFF, F_SAFE, METRICS, Objective, Scoring, Unsafe, time_to_collision
 from safevar_sumo.records import Encounter, Evaluations, Outcome, SimulationRuns, Trace
 from safevar_sumo.study import MetricsTable
 
@@ -42,6 +42,15 @@ def test_safety_degree_is_the_distance_left_when_standing() -> None:
 
 def test_safety_degree_of_a_collision_is_minus_its_speed() -> None:
     assert value("safety_degree", braking_run(10, 5, 12, collision_speed=3.5)) == -3.5
+
+
+def test_safety_degree_is_the_least_separation_of_the_encounter_alone() -> None:
+    """Over after a second, 7.5 m on: 4.5 m are left then, 2 m in the end. Without any encounter there is none."""
+    run = braking_run(10, 5, 12)
+    while_it_lasts = run.encounter._replace(in_conflict=run.trace.time[:, np.newaxis] < 1.0)
+    assert value("safety_degree", dataclasses.replace(run, encounter=while_it_lasts)) == pytest.approx(4.5, abs=10 * STEP)
+    never = run.encounter._replace(in_conflict=run.trace.gap < 0)
+    assert np.isnan(value("safety_degree", dataclasses.replace(run, encounter=never)))
 
 
 def test_exposed_and_integrated_time_of_even_approach() -> None:
@@ -78,6 +87,16 @@ def test_time_to_collision_ends_with_the_first_standstill() -> None:
     still = Encounter(run.encounter.separation, run.encounter.distance, np.ones_like(run.encounter.distance), run.encounter.in_conflict)
     ttc = time_to_collision(SimulationRuns(trace=run.trace, encounter=still, outcome=run.outcome, collision_speed=run.collision_speed))
     assert np.all(np.isinf(ttc[run.trace.time > 2.0]))
+
+
+def test_who_stands_at_the_start_has_a_time_to_collision_once_it_drives() -> None:
+    run = braking_run(10, 5, 12)
+    speed = np.where(run.trace.time[:, np.newaxis] < 1.0, 0.0, 2.0)
+    gap = 20.0 + 0 * speed
+    later = dataclasses.replace(run, trace=dataclasses.replace(run.trace, speed=speed), encounter=Encounter(gap, gap, speed, gap > 0))
+    ttc = time_to_collision(later)[:, 0]
+    assert np.isinf(ttc[run.trace.time < 1.0]).all()
+    assert ttc[run.trace.time >= 1.0] == pytest.approx(10.0)
 
 
 def test_a_vehicle_that_never_brakes_has_no_average_deceleration() -> None:
@@ -142,3 +161,11 @@ def test_a_batch_that_failed_as_a_whole_has_no_valid_objective() -> None:
 def test_average_deceleration_is_that_of_the_braking_cycle() -> None:
     assert value("ave_dece", braking_run(10, 5, 12)) == pytest.approx(5.0, rel=1e-9)
     assert value("ave_dece", braking_run(10, 5, 12), MetricsTable(ttc_threshold=2, sampling_interval=0.2)) == pytest.approx(5.0)
+
+
+def test_who_keeps_just_the_points_of_the_limit_is_unsafe() -> None:
+    """An original with 40 points: unsafe from the loss of a whole point on."""
+    unsafe, undefined = Unsafe.default({"rating_points": 40.0, "safety_degree": np.nan}, np.array(["stopped"])), np.full(4, np.nan)
+    rated = Evaluations(settings=np.ones((4, 1)), outcome=np.full(4, "stopped"), collision_speed=undefined, f_diff=np.zeros(4),
+                        f_num_diff=np.zeros(4), metrics={"safety_degree": undefined, "rating_points": np.array([40.0, 39.25, 39.0, 38.5])})
+    assert unsafe.of(rated).tolist() == [False, False, True, True]

@@ -21,7 +21,9 @@ from safevar_sumo.cli.program import commands
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, part_of, points_of, protocol_of
 from safevar_sumo.protocol.points import colours_of
+from safevar_sumo.protocol.rater import by_night
 from safevar_sumo.records import CellResults
+from safevar_sumo.scenarios import WEATHERS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import at_every_point, evaluate, in_cells, study_at
 from safevar_sumo.sumo.system import assemble
@@ -94,6 +96,15 @@ def test_robustness_counts_from_half_of_the_standard_range_and_claims_count_as_h
     assert shares == pytest.approx([held / len(layers), (held + 1) / len(layers)])
 
 
+def test_a_layer_of_a_test_whose_cells_are_all_red_does_not_hold() -> None:
+    """There is nothing whose variations could hold; one cell that is not red is enough."""
+    layers = [("CBNA", one.layer) for one in PROTOCOL.layers_of("CBNA") if one.simulated]
+    for red, holds in ((12, False), (11, True)):
+        impact = np.full(N, np.nan)
+        impact[numbers("CBNA", "standard")[:red]] = 50.0
+        assert {points_of(PROTOCOL, results(impact)).layers[key][0] for key in layers} == {holds}
+
+
 def test_a_required_cell_that_is_not_green_costs_everything() -> None:
     impact = np.full(N, np.nan)
     impact[numbers("CCRs", "standard")[0]] = 1.0
@@ -112,6 +123,15 @@ def test_faster_impacts_never_gain_points_in_a_matrix(seed: int, share: float, m
     for name in before.tests:
         assert (after.tests[name][0, :2] <= before.tests[name][0, :2] + 1e-12).all() or before.fails[0]
         assert not after.fails[0] or (after.tests[name] == 0).all()
+
+
+def test_a_weather_by_night_has_its_road_and_is_as_dark_as_both() -> None:
+    """Hard rain leaves 68 % of the range of sight, low beams 75 % of that."""
+    dark = by_night(WEATHERS["hard_rain"])
+    assert (dark.road_friction, dark.wet, dark.light) == (0.59, True, "night")
+    assert dark.visibility == pytest.approx(0.68 * 0.75)
+    assert by_night(dark) == dark
+    assert by_night(WEATHERS["clear"]) == WEATHERS["night"]
 
 
 @pytest.mark.slow

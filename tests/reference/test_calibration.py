@@ -13,7 +13,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.reference import FitSubject, ReferenceData, calibrate, calibrate_together, with_values
 from safevar_sumo.reference.calibration import _refining_population, _thinned
-from safevar_sumo.reference.effects import Regression, covered_by_spread, error_beyond_spread
+from safevar_sumo.reference.effects import Effect, Regression, covered_by_spread, error_beyond_spread
 from safevar_sumo.reference.fit_space import FitSpace
 from safevar_sumo.reference.loss import ReferenceLoss, original_loss
 from safevar_sumo.reference.parameters import Free, free_parameters, value_of
@@ -146,6 +146,23 @@ def test_errors_count_in_repeats_and_effects_in_the_safety_degrees(data: Referen
     error = np.abs(evaluate(assemble(mine(0.8)), data.settings).f_safe - data.metrics["safety_degree"]).mean()
     assert loss(1.0) == pytest.approx(error)
     assert loss(2.0) == pytest.approx(error / 2)
+
+
+def test_each_collision_on_one_side_alone_costs_its_share_of_the_rows(data: ReferenceData) -> None:
+    """Four there and four here, three of them the same: two rows of six differ."""
+    first, safety = np.arange(24) < 6, np.array([-2.0, -2.0, -2.0, 0.5, -1.5, 2.0])
+    there = data.take(first)._replace(metrics={"safety_degree": np.array([-1.0, -2.0, -3.0, -1.0, 0.5, 2.0])})
+    here = Evaluations(settings=there.settings, outcome=np.where(safety < 0, Outcome.COLLISION.value, Outcome.STOPPED.value),
+                       collision_speed=np.where(safety < 0, -safety, np.nan), metrics={"safety_degree": safety}, f_diff=0 * safety,
+                       f_num_diff=0 * safety)
+    study = msgspec.structs.replace(mine(0.8), fit=FitTable(rank=0.0, collisions=6.0, weights={}))
+    assert ReferenceLoss(there, study).of(here) == pytest.approx(6 * 2 / 6)
+
+
+@pytest.mark.parametrize(("reference", "nearest", "too_far"), [
+    (1.0, 1.19, 1.21), (-1.0, -0.81, -0.79), (0.2, 0.29, 0.31), (0.0, -0.09, 0.11)])
+def test_effects_agree_within_a_fifth_or_a_tenth_of_a_metre(reference: float, nearest: float, too_far: float) -> None:
+    assert [Effect("mass", reference, here).agrees for here in (nearest, too_far, None)] == [True, False, None]
 
 
 def test_a_linear_response_has_the_effects_that_it_was_made_with() -> None:

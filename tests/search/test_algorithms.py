@@ -25,6 +25,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.search import ALGORITHMS, MapElites, MoCell, Problem
 from safevar_sumo.search.evolution import Individual, fitness_of, tournament
+from safevar_sumo.search.mocell import survivor
 from safevar_sumo.search.nsga2 import survivors
 from safevar_sumo.search.safe_fuzzer import _improves, _Ranges, _scores
 from safevar_sumo.study import load_study
@@ -310,6 +311,13 @@ def test_a_grid_closes_on_itself() -> None:
     assert MoCell()._neighbours(2) == [[0, 1], [1, 0]]
 
 
+def test_a_child_that_is_as_good_as_its_cell_enters_only_where_somebody_else_is_worse() -> None:
+    cell, child, far, worst = individuals((0, 2, 0), (0, 2, 0), (2, 0, 0), (3, 3, 0))
+    assert survivor(cell, child, [cell]) is cell
+    assert survivor(cell, child, [cell, far]) is cell
+    assert survivor(cell, child, [cell, worst]) is child
+
+
 @pytest.mark.parametrize(("search", "problem"), [
     ({"mocell": {"grid": [3, 4]}}, "search.mocell.grid = [3, 4] has 12 cells\nexpected: two sides whose product is search.population = 10"),
     ({"mocell": {"neighbourhood": "hexagonal"}}, "search.mocell.neighbourhood = 'hexagonal'"),
@@ -347,6 +355,16 @@ def test_an_atlas_has_the_smallest_collision_of_every_set_of_changes() -> None:
     for changed, size in zip(SUN.changed(everything.settings)[everything.collided], everything.f_diff[everything.collided], strict=True):
         smallest[changed.tobytes()] = min(size, smallest.get(changed.tobytes(), np.inf))
     assert {changed.tobytes(): size for changed, size in zip(SUN.changed(solutions.settings), solutions.f_diff, strict=True)} == smallest
+
+
+def test_cells_of_an_atlas_over_the_speed_are_a_metre_a_second_wide_and_the_last_one_is_open() -> None:
+    """20 of them, and one without a collision, for each number of changes."""
+    speeds = [np.nan, 0.0, 0.9, 1.0, 18.9, 19.0, 25.0]
+    one, two = (dataclasses.replace(window([setting] * 7, [1.0] * 7), collision_speed=np.array(speeds)) for setting in ([60, 50], [60, 60]))
+    atlas = MapElites(behaviour="speed")
+    assert atlas._cell(one, problem()).tolist() == [0, 1, 1, 2, 19, 20, 20]
+    assert atlas._cell(two, problem()).tolist() == [21, 22, 22, 23, 40, 41, 41]
+    assert atlas.cells(2) == 42
 
 
 def test_an_atlas_that_cannot_be_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

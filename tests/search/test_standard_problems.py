@@ -175,6 +175,14 @@ def random_front(seed: int) -> np.ndarray:
     return np.concatenate([objectives, objectives[rng.integers(0, size, int(rng.integers(0, size + 1)))]])
 
 
+def test_spea2_ranks_what_nothing_dominates_by_its_distance_to_the_third_nearest_of_four() -> None:
+    """1 / (distance + 2), below one half whatever the distance: those at the ends have more room."""
+    ours = individuals(np.array([[0.0, 3.0], [1.0, 2.0], [2.0, 1.0], [3.0, 0.0]]))
+    environmental_selection(ours, 4)
+    ends, middle = 1 / (3 * np.sqrt(2) + 2), 1 / (2 * np.sqrt(2) + 2)
+    assert [one.standing[0] for one in ours] == pytest.approx([ends, middle, middle, ends])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("hundred", range(10))
 def test_survivors_of_spea2_are_those_of_pymoo_on_random_fronts(hundred: int) -> None:

@@ -67,6 +67,7 @@ def variant(tmp_path: Path, old: str, new: str) -> str:
     ("population = 50", "population = 50.5", "search.population = 50.5"),
     ("runs = 30", "", "search.runs is missing"),
     ("lower = 4200, upper = 7000", "lower = 7000, upper = 4200", "vehicle.characteristics.max_rpm: lower = 7000.0 and upper = 4200.0"),
+    ("lower = 4200, upper = 7000", "lower = 5800, upper = 5800", "vehicle.characteristics.max_rpm: lower = 5800.0 and upper = 5800.0"),
     ("lower = 4200, upper = 7000", "lower = 5900, upper = 7000", "vehicle.characteristics.max_rpm.original = 5800.0"),
     ("original = 5800", "original = nan", "vehicle.characteristics.max_rpm.original = nan"),
     ("original = 5800", "original = 'many'", "vehicle.characteristics.max_rpm.original = 'many'"),

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.protocol.driving_robot import DrivingRobot
 from safevar_sumo.records import Command, Evaluations, FloatArray, Nominal, Observation, Outcome, SimulationRuns
-from safevar_sumo.scenarios import Crossing, Scenario
+from safevar_sumo.scenarios import Crossing, Point, Scenario
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, Study, load_study
 from safevar_sumo.sumo import matrix
@@ -161,6 +162,17 @@ def test_what_cannot_hold_the_speed_is_no_valid_test_and_one_that_brakes_before_
     assert runs.test_speed_error[0] * 3.6 < -0.5
     assert np.isnan(runs.collision_speed[0])
     assert run(steep, Pedals(brakes=(0.0, 99.0)), system=WEAK).outcome[0] == Outcome.STOPPED
+
+
+@pytest.mark.parametrize(("error", "invalid"), [(-0.51, True), (-0.49, False), (0.99, False), (1.01, True)])
+def test_a_test_is_invalid_beyond_1_km_h_too_fast_and_half_a_km_h_too_slow(error: float, invalid: bool) -> None:
+    """Euro NCAP's tolerance until the system acts."""
+    vehicle, original = SUN.vehicle, SUN.characteristics.original
+    prepared = vehicle.prepare(dict(zip(SUN.characteristics.names, original[:, np.newaxis], strict=True)), 1.0, 0.05)
+    state, all_open = vehicle.at_speed(prepared, np.array([50 / 3.6])), np.ones(1, dtype=bool)
+    robot = DrivingRobot([Point(CarToCar(speed=50), SUN.weather)], vehicle, prepared, state, 0.05)
+    robot.drive(Command(state.throttle, state.brake), state._replace(speed=np.array([(50 + error) / 3.6])), all_open)
+    assert robot.invalid.tolist() == [invalid]
 
 
 def test_a_setting_with_an_invalid_test_is_neither_safe_nor_unsafe_but_a_collision_elsewhere_stands() -> None:

@@ -52,6 +52,18 @@ def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_
     assert [target(2, 0.501), target(2, 0.499), target(2, 0.499, 1.9), target(1, 0.1), target(4, 0.9)] == [2, 1, 2, 1, 4]
 
 
+def test_carlas_gearbox_shifts_as_soon_as_the_selector_lets_go_of_the_gear() -> None:
+    """In first gear at 90 % of the engine's maximum: it waits as long as it is held, and no latency after that."""
+    vehicle, p, one = SYSTEMS["carla"].vehicle, prepared("carla"), np.ones(1)
+    rim = 0.9 * 5800 * 2 * np.pi / 60 / (2.85 * 4)
+    state = vehicle.at_rest(p)._replace(gear=one, target_gear=one, speed=rim * 0.355 * one, wheel_speed=rim * one,
+                                        engine_speed=rim * 2.85 * 4 * one)
+    for _ in range(100):
+        state = step("carla", vehicle.hold_gear(p, state, one > 0), throttle=1.0)  # type: ignore[attr-defined]
+        assert state.target_gear[0] == 1
+    assert step("carla", vehicle.hold_gear(p, state, one < 0), throttle=1.0).target_gear[0] == 2  # type: ignore[attr-defined]
+
+
 def test_carlas_pedals_rise_and_fall_at_their_own_rates() -> None:
     vehicle = SYSTEMS["carla"].vehicle
     one = np.ones(1)
@@ -96,6 +108,16 @@ def test_lgsvls_gearbox_and_traction_control_have_their_numbers() -> None:
     assert torque == pytest.approx([0.325 * 450 + 337.5 * STEP * k for k in range(4)])
 
 
+@pytest.mark.parametrize(("share", "gear"), [(0.12, 2), (0.14, 3), (0.32, 3), (0.34, 4)])
+def test_lgsvls_gearbox_shifts_up_at_033_and_down_at_013_of_the_engines_maximum(share: float, gear: int) -> None:
+    """From third gear, 8299 r/min at most."""
+    one = np.ones(1)
+    state = SYSTEMS["lgsvl"].vehicle.at_rest(prepared("lgsvl"))._replace(speed=5 * one, wheel_speed=5 / 0.35 * one, gear=3 * one,
+                                                                         old_ratio=2.11 * one, new_ratio=2.11 * one,
+                                                                         engine_rpm=share * 8299 * one)
+    assert step("lgsvl", state).gear[0] == gear
+
+
 @pytest.mark.parametrize(("slip", "share"), [(0.2, 0.75), (0.4, 1.0), (0.6, 0.75), (0.8, 0.5), (0.95, 0.5)])
 def test_lgsvls_tyres_follow_unitys_curve(slip: float, share: float) -> None:
     """A parabola up to the extremum at slip 0.4, a line down to half of it at 0.8; load with 2 v^2 N of downforce."""
@@ -110,6 +132,17 @@ def test_sumos_sensor_sees_less_far_in_bad_sight(visibility: float, seen: bool) 
     vehicle, p, one = SYSTEMS["sumo"].vehicle, prepared("sumo"), np.ones(1)
     result, _ = vehicle.sense(p, vehicle.at_rest(p), Observation(0.0, one, 60 * one, one, 0 * one, 0 * one, visibility))
     assert bool(np.isfinite(result.gap[0])) == seen, "80 m in clear sight"
+
+
+def test_who_brakes_sumos_vehicle_does_not_go_on_speeding_up_until_the_lag_of_its_actuators_is_over() -> None:
+    """A lag of 0.5 s leaves most of full throttle's acceleration to the next step; a tenth of the brake ends it at once."""
+    vehicle, p = SYSTEMS["sumo"].vehicle, prepared("sumo", tau=0.5, brakeDelay=0.0)
+    state = vehicle.at_rest(p)
+    for _ in range(40):
+        state = vehicle.advance(p, state, Command(np.ones(1), np.zeros(1)))
+    released, braked = (vehicle.advance(p, state, Command(np.zeros(1), np.full(1, brake))) for brake in (0.0, 0.1))
+    assert released.speed[0] > state.speed[0]
+    assert braked.speed[0] <= state.speed[0]
 
 
 def test_a_calibration_drive_finds_what_the_brake_adds_to_coasting() -> None:

@@ -57,6 +57,14 @@ def test_deceleration_is_that_of_two_axles_of_which_none_brakes_more_than_its_lo
     assert CAR.sumo_type(p).decel[0] == pytest.approx(low, rel=1e-9)
 
 
+def test_sumo_is_told_what_the_worn_car_can_do() -> None:
+    """3900 N of engine on dry road, 0.9 of g times the road's friction on ice; the brakes respond after 0.1 s and a step."""
+    dry, icy = CAR.sumo_type(prepared(1.0)), CAR.sumo_type(prepared(0.1))
+    assert dry.accel[0] == pytest.approx(3900 / (1500 + 75))
+    assert (icy.accel[0], icy.decel[0]) == pytest.approx((0.09 * GRAVITY, 0.09 * GRAVITY))
+    assert dry.tau[0] == pytest.approx(0.1 + 0.05)
+
+
 @pytest.mark.slow
 def test_stopping_distances_of_worn_tyres_are_in_the_published_ratios_on_a_wet_road_and_equal_on_a_dry_one() -> None:
     """MIRA for RoSPA: +36.8 % from 6.7 to 1.6 mm; MIRA for Continental, from 50 mph: 31.7 m at 3 mm, 39.9 m at 1.6 mm."""
