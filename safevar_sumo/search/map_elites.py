@@ -15,7 +15,7 @@ from safevar_sumo.search.evolution import Probability, TournamentSize
 MOST_CELLS = 2**16
 """Maximum number of cells of an atlas: with more than 16 characteristics, not every set of changes can be a cell."""
 FASTEST = 20.0
-"""Speed of a collision at which the last cell begins [m/s]."""
+"""Speed of a collision up to which the cells are equally wide; faster ones are in the last cell, too [m/s]."""
 
 NEVER_REACHED = 1e6
 """Larger than any objective."""
