@@ -212,9 +212,9 @@ def test_the_side_is_the_one_in_which_bodies_began_to_overlap_last(
     own, other = Body(np.zeros(2), EAST, 4.0, 2.0, 10.0), Body(np.array(middle), np.array(along), 0.6, 0.4, speed)
     touch = touches(Body.columns([own]), Body.columns([other]))
     assert touch.side == contact[0]
-    assert touch.ago == pytest.approx(contact[1])
+    assert touch.age == pytest.approx(contact[1])
     if contact[2] is not None:
-        assert touch.behind_front == pytest.approx(contact[2] - 0.2)
+        assert touch.front_distance == pytest.approx(contact[2] - 0.2)
 
 
 def test_who_tests_a_vehicle_faster_than_it_was_fitted_is_told() -> None:

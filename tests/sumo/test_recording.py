@@ -20,7 +20,7 @@ from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import Engine, at_every_point, reason_for_sumo, recording
-from safevar_sumo.sumo.recorded_world import distance
+from safevar_sumo.sumo.recorded_world import distance_covered
 from safevar_sumo.sumo.recording import recorded_scenes
 from safevar_sumo.sumo.system import System, assemble
 
@@ -69,7 +69,7 @@ def test_vehicles_in_a_recorded_scene_do_what_they_do_in_sumo_to_the_last_bit(an
 def test_a_step_is_as_long_as_sumos_where_the_order_of_operations_shows() -> None:
     """Of 7,168 settings two were 1.4e-14 m off where speeds were averaged: places of these before and after a step in SUMO."""
     before, after = np.array([0.0, 0.49783446695015615]), np.array([0.4348049848410796, 1.0073508794958133])
-    there = np.array([28.196, 28.208445861673756]) + distance(before, after, 0.05)
+    there = np.array([28.196, 28.208445861673756]) + distance_covered(before, after, 0.05)
     assert there.tolist() == [28.206870124621027, 28.246075495334903]
 
 
