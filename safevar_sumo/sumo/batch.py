@@ -24,7 +24,7 @@ from safevar_sumo.sumo.recording import Recording, recorded_scenes
 from safevar_sumo.sumo.staging import staged
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
-from safevar_sumo.sumo.world import SURE_BRAKES, SumoWorld
+from safevar_sumo.sumo.world import INSERTION_DECELERATION, SumoWorld
 from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, at_start, slope_of
 
 Watcher = Callable[[SumoWorld], None]
@@ -32,7 +32,7 @@ Watcher = Callable[[SumoWorld], None]
 
 @np.errstate(all="ignore")
 def score(system: System, settings: FloatArray, run: SimulationRuns) -> Evaluations:
-    """Metrics and objectives of simulated settings."""
+    """The metrics and objectives of settings that have been simulated in `run`."""
     metrics = {name: metric(run, system.metrics) for name, metric in system.measuring.metrics.items()}
     invalid = run.outcome == Outcome.INVALID_TEST
     if invalid.any():
@@ -48,7 +48,7 @@ def score(system: System, settings: FloatArray, run: SimulationRuns) -> Evaluati
 
 
 def reason_for_sumo(system: System) -> str:
-    """The reason why a system is simulated in SUMO, with a copy of the network for each vehicle; "" if it runs in recorded scenes."""
+    """The reason why a system is simulated in SUMO, in one copy of the network per vehicle; "" if recorded scenes suffice."""
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
     scenes = recorded_scenes([point.scenario for point in system.points], step_options(system))
@@ -57,11 +57,11 @@ def reason_for_sumo(system: System) -> str:
 
 def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = (),
               watch: Watcher | None = None) -> SimulationRuns:
-    """Simulate every setting, shape (N, n), at every point; `watch` is called with SUMO's world at every sample.
+    """Simulate N settings of n characteristics, shape (N, n), at every point; `watch` is called with SUMO's world at every sample.
 
-    Several points must share a network and have recorded scenes; SUMO simulates one point only.
+    Several points must share a network and have recorded scenes; SUMO simulates only one point at once.
 
-    The runs at the first point come first, then those at the second, and so on.
+    The result holds the runs at the first point, then the runs at the second point, and so on.
 
     Raises
     ------
@@ -74,12 +74,12 @@ def drive_all(system: System, settings: FloatArray, engine: Engine = Engine.RECO
     if engine is Engine.RECORDED:
         if watch is None and not reason_for_sumo(system):
             scenes = recorded_scenes(scenarios, options)
-            recorded = RecordedWorld([scene for scene in scenes if isinstance(scene, Recording)], len(settings))
-            return drive(system, np.tile(settings, (len(system.points), 1)), recorded)
+            world = RecordedWorld([scene for scene in scenes if isinstance(scene, Recording)], len(settings))
+            return drive(system, np.tile(settings, (len(system.points), 1)), world)
         engine = Engine.LIBSUMO
     (scenario,) = scenarios
-    with open_world(copied_network(staged(scenario).folder, len(settings)), len(settings), engine, options) as world:
-        return drive(system, settings, world, watch)
+    with open_world(copied_network(staged(scenario).folder, len(settings)), len(settings), engine, options) as sumo_world:
+        return drive(system, settings, sumo_world, watch)
 
 
 def step_options(system: System) -> tuple[str, ...]:
@@ -89,27 +89,27 @@ def step_options(system: System) -> tuple[str, ...]:
 
 @np.errstate(all="ignore")
 def drive(system: System, settings: FloatArray, world: SumoWorld | RecordedWorld, watch: Watcher | None = None) -> SimulationRuns:
-    """Simulate the vehicles of an open world before its first step; see `drive_all`.
+    """Simulate vehicles in an open world that has not taken its first step; see `drive_all`.
 
-    With several points the k-th part of the settings is at the k-th point.
+    With K points, `settings` has K equal parts, and part k drives at point k.
     """
     guards = [member.guard for member in system.members if member.guard is not None]
     with guard_process_state(guards[0].source if guards else "", [guard.name for guard in guards]):
-        return _simulated(system, settings, world, watch)
+        return _simulate(system, settings, world, watch)
 
 
-def _simulated(system: System, settings: FloatArray, world: Any, watch: Watcher | None) -> SimulationRuns:
+def _simulate(system: System, settings: FloatArray, world: Any, watch: Watcher | None) -> SimulationRuns:
     vehicle, step, n = system.vehicle, world.step_length, len(settings)
     characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = vehicle.prepare(characteristics, _road_friction(system.points, n), step, *_surface(system.points, n))
     types = vehicle.sumo_type(prepared)
-    world.set_types(types._replace(decel=np.maximum(types.decel, SURE_BRAKES)))
+    world.set_types(types._replace(decel=np.maximum(types.decel, INSERTION_DECELERATION)))
     world.depart()
     world.set_decelerations(types.decel)
     length, frame = world.vehicle_length(VUT), Frame.through_origin(Lane(*world.lane_of(VUT)))
 
     state = at_start(vehicle, prepared, world.speeds())
-    if isinstance(system.ads, TraciController):  # other ADSs get sensed observations
+    if isinstance(system.ads, TraciController):  # other ADSs do not read the world, but get observations
         world.sensors = _sensors(system, prepared, n)
     driver = system.ads.start(n, system.nominal, step)
     batch = PointBatch(system.points, world, n)
@@ -122,9 +122,9 @@ def _simulated(system: System, settings: FloatArray, world: Any, watch: Watcher 
         speed = world.speeds()
         scene = batch.scene(verdict.open)
         active = verdict.judge(speed, scene.over, contacts.collisions(world, verdict.open, scene), last=sample >= batch.last_step)
-        seen = batch.observe(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
-        seen, state = vehicle.sense(prepared, state, seen)
-        command, driver = system.ads.drive(seen, driver)
+        observation = batch.observe(sample * step, speed, scene)._replace(throttle=state.throttle, brake=state.brake)
+        observation, state = vehicle.sense(prepared, state, observation)
+        command, driver = system.ads.drive(observation, driver)
         warnings.update(driver, speed, scene, verdict.open)
         command, state = robot.drive(command, state, verdict.open)
         log.write(sample, position=world.vehicle_positions(VUT), speed=speed, gap=scene.gap, lateral=scene.lateral,
@@ -133,9 +133,9 @@ def _simulated(system: System, settings: FloatArray, world: Any, watch: Watcher 
         if not np.count_nonzero(verdict.open):
             break
         if watch is None:
-            world.leave(verdict.ended)
+            world.leave(verdict.ended_copies)
         state = vehicle.advance(prepared, state, command)
-        _refuse_nan(state.speed, settings, system.characteristics)
+        _check_finite(state.speed, settings, system.characteristics)
         world.advance(np.where(verdict.open, state.speed, 0.0))
     trace = log.trace(sample + 1, step, length)
     return SimulationRuns(
@@ -144,10 +144,10 @@ def _simulated(system: System, settings: FloatArray, world: Any, watch: Watcher 
         test_speed_error=robot.error, warning_ttc=warnings.time_to_collision)
 
 
-def _refuse_nan(speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet) -> None:
-    """Refuse speeds that are not finite: SUMO would take them for 0, and a vehicle whose model diverged would seem to stand.
+def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet) -> None:
+    """Refuse speeds that are not finite: SUMO would use 0 instead, and a vehicle whose model diverged would appear to stand.
 
-    The error replaces numpy's warnings of overflows, which name neither characteristic nor value.
+    The error replaces numpy's overflow warnings, which name neither a characteristic nor a value.
     """
     if np.count_nonzero(np.isfinite(speed)) < len(speed):
         copy = np.flatnonzero(~np.isfinite(speed))[0]
@@ -157,29 +157,29 @@ def _refuse_nan(speed: FloatArray, settings: FloatArray, characteristics: Charac
 
 
 def _road_friction(points: Sequence[Point], n: int) -> Any:
-    """Factor on the tyres' friction: a number, or shape (n,) where the points differ."""
+    """Factor on the tyres' friction: a number if all points share it, else an array of shape (n,)."""
     factors = [point.weather.road_friction for point in points]
     return factors[0] if len(set(factors)) == 1 else np.repeat(factors, n // len(points))
 
 
 def _surface(points: Sequence[Point], n: int) -> list[Any]:
-    """Slope and wetness of the points' roads, each for its part of the vehicles.
+    """Slope and wetness of the roads at the n vehicles, as further arguments of `Vehicle.prepare`.
 
-    Empty if all are level and dry, as not every vehicle model accepts them.
+    The list is empty if all roads are level and dry, because not every vehicle model accepts these arguments.
     """
-    grades, wet = [getattr(point.scenario, "grade", 0.0) for point in points], [point.weather.wet for point in points]
+    grades, wetness = [getattr(point.scenario, "grade", 0.0) for point in points], [point.weather.wet for point in points]
     slope = slope_of(np.repeat(grades, n // len(points))) if any(grades) else LEVEL
-    return [slope, np.repeat(wet, n // len(points))] if any(wet) else [slope] if any(grades) else []
+    return [slope, np.repeat(wetness, n // len(points))] if any(wetness) else [slope] if any(grades) else []
 
 
 def _sensors(system: System, prepared: Any, n: int) -> Sensors:
-    """The vehicles' sensors in the weathers of their points, with recognition delay and visibility applied."""
+    """The vehicles' sensors: each point's weather adds its recognition delay and scales the range by its visibility."""
     method = getattr(system.vehicle, "sensors", None)
-    own = (None if method is None else method(prepared)) or Sensors.perfect(n)
+    sensors = (None if method is None else method(prepared)) or Sensors.perfect(n)
     weathers = [point.weather for point in system.points]
     delay = np.repeat([weather.recognition_delay for weather in weathers], n // len(weathers))
     visibility = np.repeat([weather.visibility for weather in weathers], n // len(weathers))
-    return Sensors(own.latency + delay, own.reach * visibility, own.scale)
+    return Sensors(sensors.latency + delay, sensors.reach * visibility, sensors.scale)
 
 
 class _Warnings:
@@ -190,68 +190,68 @@ class _Warnings:
         self.time_to_collision = np.full(n, np.nan)
 
     def update(self, memory: Any, speed: FloatArray, scene: Scene, open_: BoolArray) -> None:
-        """Process one sample, with the true position of the obstacle instead of the sensed one."""
+        """Process one sample; `scene` holds the true position of the obstacle, not the sensed position."""
         if self._warns is None:
             return
-        closing = speed - scene.obstacle_speed
-        first = self._warns(memory) & open_ & np.isnan(self.time_to_collision) & (closing > 0)
-        if first.any():
-            self.time_to_collision = np.where(first, scene.gap / closing, self.time_to_collision)
+        closing_speed = speed - scene.obstacle_speed
+        is_first = self._warns(memory) & open_ & np.isnan(self.time_to_collision) & (closing_speed > 0)
+        if is_first.any():
+            self.time_to_collision = np.where(is_first, scene.gap / closing_speed, self.time_to_collision)
 
 
 class _Log:
-    """Samples of a run in arrays of shape (T, N), and positions of the vehicles on SUMO's plane, shape (T, N, 2)."""
+    """T samples of N runs in arrays of shape (T, N), and positions of the vehicles on SUMO's plane, shape (T, N, 2)."""
 
-    _COLUMNS = ("speed", "gap", "lateral", "lateral_speed", "throttle", "brake", "gear", "active", "obstacle_speed",
+    _NAMES = ("speed", "gap", "lateral", "lateral_speed", "throttle", "brake", "gear", "active", "obstacle_speed",
                 "pedal")
 
     def __init__(self, n: int, length: int, frame: Frame) -> None:
         self.length, self._frame = length, frame
-        self._rows = {name: np.zeros((length, n), dtype=bool if name == "active" else float) for name in self._COLUMNS}
+        self._columns = {name: np.zeros((length, n), dtype=bool if name == "active" else float) for name in self._NAMES}
         self._positions = np.zeros((length, n, 2))
 
     def write(self, sample: int, position: FloatArray, **columns: FloatArray | BoolArray) -> None:
         self._positions[sample] = position
         for name, values in columns.items():
-            self._rows[name][sample] = values
+            self._columns[name][sample] = values
 
     def trace(self, length: int, step: float, vehicle_length: float) -> Trace:
-        rows = {name: values[:length] for name, values in self._rows.items()}
-        rows["position"] = self._frame.along(self._positions[:length].reshape(-1, 2)).reshape(length, -1)
-        return Trace(step=step, vehicle_length=vehicle_length, time=np.round(np.arange(length) * step, TIME_DECIMALS), **rows)
+        columns = {name: values[:length] for name, values in self._columns.items()}
+        columns["position"] = self._frame.along(self._positions[:length].reshape(-1, 2)).reshape(length, -1)
+        return Trace(step=step, vehicle_length=vehicle_length, time=np.round(np.arange(length) * step, TIME_DECIMALS), **columns)
 
 
 class _Outcomes:
-    """Outcomes of N simulations (method section 4); `open` where the outcome can still change, `ended` those that ended in this step."""
+    """Outcomes of N runs (method section 4): `open` is true where an outcome can change; `ended_copies` ended in this step."""
 
     def __init__(self, n: int) -> None:
         self.open = np.ones(n, dtype=bool)
-        self.ended: list[int] = []
+        self.ended_copies: list[int] = []
         self.collision_speed = np.full(n, np.nan)
-        self._moved = np.zeros(n, dtype=bool)
-        self._stood = np.zeros(n, dtype=bool)
-        self._over = np.zeros(n, dtype=bool)
+        self._has_moved = np.zeros(n, dtype=bool)
+        self._has_stopped = np.zeros(n, dtype=bool)
+        self._is_over = np.zeros(n, dtype=bool)
 
     def judge(self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: BoolArray | bool) -> BoolArray:
-        """Process one sample; returns for which vehicles the sample still belongs to the run."""
-        before, active = self.open.copy(), self.open & ~over
+        """Process one sample; returns for which vehicles it belongs to the run."""
+        was_open, active = self.open.copy(), self.open & ~over
         for copy, collision_speed in collisions.items():
             if self.open[copy]:
                 self.collision_speed[copy] = collision_speed
                 active[copy], self.open[copy] = True, False
-        standing = speed <= STANDSTILL
-        self._stood |= self.open & self._moved & standing
-        self._moved |= self.open & ~standing
-        self._over |= self.open & over
+        is_standing = speed <= STANDSTILL
+        self._has_stopped |= self.open & self._has_moved & is_standing
+        self._has_moved |= self.open & ~is_standing
+        self._is_over |= self.open & over
         self.open &= ~over & ~np.asarray(last)
-        self.ended = (before & ~self.open).nonzero()[0].tolist()
+        self.ended_copies = (was_open & ~self.open).nonzero()[0].tolist()
         return active
 
     def outcome(self) -> npt.NDArray[np.str_]:
-        """The outcome of every simulation, when no run is open."""
+        """The outcomes of all runs, once no run is open."""
         outcome = np.full(len(self.open), Outcome.TIMEOUT.value, dtype="U16")
-        outcome[self._over] = Outcome.PASSED
-        outcome[self._stood] = Outcome.STOPPED
-        outcome[~self._moved] = Outcome.NEVER_MOVED
+        outcome[self._is_over] = Outcome.PASSED
+        outcome[self._has_stopped] = Outcome.STOPPED
+        outcome[~self._has_moved] = Outcome.NEVER_MOVED
         outcome[~np.isnan(self.collision_speed)] = Outcome.COLLISION
         return outcome

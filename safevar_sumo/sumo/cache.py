@@ -1,4 +1,4 @@
-"""Built files in the user's cache folder: named by their sources, written atomically, and checked before use."""
+"""Built files in the user's cache folder; they are named by their sources, written atomically and checked before use."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ import platformdirs
 
 from safevar_sumo.errors import EnvironmentFault
 
-CHECKSUM = ".sha256"
+CHECKSUM_ENDING = ".sha256"
 
 
 def cached(folder: str, name: str, build: Callable[[Path], None]) -> Path:
-    """A file of the cache, built if it is missing or damaged.
+    """The path of a file in the cache; the file is built if it is missing or damaged.
 
     Parameters
     ----------
     folder
-        Folder within the cache, different for different contents.
+        Folder in the cache; different contents need different folders.
     build
-        Function that writes the file `name`, always with the same bytes, into the directory that is its argument.
+        Function that writes the file `name` into a given directory, always with the same bytes.
 
     Raises
     ------
@@ -31,13 +31,13 @@ def cached(folder: str, name: str, build: Callable[[Path], None]) -> Path:
         If the cache cannot be written.
     """
     target = platformdirs.user_cache_path("safevar_sumo") / "networks" / folder / name
-    if not _intact(target):
+    if not _is_intact(target):
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=target.parent) as temporary:
                 build(Path(temporary))
                 built = Path(temporary) / name
-                checksum = built.with_name(name + CHECKSUM)
+                checksum = built.with_name(name + CHECKSUM_ENDING)
                 checksum.write_text(_sha256(built), encoding="ascii")
                 for file in (built, checksum):
                     _sync(file)
@@ -47,9 +47,9 @@ def cached(folder: str, name: str, build: Callable[[Path], None]) -> Path:
     return target
 
 
-def _intact(target: Path) -> bool:
+def _is_intact(target: Path) -> bool:
     try:
-        return target.with_name(target.name + CHECKSUM).read_text(encoding="ascii") == _sha256(target)
+        return target.with_name(target.name + CHECKSUM_ENDING).read_text(encoding="ascii") == _sha256(target)
     except (OSError, UnicodeDecodeError):
         return False
 

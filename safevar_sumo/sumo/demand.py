@@ -9,17 +9,17 @@ from pathlib import Path
 
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.sumo.copies import DEMAND, seconds
+from safevar_sumo.sumo.copies import DEMAND_IDS, seconds
 
-LEVEL = 0.005
-"""Largest climb of a road that counts as level, over its length [-]."""
+MAX_SLOPE = 0.005
+"""Largest difference in height on a road that counts as level, per length [-]."""
 
 Lanes = dict[str, list[ElementTree.Element]]
 """Lanes by edge."""
 
 
-def check_places(root: ElementTree.Element, file: Path, roads: ElementTree.Element) -> None:
-    """Refuse positions beyond the end of a lane, and a road of the vehicle under test that climbs or is slippery.
+def check_positions(root: ElementTree.Element, file: Path, roads: ElementTree.Element) -> None:
+    """Refuse positions beyond the end of a lane, and a sloping or slippery road of the vehicle under test.
 
     Raises
     ------
@@ -31,22 +31,22 @@ def check_places(root: ElementTree.Element, file: Path, roads: ElementTree.Eleme
     for actor in root:
         edges = _edges_of(actor, routes)
         if edges:
-            _check_on(actor, ("departPos",), edges[0], lanes, file)
+            _check_position(actor, ("departPos",), edges[0], lanes, file)
         if actor.get("id") == VUT and actor.tag in ("vehicle", "trip"):
             for edge in edges:
                 _check_surface(lanes[edge], file)
     for stop in root.iter("stop"):
-        _check_on(stop, ("startPos", "endPos"), stop.get("edge") or stop.get("lane", "").rpartition("_")[0], lanes, file)
+        _check_position(stop, ("startPos", "endPos"), stop.get("edge") or stop.get("lane", "").rpartition("_")[0], lanes, file)
 
 
 def edges_of_vut(root: ElementTree.Element) -> list[str]:
-    """The edges of the vehicle under test, as far as the traffic file names them."""
+    """The edges that the traffic file names for the vehicle under test."""
     routes = {route.get("id", ""): route for route in root.findall("route")}
     return [edge for actor in root if actor.get("id") == VUT and actor.tag in ("vehicle", "trip") for edge in _edges_of(actor, routes)]
 
 
 def _edges_of(actor: ElementTree.Element, routes: dict[str, ElementTree.Element]) -> list[str]:
-    """The edges on which an actor starts and, as far as the file names them, continues."""
+    """The edges that the file names for an actor, the start first."""
     for part in (actor.find("route"), routes.get(actor.get("route", "")), actor, actor.find("walk"), actor.find("personTrip")):
         if part is not None:
             edges = " ".join(part.get(name, "") for name in ("edges", "from", "via", "to")).split()
@@ -55,19 +55,19 @@ def _edges_of(actor: ElementTree.Element, routes: dict[str, ElementTree.Element]
     return []
 
 
-def _check_on(element: ElementTree.Element, names: tuple[str, ...], edge: str, lanes: Lanes, file: Path) -> None:
+def _check_position(element: ElementTree.Element, names: tuple[str, ...], edge: str, lanes: Lanes, file: Path) -> None:
     length = max((float(lane.get("length", 0)) for lane in lanes.get(edge, [])), default=float("inf"))
     for name in names:
         value = element.get(name, "0")
         if is_number(value) and not abs(float(value)) <= length:
-            raise InputError(file, f"{_called(element)}: {name} = {value} is not on {edge!r}", f"at most its length, {length:g} m")
+            raise InputError(file, f"{_label(element)}: {name} = {value} is not on {edge!r}", f"at most its length, {length:g} m")
 
 
 def _check_surface(lanes: list[ElementTree.Element], file: Path) -> None:
     for lane in lanes:
         heights = [float((*point.split(","), "0")[2]) for point in lane.get("shape", "").split()]
         climb = max(heights, default=0.0) - min(heights, default=0.0)
-        if climb > LEVEL * float(lane.get("length", 0)):
+        if climb > MAX_SLOPE * float(lane.get("length", 0)):
             raise InputError(file, f"vehicle {VUT!r} is to drive on lane {lane.get('id')!r}, which climbs {climb:.2f} m",
                              "a level road, and a scenario's grade; netconvert's option flatten makes one")
         if float(lane.get("friction", 1)) != 1:
@@ -85,34 +85,34 @@ def is_number(text: str) -> bool:
 
 
 _ACTORS = ("vehicle", "trip", "flow", "person", "personFlow")
-_RIDING, _WALKING = ("route", "stop", "param"), ("walk", "personTrip", "stop", "param")
+_VEHICLE_CHILDREN, _PERSON_CHILDREN = ("route", "stop", "param"), ("walk", "personTrip", "stop", "param")
 CHILDREN: Mapping[str, tuple[str, ...]] = {
-    "routes": ("vType", "route", *_ACTORS), "vType": ("param",), "route": ("stop", "param"), "vehicle": _RIDING,
-    "trip": ("stop", "param"), "flow": _RIDING, "person": _WALKING, "personFlow": _WALKING, "walk": ("param",), "personTrip": ("param",),
-    "stop": ("param",), "param": (),
+    "routes": ("vType", "route", *_ACTORS), "vType": ("param",), "route": ("stop", "param"), "vehicle": _VEHICLE_CHILDREN,
+    "trip": ("stop", "param"), "flow": _VEHICLE_CHILDREN, "person": _PERSON_CHILDREN, "personFlow": _PERSON_CHILDREN,
+    "walk": ("param",), "personTrip": ("param",), "stop": ("param",), "param": (),
 }
 """Legal children of the elements of a traffic file."""
-ELSEWHERE = frozenset({
+EXTERNAL_REFERENCES = frozenset({
     "fromTaz", "toTaz", "fromJunction", "toJunction", "busStop", "trainStop", "containerStop", "chargingStation",
     "parkingArea", "overheadWireSegment", "lines", "line", "group", "departEdge", "arrivalEdge", "imgFile", "osgFile"})
-"""Attributes that refer to things outside a traffic file."""
-DEVICES = re.compile(r"(has\.|device\.).*")
-"""Parameters of devices, which write files or use random numbers."""
-RANDOM = frozenset({"lcSigma", "jmIgnoreFoeProb", "jmIgnoreJunctionFoeProb", "jmSigmaMinor", "probability"})
+"""Attributes that refer to elements or files outside a traffic file."""
+DEVICE_PARAMETERS = re.compile(r"(has\.|device\.).*")
+"""Parameters of devices; devices write files or use random numbers."""
+RANDOM_ATTRIBUTES = frozenset({"lcSigma", "jmIgnoreFoeProb", "jmIgnoreJunctionFoeProb", "jmSigmaMinor", "probability"})
 """Attributes that introduce randomness unless they are 0."""
-SIGMA = frozenset({"Krauss", "KraussOrig1", "KraussPS"})
-STEADY = frozenset({"IDM", "IDMM", "ACC", "CACC"})
-"""Car-following models that are random unless sigma is 0, and that are never random."""
+SIGMA_MODELS = frozenset({"Krauss", "KraussOrig1", "KraussPS"})
+DETERMINISTIC_MODELS = frozenset({"IDM", "IDMM", "ACC", "CACC"})
+"""Car-following models that are random unless sigma is 0, and models that are never random."""
 
-SET_BY_SETTINGS = ("mass", "accel", "decel", "emergencyDecel", "apparentDecel", "maxSpeed", "tau")
-"""Attributes of the type of the vehicle under test that the vehicle model replaces by those of the setting."""
-SUMO_DRIVER = re.compile("carFollowModel|speedFactor|speedDev|sigma.*|desiredMaxSpeed|impatience|laneChangeModel|lc[A-Z].*|jm[A-Z].*"
+SETTING_ATTRIBUTES = ("mass", "accel", "decel", "emergencyDecel", "apparentDecel", "maxSpeed", "tau")
+"""Attributes of the tested vehicle's type whose values the vehicle model replaces by values of the setting."""
+DRIVER_ATTRIBUTES = re.compile("carFollowModel|speedFactor|speedDev|sigma.*|desiredMaxSpeed|impatience|laneChangeModel|lc[A-Z].*|jm[A-Z].*"
                              "|actionStepLength|startupDelay|delta|stepping|minGapLat|maxSpeedLat|latAlignment")
 """Attributes of SUMO's own driver."""
 
 
 def check_demand(root: ElementTree.Element, file: Path, roads: ElementTree.Element, options: Mapping[str, str]) -> None:
-    """Refuse traffic that cannot be copied, that would differ between copies, or that is not on the built network.
+    """Refuse traffic that cannot be copied, that would differ between copies, or that does not fit the built network.
 
     Raises
     ------
@@ -124,53 +124,53 @@ def check_demand(root: ElementTree.Element, file: Path, roads: ElementTree.Eleme
     for parent in root.iter():
         for element in parent:
             if element.tag not in CHILDREN[parent.tag]:
-                raise InputError(file, f"{_called(parent)} has a {element.tag!r}", one_of(CHILDREN[parent.tag]) or "nothing")
+                raise InputError(file, f"{_label(parent)} has a {element.tag!r}", one_of(CHILDREN[parent.tag]) or "nothing")
             _check_element(element, file)
     _check_ids(root, file, roads)
     _check_vut(root, file)
-    _check_chance(root, file, options)
-    check_places(root, file, roads)
+    _check_randomness(root, file, options)
+    check_positions(root, file, roads)
 
 
-def _called(element: ElementTree.Element) -> str:
+def _label(element: ElementTree.Element) -> str:
     return f"{element.tag} {element.get('id')!r}" if "id" in element.attrib else element.tag
 
 
 def _check_element(element: ElementTree.Element, file: Path) -> None:
     for name, value in element.attrib.items():
-        if name in ELSEWHERE:
-            raise InputError(file, f"{_called(element)}: {name} = {value!r}", "edges and lanes of the network; no other file is read")
-        random_place = name.startswith(("depart", "arrival")) and value.startswith("random")
-        if random_place or (name == "period" and value.startswith("exp")) or (name in RANDOM and not _zero(value)):
-            raise InputError(file, f"{_called(element)}: {name} = {value!r} draws at random", "the same in every copy of the network")
-    if element.tag == "param" and DEVICES.fullmatch(element.get("key", "")):
+        if name in EXTERNAL_REFERENCES:
+            raise InputError(file, f"{_label(element)}: {name} = {value!r}", "edges and lanes of the network; no other file is read")
+        is_random_position = name.startswith(("depart", "arrival")) and value.startswith("random")
+        if is_random_position or (name == "period" and value.startswith("exp")) or (name in RANDOM_ATTRIBUTES and not _is_zero(value)):
+            raise InputError(file, f"{_label(element)}: {name} = {value!r} draws at random", "the same in every copy of the network")
+    if element.tag == "param" and DEVICE_PARAMETERS.fullmatch(element.get("key", "")):
         raise InputError(file, f"param {element.get('key')!r} gives a device", "no devices: they write files, or draw at random")
     if element.tag in _ACTORS and seconds(element.get("depart", element.get("begin", "0"))) is None:
-        raise InputError(file, f"{_called(element)}: depart = {element.get('depart', element.get('begin'))!r}", "a time [s]")
+        raise InputError(file, f"{_label(element)}: depart = {element.get('depart', element.get('begin'))!r}", "a time [s]")
     if element.tag in _ACTORS and not is_number(element.get("speedFactor", "1")):
-        raise InputError(file, f"{_called(element)}: speedFactor = {element.get('speedFactor')!r}", "a number")
+        raise InputError(file, f"{_label(element)}: speedFactor = {element.get('speedFactor')!r}", "a number")
 
 
 def _check_ids(root: ElementTree.Element, file: Path, roads: ElementTree.Element) -> None:
-    types, routes = (_unique(root, kinds, file) for kinds in (("vType",), ("route",)))
+    types, routes = (_unique_ids(root, kinds, file) for kinds in (("vType",), ("route",)))
     for kinds in (("vehicle", "trip", "flow"), ("person", "personFlow")):
-        _unique(root, kinds, file)
+        _unique_ids(root, kinds, file)
     edges = {edge.get("id", "") for edge in roads.iter("edge")}
     names = {"type": types, "vTypes": types, "route": routes, "edges": edges, "from": edges, "to": edges, "via": edges, "edge": edges,
              "lane": {lane.get("id", "") for lane in roads.iter("lane")}}
     for element in root.iter():
-        for name in DEMAND.get(element.tag, ()):
+        for name in DEMAND_IDS.get(element.tag, ()):
             for reference in element.get(name, "").split():
                 if name in names and reference not in names[name]:
-                    raise InputError(file, f"{_called(element)}: {name} = {reference!r} does not exist", _some_of(names[name]))
+                    raise InputError(file, f"{_label(element)}: {name} = {reference!r} does not exist", _one_of_names(names[name]))
 
 
-def _some_of(names: set[str]) -> str:
-    shown = sorted(name for name in names if not name.startswith(":"))
-    return f"one of {', '.join(shown[:12])}{', ...' if len(shown) > 12 else ''}" if shown else "one that is defined"
+def _one_of_names(names: set[str]) -> str:
+    visible_names = sorted(name for name in names if not name.startswith(":"))
+    return f"one of {', '.join(visible_names[:12])}{', ...' if len(visible_names) > 12 else ''}" if visible_names else "one that is defined"
 
 
-def _unique(root: ElementTree.Element, kinds: tuple[str, ...], file: Path) -> set[str]:
+def _unique_ids(root: ElementTree.Element, kinds: tuple[str, ...], file: Path) -> set[str]:
     names: set[str] = set()
     for element in root:
         if element.tag in kinds:
@@ -182,7 +182,7 @@ def _unique(root: ElementTree.Element, kinds: tuple[str, ...], file: Path) -> se
 
 
 def _check_vut(root: ElementTree.Element, file: Path) -> None:
-    """Refuse traffic without a vehicle under test that departs at time 0, has no stops, and alone has its type."""
+    """Refuse traffic unless its vehicle under test departs at time 0, has no stops, and shares its type with no other actor."""
     vut = next((actor for actor in root if actor.tag in ("vehicle", "trip") and actor.get("id") == VUT), None)
     if vut is None:
         raise InputError(file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>, the vehicle under test')
@@ -195,67 +195,67 @@ def _check_vut(root: ElementTree.Element, file: Path) -> None:
         raise InputError(file, f"vehicle {VUT!r} has a stop", "none: its ADS drives it")
     for element in root:
         if element is not vut and element.get("type") == VUT:
-            raise InputError(file, f"{_called(element)}: type = {VUT!r}, which changes with every setting", "a vType of its own")
+            raise InputError(file, f"{_label(element)}: type = {VUT!r}, which changes with every setting", "a vType of its own")
 
 
-def _check_chance(root: ElementTree.Element, file: Path, options: Mapping[str, str]) -> None:
-    """Refuse randomness in SUMO: it differs between copies, so that a result would depend on its batch."""
+def _check_randomness(root: ElementTree.Element, file: Path, options: Mapping[str, str]) -> None:
+    """Refuse random numbers in SUMO: they differ between copies, so that a result would depend on its batch."""
     types = {kind.get("id", ""): kind for kind in root if kind.tag == "vType"}
     for actor in root:
         if actor.tag in _ACTORS and actor.get("id") != VUT:
             if actor.get("type", "") not in types:
-                raise InputError(file, f"{_called(actor)} has no type, and SUMO's default draws at random",
+                raise InputError(file, f"{_label(actor)} has no type, and SUMO's default draws at random",
                                  'a vType with speedDev="0" and sigma="0"')
-            for problem, legal in _chances(types[actor.get("type", "")], actor, options):
-                raise InputError(file, f"vType {actor.get('type')!r} of {_called(actor)} draws at random: {problem}", legal)
-    walks = root.find("person") is not None or root.find("personFlow") is not None
-    if walks and options.get("pedestrian.model") != "nonInteracting" and not _zero(options.get("pedestrian.striping.dawdling", "0.2")):
-        raise InputError(file.with_name("scenario.sumocfg"), "persons dawdle at random: pedestrian.striping.dawdling = "
-                         f"{options.get('pedestrian.striping.dawdling', 'SUMO default 0.2')}", "0")
+            for problem, legal in _random_parameters(types[actor.get("type", "")], actor, options):
+                raise InputError(file, f"vType {actor.get('type')!r} of {_label(actor)} draws at random: {problem}", legal)
+    has_persons = root.find("person") is not None or root.find("personFlow") is not None
+    dawdling = options.get("pedestrian.striping.dawdling", "SUMO default 0.2")
+    if has_persons and options.get("pedestrian.model") != "nonInteracting" and not _is_zero(dawdling):
+        raise InputError(file.with_name("scenario.sumocfg"), f"persons dawdle at random: pedestrian.striping.dawdling = {dawdling}", "0")
 
 
-def _chances(kind: ElementTree.Element, actor: ElementTree.Element, options: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+def _random_parameters(kind: ElementTree.Element, actor: ElementTree.Element, options: Mapping[str, str]) -> Iterator[tuple[str, str]]:
     deviation = kind.get("speedDev", options.get("default.speeddev"))
     if not is_number(kind.get("speedFactor", "1")):
         yield f"speedFactor = {kind.get('speedFactor')!r}", "a number"
-    if not is_number(actor.get("speedFactor", "")) and not _zero(deviation or "0.1"):
+    if not is_number(actor.get("speedFactor", "")) and not _is_zero(deviation or "0.1"):
         yield f"speedDev = {deviation or 'SUMO default 0.1'}", 'speedDev="0"'
     if actor.tag in ("person", "personFlow"):
         return
     model = kind.get("carFollowModel", options.get("default.carfollowmodel", "Krauss"))
-    if model in SIGMA and not _zero(kind.get("sigma", "0.5")):
+    if model in SIGMA_MODELS and not _is_zero(kind.get("sigma", "0.5")):
         yield f"sigma = {kind.get('sigma', 'SUMO default 0.5')}", 'sigma="0"'
-    elif model not in SIGMA | STEADY:
-        yield f"carFollowModel = {model!r}", one_of(SIGMA | STEADY)
+    elif model not in SIGMA_MODELS | DETERMINISTIC_MODELS:
+        yield f"carFollowModel = {model!r}", one_of(SIGMA_MODELS | DETERMINISTIC_MODELS)
 
 
-def _zero(text: str) -> bool:
+def _is_zero(text: str) -> bool:
     return is_number(text) and float(text) == 0
 
 
-def unused(root: ElementTree.Element, roads: ElementTree.Element, fastest: float, *, sumo_drives: bool) -> list[str]:
-    """Remarks on attributes of the vehicle under test in a network that the simulation does not use.
+def unused_attributes(root: ElementTree.Element, roads: ElementTree.Element, max_speed: float, *, sumo_drives: bool) -> list[str]:
+    """Remarks on a network's attributes of the vehicle under test that the simulation does not use.
 
     Parameters
     ----------
-    fastest
+    max_speed
         Top speed of the original vehicle; higher speed limits have no effect [m/s].
     sumo_drives
-        Whether SUMO's own driver takes part, as with a controller written for TraCI.
+        Whether SUMO's own driver influences the vehicle, as with a controller written for TraCI.
     """
-    mentioned = []
+    attributes = []
     for element in (child for child in root if child.get("id") == VUT):
         for name, value in element.attrib.items():
-            if name in SET_BY_SETTINGS or (SUMO_DRIVER.fullmatch(name) and not sumo_drives and not _has_no_effect(name, value)):
-                mentioned.append(f"{name} = {value}")
-    slow = [] if sumo_drives else [lane for edge in edges_of_vut(root) for lane in roads.findall(f"edge[@id='{edge}']/lane")
-                                   if float(lane.get("speed", "inf")) < fastest]
-    if slow:
-        mentioned.append(f"the speed limit of lane {slow[0].get('id')!r} ({float(slow[0].get('speed', 'nan')):g} m/s)"
-                         f"{f' and of {len(slow) - 1} more' if len(slow) > 1 else ''}")
+            if name in SETTING_ATTRIBUTES or (DRIVER_ATTRIBUTES.fullmatch(name) and not sumo_drives and not _has_no_effect(name, value)):
+                attributes.append(f"{name} = {value}")
+    slow_lanes = [] if sumo_drives else [lane for edge in edges_of_vut(root) for lane in roads.findall(f"edge[@id='{edge}']/lane")
+                                         if float(lane.get("speed", "inf")) < max_speed]
+    if slow_lanes:
+        attributes.append(f"the speed limit of lane {slow_lanes[0].get('id')!r} ({float(slow_lanes[0].get('speed', 'nan')):g} m/s)"
+                         f"{f' and of {len(slow_lanes) - 1} more' if len(slow_lanes) > 1 else ''}")
     driver = "the study's vehicle and ADS determine how it drives"
-    return [f"not used of vehicle {VUT!r}: {', '.join(dict.fromkeys(mentioned))}; {driver}"] if mentioned else []
+    return [f"not used of vehicle {VUT!r}: {', '.join(dict.fromkeys(attributes))}; {driver}"] if attributes else []
 
 
 def _has_no_effect(name: str, value: str) -> bool:
-    return (name in ("sigma", "speedDev") and _zero(value)) or (name == "speedFactor" and is_number(value) and float(value) == 1)
+    return (name in ("sigma", "speedDev") and _is_zero(value)) or (name == "speedFactor" and is_number(value) and float(value) == 1)

@@ -1,6 +1,6 @@
-"""SUMO behind one seam: the only module that imports libsumo or traci.
+"""Starts and stops SUMO; no other module imports libsumo or traci.
 
-The two share their API; libsumo runs in this process, traci talks to `sumo` or `sumo-gui` through a socket.
+Both libraries have the same API: libsumo runs SUMO in this process, traci controls `sumo` or `sumo-gui` through a socket.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from safevar_sumo.sumo.network import CopiedNetwork
 from safevar_sumo.sumo.world import SumoWorld
 
 CONNECTION_ATTEMPTS = 15
-"""Number of attempts, one per second, of traci to connect to a SUMO process that it has started."""
+"""Number of times, once per second, that traci tries to connect to the SUMO process that it has started."""
 
 
 class Engine(StrEnum):
-    """The program that moves the vehicles: numpy in a recorded scene (LIBSUMO if somebody may react to the vehicles), or SUMO in this
-    process, in another process, or in another process with a window.
+    """The program that moves the vehicles: numpy in recorded scenes (SUMO in this process if an actor may react to the vehicles), or
+    SUMO in this process, in another process, or in another process with a window.
     """
 
     RECORDED = "recorded"
@@ -36,12 +36,12 @@ class Engine(StrEnum):
 
 @contextmanager
 def open_world(files: CopiedNetwork, n: int, engine: Engine = Engine.LIBSUMO, options: Sequence[str] = ()) -> Iterator[SumoWorld]:
-    """Start SUMO on `n` copies of a network with their traffic, and close it in every case.
+    """Start SUMO on `n` copies of a network and its traffic; close SUMO at the end, also after an error.
 
     Raises
     ------
     SimulationError
-        With SUMO's own message, if it cannot load a network or simulate a step.
+        With SUMO's message, if SUMO cannot load the network or simulate a step.
     """
     api = engine_api(engine)
     try:
@@ -88,7 +88,7 @@ def start_engine(api: Any, engine: Engine, command: list[str]) -> None:
 
 
 def binary(engine: Engine) -> str:
-    """The program of an engine."""
+    """The path of the program that an engine runs."""
     if engine is Engine.LIBSUMO:
         return "sumo"
     import sumo
@@ -97,6 +97,6 @@ def binary(engine: Engine) -> str:
 
 
 def stop_engine(api: Any) -> None:
-    """Close SUMO; errors are ignored, as SUMO may never have started or its window may be closed."""
+    """Close SUMO, without errors if SUMO never started or the user closed its window."""
     with suppress(api.TraCIException, api.FatalTraCIError):
         api.close()

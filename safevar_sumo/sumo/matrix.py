@@ -1,4 +1,4 @@
-"""Settings at the points of a study: its one scenario, or all points of a matrix, where the worst point counts."""
+"""Settings at the points of a study: its only scenario, or all points of a matrix, of which the worst point counts."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from safevar_sumo.sumo.recording import Recording, recorded_scenes
 from safevar_sumo.sumo.system import System, assemble
 
 LARGEST_WORLD = 200
-"""Largest number of copies of a network in one simulation; beyond it, SUMO exceeds the processor's caches and each copy costs more."""
+"""Largest number of copies of a network in one simulation; more copies exceed the processor's caches, and each costs more time."""
 LARGEST_BATCH = 2000
-"""Largest number of vehicles in recorded scenes at once; two hundred steps of this number take some 100 MB."""
+"""Largest number of vehicles in recorded scenes at once; 200 steps of these vehicles take about 100 MB."""
 LARGEST_ROADS = 100_000
-"""Largest number of lanes of all copies in one simulation: beyond it, loading takes minutes and gigabytes."""
-NEAREST = 4
+"""Largest number of lanes in all copies of one simulation; loading more lanes takes minutes and gigabytes."""
+N_SIMILAR_POINTS = 4
 """Number of similar points that the error about an unknown point lists."""
 
 
-class Scored(NamedTuple):
+class PointEvaluations(NamedTuple):
     """Evaluations of N settings at one point of a study."""
 
     point: Point
@@ -51,16 +51,17 @@ class AtPoint(NamedTuple):
 
 
 def point_record(result: AtPoint, row: int = 0) -> dict[str, Any]:
-    """One setting at one point as plain values: the point, the outcome, impact speeds [m/s], the largest deviation from the test speed
-    before the system acted [km/h], the time to collision at the first warning [s], the side and place of the contact [%]; None if
-    undefined.
+    """Plain values of one setting at one point; a value is None if it is undefined.
+
+    The point and the outcome; impact speeds [m/s]; the largest deviation from the test speed before the ADS acted [km/h]; the time to
+    collision at the first warning [s]; the side of the contact, and its place along that side [%].
     """
-    evaluations, relative = result.evaluations, result.runs.relative_speed
-    numbers = {"impact_speed": evaluations.collision_speed[row], "relative_impact_speed": relative[row],
+    evaluations, relative_speed = result.evaluations, result.runs.relative_speed
+    numbers = {"impact_speed": evaluations.collision_speed[row], "relative_impact_speed": relative_speed[row],
                SAFETY_DEGREE: evaluations.f_safe[row],
-               "test_speed_error": np.broadcast_to(result.runs.test_speed_error, relative.shape)[row] / KMH,
-               "warning_ttc": np.broadcast_to(result.runs.warning_ttc, relative.shape)[row]}
-    side, place = (np.broadcast_to(values, relative.shape)[row] for values in result.runs.contact)
+               "test_speed_error": np.broadcast_to(result.runs.test_speed_error, relative_speed.shape)[row] / KMH,
+               "warning_ttc": np.broadcast_to(result.runs.warning_ttc, relative_speed.shape)[row]}
+    side, place = (np.broadcast_to(values, relative_speed.shape)[row] for values in result.runs.contact)
     return {"point": result.point.name, **dict(result.point.place), "outcome": str(evaluations.outcome[row]),
             **{name: finite_or_none(value) for name, value in numbers.items()},
             **({"contact": {"side": str(side), "place": float(place)}} if side else {})}
@@ -73,32 +74,32 @@ def remarks_of(scenario: Any) -> list[str]:
 
 
 def vehicle_remarks(system: System) -> list[str]:
-    """Remarks for the user on a vehicle that is tested at higher speeds than those it was fitted to."""
-    fitted = getattr(system.vehicle, "FITTED_UP_TO", None)
+    """Remarks for the user on a vehicle that is tested at higher speeds than its model was fitted to."""
+    fitted_speed = getattr(system.vehicle, "FITTED_UP_TO", None)
     speeds = [getattr(point.scenario, "test_speed", None) or 0.0 for point in system.points]
-    if fitted is None or max(speeds) <= fitted:
+    if fitted_speed is None or max(speeds) <= fitted_speed:
         return []
     tables = system.nominal.tables()
-    fastest = min(max(speeds), float(tables.speeds[-1]))
-    drag = float(np.interp(fastest, tables.speeds, tables.coasting))
-    return [f"the vehicle was fitted to drives of up to {fitted / KMH:.0f} km/h, and is tested at up to {max(speeds) / KMH:.0f} km/h: "
-            f"beyond that speed only its equations apply, such as losing {drag:.1f} m/s^2 at {fastest / KMH:.0f} km/h with the "
+    speed = min(max(speeds), float(tables.speeds[-1]))
+    drag = float(np.interp(speed, tables.speeds, tables.coasting))
+    return [f"the vehicle was fitted to drives of up to {fitted_speed / KMH:.0f} km/h, and is tested at up to {max(speeds) / KMH:.0f} "
+            f"km/h: beyond that speed only its equations apply, such as losing {drag:.1f} m/s^2 at {speed / KMH:.0f} km/h with the "
             "accelerator released"]
 
 
 def evaluate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> Evaluations:
     """Simulate filtered settings, shape (N, n), in one batch and score them.
 
-    A pure function: row i of the result depends on row i of `settings` alone, to the bit. In a matrix a setting's row is that
-    of its worst point.
+    A pure function: row i of the result depends only on row i of `settings`, to the last bit. In a matrix, row i holds the result of
+    setting i at its worst point.
     """
-    most = _most_vehicles(system, engine)
-    parts = [settings[first:first + most] for first in range(0, len(settings), most)] or [settings]
-    evaluations = [_evaluated(system, part, engine) for part in parts]
+    size = _batch_size(system, engine)
+    parts = [settings[start:start + size] for start in range(0, len(settings), size)] or [settings]
+    evaluations = [_evaluate_part(system, part, engine) for part in parts]
     return evaluations[0] if len(evaluations) == 1 else Evaluations.concatenate(evaluations)
 
 
-def _evaluated(system: System, settings: FloatArray, engine: Engine) -> Evaluations:
+def _evaluate_part(system: System, settings: FloatArray, engine: Engine) -> Evaluations:
     if system.rater is not None:
         return rated_settings(system, settings, engine)[0]
     if system.matrix:
@@ -111,20 +112,20 @@ def rated_settings(system: System, settings: FloatArray, engine: Engine = Engine
 
     Traces are dropped, as they would take gigabytes.
     """
-    scored, columns = dict[str, Scored](), dict[str, Any]()
+    scored, columns = dict[str, PointEvaluations](), dict[str, Any]()
     for group in _groups(system, settings, engine):
         for result in group:
             name = result.point.name
-            scored[name], columns[name] = Scored(result.point, result.evaluations), cell_columns(result.runs)
+            scored[name], columns[name] = PointEvaluations(result.point, result.evaluations), cell_columns(result.runs)
     cells = joined_cells([columns[point.name] for point in system.points])
     evaluations = aggregated([scored[point.name] for point in system.points])
-    if system.rater is None:  # only some of the cells are simulated
+    if system.rater is None:  # the system has only some of the protocol's cells
         return evaluations, cells
     return replace(evaluations, metrics={**evaluations.metrics, RATING_POINTS.name: system.rater.points(cells).total}), cells
 
 
 def in_cells(system: System, settings: FloatArray, part: tuple[int, int], engine: Engine = Engine.RECORDED) -> Evaluations:
-    """Evaluations, with `cells`, of settings, shape (N, n), in part k of m of a protocol's cells; `part` is (k, m)."""
+    """Evaluations, including `cells`, of settings, shape (N, n), in the k-th of m parts of a protocol's cells; `part` is (k, m)."""
     assert system.rater is not None
     points = tuple(system.matrix[number] for number in part_of(system.rater.protocol, *part))
     evaluations, cells = rated_settings(replace(system, matrix=points, rater=None), settings, engine)
@@ -132,42 +133,42 @@ def in_cells(system: System, settings: FloatArray, part: tuple[int, int], engine
 
 
 def settings_per_batch(system: System, engine: Engine) -> int:
-    """Number of settings of an efficient batch."""
+    """Number of settings in an efficient batch."""
     return max(largest_batch(system) // len(system.points), LARGEST_WORLD) if _is_recorded(system, engine) else LARGEST_WORLD
 
 
 def largest_batch(system: System) -> int:
-    """Largest number of vehicles at once: smaller if each has an instance of an FMU."""
+    """Largest number of vehicles in one batch; it is smaller if each vehicle has its own instance of an FMU."""
     return min(LARGEST_BATCH, *(getattr(model, "most_vehicles", LARGEST_BATCH) for model in (system.vehicle, system.ads)))
 
 
 def _is_recorded(system: System, engine: Engine) -> bool:
-    """Whether the vehicles drive in recorded scenes, and not in SUMO."""
+    """Whether the vehicles drive in recorded scenes instead of SUMO."""
     return engine is Engine.RECORDED and not reason_for_sumo(system)
 
 
-def _most_vehicles(system: System, engine: Engine) -> int:
-    """Largest number of vehicles of one simulation: in recorded scenes, or in copies of the largest network."""
+def _batch_size(system: System, engine: Engine) -> int:
+    """Largest number of vehicles in one simulation, in recorded scenes or in copies of the largest network."""
     if _is_recorded(system, engine):
         return largest_batch(system)
     lanes = max(lanes_of(network) for network in {point.scenario.network for point in system.points})
     return min(max(LARGEST_ROADS // max(lanes, 1), 1), LARGEST_WORLD, largest_batch(system))
 
 
-def aggregated(at_points: Sequence[AtPoint | Scored]) -> Evaluations:
-    """Evaluations of settings at their worst points."""
+def aggregated(at_points: Sequence[AtPoint | PointEvaluations]) -> Evaluations:
+    """The evaluations of N settings, each at its worst point."""
     settings = at_points[0].evaluations.settings
-    row_of, columns = worst_points(at_points), np.arange(len(settings))
+    numbers, columns = worst_points(at_points), np.arange(len(settings))
     evaluations = Evaluations.concatenate([result.evaluations for result in at_points])
-    return evaluations.take(row_of * len(settings) + columns)
+    return evaluations.take(numbers * len(settings) + columns)
 
 
 def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = (),
              watch: Watcher | None = None) -> SimulationRuns:
-    """Run the scenario once for every setting; shape (N, n). `watch` is called with the world at every sample.
+    """Run the scenario once for every setting, shape (N, n); `watch` is called with the world at every sample.
 
-    In a matrix the result is each setting's run at its worst point; with `watch` or a window, all settings run at the worst point of
-    the last setting. Raises as `drive_all`.
+    In a matrix, the result holds each setting's run at its worst point; with `watch` or a window, all settings run at the worst point of
+    the last setting. Raises the errors of `drive_all`.
     """
     if not system.matrix:
         return drive_all(system, settings, engine, options, watch)
@@ -178,22 +179,22 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
 
 
 def at_every_point(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, options: tuple[str, ...] = ()) -> list[AtPoint]:
-    """Settings, shape (N, n), at every point, in the points' order; raises as `simulate`."""
+    """Settings, shape (N, n), at every point, in the points' order; raises the errors of `drive_all`."""
     by_name = {result.point.name: result for group in _groups(system, settings, engine, options) for result in group}
     return [by_name[point.name] for point in system.points]
 
 
 def _groups(system: System, settings: FloatArray, engine: Engine, options: tuple[str, ...] = ()) -> Iterator[list[AtPoint]]:
-    """Settings at every point, in groups of points that are simulated together."""
+    """Yield the results of settings at every point, in groups of points that share a simulation."""
     n = len(settings)
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
     if _is_recorded(system, engine):
-        groups = _together(system.points, largest_batch(system) // max(n, 1), (*step_options(system), *options))
+        groups = _point_groups(system.points, largest_batch(system) // max(n, 1), (*step_options(system), *options))
     for points in groups:
         runs = drive_all(replace(system, matrix=points), settings, engine, options)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
-        yield [AtPoint(point, evaluations.take(np.arange(first, first + n)), runs.of(slice(first, first + n)))
-               for point, first in zip(points, range(0, len(points) * n, n), strict=True)]
+        yield [AtPoint(point, evaluations.take(np.arange(start, start + n)), runs.of(slice(start, start + n)))
+               for point, start in zip(points, range(0, len(points) * n, n), strict=True)]
 
 
 def at_worst(system: System, settings: FloatArray) -> System:
@@ -211,18 +212,18 @@ def named_point(system: System, name: str, source: object) -> System:
 def _point(system: System, name: str, source: object) -> Point:
     points = {point.name: point for point in system.matrix}
     if name not in points:
-        raise InputError(source, repr(name), _similar(name, list(points)))
+        raise InputError(source, repr(name), _similar_points(name, list(points)))
     return points[name]
 
 
-def _similar(name: str, names: Sequence[str]) -> str:
-    """Points similar to an unknown name: those that share most of its parts, then the most similar ones."""
+def _similar_points(name: str, names: Sequence[str]) -> str:
+    """Points similar to an unknown name: first by the number of parts in common, then by similarity of the text."""
     if not names:
         return "a study with a matrix"
     parts = {part.strip() for part in name.split(",")}
-    order = sorted(names, key=lambda point: (-len(parts & set(point.split(", "))), -SequenceMatcher(None, point, name).ratio()))
-    legal = "; ".join(order[:NEAREST])
-    return legal if len(names) <= NEAREST else f"one of {len(names)} points, the most similar: {legal}"
+    points = sorted(names, key=lambda point: (-len(parts & set(point.split(", "))), -SequenceMatcher(None, point, name).ratio()))
+    legal = "; ".join(points[:N_SIMILAR_POINTS])
+    return legal if len(names) <= N_SIMILAR_POINTS else f"one of {len(names)} points, the most similar: {legal}"
 
 
 def study_at(study: Study, name: str, source: object) -> Study:
@@ -231,7 +232,7 @@ def study_at(study: Study, name: str, source: object) -> Study:
     Raises
     ------
     InputError
-        If there is no point of that name.
+        If no point has this name.
     """
     system = assemble(study)
     place = dict(_point(system, name, source).place)
@@ -241,56 +242,56 @@ def study_at(study: Study, name: str, source: object) -> Study:
     title, weather = place.pop("test"), place.pop("weather")
     test = next(row for row in study.matrix.tests
                 if row.name == title and row.over.keys() == place.keys() and all(value in row.over[key] for key, value in place.items()))
-    only = replace_in(test, over={key: [value] for key, value in place.items()}, weathers=[weather] if test.weathers else [])
-    return replace_in(study, matrix=replace_in(study.matrix, tests=[only]))
+    reduced_test = replace_in(test, over={key: [value] for key, value in place.items()}, weathers=[weather] if test.weathers else [])
+    return replace_in(study, matrix=replace_in(study.matrix, tests=[reduced_test]))
 
 
-def _together(points: Sequence[Point], most: int, options: Sequence[str]) -> Iterator[tuple[Point, ...]]:
-    """Groups of at most `most` points with recorded scenes of one road, sorted by duration."""
+def _point_groups(points: Sequence[Point], size: int, options: Sequence[str]) -> Iterator[tuple[Point, ...]]:
+    """Groups of at most `size` points whose recorded scenes are on one road, sorted by duration."""
     groups: dict[Hashable, list[Point]] = {}
     for point, scene in zip(points, recorded_scenes([point.scenario for point in points], options), strict=True):
         groups.setdefault(scene.road if isinstance(scene, Recording) else "", []).append(point)
     for group in groups.values():
         group.sort(key=lambda point: point.scenario.duration)
-        for start in range(0, len(group), max(most, 1)):
-            yield tuple(group[start:start + max(most, 1)])
+        for start in range(0, len(group), max(size, 1)):
+            yield tuple(group[start:start + max(size, 1)])
 
 
-def worst_points(at_points: Sequence[AtPoint | Scored]) -> npt.NDArray[np.intp]:
-    """For every setting the number of the point with the least safety degree; ties are decided by name.
+def worst_points(at_points: Sequence[AtPoint | PointEvaluations]) -> npt.NDArray[np.intp]:
+    """For every setting, the number of the point with the least safety degree; of equal points, the first by name.
 
-    A collision at a valid point counts in every case. Without a collision, a single invalid test leaves open whether the setting is
-    safe: then that point counts.
+    A collision in a valid test always counts. Without a collision, a point with an invalid test counts as the worst, because such a test
+    leaves open whether the setting is safe.
     """
     order = sorted(range(len(at_points)), key=lambda k: at_points[k].point.name)
-    degrees = np.stack([at_points[k].evaluations.f_safe for k in order])
-    degrees = np.where(np.isnan(degrees), np.inf, degrees)
-    invalid = np.stack([at_points[k].evaluations.outcome == Outcome.INVALID_TEST for k in order])
-    if invalid.any():
-        collided = np.stack([at_points[k].evaluations.collided for k in order]).any(axis=0)
-        degrees = np.where(invalid & ~collided, -np.inf, degrees)
-    return np.asarray(np.array(order)[np.argmin(degrees, axis=0)])
+    safety_degrees = np.stack([at_points[k].evaluations.f_safe for k in order])
+    safety_degrees = np.where(np.isnan(safety_degrees), np.inf, safety_degrees)
+    is_invalid = np.stack([at_points[k].evaluations.outcome == Outcome.INVALID_TEST for k in order])
+    if is_invalid.any():
+        has_collided = np.stack([at_points[k].evaluations.collided for k in order]).any(axis=0)
+        safety_degrees = np.where(is_invalid & ~has_collided, -np.inf, safety_degrees)
+    return np.asarray(np.array(order)[np.argmin(safety_degrees, axis=0)])
 
 
-def _selected_runs(runs_at_points: Sequence[SimulationRuns], number: npt.NDArray[np.intp]) -> SimulationRuns:
-    """For every vehicle one of several runs; shorter runs repeat their last sample, marked as inactive."""
-    length, columns = max(len(runs.trace.time) for runs in runs_at_points), np.arange(len(number))
+def _selected_runs(runs_at_points: Sequence[SimulationRuns], point_numbers: npt.NDArray[np.intp]) -> SimulationRuns:
+    """Every vehicle's run at the point with its number; shorter runs repeat their last sample, which is marked as inactive."""
+    length, columns = max(len(runs.trace.time) for runs in runs_at_points), np.arange(len(point_numbers))
 
     def select_samples(values: Sequence[np.ndarray]) -> np.ndarray:
         padded = [np.concatenate([samples, np.repeat(samples[-1:], length - len(samples), axis=0)]) for samples in values]
-        return np.stack(padded)[number, :, columns].T
+        return np.stack(padded)[point_numbers, :, columns].T
 
     def select(values: Iterable[np.ndarray]) -> np.ndarray:
-        return np.stack([np.broadcast_to(column, number.shape) for column in values])[number, columns]
+        return np.stack([np.broadcast_to(column, point_numbers.shape) for column in values])[point_numbers, columns]
 
-    longest = max((runs.trace for runs in runs_at_points), key=lambda trace: len(trace.time))
-    names = [field.name for field in fields(Trace) if np.ndim(getattr(longest, field.name)) == 2]
+    longest_trace = max((runs.trace for runs in runs_at_points), key=lambda trace: len(trace.time))
+    names = [field.name for field in fields(Trace) if np.ndim(getattr(longest_trace, field.name)) == 2]
     columns_of: dict[str, Any] = {name: select_samples([getattr(runs.trace, name) for runs in runs_at_points]) for name in names}
-    trace = replace(longest, **columns_of)
-    ended = np.array([len(runs.trace.time) for runs in runs_at_points])[number]
-    active = trace.active & (np.arange(length)[:, np.newaxis] < ended)
+    trace = replace(longest_trace, **columns_of)
+    lengths = np.array([len(runs.trace.time) for runs in runs_at_points])[point_numbers]
+    active = trace.active & (np.arange(length)[:, np.newaxis] < lengths)
     encounters, contacts = ([*zip(*(getattr(runs, name) for runs in runs_at_points), strict=True)] for name in ("encounter", "contact"))
-    by_vehicle: dict[str, Any] = {name: select(getattr(runs, name) for runs in runs_at_points)
+    vehicle_values: dict[str, Any] = {name: select(getattr(runs, name) for runs in runs_at_points)
                                   for name in ("outcome", "collision_speed", "test_speed_error", "warning_ttc")}
     return SimulationRuns(trace=replace(trace, active=active), encounter=Encounter._make(map(select_samples, encounters)),
-                          contact=Contact._make(map(select, contacts)), **by_vehicle)
+                          contact=Contact._make(map(select, contacts)), **vehicle_values)

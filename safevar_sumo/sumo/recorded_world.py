@@ -1,8 +1,8 @@
 """Vehicles that drive in recorded scenes, without SUMO.
 
-N vehicles move over the scene's lanes as SUMO's ballistic update moves them and collide where bodies overlap. Positions are SUMO's to
-the last bit: the operations are those of `MSVehicle::updateState`, `MSLane::interpolateLanePosToGeometryPos` and
-`PositionVector::positionAtOffset`, in their order.
+N vehicles move along the scene's lanes by SUMO's ballistic update, and collide where bodies overlap. Their positions equal SUMO's to the
+last bit, because this module repeats the operations of `MSVehicle::updateState`, `MSLane::interpolateLanePosToGeometryPos` and
+`PositionVector::positionAtOffset` in the same order.
 """
 
 from __future__ import annotations
@@ -23,50 +23,50 @@ from safevar_sumo.sumo.world import Body, direction_of
 from safevar_sumo.vehicles import Sensors
 
 NUMERICAL_EPS = 0.001
-"""SUMO, utils/common/StdDefs.h [m]."""
-NOBODY = np.empty((0, 2), dtype=np.intp)
-"""An empty array of (scene, actor) pairs."""
-PARALLEL = 1 - 1e-9
-"""Cosine of the angle between two vehicles, above which they count as having the same direction."""
+"""SUMO's tolerance for positions on lanes [m] (utils/common/StdDefs.h)."""
+NO_PAIRS = np.empty((0, 2), dtype=np.intp)
+"""No (scene, actor) pairs: an empty array."""
+PARALLEL_COSINE = 1 - 1e-9
+"""Least absolute cosine of the angle between two vehicles that count as parallel; opposite directions count too."""
 
 
 class UnknownActorError(Exception):
-    """A scenario asks for an actor or a lane that a scene does not have."""
+    """A scenario queries an actor or a lane that does not exist in the recorded scene."""
 
 
-def distance(before: FloatArray, after: FloatArray, step: float) -> FloatArray:
-    """Distance covered in a step between two speeds at constant acceleration [m], with SUMO's operations (`MSVehicle::getDeltaPos`)."""
-    acceleration = (after - before) / step
-    return np.asarray((before + 0.5 * (acceleration * step)) * step)
+def distance_covered(old_speed: FloatArray, new_speed: FloatArray, step: float) -> FloatArray:
+    """Distance [m] covered in a time step at constant acceleration, by the operations of SUMO's `MSVehicle::getDeltaPos`."""
+    acceleration = (new_speed - old_speed) / step
+    return np.asarray((old_speed + 0.5 * (acceleration * step)) * step)
 
 
-def not_on_the_road(actor: str, time: float) -> SimulationError:
-    """The error for an actor that has not departed, or has arrived, at a time [s]."""
+def absence_error(actor: str, time: float) -> SimulationError:
+    """The error for an actor that has not departed yet, or has already arrived, at a time [s]."""
     return SimulationError(f"SUMO failed: {actor!r} is not on the road at {time:g} s")
 
 
-class Samples:
-    """A recorded scene at all of its samples at once, as if each sample were a copy of the network.
+class SampledScene:
+    """A recorded scene at all of its T samples at once; it looks like T copies of the network.
 
-    `absent`, shape (T,), is true where the actor last asked for is not on the road; the actor then keeps its last position.
+    `absence`, shape (T,), is true at samples at which `actor`, the last actor queried, is not on the road and keeps its last position.
     """
 
     def __init__(self, tracks: Mapping[str, Track]) -> None:
-        self._tracks, self.actor, self.absent = tracks, "", np.zeros(0, dtype=bool)
+        self._tracks, self.actor, self.absence = tracks, "", np.zeros(0, dtype=bool)
 
     def vehicle_positions(self, actor: str) -> FloatArray:
-        """Positions of the front; shape (T, 2) [m]."""
+        """Positions of the actor's front, shape (T, 2) [m]."""
         positions = self._tracks[actor].position
-        self.actor, self.absent = actor, np.isnan(positions[:, 0])
-        return positions[np.maximum.accumulate(np.where(self.absent, 0, np.arange(len(positions))))]
+        self.actor, self.absence = actor, np.isnan(positions[:, 0])
+        return positions[np.maximum.accumulate(np.where(self.absence, 0, np.arange(len(positions))))]
 
     person_positions = vehicle_positions
 
 
 class RecordedScene:
-    """The vehicles of one scene of a recorded world, with the methods of `SumoWorld` that scenarios call; shapes (N,) and (N, 2).
+    """The N vehicles in one scene of a recorded world, with the methods of `SumoWorld` that scenarios call.
 
-    All other actors move as recorded, so commands to them have no effect.
+    Arrays have shape (N,) or (N, 2). All other actors move as recorded, so commands to them have no effect.
     """
 
     lookup_errors = (UnknownActorError,)
@@ -80,9 +80,9 @@ class RecordedScene:
 
     drive = turn_back = walk
 
-    def samples(self) -> Samples:
-        """The scene at all of its samples."""
-        return Samples(self._recording.tracks)
+    def at_all_samples(self) -> SampledScene:
+        """The scene at all of its T samples."""
+        return SampledScene(self._recording.tracks)
 
     def speeds(self) -> FloatArray:
         return self._world.speeds()[self._rows]
@@ -91,9 +91,9 @@ class RecordedScene:
         if actor == VUT:
             return self._world.vehicle_positions(VUT)[self._rows]
         sample, positions = self._world.sample, self._track(actor).position
-        position = positions[min(sample, len(positions) - 1)]  # of a batch in which other scenes last longer
+        position = positions[min(sample, len(positions) - 1)]  # other scenes of the batch may last longer
         if math.isnan(position[0]):
-            raise not_on_the_road(actor, sample * self.step_length)
+            raise absence_error(actor, sample * self.step_length)
         result = np.empty((self.n, 2))
         result[:] = position
         return result
@@ -130,138 +130,139 @@ class RecordedScene:
 
 
 class RecordedWorld:
-    """N vehicles in each of several recorded scenes of one network, with the methods of `SumoWorld` for vehicles under test."""
+    """K recorded scenes of one network with `size` vehicles in each, and the methods of `SumoWorld` for these K * size vehicles."""
 
-    def __init__(self, recordings: Sequence[Recording], n: int) -> None:
-        self._recordings, self._size, road = recordings, n, recordings[0]
-        self.n, self.step_length, self.sample = n * len(recordings), road.step_length, 0
-        self.scenes = [RecordedScene(self, recording, slice(k * n, (k + 1) * n)) for k, recording in enumerate(recordings)]
+    def __init__(self, recordings: Sequence[Recording], size: int) -> None:
+        self._recordings, self._size, road = recordings, size, recordings[0]
+        self.n, self.step_length, self.sample = size * len(recordings), road.step_length, 0
+        self.scenes = [RecordedScene(self, recording, slice(k * size, (k + 1) * size)) for k, recording in enumerate(recordings)]
         self.vehicle_length, self.lane_of = self.scenes[0].vehicle_length, self.scenes[0].lane_of
-        self._speeds = np.repeat([recording.speed for recording in recordings], n)
-        self._lane, self._place = np.zeros(self.n, dtype=np.intp), np.repeat([recording.start for recording in recordings], n)
-        self._lanes, self._left = road.way.at(self._lane), np.zeros(self.n, dtype=bool)
-        self._front: FloatArray | None = None
-        self._struck: dict[int, Body] = {}
+        self._speeds = np.repeat([recording.speed for recording in recordings], size)
+        self._lane_number = np.zeros(self.n, dtype=np.intp)
+        self._lane_position = np.repeat([recording.start for recording in recordings], size)
+        self._lanes, self._frozen_rows = road.way.at(self._lane_number), np.zeros(self.n, dtype=bool)
+        self._fronts: FloatArray | None = None
+        self._struck_bodies: dict[int, Body] = {}
         self.sensors = Sensors.perfect(self.n)
-        self._front_before, self._speeds_before = self.vehicle_positions(VUT), self._speeds
-        self._ahead_before = self._front_before @ road.along
-        self._extents, self._others = _joined_extents(recordings), [[*recording.tracks.values()] for recording in recordings]
+        self._last_fronts, self._last_speeds = self.vehicle_positions(VUT), self._speeds
+        self._last_coordinates = self._last_fronts @ road.along
+        self._extents, self._tracks = _joined_extents(recordings), [[*recording.tracks.values()] for recording in recordings]
 
     def set_types(self, *_: object) -> None:
-        """Do nothing: everybody has departed, and SUMO obeys every speed that is set, whatever a vehicle's type and decelerations."""
+        """Do nothing: all vehicles have departed, and their types and decelerations do not limit the commanded speeds."""
 
     depart = set_decelerations = set_types
 
     def leave(self, copies: Sequence[int]) -> None:
-        """Freeze position and speed of vehicles whose runs are over."""
-        self._left[copies] = True
+        """Freeze the positions and speeds of vehicles whose runs have ended."""
+        self._frozen_rows[copies] = True
 
     def advance(self, speeds: FloatArray) -> None:
-        """One step in which the vehicles reach `speeds` [m/s], at a constant acceleration.
+        """Simulate one step, in which the vehicles reach `speeds` [m/s] at a constant acceleration.
 
         Raises
         ------
         SimulationError
             If a vehicle leaves its last lane.
         """
-        self._front_before, self._speeds_before = self.vehicle_positions(VUT), self._speeds
-        way = distance(self._speeds, speeds, self.step_length)
-        if np.count_nonzero(self._left):
-            speeds, way = np.where(self._left, self._speeds, speeds), np.where(self._left, 0.0, way)
-        self._place = self._place + way
-        self._speeds, self._front, self.sample = speeds, None, self.sample + 1
-        while np.count_nonzero(beyond := self._place > self._lanes.end):
-            way_ahead = self._recordings[0].way
-            if (self._lane[beyond] == len(way_ahead.end) - 1).any():
+        self._last_fronts, self._last_speeds = self.vehicle_positions(VUT), self._speeds
+        distances = distance_covered(self._speeds, speeds, self.step_length)
+        if np.count_nonzero(self._frozen_rows):
+            speeds, distances = np.where(self._frozen_rows, self._speeds, speeds), np.where(self._frozen_rows, 0.0, distances)
+        self._lane_position = self._lane_position + distances
+        self._speeds, self._fronts, self.sample = speeds, None, self.sample + 1
+        while np.count_nonzero(is_beyond := self._lane_position > self._lanes.end):
+            way = self._recordings[0].way
+            if (self._lane_number[is_beyond] == len(way.end) - 1).any():
                 raise SimulationError("SUMO failed: a vehicle under test drives beyond the end of its route")
-            self._place = np.where(beyond, self._place - self._lanes.end, self._place)
-            self._lane = self._lane + beyond
-            self._lanes = way_ahead.at(self._lane)
+            self._lane_position = np.where(is_beyond, self._lane_position - self._lanes.end, self._lane_position)
+            self._lane_number = self._lane_number + is_beyond
+            self._lanes = way.at(self._lane_number)
 
     def speeds(self) -> FloatArray:
         return self._speeds
 
     def vehicle_positions(self, _: str) -> FloatArray:
         """Positions of the vehicles under test."""
-        if self._front is None:
-            self._front = self._lanes.positions(self._place)
-        return self._front
+        if self._fronts is None:
+            self._fronts = self._lanes.positions(self._lane_position)
+        return self._fronts
 
     def collisions(self, open_: BoolArray) -> dict[int, float]:
-        """Vehicles of open runs whose body overlaps another, and their speeds [m/s].
+        """Speeds [m/s] of the vehicles of open runs whose body overlaps another actor's, by the vehicle's row.
 
         SUMO checks twice in a step: after persons have moved but before vehicles have, and after vehicles have
         moved (`MSNet::simulationStep`: `STAGE_EVENTS`, `STAGE_MOVEMENTS`).
         """
-        self._struck, result = {}, dict[int, float]()
-        near = self._near(open_)
-        if not len(near):
+        self._struck_bodies, result = {}, dict[int, float]()
+        pairs = self._adjacent_pairs(open_)
+        if not len(pairs):
             return result
-        tracks = [self._others[k][number] for k, number in near.tolist()]
+        tracks = [self._tracks[scene][actor] for scene, actor in pairs.tolist()]
         others = Body.columns([_body(track, self.sample) for track in tracks])
         persons = np.array([track.is_person for track in tracks])
-        moved, still = (self.vehicle_positions(VUT), self._speeds), (self._front_before, self._speeds_before)
-        hits = [(pair, row, phase) for phase, (fronts, _) in enumerate((still, moved)) if phase or persons.any()
-                for pair, row in self._overlaps(fronts, open_, near[:, 0], others, persons, still=not phase)]
-        for pair, row, phase in sorted(hits, key=itemgetter(0, 2)):
+        states = (self._last_fronts, self._last_speeds), (self.vehicle_positions(VUT), self._speeds)  # at SUMO's two checks
+        hits = [(body, row, check) for check, (fronts, _) in enumerate(states) if check or persons.any()
+                for body, row in self._overlaps(fronts, open_, pairs[:, 0], others, persons, only_persons=not check)]
+        for body, row, check in sorted(hits, key=itemgetter(0, 2)):
             if row not in result:
-                result[row] = float((moved if phase else still)[1][row])
-                self._struck[row] = Body._make(column[pair] for column in others)
+                result[row] = float(states[check][1][row])
+                self._struck_bodies[row] = Body._make(column[body] for column in others)
         return dict(sorted(result.items()))
 
     def _overlaps(self, fronts: FloatArray, open_: BoolArray, scenes: Any, others: Body, persons: BoolArray, *,
-                  still: bool) -> Iterator[tuple[int, int]]:
-        """Pairs of a body, by its number, and a vehicle, by its row, whose rectangles overlap: no side of either separates them.
+                  only_persons: bool) -> Iterator[tuple[int, int]]:
+        """Yield (body, row) where body number `body` of `others` and the vehicle in this row overlap: no side separates the rectangles.
 
-        Two vehicles with the same direction must overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
+        Two parallel vehicles must overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
         """
-        own, length, width = self._recordings[0].along, self._recordings[0].length, self._recordings[0].width
-        across, other_across = _left(own), np.stack([-others.along[:, 1], others.along[:, 0]], axis=1)
-        cosine, sine = np.abs(others.along @ own), np.abs(other_across @ own)
-        least = np.where(persons | (cosine < PARALLEL), 0.0, NUMERICAL_EPS)
-        reach = (length + others.length * cosine + others.width * sine) / 2 - least
-        offset = others.middle + own * (length / 2)
+        direction, length, width = self._recordings[0].along, self._recordings[0].length, self._recordings[0].width
+        normal, other_normals = _left_normal(direction), np.stack([-others.along[:, 1], others.along[:, 0]], axis=1)
+        cosine, sine = np.abs(others.along @ direction), np.abs(other_normals @ direction)
+        min_overlap = np.where(persons | (cosine < PARALLEL_COSINE), 0.0, NUMERICAL_EPS)
+        max_distance = (length + others.length * cosine + others.width * sine) / 2 - min_overlap
+        front_targets = others.middle + direction * (length / 2)  # where a vehicle's front is if its middle is the other body's middle
         candidates = open_.reshape(-1, self._size)[scenes]
-        if still:
+        if only_persons:
             candidates = candidates & persons[:, np.newaxis]
-        ahead = np.abs((offset[:, np.newaxis] - fronts.reshape(-1, self._size, 2)[scenes]) @ own)
-        pair, place = np.nonzero(candidates & (ahead < reach[:, np.newaxis]))
-        if not len(pair):
+        distance = np.abs((front_targets[:, np.newaxis] - fronts.reshape(-1, self._size, 2)[scenes]) @ direction)
+        body, column = np.nonzero(candidates & (distance < max_distance[:, np.newaxis]))
+        if not len(body):
             return
-        row = scenes[pair] * self._size + place
-        to_other, cosine, sine, least = offset[pair] - fronts[row], cosine[pair], sine[pair], least[pair]
-        other_length, other_width = others.length[pair], others.width[pair]
-        apart = np.abs(to_other @ across) >= (width + other_length * sine + other_width * cosine) / 2 - least
-        for axis, reach in ((others.along, other_length + length * cosine + width * sine),
-                            (other_across, other_width + length * sine + width * cosine)):
-            apart |= np.abs((to_other * axis[pair]).sum(axis=1)) >= reach / 2 - least
-        yield from zip(pair[~apart].tolist(), row[~apart].tolist(), strict=True)
+        row = scenes[body] * self._size + column
+        to_other, cosine, sine, min_overlap = front_targets[body] - fronts[row], cosine[body], sine[body], min_overlap[body]
+        other_length, other_width = others.length[body], others.width[body]
+        is_separated = np.abs(to_other @ normal) >= (width + other_length * sine + other_width * cosine) / 2 - min_overlap
+        for axis, joint_extent in ((others.along, other_length + length * cosine + width * sine),
+                                   (other_normals, other_width + length * sine + width * cosine)):
+            is_separated |= np.abs((to_other * axis[body]).sum(axis=1)) >= joint_extent / 2 - min_overlap
+        yield from zip(body[~is_separated].tolist(), row[~is_separated].tolist(), strict=True)
 
-    def _near(self, open_: BoolArray) -> Any:
-        """Pairs (scene, actor), by number, with a vehicle of an open run beside the actor now or a step ago; shape (M, 2)."""
-        ahead, before = self.vehicle_positions(VUT) @ self._recordings[0].along, self._ahead_before
-        self._ahead_before = ahead
+    def _adjacent_pairs(self, open_: BoolArray) -> Any:
+        """Numbers (scene, actor) of the M actors that a vehicle of an open run is beside, now or one step ago; shape (M, 2)."""
+        coordinates, last_coordinates = self.vehicle_positions(VUT) @ self._recordings[0].along, self._last_coordinates
+        self._last_coordinates = coordinates
         if self.sample >= self._extents.shape[1]:
-            return NOBODY
-        rears, fronts = self._extents[:, self.sample]
-        if not np.count_nonzero(rears < np.maximum.reduce(ahead.reshape(-1, self._size), axis=1)[:, np.newaxis]):
-            return NOBODY
-        foremost = np.where(open_, ahead, -np.inf).reshape(-1, self._size).max(axis=1)
-        rearmost = np.where(open_, before, np.inf).reshape(-1, self._size).min(axis=1)
-        return np.argwhere((rears < foremost[:, np.newaxis]) & (fronts > rearmost[:, np.newaxis]))
+            return NO_PAIRS
+        starts, ends = self._extents[:, self.sample]
+        if not np.count_nonzero(starts < np.maximum.reduce(coordinates.reshape(-1, self._size), axis=1)[:, np.newaxis]):
+            return NO_PAIRS
+        foremost = np.where(open_, coordinates, -np.inf).reshape(-1, self._size).max(axis=1)
+        rearmost = np.where(open_, last_coordinates, np.inf).reshape(-1, self._size).min(axis=1)
+        return np.argwhere((starts < foremost[:, np.newaxis]) & (ends > rearmost[:, np.newaxis]))
 
     def bodies(self, copies: Sequence[int]) -> tuple[Body, Body]:
-        """Vehicles under test that collide in this step, and the bodies that they collide with; in columns."""
+        """The bodies of vehicles that collide in this step, and of the actors that they collide with, both in columns."""
         road, n = self._recordings[0], len(copies)
         own = Body.behind(self.vehicle_positions(VUT)[copies], road.along, road.length, road.width, self._speeds[copies])
         return (own._replace(along=np.tile(road.along, (n, 1)), length=np.full(n, road.length), width=np.full(n, road.width)),
-                Body.columns([self._struck[copy] for copy in copies]))
+                Body.columns([self._struck_bodies[copy] for copy in copies]))
 
 
 def _joined_extents(recordings: Sequence[Recording]) -> FloatArray:
-    """Extents of several scenes in one array, shape (2, T, K, A); NaN where nobody is."""
-    _, length, most = np.max([recording.extents.shape for recording in recordings], axis=0)
-    joined = np.full((2, length, len(recordings), most), np.nan)
+    """The extents of K scenes in one array, shape (2, T, K, A); NaN where a scene has no actor."""
+    _, n_samples, n_actors = np.max([recording.extents.shape for recording in recordings], axis=0)
+    joined = np.full((2, n_samples, len(recordings), n_actors), np.nan)
     for k, recording in enumerate(recordings):
         joined[:, :recording.extents.shape[1], k, :recording.extents.shape[2]] = recording.extents
     return joined
@@ -272,5 +273,5 @@ def _body(track: Track, sample: int) -> Body:
                        float(track.speed[sample]))
 
 
-def _left(direction: FloatArray) -> FloatArray:
+def _left_normal(direction: FloatArray) -> FloatArray:
     return np.array([-direction[1], direction[0]])

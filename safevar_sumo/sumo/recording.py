@@ -1,6 +1,6 @@
 """Scenes that SUMO plays once: if nobody reacts to the vehicle under test, all other actors move identically in every simulation.
 
-Meanwhile the vehicle under test stays at its start; `recorded_world.py` moves vehicles in a recorded scene.
+While SUMO plays a scene, the vehicle under test stays at its start; `recorded_world.py` moves vehicles in the recorded scene.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from safevar_sumo.sumo.sources import is_shipped
 from safevar_sumo.sumo.staging import all_staged
 from safevar_sumo.sumo.world import SumoWorld, begin, direction_of
 
-SCENES = 4000
-"""Largest number of recorded scenes that a process keeps; a scene of ten seconds takes some ten kilobytes."""
-KEPT = "scenes.msgpack"
-LEEWAY = 0.01
+MAX_SCENES = 4000
+"""Largest number of recorded scenes that a process keeps; a scene of ten seconds takes about ten kilobytes."""
+SCENES_FILE = "scenes.msgpack"
+EXTENT_MARGIN = 0.01
 """Margin of the extents [m]; an actor outside its extent is not checked for a collision."""
 POSITION_EPS = 0.1
 """Smallest length of a lane's shape (SUMO, utils/common/StdDefs.h) [m]."""
@@ -40,9 +40,9 @@ class UnrecordableError(Exception):
 
 
 class Track(NamedTuple):
-    """An actor at every step: position [m], shape (T, 2), heading clockwise from north [degrees] and speed [m/s], shape (T,).
+    """An actor at T steps: `position` [m], shape (T, 2); `angle` clockwise from north [degrees] and `speed` [m/s], shape (T,).
 
-    Values are NaN while the actor is not on the road; `length` and `width` in m.
+    Values are NaN while the actor is not on the road; `length` and `width` are in m.
     """
 
     position: FloatArray
@@ -54,9 +54,9 @@ class Track(NamedTuple):
 
 
 class Way(NamedTuple):
-    """The straight lanes that the vehicle under test follows, in order; shape (L,) or (L, 2) [m].
+    """The L straight lanes that the vehicle under test follows, in order; columns of shape (L,) or (L, 2) [m].
 
-    `end` is the length of a lane as SUMO counts positions on it, `stretch` the length of a lane's shape over the lane's length.
+    A lane's shape leads from `first` along `vector`. SUMO counts positions on a lane from 0 to `end`; `stretch` is `shape_length` / `end`.
     """
 
     first: FloatArray
@@ -66,20 +66,20 @@ class Way(NamedTuple):
     shape_length: FloatArray
 
     def at(self, lane: Any) -> Way:
-        """The lanes of N vehicles, given by number; L becomes N."""
+        """The current lanes of N vehicles, given by lane number; columns of length N."""
         return Way._make(column[lane] for column in self)
 
-    def positions(self, place: FloatArray) -> FloatArray:
-        """Front bumpers, shape (N, 2) [m], of vehicles at positions on their lanes, shape (N,)."""
-        share = place * self.stretch / self.shape_length
+    def positions(self, lane_position: FloatArray) -> FloatArray:
+        """Coordinates of the front bumpers, shape (N, 2) [m], of vehicles at positions on their lanes, shape (N,) [m]."""
+        share = lane_position * self.stretch / self.shape_length
         return np.asarray(self.first + self.vector * share[:, np.newaxis])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """A scene in which the vehicle under test does not drive: `start` and `speed` are those of its departure on its `way` [m, m/s].
+    """A scene in which the vehicle under test departs at position `start` on its `way` [m], at `speed` [m/s].
 
-    `extents`, shape (2, T, A): the vehicle is beside actor A at step T while its front is between the two positions along the way [m].
+    `extents`, shape (2, T, A): at step t, the vehicle is beside actor a while its front is between these coordinates along the way [m].
     """
 
     step_length: float
@@ -96,12 +96,12 @@ class Recording:
 
     @property
     def road(self) -> tuple[Hashable, ...]:
-        """Key of scenes whose vehicles may be in one batch."""
+        """A key: vehicles in scenes with the same key may share a batch."""
         return self.step_length, self.length, self.width, self.along.tobytes(), *(column.tobytes() for column in self.way)
 
 
 def recorded_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> list[Recording | str]:
-    """Recorded scenes of scenarios, with further options of SUMO, or the reason why a scenario needs SUMO and copies.
+    """Each scenario's recorded scene, played with additional options of SUMO, or the reason why the scenario must be simulated in SUMO.
 
     SUMO plays a scene once per process; scenes of shipped scenarios are also kept in the user's cache folder.
 
@@ -114,11 +114,11 @@ def recorded_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> li
     recordable = [scenario for scenario, reason in zip(scenarios, reasons, strict=True) if not reason]
     folders = {(scenario, network.fingerprint, tuple(options)): network.folder
                for scenario, network in zip(recordable, all_staged(recordable), strict=True)}
-    missing = {key: folder for key, folder in folders.items() if key not in _scenes}
-    if missing:
-        for old in [key for key in _scenes if key not in folders][:max(len(_scenes) + len(missing) - SCENES, 0)]:
-            del _scenes[old]
-        _scenes.update(zip(missing, _scenes_of(missing), strict=True))
+    new_folders = {key: folder for key, folder in folders.items() if key not in _scenes}
+    if new_folders:
+        for old_key in [key for key in _scenes if key not in folders][:max(len(_scenes) + len(new_folders) - MAX_SCENES, 0)]:
+            del _scenes[old_key]
+        _scenes.update(zip(new_folders, _scenes_of(new_folders), strict=True))
     scenes = {key[0]: _scenes[key] for key in folders}
     return [reason or scenes[scenario] for scenario, reason in zip(scenarios, reasons, strict=True)]
 
@@ -126,35 +126,35 @@ def recorded_scenes(scenarios: Sequence[Scenario], options: Sequence[str]) -> li
 def _reason_for_sumo(scenario: Scenario) -> str:
     if getattr(scenario, "reactive_actors", True):
         return "somebody in the scenario may react to the vehicle under test"
-    if not isinstance(scenario, GuardedScenario) and not is_shipped(scenario.network):  # a shipped scenario claims it for shipped networks
+    if not isinstance(scenario, GuardedScenario) and not is_shipped(scenario.network):  # shipped scenarios vouch for these
         return f"the traffic of the network {scenario.network!r} may react to the vehicle under test"
     return ""
 
 
 _Key = tuple[Scenario, str, tuple[str, ...]]
-"""A scenario, the fingerprint of its network and traffic, and further options."""
+"""A scenario, the fingerprint of its network and traffic, and additional options of SUMO."""
 _scenes: dict[_Key, Recording | str] = {}
-"""Scenes of this process, or the reason why a scene cannot be recorded."""
+"""The scenes that this process keeps, or the reasons why scenes cannot be recorded."""
 
 
-def _scenes_of(missing: Mapping[_Key, str]) -> list[Recording | str]:
-    """Scenes for keys and network folders, from the cache or played by SUMO."""
+def _scenes_of(folders: Mapping[_Key, str]) -> list[Recording | str]:
+    """The scenes of keys with network folders, read from the cache or played by SUMO."""
     def play() -> list[Recording | str]:
-        return [_play(scenario, folder, options) for (scenario, _, options), folder in missing.items()]
+        return [_play(scenario, folder, options) for (scenario, _, options), folder in folders.items()]
 
-    if any(isinstance(scenario, GuardedScenario) for scenario, *_ in missing):
+    if any(isinstance(scenario, GuardedScenario) for scenario, *_ in folders):
         return play()
-    digest = sha256(_code() + repr([(type(scenario).__name__, to_builtins(scenario), *rest) for scenario, *rest in missing]).encode())
+    digest = sha256(_code_bytes() + repr([(type(scenario).__name__, to_builtins(scenario), *rest) for scenario, *rest in folders]).encode())
     def build(folder: Path) -> None:
-        (folder / KEPT).write_bytes(msgpack.encode(play(), enc_hook=_packed_array))
+        (folder / SCENES_FILE).write_bytes(msgpack.encode(play(), enc_hook=_packed_array))
 
-    file = cached(f"scenes-{digest.hexdigest()[:16]}", KEPT, build)
+    file = cached(f"scenes-{digest.hexdigest()[:16]}", SCENES_FILE, build)
     return msgpack.decode(file.read_bytes(), type=list[Recording | str], dec_hook=_unpacked_array)
 
 
 @cache
-def _code() -> bytes:
-    """What determines a scene besides the scenario: SUMO's version, and our code that plays scenes."""
+def _code_bytes() -> bytes:
+    """SUMO's version and the code that plays scenes: a scene depends on them and on its scenario."""
     files = sorted(file for folder in ("sumo", "scenarios") for file in (Path(__file__).parents[1] / folder).glob("*.py"))
     return b"".join([netconvert_version().encode(), *(file.read_bytes() for file in files)])
 
@@ -163,7 +163,7 @@ def _packed_array(array: Any) -> tuple[tuple[int, ...], bytes]:
     return array.shape, array.tobytes()
 
 
-def _unpacked_array(kind: Any, packed: Any) -> FloatArray:
+def _unpacked_array(_: Any, packed: Any) -> FloatArray:
     shape, content = packed
     return np.frombuffer(content).reshape(shape)
 
@@ -183,13 +183,13 @@ def _record(scenario: Scenario, world: SumoWorld) -> Recording:
     api, vut, step = world.api, copied_id(0, VUT), world.step_length
     way, along = _way_of(api, vut)
     start, speed = float(api.vehicle.getLanePosition(vut)), float(api.vehicle.getSpeed(vut))
-    lane_of = {name: copy_and_name(api.vehicle.getLaneID(id_))[1] for id_, name in _named(api.vehicle.getIDList())}
-    lanes = {name: tuple((float(x), float(y)) for x, y in api.lane.getShape(id_)) for id_, name in _named(api.lane.getIDList())}
+    lane_of = {name: copy_and_name(api.vehicle.getLaneID(id_))[1] for id_, name in _ids_in_first_copy(api.vehicle.getIDList())}
+    lanes = {name: tuple((float(x), float(y)) for x, y in api.lane.getShape(id_)) for id_, name in _ids_in_first_copy(api.lane.getIDList())}
     length = round(scenario.duration / step) + 1
     states, sizes, memory = dict[str, FloatArray](), dict[str, tuple[bool, float, float]](), begin(scenario, world)
     for sample in range(length):
         for kind in (api.vehicle, api.person):
-            for id_, name in _named(kind.getIDList()):
+            for id_, name in _ids_in_first_copy(kind.getIDList()):
                 if name == VUT:
                     continue
                 if name not in states:
@@ -210,16 +210,16 @@ def _record(scenario: Scenario, world: SumoWorld) -> Recording:
 
 
 def _extent(track: Track, along: FloatArray, own_length: float) -> FloatArray:
-    """Least and largest position of a vehicle's front beside an actor at every step, with a margin; shape (2, T) [m]."""
+    """Coordinates between which a vehicle's front is while the vehicle is beside an actor, with a margin; shape (2, T) [m]."""
     angle = np.radians(track.angle)  # clockwise from north
     cosine, sine = along @ np.array([np.sin(angle), np.cos(angle)]), along @ np.array([np.cos(angle), -np.sin(angle)])
     middle = track.position @ along - cosine * (track.length / 2)
-    half_extent = (np.abs(cosine) * track.length + np.abs(sine) * track.width) / 2 + LEEWAY
+    half_extent = (np.abs(cosine) * track.length + np.abs(sine) * track.width) / 2 + EXTENT_MARGIN
     return np.array([middle - half_extent, middle + half_extent + own_length])
 
 
-def _named(ids: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Ids of the first copy, and their names in the original."""
+def _ids_in_first_copy(ids: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Yield the ids that belong to the first copy, each with its name in the original network."""
     for id_ in ids:
         copy, name = copy_and_name(id_)
         if copy == 0:
@@ -227,7 +227,7 @@ def _named(ids: Iterable[str]) -> Iterator[tuple[str, str]]:
 
 
 def _way_of(api: Any, vut: str) -> tuple[Way, FloatArray]:
-    """The lanes ahead of a vehicle that has departed, and their direction.
+    """The lanes of the rest of a vehicle's route, and their common direction.
 
     Raises
     ------
@@ -241,19 +241,20 @@ def _way_of(api: Any, vut: str) -> tuple[Way, FloatArray]:
         links = [link for link in api.lane.getLinks(lanes[-1]) if api.lane.getEdgeID(link[0]) == edge]
         if len(links) != 1:
             raise UnrecordableError(f"there are {len(links)} lanes from {lanes[-1]!r} to {edge!r}")
-        ahead, inside = links[0][0], links[0][4]
-        while inside:
-            lanes.append(inside)
-            inside = next(iter(api.lane.getLinks(inside)), ("", "", "", "", ""))[4]
-        lanes.append(ahead)
+        next_lane, internal_lane = links[0][0], links[0][4]
+        while internal_lane:
+            lanes.append(internal_lane)
+            internal_lane = next(iter(api.lane.getLinks(internal_lane)), ("", "", "", "", ""))[4]
+        lanes.append(next_lane)
     shapes = [api.lane.getShape(lane) for lane in lanes]
     for lane, shape in zip(lanes, shapes, strict=True):
         if len(shape) != 2:
             raise UnrecordableError(f"lane {copy_and_name(lane)[1]!r} of the vehicle under test is not straight")
-    first, last = (np.array([shape[k] for shape in shapes], dtype=float) for k in (0, 1))
-    vector, end = last - first, np.array([api.lane.getLength(lane) for lane in lanes], dtype=float)
+    starts, ends = (np.array([shape[k] for shape in shapes], dtype=float) for k in (0, 1))
+    vector, lengths = ends - starts, np.array([api.lane.getLength(lane) for lane in lanes], dtype=float)
     shape_length = np.sqrt((vector * vector).sum(axis=1))
     direction = vector / shape_length[:, np.newaxis]
-    if np.abs(direction - direction[0]).max() > 1e-6 or np.abs(first[1:] - last[:-1]).max(initial=0.0) > 1e-6:
+    if np.abs(direction - direction[0]).max() > 1e-6 or np.abs(starts[1:] - ends[:-1]).max(initial=0.0) > 1e-6:
         raise UnrecordableError("the lanes of the vehicle under test do not form a straight line")
-    return Way(first, vector, end, np.maximum(shape_length, POSITION_EPS) / end, shape_length), direction_of(api.vehicle.getAngle(vut))
+    stretch = np.maximum(shape_length, POSITION_EPS) / lengths
+    return Way(starts, vector, lengths, stretch, shape_length), direction_of(api.vehicle.getAngle(vut))

@@ -1,4 +1,4 @@
-"""The files and options of a network's folder: no option may write files, open sockets, use random numbers or read other folders."""
+"""Files and options in a network's folder: no option may write files, open sockets, use random numbers or read other folders."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ SECTIONS = frozenset({
     "configuration", "input", "time", "processing", "report", "gui_only", "random_number", "routing", "output", "projection",
     "building_defaults", "tls_building", "ramp_guessing", "edge_removal", "unregulated_nodes", "junctions", "pedestrian", "bicycle",
     "railway", "formats"})
-SIMULATING = re.compile(
+SUMO_OPTIONS = re.compile(
     r"net-file|route-files|gui-settings-file|begin|step-length|step-method\.ballistic|lateral-resolution|seed|max-depart-delay"
     r"|(collision|intermodal-collision|pedestrian|default|time-to-teleport|emergencydecel)(\.[a-z-]+)+|time-to-teleport"
     r"|ignore-junction-blocker|ignore-accidents|no-internal-links|lanechange\.duration|no-warnings|no-step-log|verbose")
-"""Legal options of SUMO: how vehicles and persons move, or which of the folder's files SUMO reads."""
-BUILDING = re.compile(
+"""Legal options of SUMO: they determine how vehicles and persons move, or which files of the folder SUMO reads."""
+NETCONVERT_OPTIONS = re.compile(
     r"precision|simple-projection|proj\.(scale|rotate|utm|dhdn|inverse|dhdnutm)|speed-in-kmh|flatten|lefthand|flip-y-axis|join-lanes"
     r"|max-join-ids|dismiss-vclasses|construction-date|numerical-ids|plain\.extend-edge-shape|no-internal-links|no-left-connections"
     r"|no-turnarounds(\.[a-z]+)?|rectangular-lane-cut|ignore-widths|ignore-change-restrictions|discard-params|ignore-errors(\.[a-z-]+)?"
     r"|keep-nodes-unregulated(\.[a-z-]+)?|walkingareas|(geometry|offset|roundabouts|opposites|fringe|speed|edges|default|tls|ramps"
     r"|keep-edges|remove-edges|keep-lanes|junctions|internal-junctions|check-lane-foes|sidewalks|crossings|walkingareas|bikelanes"
     r"|railway|osm|opendrive)(\.[a-zA-Z-]+)+(?<!file)(?<!output)")
-"""Legal options of netconvert: how it builds the network from the sources."""
-SOURCES = ("sumo-net-file", "osm-files", "opendrive-files", "node-files", "edge-files", "connection-files", "type-files",
+"""Legal options of netconvert: they determine how netconvert builds the network from the sources."""
+SOURCE_OPTIONS = ("sumo-net-file", "osm-files", "opendrive-files", "node-files", "edge-files", "connection-files", "type-files",
            "tllogic-files", "polygon-files")
-"""Options of netconvert with names of source files."""
-IGNORED = re.compile(r"output-file|verbose|print-options|no-warnings|aggregate-warnings|xml-validation(\.net)?|write-license|write-metadata"
-                     r"|log\.(timestamps|processid)|human-readable-time")
-"""Options of netconvert that do not affect the network and are ignored; the output file is set by this tool."""
-TRAFFIC = "traffic.rou.xml"
+"""Options of netconvert whose values are names of source files."""
+IGNORED_OPTIONS = re.compile(r"output-file|verbose|print-options|no-warnings|aggregate-warnings|xml-validation(\.net)?|write-license"
+                             r"|write-metadata|log\.(timestamps|processid)|human-readable-time")
+"""Options of netconvert that are ignored, because they do not affect the network; safevar sets the output file."""
+TRAFFIC_FILE = "traffic.rou.xml"
 
 
 def options_of(file: Path) -> dict[str, str]:
@@ -44,7 +44,7 @@ def options_of(file: Path) -> dict[str, str]:
     Raises
     ------
     InputError
-        If the file is no such configuration, or sets an option twice.
+        If the file is no configuration of SUMO or netconvert, or sets an option twice.
     """
     try:
         root = ElementTree.fromstring(file.read_bytes())
@@ -71,17 +71,17 @@ def check_options(file: Path) -> None:
     """
     options = options_of(file)
     for name in options:
-        if not SIMULATING.fullmatch(name):
+        if not SUMO_OPTIONS.fullmatch(name):
             raise InputError(file, f"sets SUMO's option {name!r}", "options that write no file, open no socket and draw nothing at random, "
                              "such as step-length, collision.* and pedestrian.*")
     for name in ("net-file", "gui-settings-file"):
         own_files(file, name, options.get(name, ""))
-    if options.get("route-files", TRAFFIC) != TRAFFIC:
-        raise InputError(file, f"route-files = {options['route-files']!r}", f"{TRAFFIC}, all traffic in one file")
+    if options.get("route-files", TRAFFIC_FILE) != TRAFFIC_FILE:
+        raise InputError(file, f"route-files = {options['route-files']!r}", f"{TRAFFIC_FILE}, all traffic in one file")
 
 
 def recipe_of(file: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, str], str]:
-    """Source files by netconvert's option, the options that shape the network, and the name of the network that the recipe writes.
+    """Read a recipe: source files by option of netconvert, options that shape the network, and the name of the network to write.
 
     Raises
     ------
@@ -89,20 +89,20 @@ def recipe_of(file: Path) -> tuple[dict[str, tuple[str, ...]], dict[str, str], s
         Naming the file and the illegal option.
     """
     sources, options = dict[str, tuple[str, ...]](), dict[str, str]()
-    configured = options_of(file)
-    for name, value in configured.items():
-        if name in SOURCES:
+    recipe = options_of(file)
+    for name, value in recipe.items():
+        if name in SOURCE_OPTIONS:
             sources[name] = own_files(file, name, value)
-        elif BUILDING.fullmatch(name):
+        elif NETCONVERT_OPTIONS.fullmatch(name):
             options[name] = value
-        elif not IGNORED.fullmatch(name):
+        elif not IGNORED_OPTIONS.fullmatch(name):
             raise InputError(file, f"sets netconvert's option {name!r}", f"options that shape the network, such as junctions.*, tls.* and "
-                             f"no-turnarounds, and its sources: {', '.join(SOURCES)}")
-    return sources, options, configured.get("output-file", "")
+                             f"no-turnarounds, and its sources: {', '.join(SOURCE_OPTIONS)}")
+    return sources, options, recipe.get("output-file", "")
 
 
 def own_files(file: Path, name: str, value: str) -> tuple[str, ...]:
-    """The files named by an option, which are in the folder of the configuration.
+    """The files that an option names; they must be in the folder of the configuration.
 
     Raises
     ------
@@ -110,144 +110,145 @@ def own_files(file: Path, name: str, value: str) -> tuple[str, ...]:
         If a file is in another folder or missing.
     """
     files = tuple(part.strip() for part in value.split(",") if part.strip())
-    for named in files:
-        if Path(named).name != named or "\\" in named:
-            raise InputError(file, f"{name} = {named!r} is in another folder", "the name of a file in the same folder")
-        if name in SOURCES and not (file.parent / named).is_file():
-            raise InputError(file, f"{name}: {named} is missing", "a file in the same folder")
+    for file_name in files:
+        if Path(file_name).name != file_name or "\\" in file_name:
+            raise InputError(file, f"{name} = {file_name!r} is in another folder", "the name of a file in the same folder")
+        if name in SOURCE_OPTIONS and not (file.parent / file_name).is_file():
+            raise InputError(file, f"{name}: {file_name} is missing", "a file in the same folder")
     return files
 
 
-OPTIONS = "scenario.sumocfg"
-BUILT = ".net.xml"
-PLAIN = {"node-files": "nod", "edge-files": "edg", "connection-files": "con", "type-files": "typ", "tllogic-files": "tll"}
-"""Endings of the files of netconvert's options."""
-REQUIRED = ("network.nod.xml", "network.edg.xml", "network.con.xml", TRAFFIC, OPTIONS)
-LEGAL = f"a folder with {', '.join(REQUIRED)}; or with a {BUILT}, {TRAFFIC} and {OPTIONS}"
-PRECISION = {"precision": "4"}
-"""Digits of coordinates unless a recipe sets them."""
+OPTIONS_FILE = "scenario.sumocfg"
+NETWORK_ENDING = ".net.xml"
+PLAIN_ENDINGS = {"node-files": "nod", "edge-files": "edg", "connection-files": "con", "type-files": "typ", "tllogic-files": "tll"}
+"""Options of netconvert, with the endings of their source files."""
+REQUIRED_FILES = ("network.nod.xml", "network.edg.xml", "network.con.xml", TRAFFIC_FILE, OPTIONS_FILE)
+LEGAL_FOLDERS = f"a folder with {', '.join(REQUIRED_FILES)}; or with a {NETWORK_ENDING}, {TRAFFIC_FILE} and {OPTIONS_FILE}"
+DEFAULT_OPTIONS = {"precision": "4"}
+"""Options of netconvert for a folder without a recipe: decimal digits of coordinates."""
 
 
 class Sources(NamedTuple):
-    """A network's folder, and the files in it that are used.
+    """A network's folder, and the names of the files in it that are used.
 
-    Either `built` names the network, or netconvert builds it with `options` from `plain`, files by netconvert's options;
-    `recipe` names the file with these options, and `builds` the network that it writes.
+    Either `network_file` is the network, or netconvert builds the network with `options` from `plain_files`, which are given by option;
+    the file `recipe` contains these options, and `output_file` is the network that the recipe writes.
     """
 
-    place: Path
-    built: str = ""
-    plain: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    folder: Path
+    network_file: str = ""
+    plain_files: tuple[tuple[str, tuple[str, ...]], ...] = ()
     options: tuple[tuple[str, str], ...] = ()
     recipe: str = ""
-    builds: str = ""
+    output_file: str = ""
 
     @property
-    def roads(self) -> tuple[str, ...]:
+    def road_files(self) -> tuple[str, ...]:
         """The source files of the network itself."""
-        named = (self.built, *(name for _, names in self.plain for name in names), self.recipe)
-        return tuple(name for name in named if name)
+        names = (self.network_file, *(name for _, option_names in self.plain_files for name in option_names), self.recipe)
+        return tuple(name for name in names if name)
 
     @property
     def files(self) -> tuple[str, ...]:
         """All files that are used."""
-        return (*self.roads, TRAFFIC, OPTIONS)
+        return (*self.road_files, TRAFFIC_FILE, OPTIONS_FILE)
 
     def contents(self, *names: str) -> tuple[bytes, ...]:
-        """Contents of some of the files."""
-        return tuple((self.place / name).read_bytes() for name in names)
+        """Contents of the named files."""
+        return tuple((self.folder / name).read_bytes() for name in names)
 
 
 def sources_of(network: str) -> Sources:
-    """The sources of a network of `sumo_nets/`, of a folder, or of a `.net.xml` beside its traffic, by path.
+    """The sources of a network, given by its name in `sumo_nets/`, by its folder, or by a `.net.xml` file beside its traffic.
 
     Raises
     ------
     InputError
-        If there is no such network, a file is missing, or it is unclear which files to use.
+        If the network does not exist, a file is missing, or it is unclear which files to use.
     """
-    place = NETWORKS / network if is_shipped(network) else Path(network)
-    if is_network(place):
-        sources = _in_folder(place, _listing(place)) if place.is_dir() else Sources(place.parent, built=place.name)
-        if "," in str(sources.place.absolute()):
-            raise InputError(sources.place, "has a comma in its path, at which SUMO splits file names", "a path without commas")
-        for name in (TRAFFIC, OPTIONS):
-            if not (sources.place / name).is_file():
-                raise InputError(sources.place, f"{name} is missing", LEGAL)
+    path = NETWORKS / network if is_shipped(network) else Path(network)
+    if is_network(path):
+        sources = _folder_sources(path, _listing(path)) if path.is_dir() else Sources(path.parent, network_file=path.name)
+        if "," in str(sources.folder.absolute()):
+            raise InputError(sources.folder, "has a comma in its path, at which SUMO splits file names", "a path without commas")
+        for name in (TRAFFIC_FILE, OPTIONS_FILE):
+            if not (sources.folder / name).is_file():
+                raise InputError(sources.folder, f"{name} is missing", LEGAL_FOLDERS)
         return sources
     names = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
     raise InputError("scenario.parameters.network", f"there is no network {network!r}{did_you_mean(network, names)}",
-                     f"one of {', '.join(names)}, a folder, or a {BUILT} beside {TRAFFIC} and {OPTIONS}")
+                     f"one of {', '.join(names)}, a folder, or a {NETWORK_ENDING} beside {TRAFFIC_FILE} and {OPTIONS_FILE}")
 
 
 def is_shipped(network: str) -> bool:
-    """Whether this is the name of a network in `sumo_nets/`."""
+    """Whether a network is given by its name in `sumo_nets/`."""
     return network not in ("", ".", "..") and Path(network).name == network and is_network(NETWORKS / network)
 
 
-def is_network(place: Path) -> bool:
-    """Whether a path may be that of a network: a folder or a built network."""
+def is_network(path: Path) -> bool:
+    """Whether a path can be a network: a folder or a built network."""
     try:
-        return place.is_dir() or (place.name.endswith(BUILT) and place.is_file())
-    except OSError:  # such as a name that is too long
+        return path.is_dir() or (path.name.endswith(NETWORK_ENDING) and path.is_file())
+    except OSError:  # for example, a name is too long
         return False
 
 
-def _listing(place: Path) -> tuple[tuple[str, int, int], ...]:
+def _listing(folder: Path) -> tuple[tuple[str, int, int], ...]:
     """Names, modification times and sizes of the files in a folder."""
-    with os.scandir(place) as entries:
+    with os.scandir(folder) as entries:
         return tuple(sorted((entry.name, entry.stat().st_mtime_ns, entry.stat().st_size) for entry in entries if entry.is_file()))
 
 
 @lru_cache(maxsize=256)
-def _in_folder(place: Path, listing: tuple[tuple[str, int, int], ...]) -> Sources:
-    """The sources in a folder; read again when its `listing` changes."""
-    plain, named = _plain(place), _named(place)
-    if plain is not None and (not plain.builds or named in ("", plain.builds) or not (place / named).is_file()):
+def _folder_sources(folder: Path, listing: tuple[tuple[str, int, int], ...]) -> Sources:
+    """The sources in a folder; they are read again when the folder's `listing` changes."""
+    plain, name = _plain_sources(folder), _configured_network(folder)
+    if plain is not None and (not plain.output_file or name in ("", plain.output_file) or not (folder / name).is_file()):
         sources = plain
-    elif named and (place / named).is_file():
-        sources = Sources(place, built=named)
+    elif name and (folder / name).is_file():
+        sources = Sources(folder, network_file=name)
     else:
-        sources = Sources(place, built=_only(place))
-    for ending in PLAIN.values():
-        for file in sorted(place.glob(f"*.{ending}.xml")):
-            if file.name not in sources.roads:
-                reason = f"{sources.recipe} does not name it" if sources.recipe else f"the network is made of {', '.join(sources.roads)}"
+        sources = Sources(folder, network_file=_only_network(folder))
+    names = sources.road_files
+    for ending in PLAIN_ENDINGS.values():
+        for file in sorted(folder.glob(f"*.{ending}.xml")):
+            if file.name not in names:
+                reason = f"{sources.recipe} does not name it" if sources.recipe else f"the network is made of {', '.join(names)}"
                 raise InputError(file, f"is not used: {reason}", "sources that a network.netccfg names; or a folder without unused files")
     return sources
 
 
-def _plain(place: Path) -> Sources | None:
-    """The plain sources, given by a recipe or by their names; None if there are none."""
-    recipes = sorted(place.glob("*.netccfg"))
+def _plain_sources(folder: Path) -> Sources | None:
+    """The plain sources in a folder, given by a recipe or by their file names; None if the folder has no plain sources."""
+    recipes = sorted(folder.glob("*.netccfg"))
     if len(recipes) > 1:
-        raise InputError(place, f"has {' and '.join(file.name for file in recipes)}", "one recipe")
+        raise InputError(folder, f"has {' and '.join(file.name for file in recipes)}", "one recipe")
     if recipes:
         (recipe,) = recipes
-        sources, options, builds = recipe_of(recipe)
+        sources, options, output_file = recipe_of(recipe)
         if not sources:
             raise InputError(recipe, "names no sources", "node-files, edge-files and connection-files, or another network")
-        return Sources(place, "", tuple(sources.items()), tuple(options.items()), recipe.name, builds)
-    names = {option: f"network.{ending}.xml" for option, ending in PLAIN.items()}
-    files = {option: (name,) for option, name in names.items() if (place / name).is_file()}
+        return Sources(folder, "", tuple(sources.items()), tuple(options.items()), recipe.name, output_file)
+    names = {option: f"network.{ending}.xml" for option, ending in PLAIN_ENDINGS.items()}
+    files = {option: (name,) for option, name in names.items() if (folder / name).is_file()}
     if not files:
         return None
-    for name in REQUIRED[:3]:
-        if not (place / name).is_file():
-            raise InputError(place, f"{name} is missing", LEGAL)
-    return Sources(place, "", tuple(files.items()), tuple(PRECISION.items()), "", f"network{BUILT}")
+    for name in REQUIRED_FILES[:3]:
+        if not (folder / name).is_file():
+            raise InputError(folder, f"{name} is missing", LEGAL_FOLDERS)
+    return Sources(folder, "", tuple(files.items()), tuple(DEFAULT_OPTIONS.items()), "", f"network{NETWORK_ENDING}")
 
 
-def _named(place: Path) -> str:
-    """The network that the folder's configuration names; "" if none."""
-    return options_of(place / OPTIONS).get("net-file", "") if (place / OPTIONS).is_file() else ""
+def _configured_network(folder: Path) -> str:
+    """The network that the folder's configuration of SUMO names; "" if it names no network."""
+    return options_of(folder / OPTIONS_FILE).get("net-file", "") if (folder / OPTIONS_FILE).is_file() else ""
 
 
-def _only(place: Path) -> str:
-    """The one network that has been built in a folder without sources."""
-    networks = sorted(file.name for file in place.glob(f"*{BUILT}"))
+def _only_network(folder: Path) -> str:
+    """The only built network in a folder without sources."""
+    networks = sorted(file.name for file in folder.glob(f"*{NETWORK_ENDING}"))
     if not networks:
-        raise InputError(place, f"{REQUIRED[0]} is missing", LEGAL)
+        raise InputError(folder, f"{REQUIRED_FILES[0]} is missing", LEGAL_FOLDERS)
     if len(networks) > 1:
-        raise InputError(place, f"has {' and '.join(networks)}", f"one network, or net-file in {OPTIONS} that names one")
+        raise InputError(folder, f"has {' and '.join(networks)}", f"one network, or net-file in {OPTIONS_FILE} that names one")
     return networks[0]

@@ -1,4 +1,4 @@
-"""Copies of a network in the user's cache, with lanes and traffic as a scenario's parameters demand."""
+"""Variants of a network in the user's cache, with the lanes and traffic that a scenario's parameters require."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ import platformdirs
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.scenarios import GuardedScenario, Lane, Scenario
 from safevar_sumo.scenarios.base import XmlChanges, lane_through
-from safevar_sumo.sumo.copies import parsed
-from safevar_sumo.sumo.network import ROADS, built_network, network_fingerprint
-from safevar_sumo.sumo.sources import OPTIONS, TRAFFIC, Sources, options_of, sources_of
+from safevar_sumo.sumo.copies import parse_xml
+from safevar_sumo.sumo.network import NETWORK_FILE, built_network, network_fingerprint
+from safevar_sumo.sumo.sources import OPTIONS_FILE, TRAFFIC_FILE, Sources, options_of, sources_of
 
 
 class Staged(NamedTuple):
-    """The folder of a network with a scenario's traffic, and a digest of its content."""
+    """The folder of a network with a scenario's lanes and traffic, and a digest of the network's content."""
 
     folder: str
     fingerprint: str
@@ -34,16 +34,16 @@ def staged(scenario: Scenario) -> Staged:
     Raises
     ------
     InputError
-        If the parameters are impossible, or change an element that the traffic file lacks.
+        If the parameters are impossible, or change an element that the network or the traffic file lacks.
     """
     return all_staged([scenario])[0]
 
 
 def all_staged(scenarios: Sequence[Scenario]) -> list[Staged]:
-    """The networks of several scenarios; each network's files are read once. Raises the errors of `staged`."""
+    """The networks of several scenarios, whose files are read once per network; raises the errors of `staged`."""
     fingerprints = {name: network_fingerprint(name) for name in {scenario.network for scenario in scenarios}}
     def stage(scenario: Any) -> Staged:
-        may_vary = isinstance(scenario, GuardedScenario)  # a user's own scenario may return other changes every time
+        may_vary = isinstance(scenario, GuardedScenario)  # a user's scenario may return different changes in each call
         return (_staged.__wrapped__ if may_vary else _staged)(scenario, fingerprints[scenario.network])
 
     return [stage(scenario) for scenario in scenarios]
@@ -51,25 +51,25 @@ def all_staged(scenarios: Sequence[Scenario]) -> list[Staged]:
 
 @lru_cache(maxsize=10_000)
 def _staged(scenario: Any, fingerprint: str) -> Staged:
-    """The staged network; `fingerprint` represents the contents of the network's files in the cache key."""
+    """The staged network; `fingerprint` makes the contents of the network's files part of the cache key."""
     folder = scenario.network
     lanes, actors = (getattr(scenario, name, None) for name in ("lanes", "actors"))
     if lanes is not None and (changes := lanes(_BuiltRoads(folder))):
-        folder = str(_with_lanes(sources_of(folder), built_network(folder), changes))
+        folder = str(_change_lanes(sources_of(folder), built_network(folder), changes))
     if actors is not None and (changes := actors(_BuiltRoads(folder))):
-        folder = str(_with_traffic(sources_of(folder), changes))
+        folder = str(_change_traffic(sources_of(folder), changes))
     return Staged(folder, fingerprint if folder == scenario.network else network_fingerprint(folder))
 
 
 class _BuiltRoads:
-    """The lanes of a network as netconvert built it."""
+    """The lanes of a built network."""
 
     def __init__(self, network: str) -> None:
         self._network = network
 
     def lane(self, lane: str) -> Lane:
         if lane not in self._lanes:
-            raise InputError(sources_of(self._network).place, f"there is no lane {lane!r}")
+            raise InputError(sources_of(self._network).folder, f"there is no lane {lane!r}")
         return self._lanes[lane]
 
     @cached_property
@@ -87,26 +87,26 @@ def _shapes(network: Path, content: bytes) -> dict[str, Lane]:
     return shapes
 
 
-def _with_lanes(sources: Sources, built: Path, changes: XmlChanges) -> Path:
-    """A copy of a network as it was built, with changes to its lanes."""
-    files = {ROADS: ElementTree.tostring(_changed(built, changes)), **_files(sources, TRAFFIC, OPTIONS)}
-    return _stored(sources.place.name, tuple(files.items()))
+def _change_lanes(sources: Sources, network_file: Path, changes: XmlChanges) -> Path:
+    """A copy of a built network with changes to its lanes."""
+    files = {NETWORK_FILE: ElementTree.tostring(_changed_xml(network_file, changes)), **_files(sources, TRAFFIC_FILE, OPTIONS_FILE)}
+    return _store(sources.folder.name, tuple(files.items()))
 
 
-def _with_traffic(sources: Sources, changes: XmlChanges) -> Path:
-    """A copy of a network with changes to its traffic; it is built within its folder where it has sources."""
-    files = _files(sources, *sources.files) | {TRAFFIC: ElementTree.tostring(_changed(sources.place / TRAFFIC, changes))}
-    return _stored(sources.place.name, tuple(files.items())) / sources.built
+def _change_traffic(sources: Sources, changes: XmlChanges) -> Path:
+    """A copy of a network, or of its sources, with changes to its traffic."""
+    files = _files(sources, *sources.files) | {TRAFFIC_FILE: ElementTree.tostring(_changed_xml(sources.folder / TRAFFIC_FILE, changes))}
+    return _store(sources.folder.name, tuple(files.items())) / sources.network_file
 
 
 def _files(sources: Sources, *names: str) -> dict[str, bytes]:
-    """Contents of some of a network's files, and of its sumo-gui settings."""
-    gui_settings = options_of(sources.place / OPTIONS).get("gui-settings-file", "")
-    return {name: (sources.place / name).read_bytes() for name in (*names, gui_settings) if (sources.place / name).is_file()}
+    """Contents of the named files of a network, and of its settings of sumo-gui."""
+    gui_settings = options_of(sources.folder / OPTIONS_FILE).get("gui-settings-file", "")
+    return {name: (sources.folder / name).read_bytes() for name in (*names, gui_settings) if (sources.folder / name).is_file()}
 
 
-def _changed(file: Path, changes: XmlChanges) -> ElementTree.Element:
-    root = parsed(file)
+def _changed_xml(file: Path, changes: XmlChanges) -> ElementTree.Element:
+    root = parse_xml(file)
     for path, attributes in changes.items():
         elements = root.findall(path)
         if not elements:
@@ -120,7 +120,7 @@ def _changed(file: Path, changes: XmlChanges) -> ElementTree.Element:
 
 
 @lru_cache(maxsize=1000)
-def _stored(name: str, files: tuple[tuple[str, bytes], ...]) -> Path:
+def _store(name: str, files: tuple[tuple[str, bytes], ...]) -> Path:
     digest = hashlib.sha256(repr(files).encode()).hexdigest()
     target = platformdirs.user_cache_path("safevar_sumo") / "staged" / digest[:16] / (name or "network")
     if not target.is_dir():

@@ -1,4 +1,4 @@
-"""Assembles a study: looks up its models by name and creates them with their parameters."""
+"""Assembles the parts of a study: looks up its models by name, and creates the models with their parameters."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ from safevar_sumo.vehicles import (
     region_of,
 )
 
-RESERVED = (
+COLUMNS = (
     "algorithm", "run", "evaluation", "outcome", "handle", "collision", "collision_speed", "setting", "f_safe", "f_diff", "f_num_diff")
-"""Names of result columns, which no characteristic and no metric may have."""
-OBJECTIVES = "search.objectives"
+"""Names of result columns, which no characteristic or metric may use."""
+OBJECTIVES_KEY = "search.objectives"
 
 
 class Measuring(NamedTuple):
-    """Metrics and further measures of change by column, the objectives, and the members that come from outside."""
+    """Metrics and additional measures of change by column, the objectives, and the members that are not shipped."""
 
     metrics: Mapping[str, Metric]
     changes: Mapping[str, Change]
@@ -65,26 +65,26 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     Raises
     ------
     InputError
-        If a record does not exist or is invalid, or its name is taken.
+        If a metric or measure of change does not exist, is invalid, or has a name that is taken.
     """
     metrics, members = {**METRICS, **({RATING_POINTS.name: RATING_POINTS} if is_rated(study) else {})}, list[Member]()
     default_metrics = dict(metrics)
-    changes = {name: change for name, change in CHANGES.items() if name not in RESERVED}
+    changes = {name: change for name, change in CHANGES.items() if name not in COLUMNS}
     by_name: dict[str, Metric | Change] = {}
 
     def add(name: str, key: str) -> Metric | Change:
         if name in by_name:
             return by_name[name]
-        own = {**default_metrics, **FURTHER, **({**CHANGES, **BY_OBJECTIVE} if key == OBJECTIVES else {})}
-        member = lookup.find(own, name, key)
+        shipped = {**default_metrics, **FURTHER, **({**CHANGES, **BY_OBJECTIVE} if key == OBJECTIVES_KEY else {})}
+        member = lookup.find(shipped, name, key)
         if member.guard is None:
             if name in FURTHER:
                 metrics[name] = member.target
             return member.target  # type: ignore[no-any-return]
         members.append(member)
-        foreign = isinstance(member.target, Change) and key == OBJECTIVES
-        record = foreign_change(member.target, member.guard) if foreign else foreign_metric(member.target, member.guard)
-        if record.name in (*RESERVED, *metrics, *FURTHER, *changes, *study.vehicle.characteristics):
+        is_change = isinstance(member.target, Change) and key == OBJECTIVES_KEY
+        record = foreign_change(member.target, member.guard) if is_change else foreign_metric(member.target, member.guard)
+        if record.name in (*COLUMNS, *metrics, *FURTHER, *changes, *study.vehicle.characteristics):
             raise InputError(lookup.source, f"{key} = {name!r}: the name {record.name!r} is taken", "a unique name")
         if isinstance(record, Change):
             changes[record.name] = record
@@ -96,8 +96,8 @@ def measuring_of(study: Study, lookup: Lookup) -> Measuring:
     for name in study.metrics.also:
         add(name, "metrics.also")
     names = [BY_OBJECTIVE[name].name if name in BY_OBJECTIVE else name for name in study.search.objectives]
-    objectives = [_objective(add(name, OBJECTIVES)) for name in names]
-    _refuse_twice(objectives, lookup.source)
+    objectives = [_objective(add(name, OBJECTIVES_KEY)) for name in names]
+    _check_duplicates(objectives, lookup.source)
     scoring = Scoring(metrics=tuple(metric.facts for metric in metrics.values()), objectives=tuple(objectives))
     return Measuring(metrics, changes, scoring, tuple(members))
 
@@ -108,18 +108,18 @@ def _objective(record: Metric | Change) -> Objective:
     return Objective(name=record.name, title=record.title, unit=record.unit)
 
 
-def _refuse_twice(objectives: Iterable[Objective], source: str) -> None:
+def _check_duplicates(objectives: Iterable[Objective], source: str) -> None:
     names = [objective.name for objective in objectives]
     if len(set(names)) < len(names):
         raise InputError(source, f"search.objectives: one of {', '.join(names)} is named twice", one_of([*METRICS, *FURTHER, *CHANGES]))
 
 
-STEP = "a function step(traci, vehicle_id), or a class with that method"
-"""Legal forms of a controller written for TraCI."""
+CONTROLLER_FORMS = "a function step(traci, vehicle_id), or a class with that method"
+"""The legal forms of a controller written for TraCI."""
 
 
 class Models(NamedTuple):
-    """A study's models with their parameters, and the members that they come from."""
+    """A study's models with their parameters, and the members that define the models."""
 
     vehicle: Vehicle
     ads: Ads
@@ -132,8 +132,8 @@ class Models(NamedTuple):
 class System:
     """The parts of a simulation.
 
-    `step_length` [s] is None if the network's own step applies; `rater` rates results in the matrix of a protocol; `metrics` are
-    thresholds, `measuring` the metrics computed with them; `members` are the sources of all models and metrics.
+    `step_length` [s] is None if the network determines the time step; `rater` rates results in the matrix of a protocol; `metrics` contains
+    thresholds, and `measuring` the metrics that are computed with them; `members` define all models and metrics.
     """
 
     characteristics: CharacteristicSet
@@ -152,7 +152,7 @@ class System:
 
     @property
     def points(self) -> tuple[Point, ...]:
-        """Points at which a setting is simulated: the matrix, or the study's one scenario."""
+        """Points at which a setting is simulated: the points of the matrix, or the study's only scenario."""
         return self.matrix or (Point(self.scenario, self.weather),)
 
     def at(self, point: Point) -> System:
@@ -167,14 +167,14 @@ class System:
     def remarks(self) -> list[str]:
         """Remarks on parts of networks and weathers that are not used or have no effect."""
         in_traci = isinstance(self.ads, TraciController)
-        fmus = [remark for model in (self.vehicle, self.ads) for remark in getattr(model, "remarks", ())]
+        fmu_remarks = [remark for model in (self.vehicle, self.ads) for remark in getattr(model, "remarks", ())]
         networks = dict.fromkeys(point.scenario.network for point in self.points)
         remarks = [remark for network in networks for remark in network_remarks(network, self.nominal.max_speed, sumo_drives=in_traci)]
-        remarks += fmus
-        hazy = {point.weather.name: point.weather.visibility for point in self.points if point.weather.visibility != 1}
+        remarks += fmu_remarks
+        visibilities = {point.weather.name: point.weather.visibility for point in self.points if point.weather.visibility != 1}
         if in_traci and not self._has_limited_range():
             remarks += [f"weather {name!r}: visibility = {value:g} has no effect: the vehicle has no sensor range, so a controller written "
-                      "for TraCI sees everything" for name, value in hazy.items()]
+                      "for TraCI sees everything" for name, value in visibilities.items()]
         if not any(getattr(self.ads, name, 0.0) for name in REACTIONS):
             remarks += [f"weather {name!r} has no effect: its road and its visibility are those of clear weather, and no key of "
                       "[ads.parameters] delays the ADS in it"
@@ -184,30 +184,30 @@ class System:
     def _has_limited_range(self) -> bool:
         sensors = getattr(self.vehicle, "sensors", None)
         original = dict(zip(self.characteristics.names, self.characteristics.original[:, np.newaxis], strict=True))
-        own = None if sensors is None else sensors(self.vehicle.prepare(original, 1.0, 0.1))
-        return own is not None and bool(np.isfinite(own.reach).all())
+        values = None if sensors is None else sensors(self.vehicle.prepare(original, 1.0, 0.1))
+        return values is not None and bool(np.isfinite(values.reach).all())
 
 
 def _equals_clear(weather: Weather) -> bool:
-    """Whether a weather equals clear weather in all but its name."""
+    """Whether a weather differs from clear weather in its name only."""
     clear = WEATHERS["clear"]
     return weather.name != clear.name and weather.light == clear.light and msgspec.structs.replace(weather, name=clear.name) == clear
 
 
 def assemble(study: Study, source: str = "") -> System:
-    """Look up the study's models and create them with their parameters; `source` is the name of the study in errors.
+    """Look up the study's models and create them with their parameters; errors name the study by `source`.
 
     Raises
     ------
     InputError
-        Naming the study, the key, the value and what is legal.
+        Naming the study, the key, the value and the legal values.
     """
     source = source or study.source
     with guard_process_state(source, foreign_names(study)):
-        return _assembled(study, source)
+        return _assemble(study, source)
 
 
-def _assembled(study: Study, source: str) -> System:
+def _assemble(study: Study, source: str) -> System:
     models = models_of(study, source)
     _check_units(study, models.vehicle, models.members[0].guard is None, source)
     measuring = measuring_of(study, Lookup(source, study.origin.places))
@@ -225,7 +225,7 @@ def _assembled(study: Study, source: str) -> System:
         ends = np.stack([characteristics.original, characteristics.lower, characteristics.upper])
         models.vehicle.refuse_unknown_sensors(dict(zip(characteristics.names, np.ascontiguousarray(ends.T), strict=True)))
     if models.members[0].guard is not None:
-        nominal.tables()  # raises errors of a vehicle from outside here, whichever ADS drives it
+        nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
     return System(
         characteristics=characteristics, vehicle=models.vehicle, ads=models.ads, scenario=models.scenario, weather=models.weather,
         metrics=study.metrics, nominal=nominal, members=(*models.members, *measuring.members, *region.members),
@@ -235,36 +235,36 @@ def _assembled(study: Study, source: str) -> System:
 
 def models_of(study: Study, source: str) -> Models:
     """The study's models with their parameters; raises the errors of `assemble`."""
-    lookup, limit = Lookup(source, study.origin.places), min(study.search.time_limit / 2, LONGEST)  # below the time limit of a batch
+    lookup, limit = Lookup(source, study.origin.places), min(study.search.time_limit / 2, LONGEST)  # less than the time limit of a batch
     vehicle, ads, scenario = _vehicle(study.vehicle, lookup, limit), _ads(study.ads, lookup, limit), _scenario(study.scenario, lookup)
     return Models(vehicle[0], ads[0], scenario[0], weather_of(study.weather, source), (vehicle[1], ads[1], scenario[1]))
 
 
-def _traci(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
-    """A function `step(traci, vehicle_id)` or a class with that method, written for SUMO."""
+def _traci_controller(choice: ModelTable, lookup: Lookup) -> tuple[Ads, Member]:
+    """The ADS of a controller written for TraCI: a function `step(traci, vehicle_id)` or a class with that method."""
     name = f"ads.model = {choice.model!r}"
     with importable():
         member = lookup.find({}, choice.model, "ads.model")
-        what, parameters = member.target, lookup.with_paths(member, choice.parameters, "ads.parameters")
-        if not callable(getattr(what, "step", None) if inspect.isclass(what) else what):
-            raise InputError(lookup.source, f"{name} has no step", STEP)
-        if not inspect.isclass(what):
-            check_parameters(what, (None, None), parameters, name, "ads.parameters", lookup.source)
+        controller, parameters = member.target, lookup.with_paths(member, choice.parameters, "ads.parameters")
+        if not callable(getattr(controller, "step", None) if inspect.isclass(controller) else controller):
+            raise InputError(lookup.source, f"{name} has no step", CONTROLLER_FORMS)
+        if not inspect.isclass(controller):
+            check_parameters(controller, (None, None), parameters, name, "ads.parameters", lookup.source)
 
-        def controller_of(what: Any) -> Any:
-            """A controller for one vehicle, from its own instance of the module."""
-            if not inspect.isclass(what):
-                return partial(what, **parameters)
-            return instance_of(member._replace(target=what), parameters, name, "ads.parameters", lookup.source)
+        def controller_of(target: Any) -> Any:
+            """A controller for one vehicle, from the vehicle's own instance of the module."""
+            if not inspect.isclass(target):
+                return partial(target, **parameters)
+            return instance_of(member._replace(target=target), parameters, name, "ads.parameters", lookup.source)
 
-        controller_of(what)
+        controller_of(controller)
     places, attribute = [*lookup.places, os.getcwd()], choice.model.partition(":")[2]
     modules = partial(OwnModules, member, attribute, places, set())
     return TraciController(modules, controller_of, member.guard or Guard(lookup.source, name)), member
 
 
 def _matrix(study: Study, source: str) -> tuple[Point, ...]:
-    """The points of a study's matrix; raises an error unless their names are unique."""
+    """The points of a study's matrix; raises an error if several points share a name."""
     points = [] if study.matrix is None else [point for test in study.matrix.tests for point in _points_of(test, study, source)]
     counts = Counter(point.name for point in points)
     for name, number in counts.items():
@@ -288,10 +288,10 @@ def _points_of(test: MatrixTest, study: Study, source: str) -> Iterator[Point]:
             yield Point(scenario, weather, name, tuple(place.items()))
 
 
-def _with_network(scenario: Any, places: Sequence[str]) -> Any:
-    """The scenario with its network's folder beside the study, if there is such a folder and the name is not that of a shipped network.
+def _locate_network(scenario: Any, places: Sequence[str]) -> Any:
+    """The scenario with the path of its network, if the network is not shipped but is a folder or file beside the study.
 
-    A folder with sources comes first: a results directory beside the study may have the same name.
+    A folder with sources has priority, because a results directory beside the study may have the same name.
     """
     folder = scenario.network
     paths = [path for place in places if is_network(path := Path(place, folder))]
@@ -307,8 +307,8 @@ def _with_network(scenario: Any, places: Sequence[str]) -> Any:
 def _check_units(study: Study, vehicle: Vehicle, is_shipped_model: bool, source: str) -> None:
     table, units = study.vehicle.characteristics, vehicle.UNITS
     for name in table:
-        if name in RESERVED:
-            raise InputError(source, f"vehicle.characteristics.{name}: the name is a column of results", f"none of {', '.join(RESERVED)}")
+        if name in COLUMNS:
+            raise InputError(source, f"vehicle.characteristics.{name}: the name is a column of results", f"none of {', '.join(COLUMNS)}")
         if name not in units:
             raise unknown(source, f"vehicle.characteristics.{name}: {study.vehicle.model} has no such characteristic", name, units)
         if table[name].unit != units[name]:
@@ -338,12 +338,12 @@ def _scenario(choice: ModelTable, lookup: Lookup) -> tuple[Scenario, Member]:
     member = lookup.class_of(SCENARIOS, choice.model, "scenario.model", SCENARIO_CONTRACT)
     parameters = lookup.with_paths(member, choice.parameters, "scenario.parameters")
     scenario = instance_of(member, parameters, f"scenario.model = {choice.model!r}", "scenario.parameters", lookup.source)
-    return _with_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.places), member
+    return _locate_network(scenario if member.guard is None else GuardedScenario(scenario, member.guard), lookup.places), member
 
 
 def _ads(choice: ModelTable, lookup: Lookup, limit: float) -> tuple[Ads, Member]:
     if choice.kind == "traci":
-        return _traci(choice, lookup)
+        return _traci_controller(choice, lookup)
     if choice.kind == "fmu":
         guard = Guard(lookup.source, f"ads.model = {choice.model!r}")
         parameters = lookup.with_paths(Member(FmuAds, guard), choice.parameters, "ads.parameters")
@@ -351,11 +351,11 @@ def _ads(choice: ModelTable, lookup: Lookup, limit: float) -> tuple[Ads, Member]
         ads = FmuAds(description, choice.inputs, choice.outputs, parameters, choice.step, guard, limit)
         return ads, Member(FmuAds, guard, file=description.path)
     member = lookup.class_of(ADS, choice.model, "ads.model", SCALAR_ADS_CONTRACT, ADS_CONTRACT,
-                             otherwise=f'with ads.kind = "traci" {STEP}')
+                             otherwise=f'with ads.kind = "traci" {CONTROLLER_FORMS}')
     name = f"ads.model = {choice.model!r}"
     parameters = lookup.with_paths(member, choice.parameters, "ads.parameters")
     make = partial(instance_of, member, parameters, name, "ads.parameters", lookup.source)
-    driver = make()  # for a ScalarAds, too, so that wrong parameters raise their errors here
+    driver = make()  # also for a ScalarAds, so that wrong parameters raise errors here
     if issubclass(member.target, ScalarAds):
         return PerVehicle(make, member.guard or Guard(lookup.source, name)), member
     return (driver if member.guard is None else GuardedAds(driver, member.guard)), member

@@ -1,8 +1,8 @@
 """A controller that was written for SUMO: it reads the running simulation and commands the vehicle through TraCI's functions.
 
-Its `step(traci, vehicle_id)` sees its own copy of the network under the traffic file's ids, and other actors through the vehicle's
-sensors. Queries of the vehicle's type return the original vehicle's values. Commanded speeds and accelerations are converted to pedals
-of the vehicle model.
+The controller's `step(traci, vehicle_id)` sees one copy of the network, with the ids of the traffic file, and other actors through the
+vehicle's sensors. Queries of the vehicle's type return the values of the original vehicle. Commanded speeds and accelerations are
+converted to pedal positions of the vehicle model.
 """
 
 from __future__ import annotations
@@ -17,59 +17,59 @@ from safevar_sumo.plugins import Guard, OwnModules
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.sensing import Sensing
-from safevar_sumo.sumo.traci_module import Subscriptions, driving, importable, traci_module
+from safevar_sumo.sumo.traci_module import Subscriptions, driven_vehicle, importable, traci_module
 from safevar_sumo.sumo.traci_view import TraciView
-from safevar_sumo.sumo.world import present_world
+from safevar_sumo.sumo.world import current_world
 from safevar_sumo.vehicles import SumoType
 
 
 class TraciController:
-    """Drives every vehicle with its own controller, a function `step(traci, vehicle_id)` or a class with `start` and `step`.
+    """Drives each vehicle with a controller of its own: a function `step(traci, vehicle_id)` or a class with `start` and `step`.
 
     Parameters
     ----------
     modules
         Creates separate instances of the user's modules for each vehicle, so that vehicles share no module state.
     controller_of
-        Creates the controller from the object that the study names in those modules.
+        Creates a controller from the object that the study names in these modules.
     """
 
     def __init__(self, modules: Callable[[], OwnModules], controller_of: Callable[[Any], Any], guard: Guard) -> None:
         self._modules, self._controller_of, self._guard = modules, controller_of, guard
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        world = present_world()
+        world = current_world()
         world.set_types(SumoType(*(np.full(n, getattr(nominal, name)) for name in SumoType._fields)))
         names, sensing = world.names(), Sensing(world, step)
         views = [TraciView(world, copy, names, sensing, nominal, step) for copy in range(n)]
-        sensing.look()
+        sensing.record_step()
         with importable():
             drivers = [_Driver(view, self._modules(), self._controller_of, self._guard) for view in views]
         return _Memory(nominal, sensing, drivers, None)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        trimmed = trim(memory.nominal, seen) if memory.trimmed is None else memory.trimmed
-        wanted = np.zeros(len(memory.drivers))
-        if memory.trimmed is not None:  # the first observation was made at the start
-            memory.sensing.look()
+        initial_trim = trim(memory.nominal, seen) if memory.initial_trim is None else memory.initial_trim
+        accelerations = np.zeros(len(memory.drivers))
+        if memory.initial_trim is not None:  # `start` recorded the first step
+            memory.sensing.record_step()
         with importable():
             for i, driver in enumerate(memory.drivers):
                 if driver.view.on_the_road:
-                    wanted[i] = driver.step(seen.time, float(seen.speed[i]))
-        return pedals(memory.nominal, seen.speed, wanted, trimmed), memory._replace(trimmed=trimmed)
+                    accelerations[i] = driver.step(seen.time, float(seen.speed[i]))
+        return pedals(memory.nominal, seen.speed, accelerations, initial_trim), memory._replace(initial_trim=initial_trim)
 
 
 class _Memory(NamedTuple):
-    """The original vehicle, the vehicles' sensing, a driver for each vehicle, and the trim at the first observation."""
+    """The original vehicle, the sensing of all vehicles, each vehicle's driver, and the trim at the first observation."""
 
     nominal: Nominal
     sensing: Sensing
     drivers: list[_Driver]
-    trimmed: Trim | None
+    initial_trim: Trim | None
 
 
 class _Driver:
-    """The controller of one vehicle, with its own instances of the modules."""
+    """The controller of one vehicle, with separate instances of the user's modules."""
 
     def __init__(self, view: TraciView, modules: OwnModules, controller_of: Callable[[Any], Any], guard: Guard) -> None:
         self.view, self._modules, self._guard = view, modules, guard
@@ -84,10 +84,10 @@ class _Driver:
         """The commanded acceleration [m/s^2]."""
         self.view.time = time
         self._call("step", self._step)
-        return self.view.commanded.acceleration(speed, time, self.view.speed_of_sumo(speed))
+        return self.view.commanded_speed.acceleration(speed, time, self.view.speed_of_sumo(speed))
 
     def _call(self, method: str, function: Callable[..., Any]) -> None:
-        with self._modules.inside(), driving(self.view, self._subscriptions):
+        with self._modules.inside(), driven_vehicle(self.view, self._subscriptions):
             self._guard.call(method, function, traci_module(), VUT)
-        if self.view.refused is not None:  # the controller caught the error and continued
-            raise self._guard.failed(method, self.view.refused)
+        if self.view.last_error is not None:  # the controller caught the error and continued
+            raise self._guard.failed(method, self.view.last_error)

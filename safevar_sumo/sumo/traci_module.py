@@ -1,4 +1,4 @@
-"""TraCI as controllers import it: `import traci` in any module refers to the vehicle that is being driven; and subscriptions."""
+"""TraCI and its subscriptions for controllers: `import traci` in any module refers to the vehicle that is being driven."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.sumo.engine import Engine, engine_api
-from safevar_sumo.sumo.traci_view import TraciView, positional, real_traci, traci_exception
+from safevar_sumo.sumo.traci_view import TraciView, positional_arguments, real_traci, traci_exception
 
 VARIABLES: Mapping[str, str] = {
     "TRACI_ID_LIST": "getIDList", "ID_COUNT": "getIDCount", "VAR_POSITION": "getPosition", "VAR_POSITION3D": "getPosition3D",
@@ -23,118 +23,117 @@ VARIABLES: Mapping[str, str] = {
     "VAR_MAXSPEED": "getMaxSpeed", "VAR_ACCEL": "getAccel", "VAR_DECEL": "getDecel", "VAR_TAU": "getTau", "VAR_ROUTE_ID": "getRouteID",
     "VAR_WAITING_TIME": "getWaitingTime", "VAR_TIME": "getTime", "VAR_DELTA_T": "getDeltaT",
 }
-"""TraCI's variables for subscriptions, and the functions that return the same values."""
-AROUND = {"CMD_GET_VEHICLE_VARIABLE": "vehicle", "CMD_GET_PERSON_VARIABLE": "person"}
-DEFAULT = ("VAR_ROAD_ID", "VAR_LANEPOSITION")
+"""TraCI's variables for subscriptions, each with the function that returns the same value."""
+CONTEXT_DOMAINS = {"CMD_GET_VEHICLE_VARIABLE": "vehicle", "CMD_GET_PERSON_VARIABLE": "person"}
+DEFAULT_VARIABLES = ("VAR_ROAD_ID", "VAR_LANEPOSITION")
 
 
 class Subscriptions:
-    """Subscriptions of a controller; their results are those of the functions for the variables, through the sensors."""
+    """A controller's subscriptions; a variable's result is the value that its function returns, as the sensors report it."""
 
     def __init__(self, view: TraciView) -> None:
         self._view = view
-        self._subscribed: dict[tuple[str, str], dict[int, tuple[Any, ...]]] = {}
-        self._around: dict[tuple[str, str], tuple[str, float, dict[int, tuple[Any, ...]]]] = {}
+        self._subscriptions: dict[tuple[str, str], dict[int, tuple[Any, ...]]] = {}
+        self._context_subscriptions: dict[tuple[str, str], tuple[str, float, dict[int, tuple[Any, ...]]]] = {}
 
     def call(self, domain: str, name: str, arguments: tuple[Any, ...], named: Mapping[str, Any]) -> Any:
-        """Call a domain's function that subscribes, or returns results of subscriptions."""
+        """Call a function of a domain that subscribes, unsubscribes or returns results."""
         if name.startswith("get"):
-            all_results, context = name.startswith("getAll"), "Context" in name
-            results = self._contexts(domain) if context else self._results(domain)
+            results = self._context_results(domain) if "Context" in name else self._results(domain)
             key = "" if domain == "simulation" else str(next(iter((*arguments, *named.values())), ""))
-            return results if all_results else results.get(key, {})
+            return results if name.startswith("getAll") else results.get(key, {})
         functions: dict[str, Callable[..., None]] = {
             "subscribe": self._subscribe, "subscribeLeader": self._subscribe_to_leader, "unsubscribe": self._unsubscribe,
             "subscribeContext": self._subscribe_around, "unsubscribeContext": self._unsubscribe_around}
         if name not in functions:
             raise InputError(f"traci.{domain}.{name}", "is not for a controller", "subscribe, subscribeContext, and your own selection")
-        ordered = positional(domain, name, arguments, named)
-        functions[name](domain, *(("", *ordered) if domain == "simulation" else ordered))
+        positional = positional_arguments(domain, name, arguments, named)
+        functions[name](domain, *(("", *positional) if domain == "simulation" else positional))
         return None
 
     def _subscribe(self, domain: str, actor: str, variables: Any = None, begin: float = 0, end: float = 0, parameters: Any = None) -> None:
-        self._subscribed[domain, actor] = _variables(domain, variables, parameters)
+        self._subscriptions[domain, actor] = _variables(domain, variables, parameters)
 
     def _subscribe_to_leader(self, domain: str, actor: str, dist: float = 0.0, begin: float = 0, end: float = 0) -> None:
-        self._subscribed[domain, actor] = {_constant("VAR_LEADER"): (dist,)}
+        self._subscriptions[domain, actor] = {_constant("VAR_LEADER"): (dist,)}
 
     def _subscribe_around(self, domain: str, actor: str, around: int, dist: float, variables: Any = None, begin: float = 0, end: float = 0,
                           parameters: Any = None) -> None:
-        kinds = {_constant(name): kind for name, kind in AROUND.items()}
+        kinds = {_constant(name): kind for name, kind in CONTEXT_DOMAINS.items()}
         if domain != "vehicle" or around not in kinds:
             raise InputError(f"traci.{domain}.subscribeContext", f"around {actor!r}, domain = {around!r}",
-                             f"vehicles or persons around a vehicle: {', '.join(AROUND)}")
-        self._around[domain, actor] = kinds[around], dist, _variables(kinds[around], variables, parameters)
+                             f"vehicles or persons around a vehicle: {', '.join(CONTEXT_DOMAINS)}")
+        self._context_subscriptions[domain, actor] = kinds[around], dist, _variables(kinds[around], variables, parameters)
 
     def _unsubscribe(self, domain: str, actor: str = "") -> None:
-        self._subscribed.pop((domain, actor), None)
+        self._subscriptions.pop((domain, actor), None)
 
     def _unsubscribe_around(self, domain: str, actor: str, around: int = 0, dist: float = 0.0) -> None:
-        self._around.pop((domain, actor), None)
+        self._context_subscriptions.pop((domain, actor), None)
 
     def _results(self, domain: str) -> dict[str, dict[int, Any]]:
-        present = self._view.call(domain, "getIDList", (), {}) if domain in AROUND.values() else None
-        return {actor: self._values(domain, actor, variables) for (kind, actor), variables in self._subscribed.items()
-                if kind == domain and (present is None or actor in present)}
+        actors = self._view.call(domain, "getIDList", (), {}) if domain in CONTEXT_DOMAINS.values() else None
+        return {actor: self._values(domain, actor, variables) for (kind, actor), variables in self._subscriptions.items()
+                if kind == domain and (actors is None or actor in actors)}
 
-    def _contexts(self, domain: str) -> dict[str, dict[str, dict[int, Any]]]:
+    def _context_results(self, domain: str) -> dict[str, dict[str, dict[int, Any]]]:
         results = {}
-        for (of, actor), (kind, dist, variables) in self._around.items():
-            if of == domain and actor in self._view.call(of, "getIDList", (), {}):
+        for (centre_domain, actor), (kind, dist, variables) in self._context_subscriptions.items():
+            if centre_domain == domain and actor in self._view.call(domain, "getIDList", (), {}):
                 results[actor] = {other: self._values(kind, other, variables) for other in self._view.call(kind, "getIDList", (), {})
-                              if self._distance(of, actor, kind, other) <= dist}
+                              if self._distance((domain, actor), (kind, other)) <= dist}
         return results
 
-    def _distance(self, of: str, actor: str, kind: str, other: str) -> float:
-        first, second = (self._view.call(domain, "getPosition", (name,), {}) for domain, name in ((of, actor), (kind, other)))
-        return float(((first[0] - second[0]) ** 2 + (first[1] - second[1]) ** 2) ** 0.5)
+    def _distance(self, *actors: tuple[str, str]) -> float:
+        (x, y), (other_x, other_y) = (self._view.call(domain, "getPosition", (name,), {}) for domain, name in actors)
+        return float(((x - other_x) ** 2 + (y - other_y) ** 2) ** 0.5)
 
     def _values(self, domain: str, actor: str, variables: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
         functions = {_constant(name): function for name, function in VARIABLES.items()}
-        return {variable: self._view.call(domain, functions[variable], (*((actor,) if actor else ()), *more), {})
-                for variable, more in variables.items()}
+        return {variable: self._view.call(domain, functions[variable], (*((actor,) if actor else ()), *arguments), {})
+                for variable, arguments in variables.items()}
 
 
 def _variables(domain: str, requested: Any, parameters: Any) -> dict[int, tuple[Any, ...]]:
-    """Further arguments of the functions for variables, by variable."""
+    """The requested variables, each with the arguments of its function after the actor's id."""
     names_by_constant = {_constant(name): name for name in VARIABLES}
-    default = ("VAR_TIME",) if domain == "simulation" else DEFAULT
-    chosen = [*map(_constant, default)] if requested is None else list(requested)
-    for variable in chosen:
+    default = ("VAR_TIME",) if domain == "simulation" else DEFAULT_VARIABLES
+    variables = [*map(_constant, default)] if requested is None else list(requested)
+    for variable in variables:
         if variable not in names_by_constant:
             raise InputError(f"traci.{domain}.subscribe", f"variable {variable!r}", f"traci.constants.{', '.join(VARIABLES)}")
     arguments = {variable: value[1:] if isinstance(value, tuple) else (value,) for variable, value in (parameters or {}).items()}
-    return {variable: arguments.get(variable, ()) for variable in chosen}
+    return {variable: arguments.get(variable, ()) for variable in variables}
 
 
 def _constant(name: str) -> int:
     return int(getattr(real_traci().constants, name))
 
 
-_driven: list[tuple[TraciView, Subscriptions]] = []
-"""Vehicles for which TraCI is called at the moment, innermost last."""
+_driven_vehicles: list[tuple[TraciView, Subscriptions]] = []
+"""Vehicles whose controllers run at the moment, innermost last."""
 
 
 @contextmanager
-def driving(view: TraciView, subscriptions: Subscriptions) -> Iterator[None]:
+def driven_vehicle(view: TraciView, subscriptions: Subscriptions) -> Iterator[None]:
     """Context in which TraCI refers to this vehicle."""
-    _driven.append((view, subscriptions))
+    _driven_vehicles.append((view, subscriptions))
     try:
         yield
     finally:
-        _driven.pop()
+        _driven_vehicles.pop()
 
 
 @contextmanager
 def importable() -> Iterator[None]:
-    """Context in which `import traci` and `import libsumo` import TraCI as controllers have it."""
+    """Context in which `import traci` and `import libsumo` import the substitutes for controllers."""
     real_traci()
-    before = {name: sys.modules.get(name) for name in ("traci", "libsumo")}
-    sys.modules.update({name: traci_module(name) for name in before})
+    modules = {name: sys.modules.get(name) for name in ("traci", "libsumo")}
+    sys.modules.update({name: traci_module(name) for name in modules})
     try:
         yield
     finally:
-        for name, module in before.items():
+        for name, module in modules.items():
             if module is None:
                 del sys.modules[name]
             else:
@@ -143,7 +142,7 @@ def importable() -> Iterator[None]:
 
 @cache
 def traci_module(name: str = "traci") -> ModuleType:
-    """TraCI as a module."""
+    """The substitute for the module traci or libsumo."""
     return _Module(engine_api(Engine(name)))
 
 
@@ -179,10 +178,10 @@ class _Domain:
 @cache
 def _function(domain: str, name: str) -> Callable[..., Any]:
     def function(*arguments: Any, **named: Any) -> Any:
-        if not _driven:
+        if not _driven_vehicles:
             raise InputError(f"traci.{domain}.{name}".replace("..", "."), "is called while no vehicle is driven",
                              "calls within start and step, not where a module is imported")
-        view, subscriptions = _driven[-1]
+        view, subscriptions = _driven_vehicles[-1]
         if domain and "subscri" in name.lower():
             with view.translated_errors():
                 return subscriptions.call(domain, name, arguments, named)

@@ -17,18 +17,18 @@ from safevar_sumo.scenarios.base import lane_through
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import Sensors, SumoType
 
-SURE_BRAKES = 9.0
-"""Deceleration of all vehicles at their insertion [m/s^2]: SUMO inserts no vehicle that could not stop before an obstacle ahead."""
-FASTEST = 200.0
+INSERTION_DECELERATION = 9.0
+"""Deceleration at insertion [m/s^2]: SUMO inserts only vehicles that could stop before every obstacle ahead."""
+MAX_DEPARTURE_SPEED = 200.0
 """Highest speed at which a vehicle may depart in a recorded scene [m/s]."""
-# Speed mode: SUMO obeys every speed that is set and yields to nobody on a junction (TraCI "set speed mode", bit 5).
-OBEY = 32
-# Lane change mode: none at all (TraCI "set lane change mode").
-KEEP_LANE = 0
+# TraCI "set speed mode", bit 5: SUMO obeys every speed that is set, and its vehicle yields to nobody on a junction.
+SPEED_MODE = 32
+# TraCI "set lane change mode": the vehicle never changes lanes.
+LANE_CHANGE_MODE = 0
 
 
 class Body(NamedTuple):
-    """A vehicle or person as a rectangle: middle [m] and direction, a unit vector, shape (2,); m, m, m/s. Or M bodies in columns."""
+    """A vehicle or person as a rectangle, or M of them in columns; `along`, the direction, is a unit vector; units are m and m/s."""
 
     middle: FloatArray
     along: FloatArray
@@ -38,38 +38,38 @@ class Body(NamedTuple):
 
     @classmethod
     def behind(cls, front: FloatArray, along: FloatArray, length: float, width: float, speed: Any) -> Body:
-        """The body with the middle of its front at `front`."""
+        """The body whose front has its middle at `front`."""
         return cls(front - along * (length / 2), along, length, width, speed)
 
     @classmethod
     def columns(cls, bodies: Sequence[Body]) -> Body:
-        """M bodies in columns: positions and directions of shape (M, 2), the others of shape (M,)."""
+        """M bodies in columns: `middle` and `along` of shape (M, 2), the other columns of shape (M,)."""
         return cls._make(np.array(column) for column in zip(*bodies, strict=True))
 
 
 class SumoWorld:
-    """N copies of a network in a running simulation; created by `open_world`. Shapes: (N,) or (N, 2)."""
+    """N copies of a network in a running simulation, created by `open_world`. Arrays have shape (N,) or (N, 2)."""
 
     def __init__(self, api: Any, n: int, *, watched: bool = False) -> None:
         self._api, self.n = api, n
-        self._set_speed, self._get_speed = _direct(api, "vehicle", "setSpeed"), _direct(api, "vehicle", "getSpeed")
-        self._vehicle_position, self._person_position = _direct(api, "vehicle", "getPosition"), _direct(api, "person", "getPosition")
+        self._set_speed, self._get_speed = _function(api, "vehicle", "setSpeed"), _function(api, "vehicle", "getSpeed")
+        self._vehicle_position, self._person_position = _function(api, "vehicle", "getPosition"), _function(api, "person", "getPosition")
         self._last_speeds, self._last_positions = np.zeros(n), np.zeros((n, 2))
         """Speeds and positions of vehicles under test that have left the road."""
         self._speeds_now: FloatArray | None = None
-        self._struck: dict[int, str] = {}
-        """By copy, the id of the actor in the vehicle under test's last collision."""
+        self._struck_ids: dict[int, str] = {}
+        """Ids of the actors that the vehicles under test collided with last, by copy."""
         self._ids: dict[str, list[str]] = {}
         self._positions: dict[str, FloatArray] = {}
         self._copy_of = {name: copy for copy, name in enumerate(self.ids(VUT))}
-        self._driving, self._rows = dict(self._copy_of), np.arange(len(self._copy_of))
-        """Copies whose vehicle under test is on the road."""
-        self._commanded = np.full(len(self._rows), np.nan)
+        self._driving_copies, self._driving_rows = dict(self._copy_of), np.arange(len(self._copy_of))
+        """Copies whose vehicle under test is on the road: by the vehicle's id, and as an array."""
+        self._commanded_speeds = np.full(len(self._driving_rows), np.nan)
         """Last speeds commanded to the vehicles under test [m/s]."""
         self.step_length: float = api.simulation.getDeltaT()
         self._pause = self.step_length if watched else 0.0
         self.sensors = Sensors.perfect(n)
-        """Sensors of ADSs that read the world themselves, including the weather."""
+        """The vehicles' sensors in their weather, for ADSs that read the world themselves."""
 
     def ids(self, name: str) -> list[str]:
         """The ids of an actor in its copies."""
@@ -89,10 +89,10 @@ class SumoWorld:
         self.set_decelerations(types.decel)
 
     def allow_departure(self) -> None:
-        """Set types of the vehicles under test with which SUMO inserts them at any speed."""
+        """Set SUMO vehicle types that let SUMO insert the vehicles under test at any speed."""
         for name in self.ids(VUT):
-            self._api.vehicletype.setMaxSpeed(name, FASTEST)
-        self.set_decelerations(np.full(self.n, SURE_BRAKES))
+            self._api.vehicletype.setMaxSpeed(name, MAX_DEPARTURE_SPEED)
+        self.set_decelerations(np.full(self.n, INSERTION_DECELERATION))
 
     def set_decelerations(self, decel: FloatArray) -> None:
         """Set the largest decelerations of the vehicles under test, also in emergencies [m/s^2]."""
@@ -108,23 +108,23 @@ class SumoWorld:
         SimulationError
             If SUMO cannot insert a vehicle under test.
         """
-        global _present
-        _present = self
+        global _current_world
+        _current_world = self
         self._api.simulationStep()
         departed = set(self._api.vehicle.getIDList())
         for name in self.ids(VUT):
             if name not in departed:
                 raise SimulationError(f"SUMO found no place for vehicle {name!r}: look at the network's traffic file")
-            self._api.vehicle.setSpeedMode(name, OBEY)
-            self._api.vehicle.setLaneChangeMode(name, KEEP_LANE)
+            self._api.vehicle.setSpeedMode(name, SPEED_MODE)
+            self._api.vehicle.setLaneChangeMode(name, LANE_CHANGE_MODE)
 
     def advance(self, speeds: FloatArray) -> None:
-        """One simulation step in which the vehicles under test reach `speeds` [m/s]."""
+        """Simulate one step, in which the vehicles under test reach `speeds` [m/s]."""
         set_speed, names = self._set_speed, self.ids(VUT)
-        changed = self._rows[(speeds != self._commanded)[self._rows]]
-        for copy, speed in zip(changed.tolist(), speeds[changed].tolist(), strict=True):
+        changed_copies = self._driving_rows[(speeds != self._commanded_speeds)[self._driving_rows]]
+        for copy, speed in zip(changed_copies.tolist(), speeds[changed_copies].tolist(), strict=True):
             set_speed(names[copy], speed)
-        self._commanded = speeds
+        self._commanded_speeds = speeds
         self._api.simulationStep()
         self._positions.clear()
         self._speeds_now = None
@@ -132,24 +132,24 @@ class SumoWorld:
             time.sleep(self._pause)
 
     def collisions(self, open_: BoolArray) -> dict[int, float]:
-        """Copies of open runs whose vehicle under test collides in this step, and its speed [m/s].
+        """Speeds [m/s] of the vehicles under test of open runs that collide in this step, by copy.
 
-        On a junction SUMO calls the vehicle that must yield the collider (`MSLane::detectCollisions`): either may be under test.
+        On a junction SUMO calls the vehicle that must yield the collider (`MSLane::detectCollisions`): either may be tested.
         """
-        self._struck, speeds = {}, dict[int, float]()
+        self._struck_ids, speeds = {}, dict[int, float]()
         for collision in self._api.simulation.getCollisions():
             pairs = [(collision.collider, collision.colliderSpeed, collision.victim)]
             if collision.type == "junction":
                 pairs.append((collision.victim, collision.victimSpeed, collision.collider))
             for name, speed, other in pairs:
                 if (copy := self._copy_of.get(name)) is not None and open_[copy]:
-                    speeds[copy], self._struck[copy] = speed, other
+                    speeds[copy], self._struck_ids[copy] = speed, other
         return speeds
 
     def bodies(self, copies: Sequence[int]) -> tuple[Body, Body]:
-        """Vehicles under test that collide in this step, and the bodies that they collide with; in columns."""
+        """The bodies of vehicles that collide in this step, and of the actors that they collide with, both in columns."""
         return (Body.columns([self._body_of(self.ids(VUT)[copy]) for copy in copies]),
-                Body.columns([self._body_of(self._struck[copy]) for copy in copies]))
+                Body.columns([self._body_of(self._struck_ids[copy]) for copy in copies]))
 
     def _body_of(self, name: str) -> Body:
         kind = self._api.person if name in self._api.person.getIDList() else self._api.vehicle
@@ -157,20 +157,20 @@ class SumoWorld:
                            kind.getWidth(name), kind.getSpeed(name))
 
     def leave(self, copies: Sequence[int]) -> None:
-        """Remove vehicles under test whose runs are over: their last state is kept, and SUMO no longer simulates them."""
+        """Remove vehicles whose runs have ended from SUMO's simulation, and keep their last positions and speeds."""
         if not copies:
             return
         self._last_speeds[copies], self._last_positions[copies] = self.speeds()[copies], self.vehicle_positions(VUT)[copies]
         for name in [self.ids(VUT)[copy] for copy in copies]:
             self._api.vehicle.remove(name)
-            del self._driving[name]
-        self._rows = np.array([*self._driving.values()], dtype=np.intp)
+            del self._driving_copies[name]
+        self._driving_rows = np.array([*self._driving_copies.values()], dtype=np.intp)
 
     def speeds(self) -> FloatArray:
         """Speeds of the vehicles under test in this step [m/s]; repeated calls return the same array."""
         if self._speeds_now is None:
             self._speeds_now = self._last_speeds.copy()
-            self._speeds_now[self._rows] = [*map(self._get_speed, self._driving)]
+            self._speeds_now[self._driving_rows] = [*map(self._get_speed, self._driving_copies)]
         return self._speeds_now
 
     def vehicle_positions(self, actor: str) -> FloatArray:
@@ -180,13 +180,13 @@ class SumoWorld:
         return self._positions_of(actor, self._person_position)
 
     def _positions_of(self, actor: str, position: Callable[[str], tuple[float, float]]) -> FloatArray:
-        """Positions in this step; repeated calls return the same array."""
+        """The actor's positions in this step; repeated calls return the same array."""
         if actor not in self._positions:
-            names = self._driving if actor == VUT else self.ids(actor)
+            names = self._driving_copies if actor == VUT else self.ids(actor)
             positions = np.fromiter(chain.from_iterable(map(position, names)), float, 2 * len(names)).reshape(-1, 2)
             if len(names) < self.n:
-                positions, on_the_road = self._last_positions.copy(), positions
-                positions[self._rows] = on_the_road
+                positions, new_positions = self._last_positions.copy(), positions
+                positions[self._driving_rows] = new_positions
             self._positions[actor] = positions
         return self._positions[actor]
 
@@ -197,12 +197,12 @@ class SumoWorld:
 
     @property
     def api(self) -> Any:
-        """libsumo, or traci."""
+        """The module libsumo or traci."""
         return self._api
 
     def has_left(self, name: str) -> bool:
-        """Whether a vehicle under test is off the road for good."""
-        return name not in self._driving
+        """Whether a vehicle under test has left the road; it never returns."""
+        return name not in self._driving_copies
 
     def names(self) -> frozenset[str]:
         """Names of vehicles, persons, roads and types in the original network."""
@@ -211,7 +211,7 @@ class SumoWorld:
         return frozenset(name.removeprefix(":").partition(".")[2] for kind in kinds for name in kind.getIDList())
 
     def whereabouts(self) -> dict[str, tuple[float, float, float]]:
-        """Positions of all actors on the road by id: front bumper or person [m], heading clockwise from north [degrees]."""
+        """x and y of the front bumper or person [m], and heading clockwise from north [degrees], of all actors on the road, by id."""
         kinds = (self._api.vehicle, self._api.person)
         return {name: (*kind.getPosition(name), kind.getAngle(name)) for kind in kinds for name in kind.getIDList()}
 
@@ -246,7 +246,7 @@ class SumoWorld:
 
     def drive(self, vehicle: str, speed: float) -> None:
         for name in self.ids(vehicle):
-            self._api.vehicle.setSpeedMode(name, OBEY)
+            self._api.vehicle.setSpeedMode(name, SPEED_MODE)
             self._api.vehicle.setSpeed(name, speed)
 
     def turn_back(self, person: str) -> None:
@@ -258,7 +258,7 @@ class SumoWorld:
 
 
 def begin(scenario: Scenario, world: Any) -> Any:
-    """Start a scenario in a world before the first step; returns the scenario's memory.
+    """Start a scenario in a world before its first step, and return the scenario's memory.
 
     Raises
     ------
@@ -272,14 +272,14 @@ def begin(scenario: Scenario, world: Any) -> Any:
                          "a network and traffic with the ids that the scenario names") from None
 
 
-_present: SumoWorld | None = None
-"""The world that is being simulated in this process; SUMO allows one per process, too."""
+_current_world: SumoWorld | None = None
+"""The world that this process simulates; SUMO, too, allows only one per process."""
 
 
-def present_world() -> SumoWorld:
-    """The world that is being simulated."""
-    assert _present is not None
-    return _present
+def current_world() -> SumoWorld:
+    """The world that this process simulates."""
+    assert _current_world is not None
+    return _current_world
 
 
 def direction_of(angle: float) -> FloatArray:
@@ -287,7 +287,7 @@ def direction_of(angle: float) -> FloatArray:
     return np.array([math.sin(math.radians(angle)), math.cos(math.radians(angle))])
 
 
-def _direct(api: Any, domain: str, name: str) -> Callable[..., Any]:
-    """A function of libsumo without its Python wrapper, which costs as much as the call; a function of traci as it is."""
+def _function(api: Any, domain: str, name: str) -> Callable[..., Any]:
+    """A function of traci, or one of libsumo without its Python wrapper, which takes as long as the function itself."""
     compiled = getattr(api, "_libsumo", None)
     return getattr(getattr(api, domain), name) if compiled is None else getattr(compiled, f"{domain}_{name}")  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-"""The kernel: a setting's result depends on that setting alone, and ends in a typed outcome."""
+"""Batches: the result of a setting depends on this setting only, and has a typed outcome."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_the_original_vehicle_does_not_collide(any_system: System) -> None:
     assert original.f_diff[0] == original.f_num_diff[0] == 0
 
 
-def test_every_end_of_every_domain_moves_and_ends_in_a_typed_outcome(any_system: System) -> None:
+def test_vehicles_at_the_ends_of_all_domains_move_and_have_a_typed_outcome(any_system: System) -> None:
     characteristics = any_system.characteristics
     n = len(characteristics)
     ends = np.repeat(characteristics.original[np.newaxis], 2 * n, axis=0)
@@ -64,8 +64,8 @@ def test_every_end_of_every_domain_moves_and_ends_in_a_typed_outcome(any_system:
     assert np.all(run.trace.speed.max(axis=0) > 1.0)
 
 
-def test_sumo_moves_the_vehicle_as_the_plant_says(any_system: System) -> None:
-    """SUMO's position is the integral of the speeds that were set: mean of both speeds of a step, as the ballistic method has it."""
+def test_sumo_moves_the_vehicle_at_the_speeds_of_the_vehicle_model(any_system: System) -> None:
+    """SUMO's position is the integral of the commanded speeds: in each step the mean of both speeds, by the ballistic method."""
     trace = simulate(any_system, drawn(any_system, 3, 11)).trace
     travelled = np.add.accumulate((trace.speed[1:] + trace.speed[:-1]) / 2 * trace.step, axis=0)
     until = trace.active[1:]
@@ -73,7 +73,7 @@ def test_sumo_moves_the_vehicle_as_the_plant_says(any_system: System) -> None:
 
 
 def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool], float]:
-    """Outcome, which samples are active, and the collision's speed of one vehicle: (speed, encounter over, speed of a collision)."""
+    """Outcome, active samples and collision speed of one vehicle; a sample is (speed, encounter has ended, collision speed)."""
     verdict, active = _Outcomes(1), []
     for i, (speed, over, crash) in enumerate(samples):
         collisions = {} if crash is None else {0: crash}
@@ -91,21 +91,21 @@ def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool],
     (((0, False, None), (2, False, None), (2, True, None), (2, False, None)), Outcome.PASSED),
     (((0, False, None), (2, False, None), (2, False, 1.5), (0, False, None)), Outcome.COLLISION),
     (((0, False, None), (0, False, 0.0), (0, False, None)), Outcome.COLLISION)])
-def test_an_ending_has_its_outcome(samples: tuple[tuple[float, bool, float | None], ...], outcome: Outcome) -> None:
+def test_the_last_samples_determine_the_outcome(samples: tuple[tuple[float, bool, float | None], ...], outcome: Outcome) -> None:
     assert judged(*samples)[0] == outcome
 
 
-def test_who_stands_from_the_start_has_not_stopped_yet() -> None:
+def test_a_vehicle_that_stands_at_the_start_has_not_stopped() -> None:
     assert judged((0, False, None), (0, False, None), (3, False, None), (3, False, None))[0] == Outcome.TIMEOUT
 
 
-def test_the_sample_of_a_collision_counts_and_none_after_it() -> None:
+def test_the_sample_of_a_collision_is_the_last_active_sample() -> None:
     _, active, speed = judged((3, False, None), (3, False, 2.5), (1, False, 0.5), (0, False, None))
     assert active == [True, True, False, False]
     assert speed == 2.5, "the first report is the collision's"
 
 
-def test_no_sample_counts_once_the_encounter_is_over_but_a_collision_in_that_moment() -> None:
+def test_the_sample_in_which_the_encounter_ends_is_active_only_at_a_collision() -> None:
     assert judged((3, False, None), (3, True, None), (3, False, None))[1] == [True, False, False]
     assert judged((3, False, None), (3, True, 3.0), (3, False, None))[1:] == ([True, True, False], 3.0)
 
@@ -116,7 +116,7 @@ def test_the_last_sample_counts() -> None:
 
 
 class _Pedals:
-    """Drives vehicle i with a constant throttle of its own, and brakes it at a moment of its own."""
+    """Drives each vehicle with its own constant throttle, and brakes it from its own time on."""
 
     def __init__(self, throttle: np.ndarray, brakes_at: np.ndarray) -> None:
         self._throttle, self._brakes_at = throttle, brakes_at
@@ -130,7 +130,7 @@ class _Pedals:
 
 
 def driven(study: str, n: int, brakes_until: float = 9.0) -> tuple[System, SimulationRuns]:
-    """The original vehicle n times, with pedals that make for n different encounters."""
+    """The original vehicle n times, with pedals that lead to n different encounters."""
     system = assemble(load_study(study))
     rng = np.random.default_rng(7)
     ads = _Pedals(rng.uniform(0.3, 1.0, n), rng.uniform(1.5, brakes_until, n))
@@ -139,13 +139,13 @@ def driven(study: str, n: int, brakes_until: float = 9.0) -> tuple[System, Simul
 
 
 @pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
-def test_sumo_reports_a_collision_just_where_bodies_overlap(study: str) -> None:
+def test_sumo_reports_a_collision_if_and_only_if_bodies_overlap(study: str) -> None:
     _, run = driven(study, 120)
-    _held_against_geometry(study, run)
+    _check_against_geometry(study, run)
     assert 10 < np.count_nonzero(run.outcome == Outcome.COLLISION) < 110
 
 
-def _held_against_geometry(study: str, run: SimulationRuns) -> None:
+def _check_against_geometry(study: str, run: SimulationRuns) -> None:
     trace, collided = run.trace, run.outcome == Outcome.COLLISION
     half_width, person, thickness = (2.1284 / 2, 0.478, 0.215) if study == "sun" else (1.85 / 2, 0.0, 0.0)
     beside = np.abs(trace.lateral) <= half_width + thickness + 0.02 if study == "sun" else np.ones_like(trace.active)
@@ -172,7 +172,7 @@ TIMES = np.arange(12) * STEP
 
 
 def observed(delay: float) -> tuple[np.ndarray, np.ndarray]:
-    """Own speeds and (gap, closing speed, lateral, lateral speed) as seen over time, of one vehicle whose scene changes steadily."""
+    """Observed own speeds and (gap, closing speed, lateral, lateral speed) of one vehicle whose scene changes linearly."""
     perception = Perception(Weather(name="any", road_friction=1.0, visibility=0.7, recognition_delay=delay), STEP)
     seen = []
     for time in TIMES:
@@ -184,7 +184,7 @@ def observed(delay: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.05, 0.0863, 0.1, 0.15])
-def test_the_scene_is_seen_late_and_the_own_speed_at_once(delay: float) -> None:
+def test_the_scene_is_observed_with_delay_and_the_own_speed_without(delay: float) -> None:
     speed, scene = observed(delay)
     then = np.maximum(TIMES - delay, 0.0)
     assert speed == pytest.approx(5 + TIMES)
@@ -193,7 +193,7 @@ def test_the_scene_is_seen_late_and_the_own_speed_at_once(delay: float) -> None:
     assert scene == pytest.approx(np.stack([20 - 5 * then, 5 + then, -3 + 2 * then, 2 + then], axis=1))
 
 
-def test_what_appears_between_two_steps_is_not_there_yet() -> None:
+def test_an_obstacle_that_appears_is_not_interpolated_from_infinity() -> None:
     perception = Perception(Weather(name="any", road_friction=1.0, visibility=1.0, recognition_delay=0.03), STEP)
     nothing = np.zeros(1)
     gaps = [perception.observe(time, nothing, Scene(np.array([gap]), nothing, nothing, nothing > 0)).gap[0]
@@ -202,7 +202,7 @@ def test_what_appears_between_two_steps_is_not_there_yet() -> None:
 
 
 def pressed(hesitation: float, wanted: list[float]) -> list[float]:
-    """How hard one vehicle brakes that wants to brake so hard."""
+    """The brake of one vehicle over time, if its driver wants these brakes."""
     late, brakes = DelayLine.by(hesitation, STEP), []
     for brake in wanted:
         sure, late = late.delayed(np.array([brake]))
@@ -210,14 +210,14 @@ def pressed(hesitation: float, wanted: list[float]) -> list[float]:
     return brakes
 
 
-def test_who_hesitates_brakes_later_and_lets_go_at_once() -> None:
+def test_hesitation_delays_braking_but_not_the_release_of_the_brake() -> None:
     wanted = [0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.2, 0.0, 0.0]
     assert pressed(0.0, wanted) == wanted
     assert pressed(0.1, wanted) == [0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.2, 0.0, 0.0]
     assert pressed(0.12, wanted) == pytest.approx([0.0, 0.0, 0.0, 0.0, 0.6, 1.0, 1.0, 0.2, 0.0, 0.0])
 
 
-def test_rains_driver_lets_go_of_the_accelerator_and_brakes_a_hesitation_later() -> None:
+def test_rains_driver_releases_the_accelerator_at_once_and_brakes_after_the_hesitation() -> None:
     def driven(hesitation: float) -> tuple[Trace, int]:
         rain = assemble(load_study("rain", ads={"parameters": {"hesitation": hesitation}}))
         trace = simulate(rain, rain.characteristics.original[np.newaxis]).trace
@@ -230,8 +230,8 @@ def test_rains_driver_lets_go_of_the_accelerator_and_brakes_a_hesitation_later()
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted({*ADS} - {"world_on_rails", "apollo"}))
-def test_with_another_driver_rain_is_sun_but_for_the_road_and_the_sensors(name: str) -> None:
-    """The shipped rain changes neither; a weather that does is the same for both studies."""
+def test_with_another_driver_rain_equals_sun_unless_the_weather_changes_road_or_sensors(name: str) -> None:
+    """The shipped rain changes neither; a weather that changes them has the same effect in both studies."""
     mine = {"name": "mine", "road_friction": 0.8, "visibility": 0.9, "recognition_delay": 0.1}
     parameters = {"cruise_speed": 5.5} if "cruise_speed" in ADS[name].__struct_fields__ else {}
 
@@ -245,7 +245,7 @@ def test_with_another_driver_rain_is_sun_but_for_the_road_and_the_sensors(name: 
     assert np.array_equal(driven("rain", weather=mine).position, driven("sun", weather=mine).position)
 
 
-def test_a_weather_that_changes_nothing_says_so() -> None:
+def test_a_remark_says_that_a_weather_has_no_effect() -> None:
     sentence = "weather 'carla_hard_rain' has no effect"
     for driver, says in (({"model": "full_braking"}, True), ({}, False)):
         assert any(sentence in remark for remark in assemble(load_study("rain", ads=driver)).remarks) is says

@@ -1,4 +1,4 @@
-"""Settings in a matrix: the worst point counts, whatever the batch, the order of points and what else is in the matrix."""
+"""Settings in a matrix: the worst point counts, independently of the batch, the order of points and the other points."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def same(one: Evaluations, other: Evaluations) -> bool:
 
 
 @pytest.mark.slow
-def test_a_setting_is_worth_what_it_is_at_its_worst_point_and_each_point_is_as_if_alone() -> None:
+def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each_other() -> None:
     population = drawn(SYSTEM, 3)
     points = at_every_point(SYSTEM, population)
     assert [one.point.name for one in points][:3] == [
@@ -67,7 +67,7 @@ def test_a_setting_is_worth_what_it_is_at_its_worst_point_and_each_point_is_as_i
 
 
 @pytest.mark.slow
-def test_neither_the_batch_nor_the_order_of_points_nor_how_many_share_a_simulation_matters(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_do_not_depend_on_the_batch_the_order_of_points_or_the_size_of_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
     population = drawn(SYSTEM, 3)
     whole = evaluate(SYSTEM, population)
     assert same(evaluate(SYSTEM, population[1:3]), whole.take([1, 2]))
@@ -81,7 +81,7 @@ def test_a_mean_of_distances_and_speeds_is_refused() -> None:
         load_study("wear", matrix={"aggregate": "mean", "tests": [{"name": "CPNA", "parameters": {"test": "CPNA"}}]})
 
 
-def test_a_point_is_named() -> None:
+def test_named_point_finds_a_point_and_suggests_similar_names() -> None:
     assert named_point(SYSTEM, "CPLA, speed 30, clear", "--point").scenario.speed == 30  # type: ignore[attr-defined]
     with pytest.raises(InputError, match="CPNCO, speed 40, clear"):
         named_point(SYSTEM, "CPNCO", "--point")
@@ -94,7 +94,7 @@ def test_a_point_is_named() -> None:
     ([MatrixTest(name="x", weathers=["sunny"])], "sunny"),
     ([MatrixTest(name="x", model="nothing")], "nothing"),
 ])
-def test_what_is_wrong_in_a_matrix_is_told(tests: list[MatrixTest], message: str) -> None:
+def test_the_error_names_the_wrong_value_in_a_matrix(tests: list[MatrixTest], message: str) -> None:
     with pytest.raises(InputError, match=message):
         assemble(study(tests))
 
@@ -106,7 +106,7 @@ EAST = np.array([1.0, 0.0])
 
 
 class Pedals:
-    """Gas and brake over time [s]."""
+    """Throttle and brake over time [s]."""
 
     def __init__(self, throttle: float = 0.5, *, brakes: tuple[float, float] = (99.0, 99.0), lets_go: float = 99.0) -> None:
         self._throttle, self._brakes, self._lets_go = throttle, brakes, lets_go
@@ -145,7 +145,7 @@ def test_unbraked_a_vehicle_holds_the_tests_speed_in_one_gear_and_hits_with_its_
 
 
 @pytest.mark.parametrize("location", [0.0, 25.0, 75.0])
-def test_the_place_of_an_unbraked_contact_is_the_tests_impact_location(location: float) -> None:
+def test_an_unbraked_vehicle_hits_at_the_tests_impact_location(location: float) -> None:
     scenarios = (Crossing(test="CPNA", speed=40.0, impact_location=location), Crossing(test="CPFA", speed=40.0, impact_location=location),
                  CarToCar(test="CCRs", speed=40.0, impact_location=location))
     for scenario in scenarios:
@@ -154,8 +154,8 @@ def test_the_place_of_an_unbraked_contact_is_the_tests_impact_location(location:
         assert contact.place[0] == pytest.approx(location, abs=1.0)
 
 
-def test_what_cannot_hold_the_speed_is_no_valid_test_and_one_that_brakes_before_is() -> None:
-    """2404 kg g sin(atan 0.2) 0.355 m / (1.35 * 4), 304 N m, is more than the engine's 500 N m times 0.5."""
+def test_a_vehicle_that_cannot_hold_the_speed_makes_the_test_invalid_unless_it_brakes_before() -> None:
+    """The slope requires 2404 kg g sin(atan 0.2) 0.355 m / (1.35 * 4) = 304 N m; the engine has 0.5 * 500 N m."""
     steep = CarToCar(test="CCRs", speed=50.0, grade=20.0)
     runs = run(steep, system=WEAK)
     assert runs.outcome[0] == Outcome.INVALID_TEST
@@ -166,7 +166,7 @@ def test_what_cannot_hold_the_speed_is_no_valid_test_and_one_that_brakes_before_
 
 @pytest.mark.parametrize(("error", "invalid"), [(-0.51, True), (-0.49, False), (0.99, False), (1.01, True)])
 def test_a_test_is_invalid_beyond_1_km_h_too_fast_and_half_a_km_h_too_slow(error: float, invalid: bool) -> None:
-    """Euro NCAP's tolerance until the system acts."""
+    """Euro NCAP's tolerance applies until the ADS acts."""
     vehicle, original = SUN.vehicle, SUN.characteristics.original
     prepared = vehicle.prepare(dict(zip(SUN.characteristics.names, original[:, np.newaxis], strict=True)), 1.0, 0.05)
     state, all_open = vehicle.at_speed(prepared, np.array([50 / 3.6])), np.ones(1, dtype=bool)
@@ -175,7 +175,7 @@ def test_a_test_is_invalid_beyond_1_km_h_too_fast_and_half_a_km_h_too_slow(error
     assert robot.invalid.tolist() == [invalid]
 
 
-def test_a_setting_with_an_invalid_test_is_neither_safe_nor_unsafe_but_a_collision_elsewhere_stands() -> None:
+def test_a_setting_with_an_invalid_test_is_neither_safe_nor_unsafe_unless_it_collides_at_another_point() -> None:
     tests = [MatrixTest(name="CCRs", parameters={"test": "CCRs", "grade": 20.0}, over={"speed": [10, 50]})]
     steep = assemble(msgspec.structs.replace(load_study("euro_ncap_car_to_car"), matrix=MatrixTable(tests=tests)))
     steep = replace(steep, vehicle=WEAK.vehicle)
@@ -189,7 +189,7 @@ def test_a_setting_with_an_invalid_test_is_neither_safe_nor_unsafe_but_a_collisi
     assert evaluate(replace(steep, ads=Pedals()), original).outcome[0] == Outcome.COLLISION, "at 10 km/h, where the speed is held"
 
 
-def test_a_system_that_lets_go_of_the_accelerator_or_brakes_has_the_vehicle() -> None:
+def test_an_ads_that_releases_the_accelerator_or_brakes_takes_control_of_the_vehicle() -> None:
     far = CarToCar(test="CCRs", speed=50.0, headway=20.0)
     coasts = run(far, Pedals(lets_go=2.0))
     assert coasts.outcome[0] != Outcome.INVALID_TEST
@@ -207,17 +207,17 @@ def test_a_system_that_lets_go_of_the_accelerator_or_brakes_has_the_vehicle() ->
     ((-1.0, 1.25), (0.0, -1.0), 1.0, ("left", 0.05, None)),
     ((-2.2, 0.0), (1.0, 0.0), 12.0, ("rear", 0.05, None)),  # 2 m/s faster, reach 2 + 0.3
 ])
-def test_the_side_is_the_one_in_which_bodies_began_to_overlap_last(
+def test_bodies_touch_at_the_side_where_the_overlap_began_last(
         middle: tuple[float, float], along: tuple[float, float], speed: float, contact: tuple[str, float, float | None]) -> None:
     own, other = Body(np.zeros(2), EAST, 4.0, 2.0, 10.0), Body(np.array(middle), np.array(along), 0.6, 0.4, speed)
     touch = touches(Body.columns([own]), Body.columns([other]))
     assert touch.side == contact[0]
-    assert touch.ago == pytest.approx(contact[1])
+    assert touch.age == pytest.approx(contact[1])
     if contact[2] is not None:
-        assert touch.behind_front == pytest.approx(contact[2] - 0.2)
+        assert touch.front_distance == pytest.approx(contact[2] - 0.2)
 
 
-def test_who_tests_a_vehicle_faster_than_it_was_fitted_is_told() -> None:
+def test_a_remark_says_that_tests_are_faster_than_the_vehicle_was_fitted_to() -> None:
     (remark,) = vehicle_remarks(assemble(load_study("euro_ncap_pedestrian")))
     assert "22 km/h" in remark
     assert "60 km/h" in remark

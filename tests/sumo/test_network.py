@@ -1,4 +1,4 @@
-"""Copies of a network: as many as asked for, all alike, none connected with another."""
+"""Copies of a network: their number is right, all are equal, and no two are connected."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_copies_share_coordinates_and_nothing_else() -> None:
     lambda path: path.write_text(path.read_text().replace('id="0', 'id="00')), lambda path: path.write_text("<net><edge id='x'/></net>"),
     lambda path: path.write_bytes(path.read_bytes()[:-500]), lambda path: path.write_bytes(b""), Path.unlink])
 @pytest.mark.parametrize("which", ["network", "traffic"])
-def test_a_cached_file_that_is_not_what_was_built_is_built_again(spoil: Callable[[Path], None], which: str) -> None:
+def test_a_damaged_file_in_the_cache_is_built_again(spoil: Callable[[Path], None], which: str) -> None:
     file: Path = getattr(copied_network("lead_vehicle_stopped", 2), which)
     built = file.read_bytes()
     spoil(file)
@@ -59,9 +59,9 @@ def test_a_cached_file_that_is_not_what_was_built_is_built_again(spoil: Callable
 
 
 @pytest.mark.parametrize(("loss", "n"), [("half", 12), ("nothing", 25), ("error", 60)])
-def test_a_disk_that_is_full_while_a_network_is_built_leaves_nothing_behind(loss: str, n: int, tmp_path: Path,
+def test_a_full_disk_during_a_build_leaves_no_files(loss: str, n: int, tmp_path: Path,
                                                                               monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a cache of its own: other tests may have built as many copies already."""
+    """In an empty cache, because other tests may have built as many copies already."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     ran = subprocess.run
 
@@ -122,7 +122,7 @@ GOOD = {
 
 
 @pytest.mark.parametrize("what", sorted(GOOD))
-def test_it_drives_in_every_copy(mine: Path, what: str) -> None:
+def test_legal_traffic_moves_equally_in_every_copy(mine: Path, what: str) -> None:
     network = with_traffic(mine, GOOD[what])
     check_network(network)
     with open_world(copied_network(network, 2), 2) as world:
@@ -173,7 +173,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("what", sorted(BAD))
-def test_it_is_refused_by_name(mine: Path, what: str) -> None:
+def test_illegal_traffic_is_refused_with_its_name(mine: Path, what: str) -> None:
     more, message = BAD[what]
     with pytest.raises(InputError, match=r"traffic\.rou\.xml: ") as caught:
         check_network(with_traffic(mine, more))
@@ -185,7 +185,7 @@ def test_it_is_refused_by_name(mine: Path, what: str) -> None:
     ('id="vut" type="vut" depart="0"', 'id="vut" type="vut" depart="3"', "depart = '3'"),
     ('id="vut" type="vut" depart', 'id="vut" type="pedestrian" depart', "type = 'pedestrian'"),
     ('<route edges="approach departure"/>', '<route edges="approach departure"/><stop lane="departure_0" duration="9"/>', "has a stop")])
-def test_the_vehicle_under_test_is_there_from_the_beginning(mine: Path, old: str, new: str, message: str) -> None:
+def test_the_vehicle_under_test_must_depart_at_time_0(mine: Path, old: str, new: str, message: str) -> None:
     file = mine / "traffic.rou.xml"
     assert old in file.read_text()
     file.write_text(file.read_text().replace(old, new))

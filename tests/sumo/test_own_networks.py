@@ -1,4 +1,4 @@
-"""A user's own network is the one that is simulated: its recipe, types, traffic lights, or a `.net.xml` alone; else it is refused."""
+"""A user's network is simulated with its recipe, edge types and traffic lights, or as a single `.net.xml`; otherwise it is refused."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def roads(network: Path, n: int = 1) -> ElementTree.Element:
     return ElementTree.parse(copied_network(str(network), n).network).getroot()
 
 
-def test_edge_types_of_a_file_of_their_own_count(mine: Path) -> None:
+def test_edge_types_in_a_separate_file_change_the_network(mine: Path) -> None:
     before = network_fingerprint(str(mine))
     (mine / "network.typ.xml").write_text('<types><type id="slow" speed="7" numLanes="1" width="3" disallow="pedestrian"/></types>')
     with pytest.raises(InputError, match=r"network\.typ\.xml: is not used: network\.netccfg does not name it"):
@@ -81,14 +81,14 @@ def test_traffic_lights_are_copied_with_their_programmes(mine: Path) -> None:
     ('<keep-edges.input-file value="x"/>', "keep-edges.input-file"), ('<unheard-of value="1"/>', "option 'unheard-of'"),
     ('<type-files value="../types.xml"/>', "type-files = '../types.xml' is in another folder"), ('<no-turnarounds/>', "without value="),
     ('<type-files value="none.typ.xml"/>', "type-files: none.typ.xml is missing"), ('<precision value="2"/>', "sets 'precision' twice")])
-def test_a_recipe_that_writes_or_reads_elsewhere_is_refused(mine: Path, line: str, message: str) -> None:
+def test_a_recipe_that_uses_files_of_other_folders_is_refused(mine: Path, line: str, message: str) -> None:
     rewritten(mine / "network.netccfg", "</configuration>", f"{line}</configuration>")
     with pytest.raises(InputError, match=r"network\.netccfg: ") as caught:
         check_network(str(mine))
     assert message in str(caught.value)
 
 
-def test_a_built_network_alone_is_simulated_as_its_sources_are(mine: Path) -> None:
+def test_a_built_network_without_sources_gives_the_same_results(mine: Path) -> None:
     settings = np.vstack([original := load_original("smoke"), original * 1.01])
     expected = simulate(on("smoke", mine), settings).trace.gap
     for name in ("network.nod.xml", "network.edg.xml", "network.con.xml", "network.netccfg"):
@@ -112,14 +112,14 @@ def load_original(study: str) -> np.ndarray:
 @pytest.mark.parametrize(("file", "old", "new", "message"), [
     ("network.nod.xml", 'x="80" y="0"', 'x="80" y="0" z="4"', "lane 'departure_0', which climbs"),
     ("network.edg.xml", 'id="approach"', 'id="approach" friction="0.3"', "lane 'approach_0' of friction 0.3")])
-def test_a_road_that_the_vehicle_would_not_feel_is_refused(mine: Path, file: str, old: str, new: str, message: str) -> None:
+def test_a_slope_or_friction_that_has_no_effect_is_refused(mine: Path, file: str, old: str, new: str, message: str) -> None:
     rewritten(mine / file, old, new)
     with pytest.raises(InputError, match=r"traffic\.rou\.xml: vehicle 'vut' is to drive on ") as caught:
         check_network(str(mine))
     assert message in str(caught.value)
 
 
-def test_what_a_network_says_of_the_vehicle_and_is_not_used_is_mentioned(mine: Path) -> None:
+def test_a_remark_lists_the_networks_attributes_of_the_vehicle_that_are_not_used(mine: Path) -> None:
     assert on("sun", mine).remarks == []
     rewritten(mine / "network.edg.xml", 'id="approach" from="west" to="crossing" numLanes="1" width="4" speed="70"',
               'id="approach" from="west" to="crossing" numLanes="1" width="4" speed="8.33"')
@@ -129,8 +129,8 @@ def test_what_a_network_says_of_the_vehicle_and_is_not_used_is_mentioned(mine: P
                              "the speed limit of lane 'approach_0' (8.33 m/s)")
 
 
-def test_every_id_of_a_built_network_is_its_copys_alone(tmp_path: Path) -> None:
-    """Roundabouts, opposite lanes, rails, traffic lights, walking areas: no id of the original is left, no copy shares one."""
+def test_no_id_of_a_built_network_belongs_to_two_copies(tmp_path: Path) -> None:
+    """A network with sidewalks, crossings, traffic lights and opposite lanes: its copies contain no id of the original."""
     netgenerate = str(Path(sumo.SUMO_HOME) / "bin" / "netgenerate")
     subprocess.run([netgenerate, "--grid", "--grid.number", "3", "--default.lanenumber", "1", "--sidewalks.guess", "--crossings.guess",
                     "--tls.guess", "--tls.default-type", "actuated", "--opposites.guess", "-o", str(tmp_path / "town.net.xml")],

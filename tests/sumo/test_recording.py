@@ -1,4 +1,4 @@
-"""Vehicles in a recorded scene, held against as many copies in SUMO."""
+"""Vehicles in recorded scenes, compared with copies of the network in SUMO."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import Engine, at_every_point, reason_for_sumo, recording
-from safevar_sumo.sumo.recorded_world import distance
+from safevar_sumo.sumo.recorded_world import distance_covered
 from safevar_sumo.sumo.recording import recorded_scenes
 from safevar_sumo.sumo.system import System, assemble
 
@@ -34,7 +34,7 @@ class Claims(PedestrianCrossing, frozen=True, kw_only=True):
 
 
 def assert_same(system: System, number: int, seed: int) -> list[str]:
-    """The same bits everywhere; returns all outcomes."""
+    """Assert that recorded scenes and SUMO give the same bits; returns all outcomes."""
     characteristics, rng = system.characteristics, np.random.default_rng(seed)
     settings = characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (number, len(characteristics))))
     settings[0] = characteristics.original
@@ -52,7 +52,7 @@ def assert_same(system: System, number: int, seed: int) -> list[str]:
 
 
 class FullThrottle:
-    """Drives into whatever is there."""
+    """Drives at full throttle into any obstacle."""
 
     def start(self, n: int, nominal: Nominal, step: float) -> None:
         return None
@@ -61,26 +61,26 @@ class FullThrottle:
         return Command(np.ones_like(seen.speed), np.zeros_like(seen.speed)), memory
 
 
-def test_vehicles_in_a_recorded_scene_do_what_they_do_in_sumo_to_the_last_bit(any_system: System) -> None:
+def test_vehicles_in_recorded_scenes_give_the_same_bits_as_in_sumo(any_system: System) -> None:
     assert reason_for_sumo(any_system) == ""
     assert_same(any_system, 60, 5)
 
 
-def test_a_step_is_as_long_as_sumos_where_the_order_of_operations_shows() -> None:
-    """Of 7,168 settings two were 1.4e-14 m off where speeds were averaged: places of these before and after a step in SUMO."""
+def test_the_distance_of_a_step_has_sumos_order_of_operations() -> None:
+    """The mean of both speeds gave positions 1.4e-14 m off for 2 of 7,168 settings: their positions before and after a step in SUMO."""
     before, after = np.array([0.0, 0.49783446695015615]), np.array([0.4348049848410796, 1.0073508794958133])
-    there = np.array([28.196, 28.208445861673756]) + distance(before, after, 0.05)
+    there = np.array([28.196, 28.208445861673756]) + distance_covered(before, after, 0.05)
     assert there.tolist() == [28.206870124621027, 28.246075495334903]
 
 
 @pytest.mark.parametrize("study", ["rain", "sun", "lgsvl", "native"])
-def test_who_drives_into_whatever_is_there_collides_as_in_sumo(study: str) -> None:
+def test_a_vehicle_at_full_throttle_collides_as_in_sumo(study: str) -> None:
     outcomes = assert_same(replace(assemble(load_study(study)), ads=FullThrottle()), 12, 7)
     assert Outcome.COLLISION in outcomes
 
 
-def test_a_scene_from_the_cache_is_the_one_that_sumo_played(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A cache of one's own: SUMO plays, the file is read in the next process, and a torn one is made again."""
+def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """In an empty cache: SUMO plays the scene, the next process reads the file, and a truncated file is written again."""
     monkeypatch.setattr(platformdirs, "user_cache_path", lambda name: tmp_path)
     scenario = assemble(load_study("sun")).scenario
 
@@ -98,7 +98,7 @@ def test_a_scene_from_the_cache_is_the_one_that_sumo_played(monkeypatch: pytest.
 
 
 def test_contacts_are_those_that_sumo_finds() -> None:
-    """Brakes that come at every gap: hit by the front, by a corner, by the side, and missed."""
+    """Vehicles that brake at various gaps: they hit with the front, a corner or the side, or miss."""
     study, rng, outcomes = load_study("sun"), np.random.default_rng(6), []
     for gap in rng.uniform(3.0, 9.0, 6):
         ads = {**study.ads.parameters, "brake_gap": float(gap), "brake_gap_before": 1.0, "first_command": float(rng.uniform(0, 1.5))}
@@ -114,7 +114,7 @@ def test_points_of_different_length_share_a_batch() -> None:
     assert_same(system, 3, 8)
 
 
-def test_a_shipped_scenario_on_somebody_elses_network_is_driven_in_sumo() -> None:
+def test_a_shipped_scenario_on_a_users_network_is_simulated_in_sumo() -> None:
     scenario = SCENARIOS["crossing"](network="my_town")
     (scene,) = recorded_scenes([scenario], ())
     assert "my_town" in str(scene)
@@ -122,7 +122,7 @@ def test_a_shipped_scenario_on_somebody_elses_network_is_driven_in_sumo() -> Non
 
 @pytest.fixture
 def reacting(in_tmp: Path) -> Path:
-    """A network whose pedestrian does not walk into a vehicle: what SUMO's pedestrians do unless they are told not to."""
+    """A network whose pedestrian stops before a vehicle, as SUMO's pedestrians do by default."""
     shutil.copytree(NETWORKS / "pedestrian_crossing", in_tmp / "reacting")
     options = in_tmp / "reacting" / "scenario.sumocfg"
     lines = options.read_text().splitlines()
@@ -130,7 +130,7 @@ def reacting(in_tmp: Path) -> Path:
     return in_tmp
 
 
-def test_a_pedestrian_who_reacts_is_driven_in_sumo_without_being_asked(reacting: Path) -> None:
+def test_a_scenario_whose_pedestrian_reacts_is_simulated_in_sumo_by_default(reacting: Path) -> None:
     study = load_study("smoke", scenario={"parameters": {"network": "reacting"}},
                        search={"runs": 1, "algorithms": ["rs"], "evaluations": 20},
                        title="", published={})
@@ -141,7 +141,7 @@ def test_a_pedestrian_who_reacts_is_driven_in_sumo_without_being_asked(reacting:
 
 
 @pytest.mark.slow
-def test_a_scenario_that_claims_that_nobody_reacts_although_he_does_is_found_out(reacting: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_false_claim_that_no_actor_reacts_is_detected(reacting: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(reacting)
     Path("claims.py").write_text(CLAIM)
     study = load_study("native", scenario={"model": "claims:Claims", "parameters": {"network": "reacting"}}, name="mine", title="",

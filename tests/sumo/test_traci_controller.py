@@ -1,4 +1,4 @@
-"""A script as SUMO users write it drives the vehicle under test: it reads SUMO, and what it commands goes through the plant."""
+"""A script for TraCI drives the vehicle under test: it reads SUMO, and the vehicle model carries out its commands."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def changed(of: System, **values: float) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_a_module_that_imports_traci_talks_to_the_simulation_and_keeps_its_state_for_one_vehicle(
+def test_a_module_that_imports_traci_reads_the_simulation_and_has_separate_state_for_each_vehicle(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "helper.py").write_text(HELPER)
     runs = system("step", tmp_path, monkeypatch, USES_HELPER)
@@ -116,8 +116,8 @@ def step(traci, vehicle_id):
 """
 
 
-def test_what_a_controller_reads_of_others_has_passed_the_sensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The leader that it is told of is the trace's gap, linear between two steps, a reaction time and a recognition delay ago."""
+def test_a_controller_reads_other_actors_through_the_sensors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The gap to the leader is the trace's gap one reaction time and one recognition delay ago, linear between two steps."""
     weather = {"name": "haze", "road_friction": 1.0, "visibility": 0.5, "recognition_delay": 0.1, "light": "day"}
     runs = system("step", tmp_path, monkeypatch, LOOKS, weather=weather)
     trace = simulate(runs, changed(runs, reactionTime=0.25, sensorRange=80)).trace
@@ -158,7 +158,7 @@ class Reads:
 """
 
 
-def test_no_function_shows_that_there_are_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_function_returns_ids_or_actors_of_other_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     runs = system("Reads", tmp_path, monkeypatch, SUBSCRIBES)
     simulate(runs, np.repeat(changed(runs, sensorRange=120, reactionTime=0.1), 3, axis=0))
 
@@ -184,7 +184,7 @@ REFUSED = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("line", "problem"), REFUSED)
-def test_calls_that_are_not_a_controllers_are_refused_even_if_it_goes_on(line: str, problem: str, tmp_path: Path,
+def test_illegal_calls_are_refused_even_if_the_controller_catches_the_error(line: str, problem: str, tmp_path: Path,
                                                                       monkeypatch: pytest.MonkeyPatch) -> None:
     script = f"def step(traci, v):\n    try:\n        {line}\n    except Exception:\n        pass\n"
     runs = system("step", tmp_path, monkeypatch, script)
@@ -194,7 +194,7 @@ def test_calls_that_are_not_a_controllers_are_refused_even_if_it_goes_on(line: s
     assert "my_controller.py:3" in str(caught.value)
 
 
-def test_a_script_stops_the_original_and_not_a_vehicle_that_has_lost_its_brakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_script_stops_the_original_but_not_a_vehicle_with_weak_brakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     runs = system("step", tmp_path, monkeypatch)
     weak = runs.characteristics.original.copy()
     weak[runs.characteristics.names.index("decel")] = 4.5
@@ -208,7 +208,7 @@ def test_a_script_stops_the_original_and_not_a_vehicle_that_has_lost_its_brakes(
     assert run.trace.speed.max() == pytest.approx(12, abs=0.7)
 
 
-def test_a_wish_is_what_the_plant_makes_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_vehicle_model_limits_a_commanded_acceleration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     runs = system("Harsh", tmp_path, monkeypatch)
     run = simulate(runs, runs.characteristics.original[np.newaxis])
     hardest = -np.diff(run.trace.speed[:, 0]).min() / run.trace.step
@@ -222,7 +222,7 @@ def test_a_wish_is_what_the_plant_makes_of_it(tmp_path: Path, monkeypatch: pytes
     ({"model": "my_controller:step", "kind": "traci", "parameters": {"margin": 2}}, r"^mine: ads.model = .* does not take ads.parameters"),
     ({"model": "my_controller:step"}, r'not a class\nexpected: .*; or with ads.kind = "traci" a function step\('),
 ])
-def test_a_table_that_cannot_be_used_is_told_before_anything_is_simulated(
+def test_a_wrong_ads_table_raises_an_error_before_the_simulation(
         table: dict[str, object], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "my_controller.py").write_text(SCRIPT)
     monkeypatch.chdir(tmp_path)
