@@ -42,7 +42,7 @@ def without_binaries(fmu: Path) -> None:
     (edited('fmiVersion="2.0"', 'fmiVersion="1.0"'), "", "is of FMI 1.0"),
     (edited("CoSimulation", "ModelExchange"), "", "is for model exchange only"),
     (without_binaries, "", "has no binary for this machine"),
-    (lambda fmu: fmu.write_text("no archive"), "", "is no FMU that can be read: BadZipFile"),
+    (lambda fmu: fmu.write_text("no archive"), "", "cannot be read as an FMU: BadZipFile"),
     (Path.unlink, "", "there is no such file"),
     (lambda fmu: (fmu.unlink(), fmu.mkdir()), "", "ads.model = 'Small.fmu': is a directory"),
     (str, IN + '\noutputs = { throttle = "pedal", brake = "pedal" }', "ads.outputs.brake = 'pedal': that variable is ads.outputs.throttle"),

@@ -153,7 +153,8 @@ def test_a_characteristic_is_no_input_too(cart: Path) -> None:
     ("[vehicle.ch", "sensors = { latency = -1 }\n[vehicle.ch", "vehicle.sensors.latency = -1\nexpected: a number of at least 0"),
     ("[vehicle.ch", 'sensors = { range = "v" }\n[vehicle.ch', "vehicle.sensors.range = 'v': there is no such characteristic"),
     ("mass = 1500", "mass = 0.0", "vehicle.sumo_type.mass = 0"),
-    ("10.8", "10.8, lower = 0", "vehicle.characteristics.power.lower = 0, and it is vehicle.sumo_type.accel\nexpected: a number above 0"),
+    ("10.8", "10.8, lower = 0",
+     "vehicle.characteristics.power.lower = 0, the value of vehicle.sumo_type.accel\nexpected: a number above 0"),
 ])
 def test_what_no_vehicle_has_is_refused(old: str, new: str, problem: str, cart: Path) -> None:
     text = CART_TABLE.format(more="[vehicle.characteristics]\npower = { original = 10.8 }")

@@ -42,7 +42,7 @@ def stopping_distance(tread: float, wet: bool = True) -> float:
 def test_deceleration_is_that_of_two_axles_of_which_none_brakes_more_than_its_load_holds(road: float, changes: dict[str, float]) -> None:
     """Found here by bisection of m a = sum of min(share F, mu N(a)), with the load going forward as it brakes."""
     p = prepared(road, **changes)
-    mass, mu, force = float(p.mass[0]), float(p.grip[0]), float(p.brake[0] * p.mass[0])
+    mass, mu, force = float(p.mass[0]), float(p.grip[0]), float(p.brake_deceleration[0] * p.mass[0])
     values = {**HEALTHY, **changes}
     centre = (CAR.kerb_mass * CAR.kerb_centre + values["payload"] * values["payloadCentre"]) / mass
 
