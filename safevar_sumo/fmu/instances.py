@@ -26,7 +26,7 @@ LONGEST = 10.0
 MOST_INSTANCES, MOST_PROCESSES = 200, 4
 """Largest number of vehicles of a simulation: with all instances in one process, and with one process for each."""
 POINT_TOLERANCE = 1e-9
-"""Largest distance of a time from a communication point at which it counts as that point, as a share of a step [-]."""
+"""Tolerance for times of communication points, as a share of a step [-]."""
 
 
 class Fault(SafevarError):
