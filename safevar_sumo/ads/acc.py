@@ -8,19 +8,19 @@ import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.ads.base import Positive
-from safevar_sumo.ads.driver import Following
+from safevar_sumo.ads.driver import CarFollowing
 from safevar_sumo.records import FloatArray
 
 # Gains of the modes [1/s for speeds, 1/s^2 for gaps] and thresholds: defaults of MSCFModel_ACC.
 SPEED_GAIN = -0.4
-CLOSING = 0.8, 0.04
-KEEPING = 0.07, 0.23
-AVOIDING = 0.23, 0.8
-FOLLOWS_BELOW = 100.0  # m
-KEEPS_GAP, KEEPS_SPEED = 0.2, 0.1  # m, m/s: errors below which the gap is kept
+CLOSING_GAINS = 0.8, 0.04
+KEEPING_GAINS = 0.07, 0.23
+AVOIDING_GAINS = 0.23, 0.8
+FOLLOWING_GAP = 100.0  # m, largest gap at which it follows
+GAP_TOLERANCE, SPEED_TOLERANCE = 0.2, 0.1  # m, m/s: errors below which it keeps the gap
 
 
-class Acc(Following, frozen=True, kw_only=True):
+class Acc(CarFollowing, frozen=True, kw_only=True):
     """Holds a speed, or a time headway behind a leader.
 
     Parameters
@@ -42,14 +42,14 @@ class Acc(Following, frozen=True, kw_only=True):
         """Commanded acceleration [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""
         excess_speed, relative_speed = speed - self.cruise_speed, leader_speed - speed
         error = gap - self.standing_gap - _standing_distance(speed) - self.headway * speed
-        keeps = (np.abs(error) < KEEPS_GAP) & (np.abs(excess_speed) < KEEPS_SPEED)
-        following = np.where(keeps, _law(KEEPING, relative_speed, error),
-                             np.where(error < 0, _law(AVOIDING, relative_speed, error), _law(CLOSING, relative_speed, error)))
-        return np.where(gap - self.standing_gap > FOLLOWS_BELOW, SPEED_GAIN * excess_speed, following)
+        keeps = (np.abs(error) < GAP_TOLERANCE) & (np.abs(excess_speed) < SPEED_TOLERANCE)
+        gap_law = np.where(error < 0, _law(AVOIDING_GAINS, relative_speed, error), _law(CLOSING_GAINS, relative_speed, error))
+        acceleration = np.where(keeps, _law(KEEPING_GAINS, relative_speed, error), gap_law)
+        return np.where(gap - self.standing_gap > FOLLOWING_GAP, SPEED_GAIN * excess_speed, acceleration)
 
 
 def _standing_distance(speed: FloatArray) -> FloatArray:
-    """Distance kept in addition to the headway [m] (Xiao et al. 2017): 2 m below 10.8 m/s, 75 / v - 5 up to 15 m/s, none above."""
+    """Distance to keep in addition to the headway [m] (Xiao et al. 2017): 2 m below 10.8 m/s, 75 / v - 5 up to 15 m/s, none above."""
     return np.minimum(np.maximum(75 / np.maximum(speed, 1.0) - 5, 0.0), 2.0)
 
 

@@ -17,7 +17,7 @@ LEAST_DECELERATION = 0.5
 
 class _Memory(NamedTuple):
     """The original vehicle; time between calls [s]; initial speed and the pedals that hold it; braking stage 0 to 2; whether it has ever
-    braked; the obstacle's speed at the last call [m/s]; whether it warns.
+    braked; the obstacle's speed at the last call [m/s]; whether it warns now.
     """
 
     nominal: Nominal
@@ -32,7 +32,8 @@ class _Memory(NamedTuple):
 class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Holds its speed; brakes in part, then fully, when the gap to an obstacle in its way falls below its braking distances.
 
-    distance = v rt + max(v_rel^2 / (2 b), v^2 / (2 b) - u^2 / (2 b_u)) + margin, with b_u the deceleration of the obstacle.
+    distance = v rt + max(v_rel^2 / (2 b), v^2 / (2 b) - u^2 / (2 b_u)) + margin, with
+    speed v and deceleration b of the vehicle, u and b_u of the obstacle, and their closing speed v_rel.
     After braking it never accelerates again.
 
     It warns its driver while gap / closing speed of an obstacle in its way is below `warning_time`, and while it brakes. The simulated
@@ -49,7 +50,7 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     margin
         Gap to keep at the stop [m].
     partial_share, partial_time
-        Pedal of the partial stage [-], and its lead over the full stage [s].
+        Pedal of the partial stage [-], and time by which this stage precedes the full stage [s].
     corridor
         Half the width of the corridor that it watches [m].
     reach
@@ -81,16 +82,16 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         nominal = memory.nominal
-        speed, pedal = memory.cruise or (self._speed_to_hold(seen), trim(nominal, seen))
+        cruise_speed, cruise_trim = memory.cruise or (self._speed_to_hold(seen), trim(nominal, seen))
         threat = in_the_way(seen, self.corridor, self.reach) & (seen.closing_speed > 0)
         stage = self._stage(seen, memory, threat)
         intervened = memory.intervened | (stage > 0)
-        cruising = pedals(nominal, seen.speed, self.cruise_gain * (speed - seen.speed), pedal)
+        cruising = pedals(nominal, seen.speed, self.cruise_gain * (cruise_speed - seen.speed), cruise_trim)
         command = Command(
             np.where(intervened, 0.0, cruising.throttle),
             np.where(stage == 2, 1.0, np.where(stage == 1, self.partial_share, np.where(intervened, 0.0, cruising.brake))))
         warns = (threat & (time_to_reach(seen) < self.warning_time)) | (stage > 0)
-        return command, _Memory(nominal, memory.step, (speed, pedal), stage, intervened, _obstacle_speed(seen), warns)
+        return command, _Memory(nominal, memory.step, (cruise_speed, cruise_trim), stage, intervened, _obstacle_speed(seen), warns)
 
     def warns(self, memory: _Memory) -> BoolArray:
         """Whether each driver is warned now."""
@@ -100,20 +101,22 @@ class Aeb(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return seen.speed if self.cruise_speed is None else np.full_like(seen.speed, self.cruise_speed)
 
     def _stage(self, seen: Observation, memory: _Memory, threat: BoolArray) -> FloatArray:
-        """The braking stage; it never falls before the obstacle has left the way."""
+        """The braking stage; it does not fall before the obstacle has left the way of the vehicle."""
         speed, obstacle_speed = seen.speed, _obstacle_speed(seen)
         deceleration = self.braking_share * memory.nominal.decel
         obstacle_deceleration = (memory.obstacle_speed - obstacle_speed) / memory.step
-        both = speed * speed / (2 * deceleration) - obstacle_speed * obstacle_speed / (
+        stop_difference = speed * speed / (2 * deceleration) - obstacle_speed * obstacle_speed / (
             2 * np.maximum(obstacle_deceleration, LEAST_DECELERATION))
-        closing = np.maximum(seen.closing_speed, 0.0)
-        braking = np.maximum(closing * closing / (2 * deceleration), np.where(obstacle_deceleration > LEAST_DECELERATION, both, 0.0))
-        full = speed * self.response_time + braking + self.margin
-        wanted = np.where(threat & (seen.gap < full), 2.0, np.where(threat & (seen.gap < full + speed * self.partial_time), 1.0, 0.0))
-        stays = np.isfinite(seen.gap) & (seen.gap > 0) & (closing > 0) & (
+        closing_speed = np.maximum(seen.closing_speed, 0.0)
+        braking_distance = np.maximum(closing_speed * closing_speed / (2 * deceleration),
+                                      np.where(obstacle_deceleration > LEAST_DECELERATION, stop_difference, 0.0))
+        full_gap = speed * self.response_time + braking_distance + self.margin
+        partial_gap = full_gap + speed * self.partial_time
+        stage = np.where(threat & (seen.gap < full_gap), 2.0, np.where(threat & (seen.gap < partial_gap), 1.0, 0.0))
+        stays = np.isfinite(seen.gap) & (seen.gap > 0) & (closing_speed > 0) & (
             (np.abs(seen.lateral) <= self.corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0))
         stands = speed <= 0
-        return np.where(stays | stands, np.maximum(wanted, memory.stage), wanted)
+        return np.where(stays | stands, np.maximum(stage, memory.stage), stage)
 
 
 def _obstacle_speed(seen: Observation) -> FloatArray:

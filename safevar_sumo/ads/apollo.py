@@ -7,7 +7,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.driver import looked_up
+from safevar_sumo.ads.driver import interpolated_tables
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
@@ -19,14 +19,14 @@ FIRST_COMMAND_ROUNDING = 1e-9  # s
 
 
 class _Memory(NamedTuple):
-    """The original vehicle; time between calls; whether it stops; planned deceleration and commanded acceleration; time crept [SI]."""
+    """The original vehicle; time between calls; whether it stops; planned deceleration, commanded acceleration, creeping time [SI]."""
 
     nominal: Nominal
     step: float
     stops: BoolArray
-    planned: FloatArray
-    commanded: FloatArray
-    crept: FloatArray
+    planned_deceleration: FloatArray
+    commanded_acceleration: FloatArray
+    creeping_time: FloatArray
 
 
 class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -72,49 +72,52 @@ class Apollo(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return _Memory(nominal, step, zeros > 0, zeros, zeros, zeros)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        planned = self._plan(seen, memory)
-        command = self._pedals(seen, planned)
+        plan = self._plan(seen, memory)
+        command = self._pedals(seen, plan)
         if seen.time >= self.first_command - FIRST_COMMAND_ROUNDING:
-            return command, planned
+            return command, plan
         waits = seen.speed == 0
-        columns = (np.where(waits, old, new) for old, new in zip(memory[2:], planned[2:], strict=True))
+        columns = (np.where(waits, old, new) for old, new in zip(memory[2:], plan[2:], strict=True))
         return Command(*(np.where(waits, 0.0, pedal) for pedal in command)), _Memory(memory.nominal, memory.step, *columns)
 
     def _plan(self, seen: Observation, memory: _Memory) -> _Memory:
-        """The commanded acceleration: cruise, or brake with v^2 / (2 d) to stop before the obstacle; then creep and hold."""
+        """Plan an acceleration: cruise, or brake with v^2 / (2 d) to stop within the distance d; then creep and hold."""
         v = seen.speed
         detected = seen.gap <= self.perception_range * seen.visibility
         distance = np.where(detected, np.minimum(seen.gap, self.perception_range) - self.stop_gap, np.inf)
-        needed = v * v / (2 * np.maximum(distance, LEAST_DISTANCE))
+        needed_deceleration = v * v / (2 * np.maximum(distance, LEAST_DISTANCE))
         # The onset allows for the distance lost by the lag of the pedals and while the deceleration rises at the jerk limit.
-        lost = v * (self.pedal_lag + 0.5 * self.comfortable_deceleration / self.jerk)
-        planned = v * v / (2 * np.maximum(distance - lost, LEAST_DISTANCE))
-        begins = (planned > self.comfortable_deceleration) & ~memory.stops
+        lost_distance = v * (self.pedal_lag + 0.5 * self.comfortable_deceleration / self.jerk)
+        planned_deceleration = v * v / (2 * np.maximum(distance - lost_distance, LEAST_DISTANCE))
+        begins = (planned_deceleration > self.comfortable_deceleration) & ~memory.stops
         stops = memory.stops | begins
-        base, most = memory.commanded, np.array(self.jerk * memory.step)
+        last_acceleration, most_change = memory.commanded_acceleration, np.array(self.jerk * memory.step)
         if np.count_nonzero(begins):
             # Planning is continuous in time: braking began within the last step, when the needed deceleration passed the limit.
-            rise = np.maximum(planned - memory.planned, 1e-9)
-            share = np.where(begins, np.minimum((planned - self.comfortable_deceleration) / rise, 1.0), 1.0)
-            base, most = np.where(begins, np.minimum(base, 0.0), base), most * share
+            rise = np.maximum(planned_deceleration - memory.planned_deceleration, 1e-9)
+            share = np.where(begins, np.minimum((planned_deceleration - self.comfortable_deceleration) / rise, 1.0), 1.0)
+            last_acceleration = np.where(begins, np.minimum(last_acceleration, 0.0), last_acceleration)
+            most_change = most_change * share
 
-        braking = np.minimum(needed, self.largest_deceleration)
+        braking = np.minimum(needed_deceleration, self.largest_deceleration)
         braking = np.minimum(braking, np.maximum(v - self.creep_speed, 0.0) / TAPER_TIME)
         cruising = np.minimum(self.cruise_gain * (self.cruise_speed - v), self.cruise_acceleration)
-        commanded = base + np.minimum(np.maximum(np.where(stops, -braking, cruising) - base, -most), most)
+        change = np.where(stops, -braking, cruising) - last_acceleration
+        acceleration = last_acceleration + np.minimum(np.maximum(change, -most_change), most_change)
 
         creeps = stops & (v < self.creep_speed + CREEP_MARGIN)
-        crept = memory.crept + memory.step * creeps
-        commanded[creeps] = 0.0
-        commanded[crept > self.creep_time] = -HOLDING_DECELERATION
-        return memory._replace(stops=stops, planned=planned, commanded=commanded, crept=crept)
+        creeping_time = memory.creeping_time + memory.step * creeps
+        acceleration[creeps] = 0.0
+        acceleration[creeping_time > self.creep_time] = -HOLDING_DECELERATION
+        return memory._replace(stops=stops, planned_deceleration=planned_deceleration, commanded_acceleration=acceleration,
+                               creeping_time=creeping_time)
 
     def _pedals(self, seen: Observation, memory: _Memory) -> Command:
         """Pedals for the commanded acceleration, from the calibration table of the original vehicle."""
         nominal = memory.nominal
-        coasting, full = looked_up(nominal.speeds, seen.speed, nominal.coasting, nominal.full_throttle)
-        beyond = memory.commanded + coasting
-        throttle = np.minimum(np.maximum(beyond / (full + coasting), 0.0), 1.0)
-        brake = np.minimum(np.maximum(-beyond / nominal.braking, 0.0), 1.0)
+        coasting, full_throttle = interpolated_tables(nominal.speeds, seen.speed, nominal.coasting, nominal.full_throttle)
+        excess = memory.commanded_acceleration + coasting
+        throttle = np.minimum(np.maximum(excess / (full_throttle + coasting), 0.0), 1.0)
+        brake = np.minimum(np.maximum(-excess / nominal.braking, 0.0), 1.0)
         throttle[memory.stops], brake[~memory.stops] = 0.0, 0.0
         return Command(throttle, brake)

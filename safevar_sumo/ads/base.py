@@ -24,10 +24,10 @@ REACTIONS = ("recognition_delay", "hesitation")
 
 
 class Ads(Protocol):
-    """An ADS that drives N vehicles at once. Its fields are filled from the study's table `ads.parameters`.
+    """An ADS that drives N vehicles at once. The study's table `ads.parameters` fills its fields.
 
     It gets an `Observation` and knows the original vehicle (`Nominal`), never the setting.
-    Neither N nor another vehicle changes a bit of element i of a command: it depends on element i of the observations.
+    Element i of a command depends only on element i of the observations, bit for bit: neither on N nor on other vehicles.
 
     Optional: a method `warns(memory) -> BoolArray`, called after `drive`, returns which drivers are warned, shape (N,).
     """
@@ -48,7 +48,7 @@ class ScalarAds(ABC):
     nominal: Nominal
     step: float
     warns = False
-    """Whether it warns its driver; `drive` may set it."""
+    """Whether the ADS warns its driver; `drive` may set it."""
 
     def start(self, nominal: Nominal, step: float) -> None:
         """Called once before the run, with the original vehicle and the time between two calls of `drive` [s]."""
@@ -64,7 +64,7 @@ SCALAR_ADS_CONTRACT = Contract.of(ScalarAds, "a ScalarAds")
 
 
 class GuardedAds:
-    """A user's own ADS: it gets read-only copies, and its commands are checked."""
+    """Guards a user's own ADS: passes read-only copies to it, and checks its commands."""
 
     def __init__(self, ads: Ads, guard: Guard) -> None:
         self._ads, self._guard = ads, guard
@@ -102,7 +102,8 @@ class PerVehicle:
         return drivers
 
     def drive(self, seen: Observation, memory: list[ScalarAds]) -> tuple[Command, list[ScalarAds]]:
-        pedals = [self._pedals(self._guard.call("drive", driver.drive, own)) for driver, own in zip(memory, _each(seen), strict=True)]
+        pedals = [self._pedals(self._guard.call("drive", driver.drive, observation))
+                  for driver, observation in zip(memory, _scalar_observations(seen), strict=True)]
         return Command(*np.array(pedals, dtype=float).reshape(len(memory), 2).T.copy()), memory
 
     def warns(self, memory: list[ScalarAds]) -> BoolArray:
@@ -118,7 +119,7 @@ class PerVehicle:
                 float(self._guard.numbers("drive", "brake", brake, (), 0.0, 1.0)))
 
 
-def _each(seen: Observation) -> Iterator[Observation]:
+def _scalar_observations(seen: Observation) -> Iterator[Observation]:
     """The observation of each vehicle, as plain numbers."""
     columns = [value.tolist() if isinstance(value, np.ndarray) and value.ndim else repeat(float(value)) for value in seen]
     return map(Observation._make, zip(*columns, strict=False))

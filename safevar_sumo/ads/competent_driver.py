@@ -7,28 +7,29 @@ from typing import NamedTuple
 import numpy as np
 from msgspec import Struct
 
-from safevar_sumo.ads.acc import KEEPING
+from safevar_sumo.ads.acc import KEEPING_GAINS
 from safevar_sumo.ads.base import NotNegative, Positive
-from safevar_sumo.ads.driver import HARDEST, Reaction, Start, in_the_way, react, time_to_reach, unaware
+from safevar_sumo.ads.driver import HARDEST_BRAKING, Reaction, Start, in_the_way, initial_reaction, react, time_to_reach
 from safevar_sumo.records import TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
 
 
 class _Memory(NamedTuple):
-    """Reaction; the obstacle's first lateral position [m], infinite before any; whether it was in the way then; time since it strayed [s],
-    negative before.
+    """Reaction; the obstacle's first lateral position [m], infinite before the first; whether the obstacle was in the way there; time
+    since the obstacle strayed from there [s], negative before.
     """
 
     reaction: Reaction
-    first: FloatArray
-    ahead: BoolArray
-    strayed: FloatArray
+    first_lateral: FloatArray
+    first_in_way: BoolArray
+    stray_time: FloatArray
 
 
 class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Holds its speed or a headway; perceives obstacles that move into its way, reacts to a TTC below 2 s, and brakes with up to 0.774 g.
 
-    After a stop it waits until the way is clear. Behind a moving leader it keeps its headway with the accelerator alone:
-    a = 0.07 (u - v) + 0.23 (gap - headway v), the gap control of Milanes and Shladover (2014), and not below `-lets_go`.
+    After a stop it waits until the way is clear. Behind a moving leader it keeps its headway by the accelerator only:
+    a = 0.07 (u - v) + 0.23 (gap - headway v), the gap control of Milanes and Shladover (2014), but at least `-lets_go`;
+    u and v are the speeds of leader and vehicle.
 
     Parameters
     ----------
@@ -59,30 +60,31 @@ class CompetentDriver(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     start_throttle: Start = ()
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        return _Memory(unaware(n, nominal, step), np.full(n, np.inf), np.zeros(n, dtype=bool), np.full(n, -1.0))
+        return _Memory(initial_reaction(n, nominal, step), np.full(n, np.inf), np.zeros(n, dtype=bool), np.full(n, -1.0))
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        perceived, memory = self._perceived(seen, memory)
-        ahead = perceived & in_the_way(seen, self.corridor)
+        perceived, memory = self._perceive(seen, memory)
+        has_leader = perceived & in_the_way(seen, self.corridor)
         command, reaction = react(
-            seen, memory.reaction, ahead & (time_to_reach(seen) < self.critical_ttc), np.full_like(seen.speed, HARDEST),
+            seen, memory.reaction, has_leader & (time_to_reach(seen) < self.critical_ttc), np.full_like(seen.speed, HARDEST_BRAKING),
             reaction_time=self.reaction_time, corridor=self.corridor, coasting_deceleration=self.lets_go, cruise_speed=self.cruise_speed,
-            start=self.start_throttle, following=self._following(seen, ahead))
+            start=self.start_throttle, following=self._following(seen, has_leader))
         return command, memory._replace(reaction=reaction)
 
-    def _following(self, seen: Observation, ahead: BoolArray) -> FloatArray:
-        """Acceleration that keeps the headway to a moving leader [m/s^2]; infinite without one."""
-        gap = np.where(ahead, seen.gap, 0.0)
-        law = KEEPING[0] * (seen.obstacle_speed - seen.speed) + KEEPING[1] * (gap - self.headway * seen.speed)
-        return np.where(ahead & (seen.obstacle_speed > 0), np.maximum(law, -self.lets_go), np.inf)
+    def _following(self, seen: Observation, has_leader: BoolArray) -> FloatArray:
+        """Acceleration that keeps the headway to a moving leader [m/s^2]; infinite without a leader."""
+        gap = np.where(has_leader, seen.gap, 0.0)
+        law = KEEPING_GAINS[0] * (seen.obstacle_speed - seen.speed) + KEEPING_GAINS[1] * (gap - self.headway * seen.speed)
+        return np.where(has_leader & (seen.obstacle_speed > 0), np.maximum(law, -self.lets_go), np.inf)
 
-    def _perceived(self, seen: Observation, memory: _Memory) -> tuple[BoolArray, _Memory]:
+    def _perceive(self, seen: Observation, memory: _Memory) -> tuple[BoolArray, _Memory]:
         sighted = np.isfinite(seen.gap) & np.isfinite(seen.lateral)
         lateral = np.where(sighted, seen.lateral, 0.0)
-        begins = sighted & ~np.isfinite(memory.first)
-        first = np.where(begins, lateral, memory.first)
-        ahead = memory.ahead | (begins & (np.abs(lateral) <= self.corridor))
-        away = np.abs(lateral - np.where(np.isfinite(first), first, 0.0))
-        strays = sighted & (away >= self.stray)
-        strayed = np.where(memory.strayed >= 0, memory.strayed + memory.reaction.step, np.where(strays, 0.0, -1.0))
-        return ahead | (strayed >= self.perception_time - TIME_ROUNDING), memory._replace(first=first, ahead=ahead, strayed=strayed)
+        appears = sighted & ~np.isfinite(memory.first_lateral)
+        first_lateral = np.where(appears, lateral, memory.first_lateral)
+        first_in_way = memory.first_in_way | (appears & (np.abs(lateral) <= self.corridor))
+        deviation = np.abs(lateral - np.where(np.isfinite(first_lateral), first_lateral, 0.0))
+        strays = sighted & (deviation >= self.stray)
+        stray_time = np.where(memory.stray_time >= 0, memory.stray_time + memory.reaction.step, np.where(strays, 0.0, -1.0))
+        perceived = first_in_way | (stray_time >= self.perception_time - TIME_ROUNDING)
+        return perceived, memory._replace(first_lateral=first_lateral, first_in_way=first_in_way, stray_time=stray_time)

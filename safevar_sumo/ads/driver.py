@@ -1,4 +1,4 @@
-"""Parts of several drivers: pedals for an acceleration, perception of an obstacle in the way, reaction to a danger, car following."""
+"""Parts that drivers share: pedals for an acceleration, perception of an obstacle in the way, reaction to a danger, car following."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from msgspec import Meta, Struct
 from safevar_sumo.records import GRAVITY, TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
 
 
-def looked_up(speeds: FloatArray, speed: FloatArray, *tables: FloatArray) -> list[FloatArray]:
+def interpolated_tables(speeds: FloatArray, speed: FloatArray, *tables: FloatArray) -> list[FloatArray]:
     """Tables over equally spaced speeds, interpolated linearly at `speed`."""
-    place = np.minimum(speed / speeds[1], len(speeds) - 1.001)
-    row = place.astype(np.intp)
-    share, next_row = place - row, row + 1
+    position = np.minimum(speed / speeds[1], len(speeds) - 1.001)
+    row = position.astype(np.intp)
+    share, next_row = position - row, row + 1
     values = ((table[row], table[next_row]) for table in tables)
     return [low + (high - low) * share for low, high in values]
 
@@ -36,19 +36,19 @@ class DelayLine(NamedTuple):
         steps, fraction = divmod(round(delay / step, STEP_DECIMALS), 1)
         return cls(int(steps), fraction)
 
-    def delayed(self, now: FloatArray) -> tuple[FloatArray, DelayLine]:
-        """The values of a delay ago, linear between two steps, and the next state; before the first step the first values hold."""
-        past = (*(self.past[1:] or (now,) * (self.steps + 1)), now)
-        before, after = past[0], past[1]
+    def delayed(self, values: FloatArray) -> tuple[FloatArray, DelayLine]:
+        """The values one delay ago, linear between two steps, and the next delay line; before the first step the first values hold."""
+        past = (*(self.past[1:] or (values,) * (self.steps + 1)), values)
+        older, newer = past[0], past[1]
         if self.fraction:
-            with np.errstate(invalid="ignore"):  # a value that appears or vanishes in between keeps its old value
-                between = after + (before - after) * self.fraction
-            after = between if np.count_nonzero(finite := np.isfinite(between)) == finite.size else np.where(finite, between, before)
-        return after, DelayLine(self.steps, self.fraction, past)
+            with np.errstate(invalid="ignore"):  # a value that appears or vanishes between two steps keeps its old value
+                mixture = newer + (older - newer) * self.fraction
+            newer = mixture if np.count_nonzero(finite := np.isfinite(mixture)) == finite.size else np.where(finite, mixture, older)
+        return newer, DelayLine(self.steps, self.fraction, past)
 
 
 class Trim(NamedTuple):
-    """Pedal positions of a rolling vehicle beyond those that hold the original vehicle's speed on a level road [-]."""
+    """Pedal positions of a rolling vehicle minus the positions that hold the original vehicle's speed on a level road [-]."""
 
     throttle: FloatArray
     brake: FloatArray
@@ -58,34 +58,34 @@ def trim(nominal: Nominal, seen: Observation) -> Trim:
     """The trim of a driver who already holds the speed of a rolling vehicle."""
     rolls = seen.speed > 0
     throttle = np.where(rolls, seen.throttle - _throttle(nominal, seen.speed, np.zeros_like(seen.speed)), 0.0)
-    (coasting,) = looked_up(nominal.speeds, seen.speed, nominal.coasting)
+    (coasting,) = interpolated_tables(nominal.speeds, seen.speed, nominal.coasting)
     return Trim(throttle, np.where(rolls & (seen.brake > 0), seen.brake + coasting / nominal.braking, 0.0))
 
 
-def pedals(nominal: Nominal, speed: FloatArray, acceleration: FloatArray, trimmed: Trim) -> Command:
-    """Pedals for an acceleration [m/s^2] at a speed [m/s], from the tables of the original vehicle and a `trim`."""
-    (coasting,) = looked_up(nominal.speeds, speed, nominal.coasting)
-    beyond = acceleration + coasting - nominal.braking * trimmed.brake
-    brake = np.minimum(np.maximum(-beyond / nominal.braking, 0.0), 1.0)
-    throttle = np.minimum(np.maximum(_throttle(nominal, speed, acceleration) + trimmed.throttle, 0.0), 1.0)
-    return Command(np.where(beyond < 0, 0.0, throttle), brake)
+def pedals(nominal: Nominal, speed: FloatArray, acceleration: FloatArray, pedal_trim: Trim) -> Command:
+    """Pedals for an acceleration [m/s^2] at a speed [m/s], from the tables of the original vehicle and a trim."""
+    (coasting,) = interpolated_tables(nominal.speeds, speed, nominal.coasting)
+    excess = acceleration + coasting - nominal.braking * pedal_trim.brake
+    brake = np.minimum(np.maximum(-excess / nominal.braking, 0.0), 1.0)
+    throttle = np.minimum(np.maximum(_throttle(nominal, speed, acceleration) + pedal_trim.throttle, 0.0), 1.0)
+    return Command(np.where(excess < 0, 0.0, throttle), brake)
 
 
 def _throttle(nominal: Nominal, speed: FloatArray, acceleration: FloatArray) -> FloatArray:
-    coasting, full = looked_up(nominal.speeds, speed, nominal.coasting, nominal.full_throttle)
-    return (acceleration + coasting) / (full + coasting)
+    coasting, full_throttle = interpolated_tables(nominal.speeds, speed, nominal.coasting, nominal.full_throttle)
+    return (acceleration + coasting) / (full_throttle + coasting)
 
 
-SLOWEST_CLOSING = 0.1
+LEAST_CLOSING_SPEED = 0.1
 """Lower bound of a positive closing speed [m/s]; keeps times finite."""
-FARTHEST = 1e6
-"""Upper bound of gaps [m]; keeps times finite."""
+LARGEST_GAP = 1e6
+"""Upper bound of gaps [m], also the time [s] or lateral position [m] without an obstacle; keeps them finite."""
 
 
 def time_to_reach(seen: Observation) -> FloatArray:
-    """Time to collision, gap over closing speed [s], shape (N,); `FARTHEST` while the gap does not shrink."""
-    gap = np.minimum(np.maximum(seen.gap, 0.0), FARTHEST)
-    return np.where(seen.closing_speed > 0, gap / np.maximum(seen.closing_speed, SLOWEST_CLOSING), FARTHEST)
+    """Time to collision, gap over closing speed [s], shape (N,); `LARGEST_GAP` while the gap does not shrink."""
+    gap = np.minimum(np.maximum(seen.gap, 0.0), LARGEST_GAP)
+    return np.where(seen.closing_speed > 0, gap / np.maximum(seen.closing_speed, LEAST_CLOSING_SPEED), LARGEST_GAP)
 
 
 def in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> BoolArray:
@@ -94,9 +94,9 @@ def in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> Boo
     `reach` is the sensors' range in clear weather [m].
     """
     detected = np.isfinite(seen.gap) & (seen.gap <= reach * seen.visibility) & (seen.gap > 0)
-    lateral = np.where(detected, seen.lateral, FARTHEST)
-    lateral_then = lateral + seen.lateral_speed * time_to_reach(seen)
-    return np.asarray(detected & ((np.abs(lateral) <= corridor) | (np.abs(lateral_then) <= corridor)))
+    lateral = np.where(detected, seen.lateral, LARGEST_GAP)
+    lateral_at_arrival = lateral + seen.lateral_speed * time_to_reach(seen)
+    return np.asarray(detected & ((np.abs(lateral) <= corridor) | (np.abs(lateral_at_arrival) <= corridor)))
 
 
 def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
@@ -105,10 +105,10 @@ def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
     return np.asarray(ahead & ((np.abs(seen.lateral) <= corridor) | (np.sign(seen.lateral) * seen.lateral_speed < 0)))
 
 
-HARDEST = 0.774 * GRAVITY
+HARDEST_BRAKING = 0.774 * GRAVITY
 """Deceleration of the competent and careful driver [m/s^2] (UN R157, annex 4, appendix 3)."""
 JERK = 12.65
-"""Jerk limit of that deceleration [m/s^3] (ibid.)."""
+"""Jerk limit while that deceleration builds up [m/s^3] (UN R157, annex 4, appendix 3)."""
 CRUISE_GAIN = 1.0
 """Acceleration per speed error [1/s]."""
 Start = tuple[Annotated[float, Meta(ge=0, le=1)], ...]
@@ -118,17 +118,18 @@ Start = tuple[Annotated[float, Meta(ge=0, le=1)], ...]
 class Reaction(NamedTuple):
     """The original vehicle; time between calls [s]; speed to hold [m/s] and trim, both from the first observation.
 
-    `waited` is the time since the danger was first seen, negative before [s]; `commanded` is the deceleration [m/s^2]; both shape (N,).
+    `danger_time` is the time since the driver first saw the danger [s], negative before; `braking` is the commanded deceleration [m/s^2];
+    both have shape (N,).
     """
 
     nominal: Nominal
     step: float
-    held: tuple[FloatArray, Trim] | None
-    waited: FloatArray
-    commanded: FloatArray
+    cruise: tuple[FloatArray, Trim] | None
+    danger_time: FloatArray
+    braking: FloatArray
 
 
-def unaware(n: int, nominal: Nominal, step: float) -> Reaction:
+def initial_reaction(n: int, nominal: Nominal, step: float) -> Reaction:
     """The state before a danger appears."""
     return Reaction(nominal, step, None, np.full(n, -1.0), np.zeros(n))
 
@@ -157,24 +158,25 @@ def react(seen: Observation, reaction: Reaction, danger: BoolArray, deceleration
     following
         Upper limit of the acceleration when following a leader, shape (N,) [m/s^2].
     """
-    held = reaction.held
-    if held is None:
+    cruise = reaction.cruise
+    if cruise is None:
         speed = seen.speed if cruise_speed is None else np.full_like(seen.speed, cruise_speed)
-        held = speed, trim(reaction.nominal, seen)
+        cruise = speed, trim(reaction.nominal, seen)
     nears = np.isfinite(seen.gap) & (seen.gap > 0) & (seen.closing_speed > 0)
     lasts = nears | blocks_the_way(seen, corridor)
-    aware = reaction.waited >= 0
-    waited = np.where(aware, np.where(lasts, reaction.waited + reaction.step, -1.0), np.where(danger, 0.0, -1.0))
-    brakes = waited >= reaction_time - TIME_ROUNDING
-    commanded = np.where(brakes, np.minimum(reaction.commanded + jerk * reaction.step, deceleration), 0.0)
-    holding = np.minimum(CRUISE_GAIN * (held[0] - seen.speed), following)
-    acceleration = np.where(brakes, -commanded, np.where((waited >= 0) & (coasting_deceleration > 0), -coasting_deceleration, holding))
-    command = pedals(reaction.nominal, seen.speed, acceleration, held[1])
+    aware = reaction.danger_time >= 0
+    danger_time = np.where(aware, np.where(lasts, reaction.danger_time + reaction.step, -1.0), np.where(danger, 0.0, -1.0))
+    brakes = danger_time >= reaction_time - TIME_ROUNDING
+    braking = np.where(brakes, np.minimum(reaction.braking + jerk * reaction.step, deceleration), 0.0)
+    cruising = np.minimum(CRUISE_GAIN * (cruise[0] - seen.speed), following)
+    coasts = (danger_time >= 0) & (coasting_deceleration > 0)
+    acceleration = np.where(brakes, -braking, np.where(coasts, -coasting_deceleration, cruising))
+    command = pedals(reaction.nominal, seen.speed, acceleration, cruise[1])
     sample = round(seen.time / reaction.step)
     if sample < len(start):
-        starts = waited < 0
+        starts = danger_time < 0
         command = Command(np.where(starts, start[sample], command.throttle), np.where(starts, 0.0, command.brake))
-    return command, reaction._replace(held=held, waited=waited, commanded=commanded)
+    return command, reaction._replace(cruise=cruise, danger_time=danger_time, braking=braking)
 
 
 class FollowingMemory(NamedTuple):
@@ -182,18 +184,18 @@ class FollowingMemory(NamedTuple):
 
     nominal: Nominal
     step: float
-    trimmed: Trim | None
+    initial_trim: Trim | None
 
 
-class Following(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class CarFollowing(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of car-following models: an acceleration from gap and speeds, converted to pedals.
 
-    Obstacles beside the way are ignored.
+    They ignore obstacles beside the way.
 
     Parameters
     ----------
     corridor
-        Half the width of its way [m].
+        Half the width of the way [m].
     """
 
     corridor: float
@@ -202,10 +204,10 @@ class Following(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return FollowingMemory(nominal, step, None)
 
     def drive(self, seen: Observation, memory: FollowingMemory) -> tuple[Command, FollowingMemory]:
-        trimmed = trim(memory.nominal, seen) if memory.trimmed is None else memory.trimmed
-        gap = np.where(in_the_way(seen, self.corridor), seen.gap, FARTHEST)
-        wanted = self.acceleration_at(gap, seen.speed, seen.obstacle_speed)
-        return pedals(memory.nominal, seen.speed, wanted, trimmed), memory._replace(trimmed=trimmed)
+        initial_trim = trim(memory.nominal, seen) if memory.initial_trim is None else memory.initial_trim
+        gap = np.where(in_the_way(seen, self.corridor), seen.gap, LARGEST_GAP)
+        acceleration = self.acceleration_at(gap, seen.speed, seen.obstacle_speed)
+        return pedals(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(initial_trim=initial_trim)
 
     def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """Commanded acceleration [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""

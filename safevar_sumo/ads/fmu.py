@@ -1,4 +1,4 @@
-"""A driving system that is an FMU: observations are its inputs; pedals or an acceleration are its outputs."""
+"""A driving system that is an FMU: its inputs are observations, its outputs are pedals or an acceleration."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 from safevar_sumo.ads.driver import Trim, pedals, trim
 from safevar_sumo.errors import ForeignError, InputError
-from safevar_sumo.fmu import Description, Fault, Fleet, History, Instances, fixed_of, ports_of
+from safevar_sumo.fmu import Description, Fault, Fleet, History, Instances, constants_of, ports_of
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
 
-OBSERVED: Mapping[str, str] = {
+OBSERVATIONS: Mapping[str, str] = {
     "time": "s", "speed": "m/s", "gap": "m", "closing_speed": "m/s", "lateral": "m", "lateral_speed": "m/s", "visibility": "-",
     "obstacle_speed": "m/s", "throttle": "-", "brake": "-", "detected": "-"}
 """Quantities that an ADS observes, and their units; `detected` is 1 while an obstacle is detected."""
@@ -22,8 +22,8 @@ CONSTANTS: Mapping[str, str] = {
     "step": "s"}
 """Facts about the original vehicle, and the time between two calls: inputs, or parameters that are set at the start."""
 NOMINAL_PREFIX = "nominal_"
-COMMANDED: Mapping[str, str] = {"throttle": "-", "brake": "-", "acceleration": "m/s^2", "warns": "-"}
-"""Quantities that it outputs; `warns` above one half is a warning."""
+OUTPUT_UNITS: Mapping[str, str] = {"throttle": "-", "brake": "-", "acceleration": "m/s^2", "warns": "-"}
+"""Quantities that the FMU outputs, and their units; `warns` above one half is a warning."""
 
 
 class _Memory(NamedTuple):
@@ -60,17 +60,17 @@ class FmuAds:
     def __init__(self, description: Description, inputs: Mapping[str, str], outputs: Mapping[str, str], parameters: Mapping[str, Any],
                  step: float | None, guard: Guard, limit: float) -> None:
         source = guard.source
-        self._guard, self._own_step = guard, step or description.step
-        input_ports = ports_of(description, inputs, {**OBSERVED, **CONSTANTS}, ("input",), source, "ads.inputs", constant=CONSTANTS)
-        output_ports = ports_of(description, outputs, COMMANDED, ("output",), source, "ads.outputs")
+        self._guard, self._communication_step = guard, step or description.step
+        input_ports = ports_of(description, inputs, {**OBSERVATIONS, **CONSTANTS}, ("input",), source, "ads.inputs", constants=CONSTANTS)
+        output_ports = ports_of(description, outputs, OUTPUT_UNITS, ("output",), source, "ads.outputs")
         if ("acceleration" in output_ports) == bool({"throttle", "brake"} & output_ports.keys()):
-            raise InputError(source, f"ads.outputs = {sorted(outputs)}", "throttle, brake or both; or acceleration")
-        if not input_ports.keys() & OBSERVED.keys():
-            raise InputError(source, "ads.inputs: no observed quantity", f"some of {', '.join(OBSERVED)}")
+            raise InputError(source, f"ads.outputs = {sorted(outputs)}", "throttle, brake or both; alternatively acceleration")
+        if not input_ports.keys() & OBSERVATIONS.keys():
+            raise InputError(source, "ads.inputs: no observed quantity", f"some of {', '.join(OBSERVATIONS)}")
         self._inputs, self._outputs = tuple(input_ports), tuple(output_ports)
         mapped_names = [port.variable.name for port in input_ports.values()]
         self._instances = Instances(description, [*input_ports.values()], [*output_ports.values()],
-                                    list(fixed_of(description, parameters, mapped_names, source, "ads.parameters")), limit)
+                                    list(constants_of(description, parameters, mapped_names, source, "ads.parameters")), limit)
         self.most_vehicles = self._instances.most_vehicles
         if "warns" in output_ports:
             self.warns = self._warns
@@ -78,7 +78,7 @@ class FmuAds:
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         constants = {"step": step, **{name: getattr(nominal, name.removeprefix(NOMINAL_PREFIX))
                                       for name in CONSTANTS if name.startswith(NOMINAL_PREFIX)}}
-        return _Memory(Fleet(self._instances, n, step, self._own_step), constants, nominal)
+        return _Memory(Fleet(self._instances, n, step, self._communication_step), constants, nominal)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         inputs = self._input_values(seen, memory.constants)
@@ -92,8 +92,8 @@ class FmuAds:
         memory = memory._replace(history=history, warns=warns)
         if "acceleration" in outputs:
             acceleration = self._guard.numbers("doStep", "acceleration", outputs["acceleration"], seen.speed.shape)
-            held = memory.trim or trim(memory.nominal, seen)
-            return pedals(memory.nominal, seen.speed, acceleration, held), memory._replace(trim=held)
+            initial_trim = memory.trim or trim(memory.nominal, seen)
+            return pedals(memory.nominal, seen.speed, acceleration, initial_trim), memory._replace(trim=initial_trim)
         zeros = np.zeros_like(seen.speed)
         return Command(*(self._guard.numbers("doStep", name, outputs.get(name, zeros), seen.speed.shape, 0.0, 1.0)
                          for name in Command._fields)), memory

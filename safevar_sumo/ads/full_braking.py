@@ -6,15 +6,15 @@ import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.ads.base import Positive
-from safevar_sumo.ads.driver import Reaction, Start, in_the_way, react, unaware
+from safevar_sumo.ads.driver import Reaction, Start, in_the_way, initial_reaction, react
 from safevar_sumo.records import Command, Nominal, Observation
 
-UNLIMITED = 1e6
-"""Deceleration beyond any brake [m/s^2], so that the pedal is fully pressed."""
+UNLIMITED_BRAKING = 1e6
+"""Deceleration beyond every brake [m/s^2]; it presses the pedal fully."""
 
 
 class FullBraking(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Holds its speed; brakes fully as soon as an obstacle is in its way or on course to be there in time.
+    """Holds its speed; brakes fully as soon as an obstacle is in its way or will be there when the vehicle arrives.
 
     Parameters
     ----------
@@ -31,9 +31,9 @@ class FullBraking(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     start_throttle: Start = ()
 
     def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
-        return unaware(n, nominal, step)
+        return initial_reaction(n, nominal, step)
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
-        hardest = np.full_like(seen.speed, UNLIMITED)
-        return react(seen, memory, in_the_way(seen, self.corridor), hardest, reaction_time=0.0, jerk=UNLIMITED / memory.step,
+        deceleration = np.full_like(seen.speed, UNLIMITED_BRAKING)
+        return react(seen, memory, in_the_way(seen, self.corridor), deceleration, reaction_time=0.0, jerk=UNLIMITED_BRAKING / memory.step,
                      corridor=self.corridor, cruise_speed=self.cruise_speed, start=self.start_throttle)

@@ -8,15 +8,15 @@ import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.ads.base import NotNegative, Positive
-from safevar_sumo.ads.driver import HARDEST, Reaction, in_the_way, react, unaware
+from safevar_sumo.ads.driver import HARDEST_BRAKING, Reaction, in_the_way, initial_reaction, react
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
-LEAST = 1e-9
-"""Accelerations and widths below this are 0 [m/s^2, m]."""
+LEAST_DIVISOR = 1e-9
+"""Lower bound of accelerations and widths by which numbers are divided [m/s^2, m]."""
 
 
 class _Memory(NamedTuple):
-    """Reaction, and the own speed at the last call [m/s], None at first."""
+    """Reaction, and the vehicle's speed at the last call [m/s], None before the first call."""
 
     reaction: Reaction
     speed: FloatArray | None
@@ -48,38 +48,38 @@ class FuzzySafety(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     corridor: Positive = 1.4
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        return _Memory(unaware(n, nominal, step), None)
+        return _Memory(initial_reaction(n, nominal, step), None)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        before = seen.speed if memory.speed is None else memory.speed
-        acceleration = (seen.speed - before) / memory.reaction.step
+        last_speed = seen.speed if memory.speed is None else memory.speed
+        acceleration = (seen.speed - last_speed) / memory.reaction.step
         gap = np.where(in_the_way(seen, self.corridor), seen.gap, np.inf)
-        proactive = self.proactive(gap, seen.speed, seen.obstacle_speed)
-        critical = self.critical(gap, seen.speed, seen.obstacle_speed, acceleration)
-        wanted = np.where(critical > 0, critical * (self.hardest - self.comfortable) + self.comfortable, proactive * self.comfortable)
-        command, reaction = react(seen, memory.reaction, (proactive > 0) | (critical > 0), np.minimum(wanted, HARDEST),
+        pfs = self.proactive(gap, seen.speed, seen.obstacle_speed)
+        cfs = self.critical(gap, seen.speed, seen.obstacle_speed, acceleration)
+        deceleration = np.where(cfs > 0, cfs * (self.hardest - self.comfortable) + self.comfortable, pfs * self.comfortable)
+        command, reaction = react(seen, memory.reaction, (pfs > 0) | (cfs > 0), np.minimum(deceleration, HARDEST_BRAKING),
                                   reaction_time=self.reaction_time, corridor=self.corridor, cruise_speed=self.cruise_speed)
         return command, _Memory(reaction, seen.speed)
 
     def proactive(self, gap: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:
-        """PFS in [0, 1] at a gap [m] and speeds [m/s], shape (N,): 0 above the safe distance, 1 below the unsafe one."""
+        """PFS in [0, 1] at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe distance, 1 below the unsafe one."""
         leader_stop = u * u / (2 * self.leader_deceleration)
-        safe = v * self.reaction_time + v * v / (2 * self.comfortable) - leader_stop + self.margin
-        unsafe = v * self.reaction_time + v * v / (2 * self.hardest) - leader_stop
-        return _share(gap - self.margin, unsafe, safe)
+        safe_distance = v * self.reaction_time + v * v / (2 * self.comfortable) - leader_stop + self.margin
+        unsafe_distance = v * self.reaction_time + v * v / (2 * self.hardest) - leader_stop
+        return _share(gap - self.margin, unsafe_distance, safe_distance)
 
     def critical(self, gap: FloatArray, v: FloatArray, u: FloatArray, a: FloatArray) -> FloatArray:
-        """CFS in [0, 1] at a gap [m], speeds [m/s] and the own acceleration a [m/s^2], shape (N,)."""
-        bounded = np.maximum(a, -self.comfortable)
-        later = v + self.reaction_time * bounded
-        closing = (v + bounded * self.reaction_time / 2 - u) * self.reaction_time
-        squared = (later - u) * (later - u)
-        fuzzy = _share(gap, closing + squared / (2 * self.hardest), closing + squared / (2 * self.comfortable))
-        slowing = np.where(gap < (v - u) * (v - u) / (2 * np.maximum(np.abs(bounded), LEAST)), 1.0, 0.0)
-        return np.where(v <= u, 0.0, np.where(later < u, slowing, fuzzy))
+        """CFS in [0, 1] at a gap [m], speeds v and u [m/s] and the acceleration a of the vehicle [m/s^2], shape (N,)."""
+        acceleration = np.maximum(a, -self.comfortable)
+        next_speed = v + self.reaction_time * acceleration
+        approach = (v + acceleration * self.reaction_time / 2 - u) * self.reaction_time
+        square = (next_speed - u) * (next_speed - u)
+        fuzzy_value = _share(gap, approach + square / (2 * self.hardest), approach + square / (2 * self.comfortable))
+        slowing_value = np.where(gap < (v - u) * (v - u) / (2 * np.maximum(np.abs(acceleration), LEAST_DIVISOR)), 1.0, 0.0)
+        return np.where(v <= u, 0.0, np.where(next_speed < u, slowing_value, fuzzy_value))
 
 
 def _share(value: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """1 below `low`, 0 above `high`, linear between."""
-    width = np.maximum(high - low, LEAST)
+    """1 below `low`, 0 above `high`, linear between both."""
+    width = np.maximum(high - low, LEAST_DIVISOR)
     return np.minimum(np.maximum((high - np.minimum(value, high + width)) / width, 0.0), 1.0)

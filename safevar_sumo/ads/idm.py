@@ -9,14 +9,14 @@ import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.ads.base import Positive
-from safevar_sumo.ads.driver import Following
+from safevar_sumo.ads.driver import CarFollowing
 from safevar_sumo.records import FloatArray
 
 LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
 
 
-class Idm(Following, frozen=True, kw_only=True):
-    """dv/dt = a (1 - (v / v0)^4 - (s* / s)^2), s* = s0 + max(0, v T + v (v - u) / (2 sqrt(a b))).
+class Idm(CarFollowing, frozen=True, kw_only=True):
+    """dv/dt = a (1 - (v / v0)^4 - (s* / s)^2), s* = s0 + max(0, v T + v (v - u) / (2 sqrt(a b))) at speed v, gap s, leader speed u.
 
     Parameters
     ----------
@@ -39,8 +39,9 @@ class Idm(Following, frozen=True, kw_only=True):
 
     def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """dv/dt [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""
-        share = speed / self.cruise_speed
-        closing = speed * (speed - leader_speed) / (2 * math.sqrt(self.acceleration * self.deceleration))
-        desired = self.standing_gap + np.maximum(speed * self.headway + closing, 0.0)
+        speed_ratio = speed / self.cruise_speed
+        closing_term = speed * (speed - leader_speed) / (2 * math.sqrt(self.acceleration * self.deceleration))
+        desired_gap = self.standing_gap + np.maximum(speed * self.headway + closing_term, 0.0)
         positive_gap = np.maximum(gap, LEAST_GAP)
-        return np.asarray(self.acceleration * (1 - share * share * share * share - desired * desired / (positive_gap * positive_gap)))
+        return np.asarray(self.acceleration * (1 - speed_ratio * speed_ratio * speed_ratio * speed_ratio
+                                               - desired_gap * desired_gap / (positive_gap * positive_gap)))

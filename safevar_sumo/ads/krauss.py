@@ -27,7 +27,7 @@ class Krauss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     standing_gap
         Intended gap at standstill [m].
     braking_share
-        Planned deceleration as a share of the original vehicle's greatest one [-].
+        Planned deceleration as a share of the original vehicle's greatest deceleration [-].
     reaction_time
         Planned time until braking begins [s].
     """
@@ -41,16 +41,16 @@ class Krauss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return _Memory(nominal, step)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        """Aim at v_safe = -b t + sqrt((b t)^2 + 2 b gap), t being the reaction time.
+        """Aim at v_safe = -b t + sqrt((b t)^2 + 2 b gap), with the planned deceleration b and the reaction time t.
 
         From v_safe the vehicle comes to rest behind a standing obstacle.
         """
         nominal = memory.nominal
-        planned = self.braking_share * nominal.decel
-        reaction_speed = planned * self.reaction_time
+        deceleration = self.braking_share * nominal.decel
+        reaction_speed = deceleration * self.reaction_time
         gap = np.minimum(np.maximum(seen.gap - self.standing_gap, 0.0), 1e6)
-        safe = np.sqrt(reaction_speed * reaction_speed + 2 * planned * gap) - reaction_speed
-        acceleration = (np.minimum(safe, self.cruise_speed) - seen.speed) / (memory.step + nominal.actuator_lag)
+        safe_speed = np.sqrt(reaction_speed * reaction_speed + 2 * deceleration * gap) - reaction_speed
+        acceleration = (np.minimum(safe_speed, self.cruise_speed) - seen.speed) / (memory.step + nominal.actuator_lag)
         throttle = np.minimum(np.maximum(acceleration / nominal.accel, 0.0), 1.0)
         brake = np.minimum(np.maximum(-acceleration / nominal.decel, 0.0), 1.0)
         return Command(throttle, brake), memory

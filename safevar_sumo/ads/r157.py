@@ -8,12 +8,13 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.ads.base import Positive
-from safevar_sumo.ads.driver import Reaction, in_the_way, react, time_to_reach, unaware
+from safevar_sumo.ads.driver import Reaction, in_the_way, initial_reaction, react, time_to_reach
 from safevar_sumo.records import Command, Nominal, Observation
 
 
 class R157(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Holds its speed; reacts to a TTC below (v - u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s, and brakes with 6 m/s^2 at once.
+    """Holds its speed; reacts to a TTC below (v - u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s, and brakes with 6 m/s^2 at once; v and u are the
+    speeds of vehicle and obstacle.
 
     Parameters
     ----------
@@ -32,10 +33,10 @@ class R157(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     corridor: Positive = 1.4
 
     def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
-        return unaware(n, nominal, step)
+        return initial_reaction(n, nominal, step)
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
-        critical = seen.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
-        danger = in_the_way(seen, self.corridor) & (time_to_reach(seen) < critical)
+        critical_ttc = seen.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
+        danger = in_the_way(seen, self.corridor) & (time_to_reach(seen) < critical_ttc)
         return react(seen, memory, danger, np.full_like(seen.speed, self.deceleration), reaction_time=self.reaction_time,
                      jerk=self.deceleration / memory.step, corridor=self.corridor, cruise_speed=self.cruise_speed)

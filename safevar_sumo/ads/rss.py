@@ -6,14 +6,14 @@ import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.ads.base import NotNegative, Positive
-from safevar_sumo.ads.driver import HARDEST, Reaction, in_the_way, react, unaware
+from safevar_sumo.ads.driver import HARDEST_BRAKING, Reaction, in_the_way, initial_reaction, react
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
 
 class Rss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Holds its speed; a gap below the safe distance is a danger, to which it reacts and brakes with up to 0.774 g.
 
-    safe distance = v rt + a rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u).
+    safe distance = v rt + a rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and leader.
 
     Parameters
     ----------
@@ -30,12 +30,12 @@ class Rss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     cruise_speed: Positive | None = None
     reaction_time: NotNegative = 0.75
     acceleration: NotNegative = 0.0
-    deceleration: Positive = HARDEST
-    leader_deceleration: Positive = HARDEST
+    deceleration: Positive = HARDEST_BRAKING
+    leader_deceleration: Positive = HARDEST_BRAKING
     corridor: Positive = 1.4
 
     def start(self, n: int, nominal: Nominal, step: float) -> Reaction:
-        return unaware(n, nominal, step)
+        return initial_reaction(n, nominal, step)
 
     def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
         danger = in_the_way(seen, self.corridor) & (seen.gap < self.safe_distance(seen.speed, seen.obstacle_speed))
@@ -44,6 +44,6 @@ class Rss(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def safe_distance(self, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """Smallest safe gap [m], at speeds [m/s] of shape (N,)."""
-        rt, faster = self.reaction_time, speed + self.reaction_time * self.acceleration
-        own = speed * rt + self.acceleration * rt * rt / 2 + faster * faster / (2 * self.deceleration)
-        return np.asarray(np.maximum(own - leader_speed * leader_speed / (2 * self.leader_deceleration), 0.0))
+        rt, reaction_speed = self.reaction_time, speed + self.reaction_time * self.acceleration
+        distance = speed * rt + self.acceleration * rt * rt / 2 + reaction_speed * reaction_speed / (2 * self.deceleration)
+        return np.asarray(np.maximum(distance - leader_speed * leader_speed / (2 * self.leader_deceleration), 0.0))

@@ -14,22 +14,22 @@ NotNegative = Annotated[float, Meta(ge=0, le=60)]
 Throttle = Annotated[float, Meta(ge=0, le=1)]
 Delay = Annotated[float, Meta(ge=0, le=5)]
 SPEED_LIMIT = 20 / KMH_PER_MS
-"""Above this speed the agent releases the throttle [m/s] (20 km/h in its source code)."""
+"""Speed above which the agent releases the throttle [m/s] (20 km/h in its source code)."""
 SPEED_LEVELS = (0.0, 8 / 3, 16 / 3)
 """Speeds between which the policy is interpolated, up to the speed limit [m/s] (four levels in 0..8 m/s in its source code)."""
-PASSED = -0.5
+PASSED_GAP = -0.5
 """Gap at which an obstacle is beside the vehicle rather than ahead [m]."""
 
 
 class _Memory(NamedTuple):
     """Whether the policy brakes; commands not yet carried out, newest last; delay lines.
 
-    `recognised` delays gap and lateral place, `brake_delay_line` the brake command.
+    `recognition_line` delays gap and lateral position, `brake_delay_line` the brake command.
     """
 
     brakes: BoolArray
-    under_way: tuple[Command, ...]
-    recognised: DelayLine
+    pending_commands: tuple[Command, ...]
+    recognition_line: DelayLine
     brake_delay_line: DelayLine
 
 
@@ -39,7 +39,7 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     Parameters
     ----------
     first_command
-        How long after the start of the run a standing vehicle first gets throttle [s].
+        Time from the start of the run to the first throttle of a standing vehicle [s].
     latency
         Time from an image to its command [s], rounded to whole steps.
     corridor
@@ -48,12 +48,12 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         The policy brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s] for an obstacle at `brake_place`.
     brake_place, brake_gap_before, brake_gap_past
         The braking gap shrinks by `brake_gap_before` for each metre that the obstacle is short of `brake_place`, and by `brake_gap_past`
-        for each metre past it [m, -, -]: the policy brakes later for obstacles that enter or leave its path. What remains of the gap is
-        multiplied by the visibility.
+        for each metre past it [m, -, -]: the policy brakes later for obstacles that enter or leave its path. The visibility
+        multiplies the remaining gap.
     throttle
         Throttle at the policy's speed levels 0, 2.7 and 5.3 m/s.
     recognition_delay
-        Additional time to recognise somebody, compared with clear weather [s].
+        Additional time to recognise an obstacle, compared with clear weather [s].
     hesitation
         Time between releasing the accelerator and braking, while the policy is not yet sure [s]. It releases the brake at once.
     """
@@ -76,24 +76,24 @@ class WorldOnRails(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
                        DelayLine.by(self.hesitation, step))
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        (gap, lateral), recognised = memory.recognised.delayed(np.array([seen.gap, seen.lateral]))
+        (gap, lateral), recognition_line = memory.recognition_line.delayed(np.array([seen.gap, seen.lateral]))
         brakes = self._brakes(seen, gap, lateral, memory.brakes)
         waits = (seen.speed == 0) & (seen.time < self.first_command)
         throttle = np.where(brakes | waits | (seen.speed > SPEED_LIMIT), 0.0, self._throttle(seen.speed))
-        command, *under_way = (*memory.under_way, Command(throttle, brakes.astype(float)))
+        command, *pending_commands = (*memory.pending_commands, Command(throttle, brakes.astype(float)))
         delayed_brake, brake_delay_line = memory.brake_delay_line.delayed(command.brake)
-        memory = _Memory(brakes, tuple(under_way), recognised, brake_delay_line)
+        memory = _Memory(brakes, tuple(pending_commands), recognition_line, brake_delay_line)
         return Command(command.throttle, np.minimum(command.brake, delayed_brake)), memory
 
     def _brakes(self, seen: Observation, gap: FloatArray, lateral: FloatArray, braked: BoolArray) -> BoolArray:
         """Whether to brake: the recognised obstacle is near and in the corridor. (The policy's brake probability exceeds one half.)"""
-        past = lateral - self.brake_place
-        aside = self.brake_gap_past * np.maximum(past, 0.0) + self.brake_gap_before * np.maximum(-past, 0.0)
-        near = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - aside)
+        offset = lateral - self.brake_place
+        reduction = self.brake_gap_past * np.maximum(offset, 0.0) + self.brake_gap_before * np.maximum(-offset, 0.0)
+        braking_gap = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - reduction)
         watched = np.abs(lateral) <= self.corridor
-        begins = watched & (gap <= near) & (gap > PASSED)
-        goes_on = watched & braked & (gap > 2 * PASSED)
-        brakes: BoolArray = begins | goes_on
+        starts_braking = watched & (gap <= braking_gap) & (gap > PASSED_GAP)
+        keeps_braking = watched & braked & (gap > 2 * PASSED_GAP)
+        brakes: BoolArray = starts_braking | keeps_braking
         return brakes
 
     def _throttle(self, speed: FloatArray) -> FloatArray:

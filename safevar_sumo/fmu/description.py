@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from safevar_sumo.errors import InputError, did_you_mean, in_one_line
-from safevar_sumo.fmu.units import BASES, USUAL, Unit
+from safevar_sumo.fmu.units import BASES, COMMON_UNITS, Unit
 
-CONVERTIBLE = ("Real", "Float64", "Float32")
+REAL_TYPES = ("Real", "Float64", "Float32")
 """Types of variables that have units."""
-NUMBERS = (*CONVERTIBLE, "Integer", "Boolean", "Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64", "Enumeration")
+NUMBER_TYPES = (*REAL_TYPES, "Integer", "Boolean", "Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64", "Enumeration")
 """Types of variables that hold numbers."""
-LEGAL = "an FMU of FMI 2.0 or 3.0 for co-simulation"
+SUPPORTED_FMU = "an FMU of FMI 2.0 or 3.0 for co-simulation"
 LONGEST_MEANING = 200
 """Longest description of a variable that becomes a characteristic's meaning [characters]."""
 MOST_LISTED = 12
@@ -28,7 +28,7 @@ MOST_LISTED = 12
 
 
 class Variable(NamedTuple):
-    """A variable; `unit` is None if its unit is not defined, `start`, `lower` and `upper` are None if not declared."""
+    """A variable; `unit` is None if the FMU does not define it; `start`, `lower` and `upper` are None if the FMU declares none."""
 
     name: str
     reference: int
@@ -44,16 +44,16 @@ class Variable(NamedTuple):
 
     @property
     def is_tunable(self) -> bool:
-        """Whether it is a real parameter with the original value and the domain that a characteristic needs."""
-        return self.causality == "parameter" and self.variability != "constant" and self.type in CONVERTIBLE and None not in (
+        """Whether this is a real parameter with the original value and the domain that a characteristic needs."""
+        return self.causality == "parameter" and self.variability != "constant" and self.type in REAL_TYPES and None not in (
             self.start, self.lower, self.upper) and self.lower < self.upper and self.start != 0  # type: ignore[operator]
 
 
 @dataclass(frozen=True)
 class Description:
-    """An FMU: its file, its digest, and what it declares.
+    """An FMU: its file, the digest of the file, and the declarations in it.
 
-    `step` is the step that it requires [s], None if any step will do; `single_instance` is true if a process may hold only one instance.
+    `step` is the step that the FMU requires [s], None if any step will do; with `single_instance` a process may hold only one instance.
     """
 
     path: str
@@ -66,7 +66,7 @@ class Description:
     units: Mapping[str, Unit] = field(compare=False, repr=False)
     variables: Mapping[str, Variable] = field(compare=False, repr=False)
 
-    def variable(self, name: str, causalities: Collection[str], source: str, key: str, types: Collection[str] = NUMBERS) -> Variable:
+    def variable(self, name: str, causalities: Collection[str], source: str, key: str, types: Collection[str] = NUMBER_TYPES) -> Variable:
         """A variable by name.
 
         Raises
@@ -74,63 +74,64 @@ class Description:
         InputError
             If the variable does not exist, or has another causality or type.
         """
-        fitting = [variable.name for variable in self.variables.values() if variable.causality in causalities and variable.type in types]
-        listed = ", ".join(fitting[:MOST_LISTED]) + ", ..." * (len(fitting) > MOST_LISTED)
-        legal = f"{_article(' or '.join(causalities))} of the FMU: {listed or 'it has none'}"
+        candidates = [variable.name for variable in self.variables.values() if variable.causality in causalities and variable.type in types]
+        listing = ", ".join(candidates[:MOST_LISTED]) + ", ..." * (len(candidates) > MOST_LISTED)
+        expected = f"{_article(' or '.join(causalities))} of the FMU: {listing or 'it has none'}"
         if name not in self.variables:
-            raise InputError(source, f"{key} = {name!r}: {Path(self.path).name} has no such variable{did_you_mean(name, fitting)}", legal)
+            problem = f"{Path(self.path).name} has no such variable{did_you_mean(name, candidates)}"
+            raise InputError(source, f"{key} = {name!r}: {problem}", expected)
         variable = self.variables[name]
         if variable.causality not in causalities:
-            raise InputError(source, f"{key} = {name!r}: that variable is {_article(variable.causality)}", legal)
+            raise InputError(source, f"{key} = {name!r}: that variable is {_article(variable.causality)}", expected)
         if variable.type not in types:
-            raise InputError(source, f"{key} = {name!r}: that variable is of type {variable.type}", f"one of type {', '.join(types)}")
+            raise InputError(source, f"{key} = {name!r}: that variable is of type {variable.type}", f"a type among {', '.join(types)}")
         return variable
 
     def rows(self, fixed: Collection[str]) -> dict[str, dict[str, Any]]:
-        """Rows of the characteristics' table for all tunable parameters that are not in `fixed`."""
+        """Rows of the characteristics' table for all tunable parameters whose names are not in `fixed`."""
         return {name: self.row(name) for name, variable in self.variables.items() if variable.is_tunable and name not in fixed}
 
     def row(self, name: str, unit: str = "") -> dict[str, Any]:
-        """The characteristic that a parameter declares, in its own unit or in another one; empty if it is no parameter."""
+        """The table row that a parameter declares, converted to `unit` if a unit is given; empty if the variable is no parameter."""
         variable = self.variables.get(name)
         if variable is None or variable.causality != "parameter":
             return {}
         row = {"unit": variable.unit_name or "-", "original": variable.start, "lower": variable.lower, "upper": variable.upper,
                "meaning": variable.meaning if len(variable.meaning) <= LONGEST_MEANING else ""}
-        declared, wanted = variable.unit, self.units.get(unit) or USUAL.get(unit)
+        declared_unit, row_unit = variable.unit, self.units.get(unit) or COMMON_UNITS.get(unit)
         if unit and unit != row["unit"] and variable.unit_name:
-            if declared is None or wanted is None or not declared.fits(wanted):
-                return {}  # the user of the unit refuses it
-            row |= {key: declared.to(wanted, row[key]) for key in ("original", "lower", "upper") if row[key] is not None}
+            if declared_unit is None or row_unit is None or not declared_unit.fits(row_unit):
+                return {}  # the vehicle model refuses the unit later
+            row |= {key: declared_unit.to(row_unit, row[key]) for key in ("original", "lower", "upper") if row[key] is not None}
         return {key: value for key, value in row.items() if value not in (None, "")}
 
-    def converted(self, variable: Variable, unit: Unit, unit_name: str, source: str, key: str) -> Unit:
-        """The unit of a variable that is to hold a quantity given in `unit`; `unit` itself if the variable has none.
+    def unit_for(self, variable: Variable, unit: Unit, unit_name: str, source: str, key: str) -> Unit:
+        """The unit of a variable that is to hold a quantity given in `unit`; `unit` itself if the variable declares no unit.
 
         Raises
         ------
         InputError
-            If its unit measures another kind of quantity or is not defined.
+            If the unit of the variable measures another kind of quantity or is not defined.
         """
-        if variable.type not in CONVERTIBLE or not variable.unit_name:
+        if variable.type not in REAL_TYPES or not variable.unit_name:
             return unit
         if variable.unit is None:
             raise InputError(source, f"{key} = {variable.name!r}: its unit {variable.unit_name!r} has no BaseUnit in the UnitDefinitions",
-                             f"a unit that says how much of {unit_name} it is")
+                             f"a unit with a BaseUnit of the same kind as {unit_name}")
         if not variable.unit.fits(unit):
             raise InputError(source, f"{key} = {variable.name!r}: its unit is {variable.unit_name!r}", f"a unit of {unit_name}")
         return variable.unit
 
 
-def file_of(model: str, places: Sequence[str]) -> str:
+def file_of(model: str, folders: Sequence[str]) -> str:
     """The path of the FMU that a study names: relative to the folders of the study's files, else to the working directory."""
     try:
-        return next((os.path.abspath(path) for place in (places or (os.getcwd(),)) if (path := Path(place, model)).is_file()), "")
+        return next((os.path.abspath(path) for folder in (folders or (os.getcwd(),)) if (path := Path(folder, model)).is_file()), "")
     except (OSError, ValueError):  # not a valid path
         return ""
 
 
-def description_of(model: str, places: Sequence[str], source: str, key: str) -> Description:
+def description_of(model: str, folders: Sequence[str], source: str, key: str) -> Description:
     """The description of the FMU that a study names.
 
     Raises
@@ -139,11 +140,11 @@ def description_of(model: str, places: Sequence[str], source: str, key: str) -> 
         If there is no such file, it is not an FMU, its version or kind is not supported, it has no binary for this machine, or FMPy
         is not installed.
     """
-    path = file_of(model, places)
+    path = file_of(model, folders)
     if not path:
-        where = places[0] if places else os.getcwd()
-        problem = "is a directory" if os.path.isdir(os.path.join(where, model)) else f"there is no such file in {where}"
-        raise InputError(source, f"{key} = {model!r}: {problem}", LEGAL)
+        folder = folders[0] if folders else os.getcwd()
+        problem = "is a directory" if os.path.isdir(os.path.join(folder, model)) else f"there is no such file in {folder}"
+        raise InputError(source, f"{key} = {model!r}: {problem}", SUPPORTED_FMU)
     status = os.stat(path)
     try:
         return _read(path, status.st_mtime_ns, status.st_size, status.st_ino)
@@ -163,23 +164,23 @@ def _read(path: str, *_: int) -> Description:
             files = set(archive.namelist())
             version = ElementTree.fromstring(archive.read("modelDescription.xml")).get("fmiVersion", "")
     except Exception as error:  # any error in a user's file
-        raise InputError("fmu", f"is no FMU that can be read: {in_one_line(error)}", LEGAL) from None
+        raise InputError("fmu", f"cannot be read as an FMU: {in_one_line(error)}", SUPPORTED_FMU) from None
     if not version.startswith(("2.", "3.")):
-        raise InputError("fmu", f"is of FMI {version}", LEGAL)
+        raise InputError("fmu", f"is of FMI {version}", SUPPORTED_FMU)
     try:
         model = read_model_description(path, validate=False)
     except Exception as error:  # any error of FMPy about a user's file
-        raise InputError("fmu", f"is no FMU that can be read: {in_one_line(error)}", LEGAL) from None
+        raise InputError("fmu", f"cannot be read as an FMU: {in_one_line(error)}", SUPPORTED_FMU) from None
     simulation = model.coSimulation
     if simulation is None:
         kind = "model exchange" if model.modelExchange is not None else "scheduled execution"
-        raise InputError("fmu", f"is for {kind} only, without a solver of its own", LEGAL)
+        raise InputError("fmu", f"is for {kind} only, without a solver of its own", SUPPORTED_FMU)
     folder = platform_tuple if model.fmiVersion.startswith("3") else platform
     if f"binaries/{folder}/{simulation.modelIdentifier}{sharedLibraryExtension}" not in files:
         platforms = sorted({name.split("/")[1] for name in files
                             if name.startswith("binaries/") and name.count("/") > 1 and name[-1] != "/"})
-        raise InputError("fmu", f"has no binary for this machine ({folder}), but {', '.join(platforms) or 'none at all'}",
-                         f"binaries/{folder}")
+        others = f"only for {', '.join(platforms)}" if platforms else "nor for any other"
+        raise InputError("fmu", f"has no binary for this machine ({folder}), {others}", f"binaries/{folder}")
     units = {unit.name: Unit(tuple(int(getattr(unit.baseUnit, base)) for base in BASES), float(unit.baseUnit.factor),
                              float(unit.baseUnit.offset)) for unit in model.unitDefinitions if unit.baseUnit is not None}
     return Description(
@@ -189,24 +190,24 @@ def _read(path: str, *_: int) -> Description:
 
 
 def _step(model: Any) -> float | None:
-    """The step that an FMU requires [s]: its internal step, or its default step if it cannot change the step."""
-    simulation, usual = model.coSimulation, getattr(model.defaultExperiment, "stepSize", None)
-    fixed = simulation.fixedInternalStepSize or (None if simulation.canHandleVariableCommunicationStepSize else usual)
-    return float(fixed) if fixed and float(fixed) > 0 else None
+    """The step that an FMU requires [s]: its internal step, or its default step if its step cannot change; None if any step will do."""
+    simulation, default_step = model.coSimulation, getattr(model.defaultExperiment, "stepSize", None)
+    step = simulation.fixedInternalStepSize or (None if simulation.canHandleVariableCommunicationStepSize else default_step)
+    return float(step) if step and float(step) > 0 else None
 
 
 def _variable(variable: Any, units: Mapping[str, Unit]) -> Variable:
-    def declared(name: str) -> Any:
-        own = getattr(variable, name, None)
-        return getattr(variable.declaredType, name, None) if own is None else own
+    def attribute(name: str) -> Any:
+        value = getattr(variable, name, None)
+        return getattr(variable.declaredType, name, None) if value is None else value
 
-    unit_name, start = declared("unit") or "", variable.start
-    unit = units.get(unit_name) or USUAL.get(unit_name)
-    if unit is not None and declared("relativeQuantity"):
+    unit_name, start = attribute("unit") or "", variable.start
+    unit = units.get(unit_name) or COMMON_UNITS.get(unit_name)
+    if unit is not None and attribute("relativeQuantity"):
         unit = unit._replace(offset=0.0)
-    variability = variable.variability or ("continuous" if variable.type in CONVERTIBLE else "discrete")
+    variability = variable.variability or ("continuous" if variable.type in REAL_TYPES else "discrete")
     return Variable(variable.name, variable.valueReference, variable.type, variable.causality or "local", variability, unit_name, unit,
-                    _number(start) if variable.type in CONVERTIBLE else start, _number(declared("min")), _number(declared("max")),
+                    _number(start) if variable.type in REAL_TYPES else start, _number(attribute("min")), _number(attribute("max")),
                     " ".join((variable.description or "").split()))
 
 

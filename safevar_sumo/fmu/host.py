@@ -1,6 +1,7 @@
 """The program that runs an FMU in a separate process, where a crash or a hang does no harm; it answers over its standard streams.
 
-It is started by its path and imports nothing of this package. Requests and answers are pickled tuples: a name and arguments.
+The parent process starts the program by its path; it imports nothing of this package. A request is a pickled tuple of a name and
+arguments; an answer is a pickled tuple of a status and a value.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ import numpy as np
 
 CHECK_INTERVAL = 0.1
 """Time between two checks for requests that take too long [s]."""
-GROUPS = {"Real": "Real", "Integer": "Integer", "Enumeration": "Integer", "Boolean": "Boolean", "String": "String"}
-"""Names of FMI 2.0's functions by the type of a variable; FMI 3.0's are named after the types, except for enumerations."""
+FUNCTION_NAMES = {"Real": "Real", "Integer": "Integer", "Enumeration": "Integer", "Boolean": "Boolean", "String": "String"}
+"""Ends of the names of FMI 2.0 functions by the type of a variable; FMI 3.0 uses the names of the types, except for enumerations."""
 
 
-class Setting(NamedTuple):
-    """Facts that all instances of an FMU share, the arguments of the first request.
+class HostSetup(NamedTuple):
+    """Facts that all instances of an FMU share; the arguments of the first request.
 
-    `path` and `digest` are those of the FMU's file; `inputs`, `parameters` and `outputs` are types and value references; `limit` is the
+    `path` and `digest` identify the FMU's file; `inputs`, `parameters` and `outputs` are types and value references; `limit` is the
     longest time that one instance may take for a request [s].
     """
 
@@ -52,53 +53,53 @@ class InstanceFailure(Exception):
 
 
 class HostedInstances:
-    """All instances in this process, by numbers that the requests give them."""
+    """All instances in this process, by the numbers that requests give them."""
 
-    def __init__(self, setting: Setting, folder: str) -> None:
+    def __init__(self, setup: HostSetup, folder: str) -> None:
         from fmpy.fmi2 import FMU2Slave
         from fmpy.fmi3 import FMU3Slave
 
-        self._is_3 = setting.version.startswith("3")
-        self._logged, self._setting = list[str](), setting
-        arguments = {"guid": setting.token, "unzipDirectory": folder, "modelIdentifier": setting.identifier}
-        self._library = (FMU3Slave if self._is_3 else FMU2Slave)(instanceName=setting.identifier, **arguments)
-        self._callbacks = None if self._is_3 else self._callbacks_2()
+        self._is_3 = setup.version.startswith("3")
+        self._messages, self._setup = list[str](), setup
+        arguments = {"guid": setup.token, "unzipDirectory": folder, "modelIdentifier": setup.identifier}
+        self._library = (FMU3Slave if self._is_3 else FMU2Slave)(instanceName=setup.identifier, **arguments)
+        self._callbacks = None if self._is_3 else self._callbacks_of_fmi_2()
         self._instances: dict[int, Any] = {}
-        self._inputs, self._parameters, self._outputs = map(self._grouped, (setting.inputs, setting.parameters, setting.outputs))
-        self.busy: tuple[float, int, str] | None = None
-        """Start time [s], place and activity of the request in progress."""
+        self._inputs, self._parameters, self._outputs = map(self._groups_of, (setup.inputs, setup.parameters, setup.outputs))
+        self.activity: tuple[float, int, str] | None = None
+        """The activity in progress: start time [s], position of the instance in the request, and description."""
 
     def start(self, numbers: list[int], parameters: list[list[Any]], inputs: list[list[float]]) -> np.ndarray:
-        """Initialise instances, new or reset; returns the outputs, shape (N, m)."""
-        return self._each(numbers, "is initialised", lambda place, instance: self._start(instance, parameters[place], inputs[place]))
+        """Initialise N instances, new or reset; returns their m outputs, shape (N, m)."""
+        return self._on_each_instance(numbers, "is initialised", lambda i, instance: self._start(instance, parameters[i], inputs[i]))
 
     def step(self, numbers: list[int], times: list[tuple[float, float]], inputs: list[list[float]], kept_steps: int) -> np.ndarray:
-        """Advance instances by some steps with constant inputs; returns outputs after the last `kept_steps`, shape (N, kept_steps, m)."""
-        def advance(place: int, instance: Any) -> list[list[float]]:
-            self._set(instance, self._inputs, inputs[place])
+        """Advance N instances by steps with constant inputs; returns m outputs after the last `kept_steps`, shape (N, kept_steps, m)."""
+        def advance(position: int, instance: Any) -> list[list[float]]:
+            self._set(instance, self._inputs, inputs[position])
             outputs = []
-            for number, (time_, step) in enumerate(times, 1):
+            for count, (time_, step) in enumerate(times, 1):
                 self._step(instance, time_, step)
-                if number > len(times) - kept_steps:
+                if count > len(times) - kept_steps:
                     outputs.append(self._read_outputs(instance))
             return outputs
 
-        return self._each(numbers, f"is at {times[0][0]:g} s", advance)
+        return self._on_each_instance(numbers, f"is at {times[0][0]:g} s", advance)
 
-    def _each(self, numbers: list[int], doing: str, work: Callable[[int, Any], Any]) -> np.ndarray:
+    def _on_each_instance(self, numbers: list[int], description: str, work: Callable[[int, Any], Any]) -> np.ndarray:
         results = []
-        for place, number in enumerate(numbers):
-            self.busy = (time.monotonic(), place, doing)
+        for position, number in enumerate(numbers):
+            self.activity = (time.monotonic(), position, description)
             try:
                 instance = self._instances.get(number)
                 if instance is None:
                     instance = self._instances[number] = self._new_instance()
-                results.append(work(place, instance))
+                results.append(work(position, instance))
             except Exception as error:  # any error of FMPy about an FMU
                 self._drop(number)
-                raise InstanceFailure(f"{self._reason(error)} while it {doing}") from error
+                raise InstanceFailure(f"{self._reason(error)} while it {description}") from error
             finally:
-                self.busy = None
+                self.activity = None
         return np.array(results, dtype=float)
 
     def _new_instance(self) -> Any:
@@ -129,33 +130,33 @@ class HostedInstances:
         result = instance.doStep(time_, step)
         if not self._is_3:
             return
-        _, terminated, early, reached = result
-        if terminated:
+        _, termination, early_return, end_time = result
+        if termination:
             raise InstanceFailure("it requests the end of the simulation")
-        if early:
-            raise InstanceFailure(f"it returned early, at {reached:g} s")
+        if early_return:
+            raise InstanceFailure(f"it returned early, at {end_time:g} s")
 
     def _set(self, instance: Any, groups: list[tuple[str, list[int], list[int]]], values: list[Any]) -> None:
         for kind, references, columns in groups:
-            chosen = [values[column] for column in columns]
+            group_values = [values[column] for column in columns]
             if kind == "Boolean":
-                chosen = [bool(value) for value in chosen]
+                group_values = [bool(value) for value in group_values]
             elif kind not in ("Real", "Float64", "Float32", "String"):
-                chosen = [round(value) for value in chosen]
-            getattr(instance, f"set{kind}")(references, chosen)
+                group_values = [round(value) for value in group_values]
+            getattr(instance, f"set{kind}")(references, group_values)
 
     def _read_outputs(self, instance: Any) -> list[float]:
-        outputs = [0.0] * len(self._setting.outputs)
+        outputs = [0.0] * len(self._setup.outputs)
         for kind, references, columns in self._outputs:
             for column, value in zip(columns, getattr(instance, f"get{kind}")(references), strict=True):
                 outputs[column] = float(value)
         return outputs
 
-    def _grouped(self, ports: tuple[tuple[str, int], ...]) -> list[tuple[str, list[int], list[int]]]:
+    def _groups_of(self, ports: tuple[tuple[str, int], ...]) -> list[tuple[str, list[int], list[int]]]:
         """Value references and columns, grouped by the FMI function that sets or gets them."""
         groups: dict[str, tuple[list[int], list[int]]] = {}
         for column, (kind, reference) in enumerate(ports):
-            name = ("Int64" if kind == "Enumeration" else kind) if self._is_3 else GROUPS[kind]
+            name = ("Int64" if kind == "Enumeration" else kind) if self._is_3 else FUNCTION_NAMES[kind]
             references, columns = groups.setdefault(name, ([], []))
             references.append(reference)
             columns.append(column)
@@ -165,7 +166,7 @@ class HostedInstances:
         """Forget an instance that failed: any further call, even freeing it, is undefined."""
         self._instances.pop(number, None)
 
-    def _callbacks_2(self) -> Any:
+    def _callbacks_of_fmi_2(self) -> Any:
         from fmpy.fmi2 import defaultCallbacks, fmi2CallbackFunctions, fmi2CallbackLoggerTYPE
         from fmpy.logging import addLoggerProxy
 
@@ -177,20 +178,20 @@ class HostedInstances:
 
     def _note(self, status: int, message: bytes | None) -> None:
         if status > 1 and message:  # worse than a warning
-            self._logged[:] = [*self._logged[-1:], " ".join(message.decode(errors="replace").split())]
+            self._messages[:] = [*self._messages[-1:], " ".join(message.decode(errors="replace").split())]
 
     def _reason(self, error: Exception) -> str:
-        logged, self._logged[:] = list(self._logged), []
+        messages, self._messages[:] = list(self._messages), []
         lines = str(error).strip().splitlines()
         text = lines[0].rstrip(".") if lines else type(error).__name__
-        return f"{text}: {logged[-1]}" if logged else text
+        return f"{text}: {messages[-1]}" if messages else text
 
 
-def unpack(setting: Setting) -> str:
-    """Unpack the FMU into a new folder."""
-    content = Path(setting.path).read_bytes()
-    if sha256(content).hexdigest() != setting.digest:
-        raise InstanceFailure("its file was changed meanwhile")
+def unpack(setup: HostSetup) -> str:
+    """Unpack the FMU into a new folder; returns its path."""
+    content = Path(setup.path).read_bytes()
+    if sha256(content).hexdigest() != setup.digest:
+        raise InstanceFailure("its file has changed since the study was read")
     folder = mkdtemp(prefix="safevar_sumo_fmu_")
     with ZipFile(BytesIO(content)) as archive:
         archive.extractall(folder)
@@ -201,15 +202,15 @@ def watch(instances: HostedInstances, limit: float, folder: str, parent: int, an
     """End the process when an instance takes too long, or when the parent process has ended."""
     while os.getppid() == parent:
         time.sleep(CHECK_INTERVAL)
-        busy = instances.busy
-        if busy is not None and time.monotonic() - busy[0] > limit:
-            send(answers, ("hangs", f"takes longer than {limit:g} s while it {busy[2]}"))
+        activity = instances.activity
+        if activity is not None and time.monotonic() - activity[0] > limit:
+            send(answers, ("hangs", f"takes longer than {limit:g} s while it {activity[2]}"))
             break
     end(folder)
 
 
 def end(folder: str) -> NoReturn:
-    """End at once, without running the code of an FMU that unloading its library would run."""
+    """End at once: to unload the library could run code of the FMU."""
     shutil.rmtree(folder, ignore_errors=True)
     os._exit(1)
 
@@ -235,11 +236,11 @@ def main() -> None:
             end(folder)
         try:
             if instances is None:
-                setting = Setting(*arguments)
-                folder = unpack(setting)
+                setup = HostSetup(*arguments)
+                folder = unpack(setup)
                 send(answers, ("done", folder))
-                instances = HostedInstances(setting, folder)
-                threading.Thread(target=watch, args=(instances, setting.limit, folder, parent, answers), daemon=True).start()
+                instances = HostedInstances(setup, folder)
+                threading.Thread(target=watch, args=(instances, setup.limit, folder, parent, answers), daemon=True).start()
                 send(answers, ("done", None))
             else:
                 send(answers, ("done", getattr(instances, name)(*arguments)))

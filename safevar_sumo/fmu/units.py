@@ -1,4 +1,4 @@
-"""Units: as a model description defines them, by factor and offset to SI base units, or by their usual names."""
+"""Units of quantities: by factor and offset to SI base units, as a model description defines them, or by their common names."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ BASES = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
 
 class Unit(NamedTuple):
-    """A unit: value in SI = `factor` * value + `offset`; `exponents` are those of `BASES`."""
+    """A unit: value in SI = `factor` * value + `offset`; `exponents` belong to the units `BASES`."""
 
     exponents: tuple[int, ...]
     factor: float = 1.0
@@ -37,7 +37,7 @@ SI: Mapping[str, Unit] = {
 """Units of the quantities that vehicles and driving systems exchange."""
 _FORCE, _TORQUE = {"kg": 1, "m": 1, "s": -2}, {"kg": 1, "m": 2, "s": -2}
 _POWER, _PRESSURE = {"kg": 1, "m": 2, "s": -3}, {"kg": 1, "m": -1, "s": -2}
-USUAL: Mapping[str, Unit] = {
+COMMON_UNITS: Mapping[str, Unit] = {
     **SI, "": _unit(), "1": _unit(), "%": _unit(0.01), "rad": _unit(rad=1), "deg": _unit(math.pi / 180, rad=1),
     "ms": _unit(1e-3, s=1), "min": _unit(60.0, s=1), "h": _unit(3600.0, s=1), "1/s": _unit(s=-1), "Hz": _unit(s=-1),
     "mm": _unit(1e-3, m=1), "cm": _unit(1e-2, m=1), "km": _unit(1e3, m=1), "m2": _unit(m=2), "m^2": _unit(m=2),
@@ -47,4 +47,4 @@ USUAL: Mapping[str, Unit] = {
     "N": _unit(**_FORCE), "kN": _unit(1e3, **_FORCE), "N.m": _unit(**_TORQUE), "Nm": _unit(**_TORQUE), "J": _unit(**_TORQUE),
     "W": _unit(**_POWER), "kW": _unit(1e3, **_POWER), "Pa": _unit(**_PRESSURE), "kPa": _unit(1e3, **_PRESSURE),
     "bar": _unit(1e5, **_PRESSURE), "K": _unit(K=1), "degC": _unit(1.0, 273.15, K=1)}
-"""Units by their usual names, for models whose description does not define them."""
+"""Units by their common names, for models whose description does not define them."""

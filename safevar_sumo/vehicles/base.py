@@ -35,9 +35,9 @@ Characteristics = Mapping[str, FloatArray]
 
 
 class SumoType(NamedTuple):
-    """The attributes of N SUMO vehicle types, each of shape (N,): kg, m/s^2, m/s^2, m/s, s.
+    """The attributes of N SUMO vehicle types, each of shape (N,), in kg, m/s^2, m/s^2, m/s and s.
 
-    `tau` is SUMO's desired headway; vehicles set their actuator lag there. SUMO's models do not drive the vehicle, so nothing acts on it.
+    `tau`, SUMO's desired headway, holds the actuator lag. It has no effect in SUMO, whose driver models do not drive the vehicle.
     """
 
     mass: FloatArray
@@ -48,7 +48,7 @@ class SumoType(NamedTuple):
 
 
 class VehicleState(Protocol):
-    """The columns of every model's state, each of shape (N,): m/s, -, -, -."""
+    """The columns that every model's state has, each of shape (N,): speed [m/s]; throttle, brake and gear [-]."""
 
     @property
     def speed(self) -> FloatArray: ...
@@ -63,9 +63,9 @@ class VehicleState(Protocol):
 class Vehicle(Protocol):
     """A vehicle model. Its fields are the parameters of `vehicle.parameters`.
 
-    Every method is a pure function over arrays of N vehicles: element i of a result depends on
-    element i of the arguments alone, to the bit. So methods use only + - * / and square roots,
-    comparisons, minima and maxima: those are exact on every machine and for every N.
+    Every method is a pure function over arrays of N vehicles: element i of a result depends only on
+    element i of the arguments, bit for bit. So methods use only + - * / and square roots, comparisons,
+    minima and maxima: these operations give the same bits on every machine and for every N.
 
     Optional: `hold_gear(prepared, state, holds)` returns the state in which the vehicles where `holds`, shape (N,), is true do not change
     gear (the driving robot of tests at a speed needs it); `FITTED_UP_TO` is the highest speed at which its parameters were identified
@@ -78,8 +78,8 @@ class Vehicle(Protocol):
                 wet: bool | BoolArray = False) -> Any:
         """Constants of a run with a time step of `step` seconds.
 
-        `road_friction` is the weather's factor on the tyres' friction; `wet` is for vehicles on which water acts beyond that factor.
-        A method without `slope` is for level roads only; a method without `wet` ignores it.
+        `road_friction` is the weather's factor on the tyres' friction; `wet` is for models in which water has further effects.
+        A model whose `prepare` lacks `slope` drives on level roads only; a `prepare` that lacks `wet` is called without `wet`.
         """
 
     def sumo_type(self, prepared: Any) -> SumoType:
@@ -99,10 +99,10 @@ class Vehicle(Protocol):
 
 
 def at_start(vehicle: Vehicle, prepared: Any, speed: FloatArray) -> Any:
-    """The initial state at a speed [m/s], shape (N,): at rest, or steady."""
-    own = getattr(vehicle, "at_start", None)
-    if own is not None:
-        return own(prepared, speed)
+    """The initial state at a speed [m/s], shape (N,): at rest if the speed is 0, else the steady state."""
+    method = getattr(vehicle, "at_start", None)
+    if method is not None:
+        return method(prepared, speed)
     rest = vehicle.at_rest(prepared)
     rolls = speed > 0
     if not rolls.any():
@@ -112,9 +112,9 @@ def at_start(vehicle: Vehicle, prepared: Any, speed: FloatArray) -> Any:
 
 
 def _selected(rolls: BoolArray, steady: Any, rest: Any) -> Any:
-    """`steady` for vehicles where `rolls` is true, `rest` for the others; a state may consist of states."""
+    """The state `steady` for vehicles where `rolls` is true, and `rest` for the others; a state may consist of states."""
     if isinstance(steady, tuple):
-        parts = [_selected(rolls, *pair) for pair in zip(steady, rest, strict=True)]
+        parts = [_selected(rolls, *columns) for columns in zip(steady, rest, strict=True)]
         return type(steady)(*parts) if hasattr(steady, "_fields") else tuple(parts)
     return steady if steady is None else np.where(rolls, steady, rest)
 
@@ -122,40 +122,40 @@ def _selected(rolls: BoolArray, steady: Any, rest: Any) -> Any:
 VEHICLE_CONTRACT = Contract.of(Vehicle, "a vehicle", optional=("at_speed",))
 FASTEST = 1000.0
 """Highest speed of a vehicle [m/s]; beyond it a model has diverged."""
-ROUNDING = 1e-9
+ROUNDING = 1e-9  # relative tolerance of speeds
 PROBE_STEP = 0.1  # s
 _BOUNDS = {"speed": (0.0, FASTEST), "throttle": (0.0, 1.0), "brake": (0.0, 1.0)}
-_INFINITE = ("gap", "lateral")
+_DISTANCES = ("gap", "lateral")
 """Quantities that are infinite while no obstacle is detected."""
 
 
 class _Prepared(NamedTuple):
-    """The model's own constants `inner`, and the SUMO types checked."""
+    """The model's own constants, and its SUMO types after the check."""
 
     n: int
-    inner: Any
+    constants: Any
     types: SumoType
 
 
 class _State(NamedTuple):
-    """The checked columns of a model's state, and the model's own state `inner`."""
+    """The columns of a model's state after the check, and the model's own state."""
 
     speed: FloatArray
     throttle: FloatArray
     brake: FloatArray
     gear: FloatArray
-    inner: Any
+    model_state: Any
 
 
 class GuardedVehicle:
-    """A model from outside: it gets read-only copies, and its results are checked."""
+    """Guards a user's own model: passes read-only copies to it, and checks its results."""
 
     UNITS: Mapping[str, str]
 
     def __init__(self, vehicle: Any, guard: Guard) -> None:
         self.model, self._guard = vehicle, guard
         units = guard.field("__init__", vehicle, "UNITS")
-        if not isinstance(units, Mapping) or not all(isinstance(text, str) for pair in units.items() for text in pair):
+        if not isinstance(units, Mapping) or not all(isinstance(text, str) for item in units.items() for text in item):
             raise guard.wrong("__init__", "UNITS", units, "a mapping from names of characteristics to their units")
         self.UNITS = dict(units)
         self.takes_slope = accepts(vehicle.prepare, 4)
@@ -166,15 +166,15 @@ class GuardedVehicle:
         n, method = len(next(iter(characteristics.values()))), self.model.prepare
         if slope is not LEVEL and not self.takes_slope:
             problem = f"{self._guard.name} has no slope in prepare(characteristics, road_friction, step, slope), and the road has a grade"
-            raise ForeignError(self._guard.source, problem, "a vehicle with it, or scenarios with grade 0")
+            raise ForeignError(self._guard.source, problem, "a vehicle with the argument slope, or scenarios with grade 0")
         arguments: tuple[Any, ...] = (read_only_copy(characteristics), road_friction, step)
         if np.any(wet) and accepts(method, 5):
             arguments = (*arguments, read_only_copy(slope), read_only_copy(wet))
         elif slope is not LEVEL:
             arguments = (*arguments, read_only_copy(slope))
-        inner = self._guard.call("prepare", method, *arguments)
-        types = self._guard.call("sumo_type", self.model.sumo_type, inner)
-        return _Prepared(n, inner, SumoType(*(
+        constants = self._guard.call("prepare", method, *arguments)
+        types = self._guard.call("sumo_type", self.model.sumo_type, constants)
+        return _Prepared(n, constants, SumoType(*(
             self._guard.numbers("sumo_type", name, self._guard.field("sumo_type", types, name), (n,), 0.0, above=True)
             for name in SumoType._fields)))
 
@@ -182,33 +182,33 @@ class GuardedVehicle:
         return prepared.types
 
     def at_rest(self, prepared: _Prepared) -> _State:
-        state = self._state("at_rest", prepared.n, self._guard.call("at_rest", self.model.at_rest, prepared.inner))
+        state = self._state("at_rest", prepared.n, self._guard.call("at_rest", self.model.at_rest, prepared.constants))
         self._guard.numbers("at_rest", "speed", state.speed, (prepared.n,), 0.0, 0.0)
         return state
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> _State:
         if not self.can_start_moving:
             problem = f"{self._guard.name} has no method at_speed(prepared, speed), and the traffic puts it onto the road in motion"
-            raise ForeignError(self._guard.source, problem, "a vehicle with it, or traffic that departs with speed 0")
-        state = self._guard.call("at_speed", self.model.at_speed, prepared.inner, read_only_copy(speed))
+            raise ForeignError(self._guard.source, problem, "a vehicle with that method, or traffic that departs with speed 0")
+        state = self._guard.call("at_speed", self.model.at_speed, prepared.constants, read_only_copy(speed))
         return self._state("at_speed", prepared.n, state)
 
     def hold_gear(self, prepared: _Prepared, state: _State, holds: BoolArray) -> _State:
         if not hasattr(self.model, "hold_gear"):
             return state
-        return self._state("hold_gear", prepared.n,
-                           self._guard.call("hold_gear", self.model.hold_gear, prepared.inner, state.inner, read_only_copy(holds)))
+        held = self._guard.call("hold_gear", self.model.hold_gear, prepared.constants, state.model_state, read_only_copy(holds))
+        return self._state("hold_gear", prepared.n, held)
 
     def sensors(self, prepared: _Prepared) -> Sensors | None:
         """The model's sensors; None for a model without that method."""
         if not hasattr(self.model, "sensors"):
             return None
-        inner = self._guard.call("sensors", self.model.sensors, prepared.inner)
-        return Sensors(*(self._guard.numbers("sensors", name, self._guard.field("sensors", inner, name), (prepared.n,), 0.0,
+        sensors = self._guard.call("sensors", self.model.sensors, prepared.constants)
+        return Sensors(*(self._guard.numbers("sensors", name, self._guard.field("sensors", sensors, name), (prepared.n,), 0.0,
                                              above=name == "scale", infinite=name == "reach") for name in Sensors._fields))
 
     def refuse_unknown_sensors(self, characteristics: Characteristics) -> None:
-        """Refuse a model whose `sense` changes observations but that has no method `sensors`: a TraCI controller bypasses `sense`."""
+        """Refuse a model that changes observations in `sense` but has no method `sensors`: a TraCI controller bypasses `sense`."""
         if hasattr(self.model, "sensors"):
             return
         prepared = self.prepare(characteristics, 1.0, PROBE_STEP)
@@ -224,23 +224,23 @@ class GuardedVehicle:
                                        "latency, reach, scale); or an ADS that gets the sensed values, without ads.kind = \"traci\"")
 
     def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
-        result = self._guard.call("sense", self.model.sense, prepared.inner, state.inner, read_only_copy(seen))
-        sensed, after = self._guard.parts("sense", result, "(Observation, state)")
+        result = self._guard.call("sense", self.model.sense, prepared.constants, state.model_state, read_only_copy(seen))
+        sensed, next_state = self._guard.parts("sense", result, "(Observation, state)")
         values: dict[str, Any] = {}
         for name, value in seen._asdict().items():
             shape = (prepared.n,) if hasattr(value, "shape") else ()
-            numbers = self._guard.numbers("sense", name, self._guard.field("sense", sensed, name), shape, infinite=name in _INFINITE)
+            numbers = self._guard.numbers("sense", name, self._guard.field("sense", sensed, name), shape, infinite=name in _DISTANCES)
             values[name] = numbers if shape else float(numbers)
-        return Observation(**values), self._state("sense", prepared.n, after)
+        return Observation(**values), self._state("sense", prepared.n, next_state)
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
-        result = self._guard.call("advance", self.model.advance, prepared.inner, state.inner, read_only_copy(command))
+        result = self._guard.call("advance", self.model.advance, prepared.constants, state.model_state, read_only_copy(command))
         state, max_speed = self._state("advance", prepared.n, result), prepared.types.max_speed
         for i in np.flatnonzero(state.speed > max_speed * (1 + ROUNDING))[:1]:  # SUMO itself accepts any speed
             raise self._guard.wrong("advance", "speed", float(state.speed[i]), f"up to max_speed = {max_speed[i]:g} of its sumo_type")
         return state
 
-    def _state(self, method: str, n: int, inner: Any) -> _State:
-        columns = {name: self._guard.numbers(method, name, self._guard.field(method, inner, name), (n,), *_BOUNDS.get(name, ()))
+    def _state(self, method: str, n: int, model_state: Any) -> _State:
+        columns = {name: self._guard.numbers(method, name, self._guard.field(method, model_state, name), (n,), *_BOUNDS.get(name, ()))
                 for name in _State._fields[:-1]}
-        return _State(**columns, inner=inner)
+        return _State(**columns, model_state=model_state)

@@ -12,16 +12,16 @@ from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
 STEP = 0.1  # s
 SPEEDS = np.arange(0.0, 20.5, 0.5)  # m/s, of the tables
-LONGEST = 60.0  # s, longest drive
+LONGEST_DRIVE = 60.0  # s
 LIGHT_BRAKE = 0.1  # pedal position while braking, far from the limit of the tyres
 
 
 def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> Nominal:
-    """The original vehicle on a dry road; its tables are simulated when first needed."""
+    """The original vehicle on a dry road; the first use of its tables simulates them."""
     types = vehicle.sumo_type(vehicle.prepare(_original(characteristics), 1.0, STEP))
-    tables = cache(partial(_simulated_tables, vehicle, characteristics))  # type: ignore[arg-type]
+    simulate_tables = cache(partial(_simulated_tables, vehicle, characteristics))  # type: ignore[arg-type]
     mass, accel, decel, max_speed, lag = (float(values[0]) for values in types)
-    return Nominal(mass=mass, accel=accel, decel=decel, max_speed=max_speed, actuator_lag=lag, tables=tables)
+    return Nominal(mass=mass, accel=accel, decel=decel, max_speed=max_speed, actuator_lag=lag, tables=simulate_tables)
 
 
 def _original(characteristics: CharacteristicSet) -> dict[str, FloatArray]:
@@ -30,25 +30,25 @@ def _original(characteristics: CharacteristicSet) -> dict[str, FloatArray]:
 
 @lru_cache(maxsize=4)
 def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> PedalTables:
-    """Accelerate at full throttle, then from the speed reached coast, and from it again brake lightly."""
+    """Accelerate at full throttle to the highest speed; from there, coast in one drive and brake lightly in another."""
     prepared = vehicle.prepare(_original(characteristics), 1.0, STEP)
     rest = vehicle.at_rest(prepared)
 
     def drive(state: object, throttle: float, brake: float) -> tuple[list[float], object]:
-        """Speeds until the end of the tables, and the last state."""
+        """The speed after each step [m/s], until it leaves the range of the tables, and the last state."""
         speeds = [float(state.speed[0])]  # type: ignore[attr-defined]
         command = Command(np.full(1, throttle), np.full(1, brake))
-        for _ in range(round(LONGEST / STEP)):
+        for _ in range(round(LONGEST_DRIVE / STEP)):
             state = vehicle.advance(prepared, state, command)
             speeds.append(float(state.speed[0]))  # type: ignore[attr-defined]
             if speeds[-1] >= SPEEDS[-1] + 1 if throttle else speeds[-1] < SPEEDS[1]:
                 break
         return speeds, state
 
-    speeding_up, fast = drive(rest, 1.0, 0.0)
-    coasting = _accelerations(drive(fast, 0.0, 0.0)[0][::-1])
-    braking = _accelerations(drive(fast, 0.0, LIGHT_BRAKE)[0][::-1])
-    tables = PedalTables(speeds=SPEEDS, full_throttle=_accelerations(speeding_up), coasting=coasting,
+    launch, fast_state = drive(rest, 1.0, 0.0)
+    coasting = _accelerations(drive(fast_state, 0.0, 0.0)[0][::-1])
+    braking = _accelerations(drive(fast_state, 0.0, LIGHT_BRAKE)[0][::-1])
+    tables = PedalTables(speeds=SPEEDS, full_throttle=_accelerations(launch), coasting=coasting,
                     braking=float(np.median(braking - coasting)) / LIGHT_BRAKE)
     for table in tables[:3]:
         table.flags.writeable = False  # many ADSs read them
@@ -56,14 +56,14 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> P
 
 
 def _accelerations(speeds: list[float]) -> FloatArray:
-    """Acceleration between each grid speed and the next, of a drive that gains speed [m/s^2].
+    """Acceleration from each of `SPEEDS` to the next, in a drive that gains speed [m/s^2].
 
-    Beyond the speeds that the drive reaches its last value holds; zero for a drive at constant speed.
+    Outside the speeds of the drive, the nearest acceleration holds. A drive at constant speed has acceleration 0.
     """
     highest = np.maximum.accumulate(np.array(speeds))
-    reached, first = np.unique(highest, return_index=True)
-    inside = SPEEDS[(reached[0] <= SPEEDS) & (reached[-1] >= SPEEDS)]
-    if len(inside) < 2:
+    distinct_speeds, samples = np.unique(highest, return_index=True)
+    grid = SPEEDS[(distinct_speeds[0] <= SPEEDS) & (distinct_speeds[-1] >= SPEEDS)]
+    if len(grid) < 2:
         return np.zeros(len(SPEEDS))
-    gains = np.diff(inside) / np.diff(np.interp(inside, reached, first * STEP))
-    return np.asarray(gains[np.clip(np.arange(len(SPEEDS)) - round(inside[0] / SPEEDS[1]), 0, len(gains) - 1)])
+    accelerations = np.diff(grid) / np.diff(np.interp(grid, distinct_speeds, samples * STEP))
+    return np.asarray(accelerations[np.clip(np.arange(len(SPEEDS)) - round(grid[0] / SPEEDS[1]), 0, len(accelerations) - 1)])

@@ -1,8 +1,8 @@
 """LincolnMkz2017 of CARLA 0.9.10: NVIDIA PhysX 3.4, PxVehicleDrive4W, along its path.
 
-Equations and order of integration are those of `PxVehicleUpdate.cpp` and `PxVehicleDefaultTireShader` (PhysX 3.4), with one
-equivalent wheel for the four: a step computes the tyre force from the slip at its beginning, then engine, clutch and wheels
-implicitly and in closed form, so that the stiff clutch does not limit the step.
+The equations and the order of integration come from `PxVehicleUpdate.cpp` and `PxVehicleDefaultTireShader` (PhysX 3.4). One
+equivalent wheel stands for the four. A step computes the tyre force from the slip at its beginning; it then computes engine, clutch
+and wheels implicitly and in closed form, so that the stiff clutch does not limit the step.
 """
 
 from __future__ import annotations
@@ -20,34 +20,35 @@ from safevar_sumo.vehicles.sensors import Sensors
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 Share = Annotated[float, Meta(gt=0, le=1)]
 # Constants used with arrays in every step are arrays themselves: numpy would convert a float each time, which doubles the cost.
-ONE, NEUTRAL, FIRST = map(np.array, (1.0, 0.0, 1.0))
+ZERO, ONE = map(np.array, (0.0, 1.0))
+NEUTRAL, FIRST_GEAR = ZERO, ONE
 RPM = 2 * math.pi / 60  # rad/s per r/min
 ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default
 # Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) r/min, N m, stretched over max_rpm.
 TORQUE_IDLE, TORQUE_PEAK, TORQUE_END = map(np.array, (400.0, 500.0, 400.0))  # N m
-PEAK_AT, END_AT = map(np.array, (1890 / 5800, 5730 / 5800))  # relative to the maximum engine speed; the falling line extends to 1
-TORQUE_RISE = np.array((TORQUE_PEAK - TORQUE_IDLE) / PEAK_AT)
-TORQUE_FALL = np.array((TORQUE_PEAK - TORQUE_END) / (END_AT - PEAK_AT))
+PEAK_SPEED, END_SPEED = map(np.array, (1890 / 5800, 5730 / 5800))  # relative to the maximum engine speed; the falling line extends to 1
+TORQUE_RISE = np.array((TORQUE_PEAK - TORQUE_IDLE) / PEAK_SPEED)
+TORQUE_FALL = np.array((TORQUE_PEAK - TORQUE_END) / (END_SPEED - PEAK_SPEED))
 GEAR_RATIOS = np.array([0.0, 2.85, 2.02, 1.35, 1.0])  # neutral first; blueprint of the LincolnMkz2017
 FINAL_RATIO = 4.0
 OVERALL_RATIOS = GEAR_RATIOS * FINAL_RATIO
-TOP = np.array(len(GEAR_RATIOS) - 1.0)
+TOP_GEAR = np.array(len(GEAR_RATIOS) - 1.0)
 WHEELS = 4
 WHEEL_MASS = 20.0  # kg each; PxVehicleWheelData.mMass
 AIR_DENSITY = 1.2  # kg/m^3
 FRONTAL_AREA = 2.2  # m^2, of the LincolnMkz2017
-HELD_BELOW = np.array(0.03)  # m/s; below it the tyres hold a braked vehicle (PxVehicle sticky tires)
-SUBSTEP = 1 / 60  # s at most; CARLA 0.9.10 (MaxSubstepDeltaTime)
-NEWTON_STEPS = 8  # to a cube root near 1, starting at 1; the last ones change nothing
-TYRE_STEPS = 3  # per substep; PhysX's number below 5 m/s (setSubStepCount), here used at every speed
+HOLD_SPEED = np.array(0.03)  # m/s; below this speed the tyres hold a braked vehicle (PxVehicle sticky tires)
+SUBSTEP = 1 / 60  # s, the longest substep; CARLA 0.9.10 (MaxSubstepDeltaTime)
+NEWTON_STEPS = 8  # from 1 to a cube root near 1; the last steps change nothing
+TYRE_STEPS = 3  # per substep, at every speed; PhysX's number below 5 m/s (setSubStepCount)
 
 
 class _Prepared(NamedTuple):
     """Constants of a run, SI; arrays of shape (N,).
 
-    `throttle_rates` and `brake_rates` are the largest fall and rise of a pedal in a substep; names with `per_step` are divided by
-    the tyre step. In a tyre step the speed changes by `speed_by_force` per unit of force and by `speed_by_air` per unit of squared
-    speed, and the slope's `pull` [N] takes `speed_by_slope`. Below `standstill` a braked vehicle is held.
+    `throttle_rates` and `brake_rates` are the largest fall and rise of a pedal in a substep. Names in `per_step` mark quantities
+    over the tyre step. In a tyre step the speed changes by `speed_by_force` per unit of force and by `speed_by_air` per unit of
+    squared speed; the slope, which pulls with `pull` [N], takes `speed_by_slope`. Below `standstill` the tyres hold a braked vehicle.
     """
 
     substeps: int
@@ -59,7 +60,7 @@ class _Prepared(NamedTuple):
     engine_inertia_per_step: FloatArray
     wheel_inertia: FloatArray
     wheel_inertia_per_step: FloatArray
-    wheel_coasts: FloatArray
+    unbraked_wheel_inertia: FloatArray
     wheel_damping: FloatArray
     brake_torque: FloatArray
     grip: FloatArray
@@ -71,7 +72,7 @@ class _Prepared(NamedTuple):
     damping_engaged: FloatArray
     damping_neutral: FloatArray
     shift_time: FloatArray
-    shift_ends: FloatArray
+    shift_end: FloatArray
     shift_latency: FloatArray
     shift_up: FloatArray
     shift_down: FloatArray
@@ -83,11 +84,11 @@ class _Prepared(NamedTuple):
     standstill: FloatArray
     assumed_height: FloatArray
     slip_offset: FloatArray
-    nothing: FloatArray
+    zeros: FloatArray
 
 
 class CarlaState(NamedTuple):
-    """State of N vehicles: m/s, rad/s, rad/s, -, -, s since a shift began, -, -."""
+    """State of N vehicles: speed [m/s], wheel and engine speeds [rad/s], gears [-], time since a shift began [s], pedals [-]."""
 
     speed: FloatArray
     wheel_speed: FloatArray
@@ -103,22 +104,22 @@ class _Driveline(NamedTuple):
     """Coefficients of engine, clutch and wheels that depend on the gears of N vehicles; arrays of shape (N,)."""
 
     clutch: FloatArray
-    through_clutch: FloatArray
-    wheel_by_engine: FloatArray  # ratio^2 times the clutch strength
-    engine: FloatArray  # inertia over a tyre step, plus damping without throttle
+    clutch_times_ratio: FloatArray
+    clutch_at_wheel: FloatArray  # clutch strength times ratio^2
+    engine_without_throttle: FloatArray  # inertia over a tyre step, plus damping without throttle
     damping_by_throttle: FloatArray
 
     @classmethod
     def of(cls, p: _Prepared, gear: FloatArray) -> _Driveline:
         in_gear, ratio = gear > NEUTRAL, OVERALL_RATIOS[gear.astype(np.intp)]
         clutch = p.clutch * in_gear
-        closed = np.where(in_gear, p.damping_engaged, p.damping_neutral)
-        through_clutch = ratio * clutch
-        return cls(clutch, through_clutch, through_clutch * ratio, p.engine_inertia_per_step + closed, p.damping_full - closed)
+        damping = np.where(in_gear, p.damping_engaged, p.damping_neutral)
+        clutch_times_ratio = ratio * clutch
+        return cls(clutch, clutch_times_ratio, clutch_times_ratio * ratio, p.engine_inertia_per_step + damping, p.damping_full - damping)
 
 
 class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The vehicle of the settings sun and rain.
+    """The vehicle of the studies sun and rain.
 
     Parameters
     ----------
@@ -137,8 +138,8 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     shift_latency
         Minimum time between the beginnings of two shifts [s] (PxVehicleAutoBoxData: 2).
     camera_height, camera_design_radius
-        Height of the camera above the road with wheels of the design radius [m, m]. With wheels of another radius, measured
-        gaps scale by the assumed over the actual height of the camera.
+        Height of the camera above the road [m] with wheels of the design radius [m]. Wheels of another radius change the height, and
+        measured gaps scale by the assumed height over the actual height.
     """
 
     UNITS = {
@@ -146,7 +147,7 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         "gearSwitchTime": "s", "clutchStrength": "kg m^2/s", "mass": "kg", "dragCoeff": "-", "tireFric": "-",
         "dampRate": "kg m^2/s", "radius": "cm", "maxBrakeTorque": "N m",
     }
-    FITTED_UP_TO: ClassVar[float] = 6.2  # m/s; the fastest drive of the published settings sun and rain, simulated
+    FITTED_UP_TO: ClassVar[float] = 6.2  # m/s; highest speed in simulations of the published settings of sun and rain
 
     tyre_friction: Positive
     longitudinal_stiffness: Positive
@@ -178,20 +179,20 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             brake_rates=(np.array(-self.brake_fall * substep), np.array(self.brake_rise * substep)),
             engine_inertia_per_step=np.array(ENGINE_INERTIA / tyre_step), wheel_inertia=wheel_inertia,
             wheel_inertia_per_step=wheel_inertia / tyre_step,
-            wheel_coasts=wheel_inertia / tyre_step + wheel_damping,
+            unbraked_wheel_inertia=wheel_inertia / tyre_step + wheel_damping,
             wheel_damping=wheel_damping, brake_torque=WHEELS * c["maxBrakeTorque"],
             grip=grip, slip_stiffness=WHEELS * GRAVITY * self.longitudinal_stiffness / (3 * grip),
             clutch=c["clutchStrength"], engine_torque=np.array(self.engine_torque),
             engine_limit=c["max_rpm"] * RPM, damping_full=c["dampRateFullT"], damping_engaged=c["dampRateZeroT_CE"],
             damping_neutral=c["dampRateZeroT_CD"], shift_time=c["gearSwitchTime"],
-            shift_ends=c["gearSwitchTime"] - TIME_ROUNDING, shift_latency=np.array(self.shift_latency),
+            shift_end=c["gearSwitchTime"] - TIME_ROUNDING, shift_latency=np.array(self.shift_latency),
             shift_up=np.array(self.shift_up), shift_down=np.array(self.shift_down),
             air_drag=air_drag, speed_by_force=speed_by_force, speed_by_air=speed_by_force * air_drag,
             pull=c["mass"] * slope.back, speed_by_slope=np.zeros_like(radius) + slope.back * tyre_step,
             assumed_height=self.camera_height / (self.camera_height + (radius - self.camera_design_radius)),
-            slip_offset=np.full_like(radius, self.slip_offset), nothing=np.zeros_like(radius), standstill=np.zeros_like(radius))
-        creeps = self._rim_at(prepared._replace(pull=np.abs(prepared.pull)), prepared.nothing)[0]
-        return prepared._replace(standstill=HELD_BELOW + creeps)
+            slip_offset=np.full_like(radius, self.slip_offset), zeros=np.zeros_like(radius), standstill=np.zeros_like(radius))
+        creep_speed = self._rim_at(prepared._replace(pull=np.abs(prepared.pull)), prepared.zeros)[0]
+        return prepared._replace(standstill=HOLD_SPEED + creep_speed)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
@@ -204,53 +205,53 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             tau=np.full_like(p.mass, p.step * p.substeps + 1 / self.brake_rise))
 
     def at_rest(self, prepared: _Prepared) -> CarlaState:
-        nothing = np.zeros_like(prepared.mass)
-        return CarlaState(*(nothing for _ in CarlaState._fields))
+        zeros = np.zeros_like(prepared.mass)
+        return CarlaState(*(zeros for _ in CarlaState._fields))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> CarlaState:
         """The steady state with the pedals that hold the speed: every equation of `_roll` with its rate of change set to zero.
 
-        The gear is the one in which the gearbox arrives while accelerating; where it would shift down, a shift has just ended.
+        The gearbox has shifted up to the gear for this speed; where it would now shift down, its last shift has just ended.
         """
-        p, nothing = prepared, np.zeros_like(prepared.mass)
+        p, zeros = prepared, np.zeros_like(prepared.mass)
         rim, force = self._rim_at(p, speed)
         wheel_speed = rim / p.radius
-        resists = p.wheel_damping * wheel_speed + p.radius * force
+        resistance = p.wheel_damping * wheel_speed + p.radius * force
 
         def engine_in(ratio: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-            """Torque through the clutch, torque left for the brake, and engine speed."""
+            """Torque through the clutch and torque that remains for the brake [N m], and engine speed [rad/s]."""
             # Downhill the engine brakes and the brake supplies the rest; then w_e = G w_w + m / k_c with m = -c_e w_e.
-            dragged = -p.damping_engaged * ratio * wheel_speed / (1 + p.damping_engaged / p.clutch)
-            through_clutch = np.maximum(resists / ratio, dragged)
-            return (through_clutch, ratio * (dragged - resists / ratio),
-                    np.minimum(ratio * wheel_speed + through_clutch / p.clutch, p.engine_limit))
+            engine_drag = -p.damping_engaged * ratio * wheel_speed / (1 + p.damping_engaged / p.clutch)
+            clutch_torque = np.maximum(resistance / ratio, engine_drag)
+            return (clutch_torque, ratio * (engine_drag - resistance / ratio),
+                    np.minimum(ratio * wheel_speed + clutch_torque / p.clutch, p.engine_limit))
 
-        gear = nothing + 1
+        gear = zeros + 1
         for ratio in OVERALL_RATIOS[1:-1]:
             gear += engine_in(ratio)[-1] > p.shift_up * p.engine_limit
-        through_clutch, left, engine_speed = engine_in(OVERALL_RATIOS[gear.astype(np.intp)])
-        brake = np.minimum(np.maximum(left / p.brake_torque, 0.0), 1.0)
-        state = CarlaState(speed, wheel_speed, engine_speed, gear, gear, nothing, nothing, nothing)
-        pull = self._torque(p, engine_speed) - (p.damping_full - p.damping_engaged) * engine_speed
-        throttle = (p.damping_engaged * engine_speed + through_clutch) / np.maximum(pull, 1.0)
+        clutch_torque, brake_torque, engine_speed = engine_in(OVERALL_RATIOS[gear.astype(np.intp)])
+        brake = np.minimum(np.maximum(brake_torque / p.brake_torque, 0.0), 1.0)
+        state = CarlaState(speed, wheel_speed, engine_speed, gear, gear, zeros, zeros, zeros)
+        throttle_torque = self._torque(p, engine_speed) - (p.damping_full - p.damping_engaged) * engine_speed
+        throttle = (p.damping_engaged * engine_speed + clutch_torque) / np.maximum(throttle_torque, 1.0)
         throttle = np.where(brake > 0, 0.0, np.minimum(throttle, 1.0))
-        lugs = (gear > 1) & (engine_speed < p.shift_down * p.engine_limit)
-        return state._replace(throttle=throttle, brake=brake, since_shift=np.where(lugs, p.shift_time, p.shift_latency))
+        shifts_down = (gear > 1) & (engine_speed < p.shift_down * p.engine_limit)
+        return state._replace(throttle=throttle, brake=brake, since_shift=np.where(shifts_down, p.shift_time, p.shift_latency))
 
     def hold_gear(self, prepared: _Prepared, state: CarlaState, holds: BoolArray) -> CarlaState:
-        """Hold the gear where `holds`, shape (N,), is true, as a selector lever does; after its release the gearbox may shift at once."""
-        free = np.where(state.since_shift < 0, prepared.shift_latency, state.since_shift)
-        return state._replace(since_shift=np.where(holds, -np.inf, free))
+        """Hold the gear where `holds`, shape (N,), is true, as a selector lever does; after the release the gearbox may shift at once."""
+        free_time = np.where(state.since_shift < 0, prepared.shift_latency, state.since_shift)
+        return state._replace(since_shift=np.where(holds, -np.inf, free_time))
 
     def _rim_at(self, p: _Prepared, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rim speed at which the tyre force balances air drag and slope [m/s], and that force [N]."""
         force = np.minimum(np.maximum(p.air_drag * speed * speed + p.pull, -p.grip), p.grip)
         share = np.abs(force) / p.grip
-        left = np.ones_like(speed)
-        for _ in range(NEWTON_STEPS):  # left^3 = 1 - force / grip; see `_tyre_force`
-            left = left - (left * left * left - 1 + share) / (3 * left * left)
-        pushes = (p.slip_stiffness * speed + p.slip_offset * (1 - left)) / (p.slip_stiffness - 1 + left)
-        return np.where(force < 0, speed - (speed + p.slip_offset) * (1 - left) / p.slip_stiffness, pushes), force
+        root = np.ones_like(speed)
+        for _ in range(NEWTON_STEPS):  # root^3 = 1 - force / grip; see `_tyre_force`
+            root = root - (root * root * root - 1 + share) / (3 * root * root)
+        driving_rim = (p.slip_stiffness * speed + p.slip_offset * (1 - root)) / (p.slip_stiffness - 1 + root)
+        return np.where(force < 0, speed - (speed + p.slip_offset) * (1 - root) / p.slip_stiffness, driving_rim), force
 
     def sensors(self, prepared: _Prepared) -> Sensors:
         return Sensors.perfect(len(prepared.mass))._replace(scale=prepared.assumed_height)
@@ -262,50 +263,51 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def advance(self, prepared: _Prepared, state: CarlaState, command: Command) -> CarlaState:
         p, s, driveline = prepared, state, None
         for _ in range(p.substeps):
-            throttle = _follows(command.throttle, s.throttle, p.throttle_rates)
-            brake = _follows(command.brake, s.brake, p.brake_rates)
+            throttle = _pedal_position(command.throttle, s.throttle, p.throttle_rates)
+            brake = _pedal_position(command.brake, s.brake, p.brake_rates)
             gear, target, since_shift = _shift(p, s, throttle)
             if driveline is None or gear is not s.gear:
                 driveline = _Driveline.of(p, gear)
             s = CarlaState(*self._roll(p, s, driveline, throttle, brake), gear, target, since_shift, throttle, brake)
-        held = (s.brake > p.nothing) & (s.speed < p.standstill)
+        held = (s.brake > p.zeros) & (s.speed < p.standstill)
         if np.count_nonzero(held):
-            s.speed[held] = s.wheel_speed[held] = NEUTRAL
+            s.speed[held] = s.wheel_speed[held] = ZERO
         return s
 
     def _roll(self, p: _Prepared, s: CarlaState, driveline: _Driveline, throttle: FloatArray,
               brake: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Engine, clutch, wheels, tyres and body over one substep: speeds of the vehicle, its wheels and its engine.
+        """Engine, clutch, wheels, tyres and body over one substep; returns the speeds of vehicle [m/s], wheels and engine [rad/s].
 
         I_e dw_e/dt = throttle T(w_e) - c_e w_e - k_c (w_e - G w_w)
         I_w dw_w/dt = G k_c (w_e - G w_w) - d w_w - T_brake - r F
         m dv/dt = F - D v |v| - m g sin
 
-        The force F is explicit. It may end the slip within a step but never reverse it, so it cannot oscillate.
+        Index e is the engine, w the wheels; G is the gear ratio, k_c the clutch strength, c_e and d are damping rates, D is the air drag.
+        The tyre force F is explicit. It may end the slip within a step but never reverse it, so the slip cannot oscillate.
         """
-        clutch, through_clutch = driveline.clutch, driveline.through_clutch
-        engine = driveline.engine + driveline.damping_by_throttle * throttle + clutch
-        wheel = p.wheel_coasts + driveline.wheel_by_engine * (ONE - clutch / engine)
-        # Coefficients of a tyre step for each speed (a wheel's at its rim), for torques and for the tyre force:
-        engine_keeps, engine_gains = p.engine_inertia_per_step / engine, throttle * self._torque(p, s.engine_speed) / engine
+        clutch, clutch_times_ratio = driveline.clutch, driveline.clutch_times_ratio
+        engine = driveline.engine_without_throttle + driveline.damping_by_throttle * throttle + clutch
+        wheel = p.unbraked_wheel_inertia + driveline.clutch_at_wheel * (ONE - clutch / engine)
+        # Coefficients of a tyre step for the speeds (of a wheel, at its rim), for torques and for the tyre force:
+        engine_share, engine_gain = p.engine_inertia_per_step / engine, throttle * self._torque(p, s.engine_speed) / engine
         rim_by_torque = p.radius / wheel
-        rim_keeps, rim_by_engine = p.wheel_inertia_per_step / wheel, through_clutch * rim_by_torque
-        rim_loses = brake * p.brake_torque * rim_by_torque
+        rim_share, rim_by_engine = p.wheel_inertia_per_step / wheel, clutch_times_ratio * rim_by_torque
+        rim_loss = brake * p.brake_torque * rim_by_torque
         rim_by_force, speed_by_force = p.radius * rim_by_torque, p.speed_by_force
-        speed_loses = p.speed_by_air * s.speed * s.speed + p.speed_by_slope
+        speed_loss = p.speed_by_air * s.speed * s.speed + p.speed_by_slope
         slip_by_force = rim_by_force + speed_by_force
-        engine_by_rim = through_clutch / (engine * p.radius)
+        engine_by_rim = clutch_times_ratio / (engine * p.radius)
 
-        speed, rim, engine_speed, nothing = s.speed, p.radius * s.wheel_speed, s.engine_speed, p.nothing
+        speed, rim, engine_speed, zeros = s.speed, p.radius * s.wheel_speed, s.engine_speed, p.zeros
         for _ in range(TYRE_STEPS):
-            engine_free = engine_keeps * engine_speed + engine_gains
-            rim_free = rim_keeps * rim + rim_by_engine * engine_free - rim_loses
-            ends_slip = (rim_free - speed) / slip_by_force
+            free_engine_speed = engine_share * engine_speed + engine_gain
+            free_rim = rim_share * rim + rim_by_engine * free_engine_speed - rim_loss
+            slip_end_force = (free_rim - speed) / slip_by_force
             force = self._tyre_force(p, speed, rim)
-            force = np.minimum(np.maximum(force, np.minimum(ends_slip, nothing)), np.maximum(ends_slip, nothing))
-            rim = np.maximum(rim_free - rim_by_force * force, nothing)
-            engine_speed = np.minimum(engine_free + engine_by_rim * rim, p.engine_limit)
-            speed = np.maximum(speed + speed_by_force * force - speed_loses, nothing)
+            force = np.minimum(np.maximum(force, np.minimum(slip_end_force, zeros)), np.maximum(slip_end_force, zeros))
+            rim = np.maximum(free_rim - rim_by_force * force, zeros)
+            engine_speed = np.minimum(free_engine_speed + engine_by_rim * rim, p.engine_limit)
+            speed = np.maximum(speed + speed_by_force * force - speed_loss, zeros)
         return speed, rim / p.radius, engine_speed
 
     def _tyre_force(self, p: _Prepared, speed: FloatArray, rim: FloatArray) -> FloatArray:
@@ -314,43 +316,43 @@ class Carla(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         With slip = (rim - speed) / (max(rim, speed) + offset) and K = C |slip| / (mu load):
         F = mu load (K - K^2 / 3 + K^3 / 27) = mu load (1 - (1 - K / 3)^3) up to K = 3, mu load beyond.
         """
-        slides, relative_to = rim - speed, np.maximum(rim, speed) + p.slip_offset
-        left = np.maximum(relative_to - p.slip_stiffness * np.abs(slides), p.nothing) / relative_to
-        force: FloatArray = np.copysign(p.grip - p.grip * left * left * left, slides)
+        slip_speed, denominator = rim - speed, np.maximum(rim, speed) + p.slip_offset
+        root = np.maximum(denominator - p.slip_stiffness * np.abs(slip_speed), p.zeros) / denominator
+        force: FloatArray = np.copysign(p.grip - p.grip * root * root * root, slip_speed)
         return force
 
     def _torque(self, p: _Prepared, engine_speed: FloatArray) -> FloatArray:
         """Engine torque at full throttle [N m]: linear between the points of the curve; no engine is faster than its limit."""
         x = engine_speed / p.engine_limit
-        rising = TORQUE_IDLE + TORQUE_RISE * x
-        falling = TORQUE_PEAK - TORQUE_FALL * (x - PEAK_AT)
-        torque: FloatArray = p.engine_torque * np.minimum(rising, falling)
+        rising_line = TORQUE_IDLE + TORQUE_RISE * x
+        falling_line = TORQUE_PEAK - TORQUE_FALL * (x - PEAK_SPEED)
+        torque: FloatArray = p.engine_torque * np.minimum(rising_line, falling_line)
         return torque
 
 
-def _follows(commanded: FloatArray, pedal: FloatArray, rates: tuple[FloatArray, FloatArray]) -> FloatArray:
+def _pedal_position(command: FloatArray, pedal: FloatArray, rates: tuple[FloatArray, FloatArray]) -> FloatArray:
     """Position of a pedal that follows its command at limited rates."""
-    falls, rises = rates
-    return pedal + np.minimum(np.maximum(commanded - pedal, falls), rises)
+    fall, rise = rates
+    return pedal + np.minimum(np.maximum(command - pedal, fall), rise)
 
 
 def _shift(p: _Prepared, s: CarlaState, throttle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Automatic gearbox: gear, target gear, time since a shift. During a shift, including the first out of neutral, the gear is neutral."""
+    """Automatic gearbox: gear, target gear, time since a shift [s]. During a shift the gear is neutral, also before the first gear."""
     target, since_shift = s.target_gear, s.since_shift + p.step
     neutral, ready = s.gear <= NEUTRAL, s.since_shift >= p.shift_latency
     any_neutral = np.count_nonzero(neutral)
-    # In most steps no vehicle can shift; numpy's calls for those that could are spared.
-    sets_off = neutral & (s.gear == target) & (throttle > p.nothing) if any_neutral else neutral
+    # In most steps no vehicle can shift; then numpy has less to compute.
+    sets_off = neutral & (s.gear == target) & (throttle > p.zeros) if any_neutral else neutral
     high = low = ready
     if np.count_nonzero(ready):
         relative = s.engine_speed / p.engine_limit
         high, low = ready & (relative > p.shift_up), ready & (relative < p.shift_down)
     if np.count_nonzero(sets_off) or np.count_nonzero(high) or np.count_nonzero(low):
-        up = sets_off | high & (s.gear > NEUTRAL) & (s.gear < TOP)
-        down = low & (s.gear > FIRST)
+        up = sets_off | high & (s.gear > NEUTRAL) & (s.gear < TOP_GEAR)
+        down = low & (s.gear > FIRST_GEAR)
         target = target + up - down
-        since_shift[up | down] = NEUTRAL
+        since_shift[up | down] = ZERO
     elif not any_neutral:
         return s.gear, target, since_shift
-    gear = np.where((target == s.gear) | (since_shift >= p.shift_ends), target, NEUTRAL)
+    gear = np.where((target == s.gear) | (since_shift >= p.shift_end), target, NEUTRAL)
     return gear if np.count_nonzero(gear != s.gear) else s.gear, target, since_shift

@@ -19,9 +19,9 @@ from safevar_sumo.plugins import Guard, read_only_copy
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import CharacteristicTable
 
-FARTHEST = 1000.0
-"""Values beyond this multiple of the domain's largest magnitude are taken for typos."""
-# Smallest width of a domain, and its beta (method section 2).
+PLAUSIBLE_MULTIPLE = 1000.0
+"""Values beyond this multiple of the domain's largest magnitude count as typos."""
+# Smallest width of a domain, and the share beta from that width on (method section 2).
 FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
 
 
@@ -29,7 +29,7 @@ FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
 class Characteristic:
     """One characteristic of the vehicle under test; all quantities in `unit`. A change counts `weight` times in f_diff.
 
-    `meaning` describes it in words, `counterpart` names what sets it in a real vehicle; both may be empty.
+    `meaning` describes the quantity, `counterpart` names the part of a real vehicle that determines it; both may be empty.
     """
 
     name: str
@@ -43,12 +43,12 @@ class Characteristic:
 
     @property
     def short_name(self) -> str:
-        """Its meaning up to the first comma or bracket, such as `engine drag`; its name where the study gives no meaning."""
+        """The meaning up to the first comma or bracket, such as `engine drag`; the name if the study gives no meaning."""
         return re.split(r"[,;(]", self.meaning)[0].strip() or self.name
 
     @property
     def words(self) -> str:
-        """Meaning and counterpart in one line; empty where the study gives neither."""
+        """Meaning and counterpart in one line; empty if the study gives neither."""
         part = f"counterpart: {self.counterpart}" if self.counterpart else ""
         return "; ".join(text for text in (self.meaning, part) if text)
 
@@ -56,12 +56,12 @@ class Characteristic:
     def threshold(self) -> float:
         """Largest change that the filter removes: Th = beta (u - l) (method section 2)."""
         width = self.upper - self.lower
-        return next(share for least, share in FILTER_SHARES if width >= least) * width
+        return next(share for smallest_width, share in FILTER_SHARES if width >= smallest_width) * width
 
     @property
     def farthest(self) -> float:
-        """Largest legal magnitude where values beyond the domain are legal."""
-        return FARTHEST * max(abs(self.lower), abs(self.upper))
+        """Largest plausible magnitude of a value beyond the domain."""
+        return PLAUSIBLE_MULTIPLE * max(abs(self.lower), abs(self.upper))
 
     def text(self, value: float) -> str:
         """A value rounded so that one unit of the last digit is at most a quarter of the threshold."""
@@ -74,9 +74,9 @@ class Characteristic:
 
     def check(self, value: float, source: object, *, beyond: bool = False, otherwise: str = "",
               switch: str = "beyond=True") -> None:
-        """Refuse a value that is not a legal number (`is_legal`).
+        """Refuse a value that is not a number or not legal (`is_legal`).
 
-        `otherwise` describes further legal values; `switch` names how a caller allows values beyond the domain, empty if it cannot.
+        `otherwise` describes further legal values; `switch` is the option that allows values beyond the domain, empty if there is none.
 
         Raises
         ------
@@ -84,17 +84,17 @@ class Characteristic:
             Naming the value and what is expected.
         """
         if not isinstance(value, Real) or not self.is_legal(value, beyond=beyond):
-            legal = (f"a finite number{' above 0' if self.lower > 0 else ''}, up to {self.farthest:g}" if beyond else
-                     f"a number in [{self.lower:g}, {self.upper:g}]")
-            only_outside = not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
-            hint = f", or any with {switch}" if only_outside and switch else ""
-            raise InputError(source, f"{self.name} = {value}{' is outside its domain' if only_outside else ''}",
-                             f"{legal}{self.suffix}{otherwise}{hint}")
+            expected = (f"a finite number{' above 0' if self.lower > 0 else ''}, up to {self.farthest:g}" if beyond else
+                        f"a number in [{self.lower:g}, {self.upper:g}]")
+            is_plausible = not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
+            hint = f", or any with {switch}" if is_plausible and switch else ""
+            raise InputError(source, f"{self.name} = {value}{' is outside its domain' if is_plausible else ''}",
+                             f"{expected}{self.suffix}{otherwise}{hint}")
 
     def is_legal(self, values: Any, *, beyond: bool = False) -> Any:
         """Whether values, a number or an array, are in the domain; with `beyond`, whether they are plausible.
 
-        Plausible values are up to 1000 times as large as the domain, and above 0 if the domain is (no mass of -5 kg).
+        A plausible magnitude is at most 1000 times the largest of the domain. If the domain is above 0, so is a plausible value.
         """
         if beyond:
             return (np.abs(values) <= self.farthest) & ((values > 0) | (self.lower <= 0))
@@ -103,7 +103,7 @@ class Characteristic:
 
 @dataclass(frozen=True)
 class CharacteristicSet:
-    """The n characteristics C_1..C_n of a study; settings of them are arrays of shape (N, n)."""
+    """The n characteristics C_1..C_n of a study; N settings are an array of shape (N, n)."""
 
     members: tuple[Characteristic, ...]
 
@@ -157,7 +157,7 @@ class CharacteristicSet:
         return np.asarray(filtered != self.original)
 
     def largest_change(self, filtered: FloatArray) -> FloatArray:
-        """f_diff = max_i w_i |v_i - v''_i| / v_i, a fraction, shape (N,); v'' are filtered (method section 3, with weights w of 1)."""
+        """f_diff = max_i w_i |v_i - v''_i| / v_i, a fraction, shape (N,); v'' is filtered (method section 3, where all weights w are 1)."""
         return np.asarray(np.max(self.weight * (np.abs(self.original - filtered) / np.abs(self.original)), axis=1))
 
     def number_changed(self, filtered: FloatArray) -> FloatArray:
@@ -213,7 +213,7 @@ CHANGES = {change.name: change for change in (
 
 
 def foreign_change(change: Any, guard: Guard) -> Change:
-    """A measure of change from outside: its function gets read-only copies, and its result is checked.
+    """Guard a user's measure of change: its function gets read-only copies, and its result is checked.
 
     Raises
     ------
@@ -226,8 +226,8 @@ def foreign_change(change: Any, guard: Guard) -> Change:
     if not callable(change.function):
         raise InputError(guard.source, f"{guard.name}: function = {change.function!r}", "a function of settings and characteristics")
 
-    def checked(settings: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
+    def guarded_function(settings: FloatArray, characteristics: CharacteristicSet) -> FloatArray:
         values = guard.call(change.name, change.function, read_only_copy(settings), characteristics)
         return guard.numbers(change.name, "values", values, (len(settings),))
 
-    return Change(name=change.name, title=change.title, unit=change.unit, function=checked)
+    return Change(name=change.name, title=change.title, unit=change.unit, function=guarded_function)

@@ -8,25 +8,25 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import ForeignError, InputError, unknown
-from safevar_sumo.fmu import CONVERTIBLE, SI, USUAL, Description, Fault, Fleet, History, Instances, Port, Unit, fixed_of, ports_of
+from safevar_sumo.fmu import COMMON_UNITS, REAL_TYPES, SI, Description, Fault, Fleet, History, Instances, Port, Unit, constants_of, ports_of
 from safevar_sumo.plugins import Guard
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.study import CharacteristicTable
 from safevar_sumo.vehicles.base import FASTEST, LEVEL, ROUNDING, Characteristics, Slope, SumoType
-from safevar_sumo.vehicles.sensors import Sensors, late_and_near
+from safevar_sumo.vehicles.sensors import Sensors, sensed_observation
 
 PEDALS: Mapping[str, str] = {"throttle": "-", "brake": "-"}
 ROAD: Mapping[str, str] = {"road_friction": "-", "grade": "-", "wet": "-", "initial_speed": "m/s", "step": "s"}
 """Quantities that are constant during a run: inputs, or parameters that are set at the start. A grade is rise over run."""
-RETURNED: Mapping[str, str] = {"speed": "m/s", "throttle": "-", "brake": "-", "gear": "-"}
-TYPE: Mapping[str, str] = {"mass": "kg", "accel": "m/s^2", "decel": "m/s^2", "max_speed": "m/s", "tau": "s"}
-USUAL_LAG = 0.1
-"""Actuator lag that a driving system assumes where the study gives none [s]."""
-SENSED: Mapping[str, str] = {"latency": "s", "range": "m"}
-NEEDED = {
+OUTPUTS: Mapping[str, str] = {"speed": "m/s", "throttle": "-", "brake": "-", "gear": "-"}
+TYPE_UNITS: Mapping[str, str] = {"mass": "kg", "accel": "m/s^2", "decel": "m/s^2", "max_speed": "m/s", "tau": "s"}
+DEFAULT_LAG = 0.1
+"""Actuator lag that a driving system assumes if the study gives no `tau` [s]."""
+SENSOR_UNITS: Mapping[str, str] = {"latency": "s", "range": "m"}
+EXPECTED_ENTRIES = {
     "inputs": "the input for that pedal", "outputs": "the output that holds the speed",
     "sumo_type": "a number in SI units; or a characteristic, or an output or parameter of the FMU"}
-READABLE = ("output", "calculatedParameter", "parameter", "local")
+READABLE_CAUSALITIES = ("output", "calculatedParameter", "parameter", "local")
 
 
 class _Prepared(NamedTuple):
@@ -41,7 +41,7 @@ class _Prepared(NamedTuple):
 
 
 class _State(NamedTuple):
-    """State of N vehicles; `seen` is the history of sensed values, `history` that of the instances."""
+    """State of N vehicles; `seen` is the history of sensed values, `history` is the history of the FMU instances."""
 
     speed: FloatArray
     throttle: FloatArray
@@ -76,10 +76,10 @@ class FmuVehicle:
     UNITS: Mapping[str, str]
 
     def __init__(self, description: Description, units: Mapping[str, str], table: Mapping[str, Any], guard: Guard, limit: float) -> None:
-        source, self._guard, self._own_step = guard.source, guard, table["step"] or description.step
+        source, self._guard, self._communication_step = guard.source, guard, table["step"] or description.step
         self.UNITS = dict(units)
-        self._sensors, self._type = dict(table["sensors"]), {"tau": USUAL_LAG, **table["sumo_type"]}
-        for key, entries, quantities in (("sensors", self._sensors, SENSED), ("sumo_type", self._type, TYPE)):
+        self._sensors, self._type = dict(table["sensors"]), {"tau": DEFAULT_LAG, **table["sumo_type"]}
+        for key, entries, quantities in (("sensors", self._sensors, SENSOR_UNITS), ("sumo_type", self._type, TYPE_UNITS)):
             for name, entry in entries.items():
                 if name not in quantities:
                     raise unknown(source, f"vehicle.{key}.{name}: there is no such quantity", name, quantities)
@@ -87,16 +87,16 @@ class FmuVehicle:
                     raise unknown(source, f"vehicle.{key}.{name} = {entry!r}: there is no such characteristic", entry, units,
                                   ", or a number")
                 self._refuse_too_small(table["characteristics"], f"vehicle.{key}.{name}", entry, may_be_0=name == "latency")
-        inputs = ports_of(description, table["inputs"], {**PEDALS, **ROAD}, ("input",), source, "vehicle.inputs", constant=ROAD)
-        outputs = ports_of(description, table["outputs"], RETURNED, ("output",), source, "vehicle.outputs")
-        for key, entries, required in (("inputs", inputs, PEDALS), ("outputs", outputs, ("speed",)), ("sumo_type", self._type, TYPE)):
+        inputs = ports_of(description, table["inputs"], {**PEDALS, **ROAD}, ("input",), source, "vehicle.inputs", constants=ROAD)
+        outputs = ports_of(description, table["outputs"], OUTPUTS, ("output",), source, "vehicle.outputs")
+        for key, entries, required in (("inputs", inputs, PEDALS), ("outputs", outputs, ("speed",)), ("sumo_type", self._type, TYPE_UNITS)):
             for name in required:
                 if name not in entries:
-                    raise InputError(source, f"vehicle.{key}.{name} is missing", NEEDED[key])
-        self._characteristic_units = {entry: self._units(description, entry, units[entry], unit, f"vehicle.{key}.{name}")
-                                      for key, entries, quantities in (("sensors", self._sensors, SENSED), ("sumo_type", self._type, TYPE))
-                                      for name, unit in quantities.items()
-                                      if isinstance(entry := entries.get(name), str) and entry in units}
+                    raise InputError(source, f"vehicle.{key}.{name} is missing", EXPECTED_ENTRIES[key])
+        self._characteristic_units = {
+            entry: self._units(description, entry, units[entry], unit, f"vehicle.{key}.{name}")
+            for key, entries, quantities in (("sensors", self._sensors, SENSOR_UNITS), ("sumo_type", self._type, TYPE_UNITS))
+            for name, unit in quantities.items() if isinstance(entry := entries.get(name), str) and entry in units}
         characteristics = {name: self._characteristic(description, name, unit) for name, unit in units.items()
                            if name in description.variables or name not in self._sensors.values()}
         for quantity, port in inputs.items():
@@ -104,53 +104,55 @@ class FmuVehicle:
                 raise InputError(source, f"vehicle.inputs.{quantity} = {port.variable.name!r}: that variable is also a characteristic",
                                  "a separate variable for each")
         variables = {name: entry for name, entry in self._type.items() if isinstance(entry, str) and entry not in units}
-        types = ports_of(description, variables, TYPE, READABLE, source, "vehicle.sumo_type")
+        types = ports_of(description, variables, TYPE_UNITS, READABLE_CAUSALITIES, source, "vehicle.sumo_type")
         self._quantities, self._characteristics, self._outputs = tuple(inputs), tuple(characteristics), (*outputs, *types)
         self._reads_type = bool(types)
         ports = [*inputs.values(), *characteristics.values()]
-        fixed = list(fixed_of(description, table["parameters"], [port.variable.name for port in ports], source, "vehicle.parameters"))
-        self._instances = Instances(description, ports, [*outputs.values(), *types.values()], fixed, limit)
+        mapped_names = [port.variable.name for port in ports]
+        constants = list(constants_of(description, table["parameters"], mapped_names, source, "vehicle.parameters"))
+        self._instances = Instances(description, ports, [*outputs.values(), *types.values()], constants, limit)
         self.most_vehicles = self._instances.most_vehicles
         self.takes_slope, self.can_start_moving = "grade" in inputs, "initial_speed" in inputs
         self._takes_friction = "road_friction" in inputs
 
     def _refuse_too_small(self, rows: Mapping[str, CharacteristicTable], key: str, entry: str | float, *, may_be_0: bool) -> None:
-        """Refuse a number, or the lower end of a characteristic, below what a positive quantity may be."""
-        least = rows[entry].lower if isinstance(entry, str) and entry in rows else entry
-        if not isinstance(least, str) and (least < 0 or (least == 0 and not may_be_0)):
-            problem = f"{key} = {least:g}" if least is entry else f"vehicle.characteristics.{entry}.lower = {least:g}, and it is {key}"
+        """Refuse a negative number, or a characteristic with a negative lower end; 0 is legal only with `may_be_0`."""
+        lower = rows[entry].lower if isinstance(entry, str) and entry in rows else entry
+        if not isinstance(lower, str) and (lower < 0 or (lower == 0 and not may_be_0)):
+            problem = f"{key} = {lower:g}" if lower is entry else f"vehicle.characteristics.{entry}.lower = {lower:g}, the value of {key}"
             raise InputError(self._guard.source, problem, "a number of at least 0" if may_be_0 else "a number above 0")
 
     def _characteristic(self, description: Description, name: str, unit: str) -> Port:
         key = f"vehicle.characteristics.{name}"
-        variable = description.variable(name, ("parameter",), self._guard.source, key, CONVERTIBLE)
+        variable = description.variable(name, ("parameter",), self._guard.source, key, REAL_TYPES)
         if unit == (variable.unit_name or unit) or (unit == "-" and variable.unit_name in ("", "1")):
             return Port(variable, SI["-"], SI["-"])
-        defined = description.units.get(unit) or USUAL.get(unit)
-        if defined is None:
+        defined_unit = description.units.get(unit) or COMMON_UNITS.get(unit)
+        if defined_unit is None:
             raise InputError(self._guard.source, f"{key}.unit = {unit!r}: the unit is not defined", repr(variable.unit_name))
-        return Port(variable, description.converted(variable, defined, unit, self._guard.source, f"{key}.unit"), defined)
+        return Port(variable, description.unit_for(variable, defined_unit, unit, self._guard.source, f"{key}.unit"), defined_unit)
 
-    def _units(self, description: Description, name: str, unit: str, wanted: str, key: str) -> tuple[Unit, Unit]:
+    def _units(self, description: Description, name: str, unit: str, quantity_unit: str, key: str) -> tuple[Unit, Unit]:
         """The units of a characteristic that sets a quantity, and of the quantity."""
-        defined = description.units.get(unit) or USUAL.get(unit)
-        if defined is None or not defined.fits(SI[wanted]):
-            raise InputError(self._guard.source, f"{key} = {name!r}: the unit of that characteristic is {unit!r}", f"a unit of {wanted}")
-        return defined, SI[wanted]
+        defined_unit = description.units.get(unit) or COMMON_UNITS.get(unit)
+        if defined_unit is None or not defined_unit.fits(SI[quantity_unit]):
+            raise InputError(self._guard.source, f"{key} = {name!r}: the unit of that characteristic is {unit!r}",
+                             f"a unit of {quantity_unit}")
+        return defined_unit, SI[quantity_unit]
 
     def prepare(self, characteristics: Characteristics, road_friction: float | FloatArray, step: float, slope: Slope = LEVEL,
                 wet: bool | BoolArray = False) -> _Prepared:
         n = len(next(iter(characteristics.values())))
         if slope is not LEVEL and not self.takes_slope:
             raise ForeignError(self._guard.source, f"{self._guard.name} has no vehicle.inputs.grade, and the road has a grade",
-                               "a variable for it, or scenarios with grade 0")
+                               "a variable for the grade, or scenarios with grade 0")
         zeros = np.zeros(n)
         inputs = {"throttle": zeros, "brake": zeros, "road_friction": zeros + road_friction, "wet": zeros + wet,
                   "grade": zeros + slope.back / slope.down, "step": zeros + step, "initial_speed": zeros}
-        fleet = Fleet(self._instances, n, step, self._own_step)
+        fleet = Fleet(self._instances, n, step, self._communication_step)
         outputs = {}
         if self._reads_type:
-            outputs = dict(zip(self._outputs, self._start(fleet, self._stacked(inputs, characteristics))[0], strict=True))
+            outputs = dict(zip(self._outputs, self._start(fleet, self._input_array(inputs, characteristics))[0], strict=True))
 
         def value(entry: str | float, name: str) -> FloatArray:
             if not isinstance(entry, str):
@@ -160,7 +162,8 @@ class FmuVehicle:
             unit, quantity_unit = self._characteristic_units[entry]
             return np.asarray(unit.to(quantity_unit, characteristics[entry]))
 
-        types = SumoType(*(self._guard.numbers("sumo_type", name, value(self._type[name], name), (n,), 0.0, above=True) for name in TYPE))
+        types = SumoType(*(self._guard.numbers("sumo_type", name, value(self._type[name], name), (n,), 0.0, above=True)
+                           for name in TYPE_UNITS))
         sensors = Sensors.perfect(n)._replace(**{{"latency": "latency", "range": "reach"}[name]: value(entry, name)
                                                  for name, entry in self._sensors.items()})
         return _Prepared(fleet, inputs, characteristics, types, sensors, step)
@@ -178,8 +181,8 @@ class FmuVehicle:
         """The initial state at a speed [m/s], shape (N,)."""
         if np.any(speed > 0) and not self.can_start_moving:
             problem = f"{self._guard.name} has no vehicle.inputs.initial_speed, and the traffic puts it onto the road in motion"
-            raise ForeignError(self._guard.source, problem, "a variable for it, or traffic that departs with speed 0")
-        inputs = self._stacked({**prepared.inputs, "initial_speed": speed}, prepared.characteristics)
+            raise ForeignError(self._guard.source, problem, "a variable for the initial speed, or traffic that departs with speed 0")
+        inputs = self._input_array({**prepared.inputs, "initial_speed": speed}, prepared.characteristics)
         outputs, history = self._start(prepared.fleet, inputs)
         released = Command(np.zeros_like(speed), np.zeros_like(speed))
         state = self._state(dict(zip(self._outputs, outputs, strict=True)), released, None, history)
@@ -191,24 +194,24 @@ class FmuVehicle:
         return prepared.sensors
 
     def sense(self, prepared: _Prepared, state: _State, seen: Observation) -> tuple[Observation, _State]:
-        """Sensors report the scene of their latency ago, and nothing beyond their range times the visibility."""
+        """Sensors report the scene as it was one latency ago, and nothing beyond their range times the visibility."""
         if not self._sensors:
             return seen, state
-        late, history = late_and_near(seen, state.seen, prepared.sensors.latency, prepared.sensors.reach, prepared.step)
-        return late, state._replace(seen=history)
+        sensed, history = sensed_observation(seen, state.seen, prepared.sensors.latency, prepared.sensors.reach, prepared.step)
+        return sensed, state._replace(seen=history)
 
     def advance(self, prepared: _Prepared, state: _State, command: Command) -> _State:
-        inputs = self._stacked({**prepared.inputs, **command._asdict()}, prepared.characteristics)
+        inputs = self._input_array({**prepared.inputs, **command._asdict()}, prepared.characteristics)
         try:
-            (now, smooth), history = prepared.fleet.advance(state.history, inputs)
+            (point_outputs, step_outputs), history = prepared.fleet.advance(state.history, inputs)
         except Fault as fault:
-            raise self._failed(fault) from None
-        outputs = dict(zip(self._outputs, now, strict=True))
-        outputs["speed"] = dict(zip(self._outputs, smooth, strict=True))["speed"]
-        after, max_speed = self._state(outputs, command, state.seen, history), prepared.types.max_speed
-        for i in np.flatnonzero(after.speed > np.maximum(max_speed, state.speed) * (1 + ROUNDING))[:1]:
-            raise self._guard.wrong("doStep", "speed", float(after.speed[i]), f"up to vehicle.sumo_type.max_speed = {max_speed[i]:g}")
-        return after
+            raise self._foreign_error(fault) from None
+        outputs = dict(zip(self._outputs, point_outputs, strict=True))
+        outputs["speed"] = dict(zip(self._outputs, step_outputs, strict=True))["speed"]
+        next_state, max_speed = self._state(outputs, command, state.seen, history), prepared.types.max_speed
+        for i in np.flatnonzero(next_state.speed > np.maximum(max_speed, state.speed) * (1 + ROUNDING))[:1]:
+            raise self._guard.wrong("doStep", "speed", float(next_state.speed[i]), f"up to vehicle.sumo_type.max_speed = {max_speed[i]:g}")
+        return next_state
 
     @property
     def remarks(self) -> list[str]:
@@ -220,12 +223,12 @@ class FmuVehicle:
         try:
             return fleet.start(inputs)
         except Fault as fault:
-            raise self._failed(fault) from None
+            raise self._foreign_error(fault) from None
 
-    def _failed(self, fault: Fault) -> ForeignError:
+    def _foreign_error(self, fault: Fault) -> ForeignError:
         return ForeignError(self._guard.source, f"{self._guard.name} {fault}")
 
-    def _stacked(self, inputs: Mapping[str, FloatArray], characteristics: Characteristics) -> FloatArray:
+    def _input_array(self, inputs: Mapping[str, FloatArray], characteristics: Characteristics) -> FloatArray:
         return np.stack([*(inputs[name] for name in self._quantities), *(characteristics[name] for name in self._characteristics)])
 
     def _state(self, outputs: Mapping[str, FloatArray], command: Command, seen: FloatArray | None, history: History) -> _State:

@@ -1,8 +1,8 @@
 """Lincoln2017MKZ of LGSVL 2021.1: VehicleSMI on Unity's WheelColliders, along its path.
 
-The equations are those of the simulator's `VehicleSMI.cs` and of Unity's WheelCollider friction, with one equivalent
-wheel for the four. In a substep wheel and body form one linear system, with the tyre's secant stiffness, which is solved
-implicitly and in closed form.
+The equations come from the simulator's `VehicleSMI.cs` and from the friction of Unity's WheelCollider. One equivalent wheel
+stands for the four. In a substep, wheel and body form one linear system with the secant stiffness of the tyre. Its implicit
+solution has a closed form.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ RPM = np.array(30 / math.pi)  # r/min per rad/s
 RADIANS = math.pi / 180  # rad per degree
 WHEELS = 4
 GEAR_RATIOS = np.array([4.17, 3.14, 2.11, 1.67, 1.28, 1.0, 0.84, 0.67])  # VehicleSMI
-FIRST, LAST = map(np.array, (1.0, len(GEAR_RATIOS)))
+FIRST_GEAR, LAST_GEAR = map(np.array, (1.0, len(GEAR_RATIOS)))
 FINAL_RATIO = np.array(2.56)  # VehicleSMI
 SHIFT_DELAY = np.array(0.7)  # s, minimum time between two shifts; VehicleSMI
 SHIFT_UP, SHIFT_DOWN = map(np.array, (0.33, 0.13))  # of maxRpm (assumption)
 RPM_RATE = 20.0  # 1/s, the engine speed follows the wheels with a lag of 1/20 s; VehicleSMI
 TRACTION_START = 1 - 0.675  # share of maxMotorTorque that the traction control allows at the start; VehicleSMI
-TRACTION_RATE = 6.75 / 0.02  # N m/s, rate at which that torque rises and falls; VehicleSMI, at 50 Hz
+TRACTION_RATE = 6.75 / 0.02  # N m/s, rate at which the allowed torque rises and falls; VehicleSMI, at 50 Hz
 AIR_DRAG, DOWNFORCE = map(np.array, (1.0, 2.0))  # N s^2/m^2; VehicleSMI
 # Unity's WheelCollider: forward friction rises to its extremum and falls to its asymptote.
 PEAK_SLIP, SLIDING_SLIP, SLIDING_FRICTION = map(np.array, (0.4, 0.8, 0.5))
-SLIPS_BEYOND, FRICTION_LOST = map(np.array, (SLIDING_SLIP - PEAK_SLIP, 1 - SLIDING_FRICTION))
+SLIDING_RANGE, FRICTION_LOSS = map(np.array, (SLIDING_SLIP - PEAK_SLIP, 1 - SLIDING_FRICTION))
 FRICTION = 1.0  # at the extremum
 SLIP_FLOOR = np.array(4.0)  # m/s, smallest denominator of a slip (assumption, as in PhysX)
-LEAST_RIM = np.array(1e-3)  # m/s, smallest rim speed that a slip limit is relative to
-HELD_BELOW = np.array(0.05)  # m/s, below which locked wheels hold the vehicle (assumption)
+LEAST_RIM_SPEED = np.array(1e-3)  # m/s, smallest rim speed that a slip limit is relative to
+HOLD_SPEED = np.array(0.05)  # m/s, below which locked wheels hold the vehicle (assumption)
 WHEELBASE = np.array(2.85)  # m
 # Initial errors for the lane keeping to correct (assumption), so that the steering angle has an effect.
 LATERAL_ERROR, HEADING_ERROR = 0.10, 0.01  # m, rad
@@ -48,19 +48,19 @@ SUBSTEPS = 2
 class _Prepared(NamedTuple):
     """Constants of a run, SI except engine speeds in r/min; shape (N,) or ().
 
-    `pedals_follow` is the share of an error that a step removes, `engine_follows` the share that a substep removes; `traction_change` is
-    the torque by which the traction control rises or falls in a substep [N m].
+    `pedal_share` is the share of its error that a pedal makes up in a step, `engine_share` the share that the engine speed makes up in a
+    substep. In a substep the traction control raises or lowers its torque by `traction_change` [N m].
     """
 
     step: FloatArray
     substep: FloatArray
-    pedals_follow: FloatArray
-    engine_follows: FloatArray
+    pedal_share: FloatArray
+    engine_share: FloatArray
     mass: FloatArray
     weight: FloatArray  # load on the road [N]
-    body: FloatArray
-    back: float | FloatArray  # deceleration by the slope, g sin(angle) [m/s^2]
-    slowed: FloatArray  # speed lost by the slope in a substep [m/s]
+    body_mass: FloatArray
+    slope_deceleration: float | FloatArray  # by the slope, g sin(angle) [m/s^2]
+    slope_loss: FloatArray  # speed lost to the slope in a substep [m/s]
     standstill: FloatArray
     radius: FloatArray
     pull_by_stiffness: FloatArray
@@ -80,7 +80,9 @@ class _Prepared(NamedTuple):
 
 
 class LgsvlState(NamedTuple):
-    """State of N vehicles: m/s, rad/s, r/min, -, -, -, s since the last shift, N m, m, rad, -, -."""
+    """State of N vehicles: speeds [m/s, rad/s, r/min], gear and gear ratios [-], time since the last shift [s], torque that the traction
+    control allows [N m], lateral position [m], heading [rad], pedals [-].
+    """
 
     speed: FloatArray
     wheel_speed: FloatArray
@@ -97,16 +99,16 @@ class LgsvlState(NamedTuple):
 
 
 class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The vehicle of the setting lgsvl.
+    """The vehicle of the study lgsvl.
 
     Parameters
     ----------
     pedal_lag
         Time constant with which pedals follow their commands [s].
     wheel_mass_share
-        Share of the four wheels' mass that the body carries beside its own [-].
+        Share of the four wheels' mass that is added to the mass of the body [-].
     wheel_damping_share
-        Share of wheelDamping that acts on a rolling wheel [-]; the published data shows little of it.
+        Share of wheelDamping that acts on a rolling wheel [-]; the published data show little damping.
     steering_design_angle
         maxSteeringAngle of the vehicle for which the lane keeping was designed [deg].
     """
@@ -128,16 +130,17 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         inertia = WHEELS * 0.5 * c["wheelMass"] * c["radius"] * c["radius"]
         damping = WHEELS * self.wheel_damping_share * c["wheelDamping"]
         prepared = _Prepared(
-            step=np.array(step), substep=np.array(substep), pedals_follow=np.array(step / (step + self.pedal_lag)),
-            engine_follows=np.array(RPM_RATE * substep / (1 + RPM_RATE * substep)), mass=c["mass"], weight=c["mass"] * slope.down,
-            body=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"], back=slope.back, slowed=np.asarray(slope.back * substep),
-            standstill=HELD_BELOW, radius=c["radius"], pull_by_stiffness=substep * c["radius"], inertia=inertia, damping=damping,
+            step=np.array(step), substep=np.array(substep), pedal_share=np.array(step / (step + self.pedal_lag)),
+            engine_share=np.array(RPM_RATE * substep / (1 + RPM_RATE * substep)), mass=c["mass"], weight=c["mass"] * slope.down,
+            body_mass=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"], slope_deceleration=slope.back,
+            slope_loss=np.asarray(slope.back * substep), standstill=HOLD_SPEED, radius=c["radius"],
+            pull_by_stiffness=substep * c["radius"], inertia=inertia, damping=damping,
             damped_inertia=inertia + substep * damping, brake_torque=WHEELS * c["maxBrakeTorque"], motor_torque=c["maxMotorTorque"],
             least_rpm=c["minRpm"], largest_rpm=c["maxRpm"], steering=c["maxSteeringAngle"] * RADIANS, rolling_drag=c["tireDragCoeff"],
             shift_time=c["shiftTime"], slip_limit=c["tractionControlSlipLimit"], traction_change=np.array(TRACTION_RATE * substep),
             friction=np.asarray(FRICTION * road_friction))
-        creeps = _rim_at(prepared, np.zeros_like(prepared.mass), np.abs(prepared.body * prepared.back))
-        return prepared._replace(standstill=HELD_BELOW + creeps)
+        creep_speed = _rim_at(prepared, np.zeros_like(prepared.mass), np.abs(prepared.body_mass * prepared.slope_deceleration))
+        return prepared._replace(standstill=HOLD_SPEED + creep_speed)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
@@ -152,19 +155,19 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def at_rest(self, prepared: _Prepared) -> LgsvlState:
         p, zeros = prepared, np.zeros_like(prepared.mass)
-        first = zeros + GEAR_RATIOS[0]
+        first_ratio = zeros + GEAR_RATIOS[0]
         return LgsvlState(
-            speed=zeros, wheel_speed=zeros, engine_rpm=p.least_rpm, gear=zeros + 1, old_ratio=first, new_ratio=first,
+            speed=zeros, wheel_speed=zeros, engine_rpm=p.least_rpm, gear=zeros + 1, old_ratio=first_ratio, new_ratio=first_ratio,
             since_shift=zeros + SHIFT_DELAY, traction_torque=TRACTION_START * p.motor_torque, lateral=zeros + LATERAL_ERROR,
             heading=zeros + HEADING_ERROR, throttle=zeros, brake=zeros)
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> LgsvlState:
         """The steady state at a speed: every equation with its rate of change set to zero.
 
-        The vehicle keeps its lane without error; the gear is the one in which the gearbox arrives while accelerating.
+        The vehicle keeps its lane without error; the gearbox has shifted up to the gear for this speed.
         """
         p, zeros = prepared, np.zeros_like(prepared.mass)
-        force = (AIR_DRAG * speed + p.rolling_drag) * speed + p.body * p.back
+        force = (AIR_DRAG * speed + p.rolling_drag) * speed + p.body_mass * p.slope_deceleration
         rim = _rim_at(p, speed, force)
         wheel_speed = rim / p.radius
         gear = zeros + 1
@@ -173,10 +176,10 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         ratio = GEAR_RATIOS[gear.astype(np.intp) - 1]
         gearing = ratio * FINAL_RATIO
         engine_rpm = p.least_rpm + wheel_speed * gearing * RPM
-        full = _torque_share(engine_rpm / p.largest_rpm) * gearing * p.motor_torque
-        needed = p.damping * wheel_speed + p.radius * force
-        throttle = np.minimum(np.maximum(needed, 0.0) / np.maximum(full, 1.0), 1.0)
-        brake = np.minimum(np.maximum(-needed, 0.0) / p.brake_torque, 1.0)
+        full_torque = _torque_share(engine_rpm / p.largest_rpm) * gearing * p.motor_torque
+        needed_torque = p.damping * wheel_speed + p.radius * force
+        throttle = np.minimum(np.maximum(needed_torque, 0.0) / np.maximum(full_torque, 1.0), 1.0)
+        brake = np.minimum(np.maximum(-needed_torque, 0.0) / p.brake_torque, 1.0)
         return LgsvlState(
             speed=speed, wheel_speed=wheel_speed, engine_rpm=engine_rpm, gear=gear, old_ratio=ratio, new_ratio=ratio,
             since_shift=zeros + SHIFT_DELAY, traction_torque=p.motor_torque, lateral=zeros, heading=zeros,
@@ -188,9 +191,9 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def advance(self, prepared: _Prepared, state: LgsvlState, command: Command) -> LgsvlState:
         p = prepared
         lateral, heading, cornering_drag = self._steer(p, state)
-        state = _shifted(p, state)._replace(
-            throttle=state.throttle + (command.throttle - state.throttle) * p.pedals_follow,
-            brake=state.brake + (command.brake - state.brake) * p.pedals_follow, lateral=lateral, heading=heading)
+        state = _after_shift(p, state)._replace(
+            throttle=state.throttle + (command.throttle - state.throttle) * p.pedal_share,
+            brake=state.brake + (command.brake - state.brake) * p.pedal_share, lateral=lateral, heading=heading)
         gearing = _ratio(p, state) * FINAL_RATIO
         for _ in range(SUBSTEPS):
             state = _roll(p, state, gearing, cornering_drag)
@@ -199,7 +202,7 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def _steer(self, p: _Prepared, s: LgsvlState) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Lane keeping, a kinematic bicycle at small angles: lateral position, heading, and cornering drag [N s/m].
 
-        The lane keeping commands a share of the full steering angle, computed for the vehicle for which it was designed.
+        The lane keeping commands a share of the full steering angle; the share suits the vehicle for which it was designed.
         """
         share = -(LATERAL_GAIN * s.lateral + HEADING_GAIN * s.heading) / (self.steering_design_angle * RADIANS)
         angle = np.minimum(np.maximum(share, -ONE), ONE) * p.steering
@@ -209,12 +212,12 @@ class Lgsvl(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return lateral, heading, p.mass * np.abs(curvature * angle) * s.speed
 
 
-def _shifted(p: _Prepared, s: LgsvlState) -> LgsvlState:
-    """Automatic gearbox by engine speed; during shiftTime the ratio moves linearly from the old one to the new."""
+def _after_shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
+    """Automatic gearbox by engine speed; during shiftTime the ratio moves linearly from the old to the new ratio."""
     share = s.engine_rpm / p.largest_rpm
-    free = s.since_shift >= SHIFT_DELAY
-    up = free & (share > SHIFT_UP) & (s.gear < LAST)
-    down = free & (share < SHIFT_DOWN) & (s.gear > FIRST)
+    ready = s.since_shift >= SHIFT_DELAY
+    up = ready & (share > SHIFT_UP) & (s.gear < LAST_GEAR)
+    down = ready & (share < SHIFT_DOWN) & (s.gear > FIRST_GEAR)
     changes = up | down
     if not np.count_nonzero(changes):
         return s
@@ -237,22 +240,22 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
     m dv/dt = K (r w - v) - (D_air v + D_tyre + D_corner) v - m g sin
     """
     h = p.substep
-    wanted = p.least_rpm + s.wheel_speed * gearing * RPM
-    engine_rpm = s.engine_rpm + (wanted - s.engine_rpm) * p.engine_follows
+    steady_rpm = p.least_rpm + s.wheel_speed * gearing * RPM
+    engine_rpm = s.engine_rpm + (steady_rpm - s.engine_rpm) * p.engine_share
     drive = _torque_share(engine_rpm / p.largest_rpm) * gearing * s.traction_torque * s.throttle
 
     rim = p.radius * s.wheel_speed
-    slipping = rim - s.speed
-    spins = slipping > p.slip_limit * np.maximum(rim, LEAST_RIM)
+    slip_speed = rim - s.speed
+    spins = slip_speed > p.slip_limit * np.maximum(rim, LEAST_RIM_SPEED)
     traction = s.traction_torque + np.where(spins, -p.traction_change, p.traction_change)
 
-    stiffness = _tyre_stiffness(p, s.speed, rim, slipping)
+    stiffness = _tyre_stiffness(p, s.speed, rim, slip_speed)
     pull = p.pull_by_stiffness * stiffness
-    body = p.body + h * (stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag)
-    moving = s.speed - p.slowed
-    push = p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body * moving / body
-    wheel_speed = np.maximum(push, ZERO) / (p.damped_inertia + pull * p.radius - pull * pull / body)
-    speed = np.maximum((p.body * moving + pull * wheel_speed) / body, ZERO)
+    damped_mass = p.body_mass + h * (stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag)
+    slope_speed = s.speed - p.slope_loss
+    wheel_momentum = p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body_mass * slope_speed / damped_mass
+    wheel_speed = np.maximum(wheel_momentum, ZERO) / (p.damped_inertia + pull * p.radius - pull * pull / damped_mass)
+    speed = np.maximum((p.body_mass * slope_speed + pull * wheel_speed) / damped_mass, ZERO)
     held = (wheel_speed <= ZERO) & (speed < p.standstill)
     if np.count_nonzero(held):
         speed[held] = ZERO
@@ -261,7 +264,7 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
 
 
 def _torque_share(share: FloatArray) -> FloatArray:
-    """Engine torque over the largest one, at a share of maxRpm: a parabola below maxRpm, zero from there on (assumption)."""
+    """Engine torque as a share of the largest, at an engine speed as a share of maxRpm: a parabola below 1, zero from 1 on (assumption)."""
     torque = TORQUE_IDLE + TORQUE_BEND * share * (ONE - share)
     overspeed = share >= ONE
     if np.count_nonzero(overspeed):
@@ -270,22 +273,22 @@ def _torque_share(share: FloatArray) -> FloatArray:
 
 
 def _rim_at(p: _Prepared, speed: FloatArray, force: FloatArray) -> FloatArray:
-    """Rim speed at which the tyre force is `force` [m/s]: the rising part of `_tyre_stiffness` solved for the rim speed."""
+    """Rim speed [m/s] at which the tyre force is `force` [N]: the rising part of `_tyre_stiffness` solved for the rim speed."""
     share = np.minimum(np.abs(force) / (p.friction * (p.weight + DOWNFORCE * speed * speed)), 1.0)
     slip = PEAK_SLIP * share / (1 + np.sqrt(1 - share))
-    slow = speed + SLIP_FLOOR * slip
-    pushes = np.where(slow <= SLIP_FLOOR, slow, speed / (1 - slip))
-    return np.asarray(np.where(force < 0, speed - np.maximum(speed, SLIP_FLOOR) * slip, pushes))
+    slow_rim = speed + SLIP_FLOOR * slip
+    driving_rim = np.where(slow_rim <= SLIP_FLOOR, slow_rim, speed / (1 - slip))
+    return np.asarray(np.where(force < 0, speed - np.maximum(speed, SLIP_FLOOR) * slip, driving_rim))
 
 
-def _tyre_stiffness(p: _Prepared, speed: FloatArray, rim: FloatArray, slipping: FloatArray) -> FloatArray:
-    """Force per speed of slipping [N s/m] of Unity's WheelCollider: a parabola to the extremum, then down to the asymptote."""
+def _tyre_stiffness(p: _Prepared, speed: FloatArray, rim: FloatArray, slip_speed: FloatArray) -> FloatArray:
+    """Tyre force over slip speed [N s/m], by Unity's WheelCollider: a parabola to the extremum, then a line to the asymptote."""
     denominator = np.maximum(np.maximum(speed, rim), SLIP_FLOOR)
-    slip = np.abs(slipping) / denominator
+    slip = np.abs(slip_speed) / denominator
     friction = (TWO - slip / PEAK_SLIP) / PEAK_SLIP
     slides = slip >= PEAK_SLIP
     if np.count_nonzero(slides):
-        beyond = np.minimum((slip - PEAK_SLIP) / SLIPS_BEYOND, ONE)
-        friction = np.where(slides, (ONE - FRICTION_LOST * beyond) / np.maximum(slip, PEAK_SLIP), friction)
+        sliding_share = np.minimum((slip - PEAK_SLIP) / SLIDING_RANGE, ONE)
+        friction = np.where(slides, (ONE - FRICTION_LOSS * sliding_share) / np.maximum(slip, PEAK_SLIP), friction)
     load = p.weight + DOWNFORCE * speed * speed
     return np.asarray(p.friction * load * friction / denominator)

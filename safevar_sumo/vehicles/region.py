@@ -16,40 +16,40 @@ from safevar_sumo.study import Constraint, Study
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
 SLACK = 1e-9
-"""Tolerated violation of a bound, over the range of the quantity in the domains [-]; covers rounding."""
+"""Tolerance for the violation of a bound, as a share of the range of the quantity in the domains [-]; covers rounding."""
 STEPS_BACK = 64
-"""Number of points tried between an infeasible setting and the original."""
+"""Number of points that a repair tries between an infeasible setting and the original."""
 REJECTIONS = 1000
 """Maximum number of settings drawn for each feasible setting."""
 PROBES = 512
-"""Number of settings searched for a feasible change, in addition to vertices and ends of the domains."""
+"""Number of random settings among which a feasible change is sought, in addition to vertices and ends of the domains."""
 Draw = Callable[[int], FloatArray]
-"""Draws the given number of settings."""
+"""A function that draws a number of settings."""
 
 
 class _Bounds(NamedTuple):
-    """A constraint that can be computed: `quantity` takes settings, shape (N, n); `range` is its range over the domains."""
+    """A constraint as a computation: `quantity` maps settings, shape (N, n), to values, shape (N,); `range` is the range of the values."""
 
     constraint: Constraint
-    legal: str
+    condition: str
     suffix: str
     quantity: Callable[[FloatArray], FloatArray]
-    at_least: float
-    at_most: float
+    minimum: float
+    maximum: float
     range: float
 
     def excess(self, settings: FloatArray) -> FloatArray:
-        """Violation of the bounds by each setting, over the range of the quantity, shape (N,)."""
+        """Violation of the bounds by each setting, as a share of the range of the quantity, shape (N,)."""
         values = self.quantity(settings)
-        return np.asarray(np.maximum(np.maximum(self.at_least - values, values - self.at_most), 0.0) / self.range)
+        return np.asarray(np.maximum(np.maximum(self.minimum - values, values - self.maximum), 0.0) / self.range)
 
     def __str__(self) -> str:
-        return f"{self.constraint.quantity} {self.legal}"
+        return f"{self.constraint.quantity} {self.condition}"
 
 
 @dataclass(frozen=True)
 class FeasibleRegion:
-    """Settings that satisfy all constraints of a study; without constraints, all of them.
+    """Settings that satisfy all constraints of a study; without constraints, all settings.
 
     `vertices` are vertices of the polytope of the linear constraints, shape (V, n); empty without linear constraints.
     """
@@ -66,7 +66,7 @@ class FeasibleRegion:
         return "; ".join(map(str, self.bounds))
 
     def violation(self, settings: FloatArray) -> FloatArray:
-        """Sum of the violations of all constraints, each over the range of its quantity; 0 if feasible; shape (N,)."""
+        """Sum of the violations of all constraints, each as a share of the range of its quantity, shape (N,); 0 if feasible."""
         excess = np.zeros(len(settings))
         for bound in self.bounds:
             excess = excess + bound.excess(settings)
@@ -82,13 +82,14 @@ class FeasibleRegion:
         Raises
         ------
         InputError
-            Naming the constraint that the first infeasible setting violates, and its values.
+            Naming the constraint that the first infeasible setting violates, and the values of that setting.
         """
         for setting in settings[~self.feasible(settings)][:1]:
             for bound in self.bounds:
                 if bound.excess(setting[np.newaxis])[0] > SLACK / len(self.bounds):
                     quantity = f"{bound.constraint.quantity} = {bound.quantity(setting[np.newaxis])[0]:g}{bound.suffix}"
-                    raise InputError(source, f"violates a constraint: {quantity} ({self._values(bound, setting)})", bound.legal + otherwise)
+                    raise InputError(source, f"violates a constraint: {quantity} ({self._values(bound, setting)})",
+                                     bound.condition + otherwise)
 
     def _values(self, bound: _Bounds, setting: FloatArray) -> str:
         return ", ".join(f"{member.name} = {value:g}{member.suffix}"
@@ -97,7 +98,7 @@ class FeasibleRegion:
                          or (bound.constraint.function and value != member.original)) or "the original"
 
     def repaired(self, settings: FloatArray, *, filtered: bool = True) -> FloatArray:
-        """Settings moved towards the original until they are feasible, if `filtered` after the filter; shape (N, n)."""
+        """Settings moved towards the original until they are feasible; if `filtered`, feasible after the filter. Shape (N, n)."""
         result = settings.copy()
         infeasible = np.flatnonzero(~self._accepted(settings, filtered))
         for share in np.arange(STEPS_BACK - 1, -1, -1) / STEPS_BACK:
@@ -112,17 +113,17 @@ class FeasibleRegion:
                 rejections: int = REJECTIONS) -> FloatArray:
         """The first `number` feasible settings drawn, shape (number, n).
 
-        Where fewer than one setting in `rejections` is feasible, random mixtures of the region's vertices follow; without `rng` the
-        result has fewer settings.
+        If `rejections` draws per setting do not suffice, random mixtures of the region's vertices follow; without `rng` the result
+        has fewer settings.
         """
-        batches, drawn = [np.zeros((0, len(self.characteristics)))], 0
-        while (missing := number - sum(map(len, batches))) and drawn < rejections * number:
-            settings = draw(max(missing, min(drawn, 10_000)))
-            drawn += len(settings)
-            batches.append(settings[self._accepted(settings, filtered)][:missing])
-        if missing and rng is not None:
+        batches, draws = [np.zeros((0, len(self.characteristics)))], 0
+        while (shortage := number - sum(map(len, batches))) and draws < rejections * number:
+            settings = draw(max(shortage, min(draws, 10_000)))
+            draws += len(settings)
+            batches.append(settings[self._accepted(settings, filtered)][:shortage])
+        if shortage and rng is not None:
             corners = np.concatenate([self.vertices, self.characteristics.original[np.newaxis]])
-            mixtures = rng.dirichlet(np.full(len(corners), 0.5), missing) @ corners
+            mixtures = rng.dirichlet(np.full(len(corners), 0.5), shortage) @ corners
             mixtures = np.clip(mixtures, self.characteristics.lower, self.characteristics.upper)
             batches.append(self.repaired(mixtures, filtered=filtered))
         return np.concatenate(batches)
@@ -146,35 +147,35 @@ def region_of(study: Study, source: str = "") -> FeasibleRegion:
     lookup, members = Lookup(source, study.origin.places), list[Member]()
     bounds = tuple(_bounds(constraint, study, characteristics, lookup, f"constraints[{number}]", members)
                    for number, constraint in enumerate(study.constraints))
-    linear = [(tuple(bound.constraint.sum.get(name, 0.0) for name in characteristics.names), bound.at_least, bound.at_most)
+    linear = [(tuple(bound.constraint.sum.get(name, 0.0) for name in characteristics.names), bound.minimum, bound.maximum)
               for bound in bounds if bound.constraint.sum]
-    ends = tuple(characteristics.lower.tolist()), tuple(characteristics.upper.tolist())
+    domain_ends = tuple(characteristics.lower.tolist()), tuple(characteristics.upper.tolist())
     for bound in bounds:
         if bound.constraint.sum:
             _refuse_unreachable(source, bound, characteristics)
-    vertices = _vertices(tuple(linear), *ends) if linear else np.zeros((0, len(characteristics)))
+    vertices = _vertices(tuple(linear), *domain_ends) if linear else np.zeros((0, len(characteristics)))
     if vertices is None:
         raise InputError(source, f"constraints: no setting in the domains satisfies all of them: {'; '.join(map(str, bounds))}",
                          "constraints that leave a region, with the original in it")
     region = FeasibleRegion(characteristics, bounds, vertices, tuple(members))
     region.check(characteristics.original[np.newaxis], f"{source}: the original vehicle",
                  otherwise="; the original vehicle must satisfy every constraint")
-    if not _leaves_a_change(region):
-        raise InputError(source, f"constraints leave only the original vehicle, no change that the filter keeps: {region}",
-                         "constraints that leave a region around it")
+    if not _has_feasible_change(region):
+        raise InputError(source, f"constraints leave only the original vehicle, as no feasible change passes the filter: {region}",
+                         "constraints that leave a region around the original")
     return region
 
 
 def _bounds(constraint: Constraint, study: Study, characteristics: CharacteristicSet, lookup: Lookup, key: str,
             members: list[Member]) -> _Bounds:
-    least = -np.inf if constraint.at_least is None else constraint.at_least
-    most = np.inf if constraint.at_most is None else constraint.at_most
-    legal, unit = constraint.legal(study.vehicle.characteristics), constraint.unit_of(study.vehicle.characteristics)
+    minimum = -np.inf if constraint.at_least is None else constraint.at_least
+    maximum = np.inf if constraint.at_most is None else constraint.at_most
+    condition, unit = constraint.legal(study.vehicle.characteristics), constraint.unit_of(study.vehicle.characteristics)
     suffix = "" if unit == "-" else f" {unit}"
     if constraint.sum:
         weights = [(characteristics.names.index(name), weight) for name, weight in constraint.sum.items()]
         width = sum(abs(weight) * (characteristics.upper - characteristics.lower)[column] for column, weight in weights)
-        return _Bounds(constraint, legal, suffix, lambda settings: _weighted(settings, weights), least, most, float(width))
+        return _Bounds(constraint, condition, suffix, lambda settings: _weighted_sum(settings, weights), minimum, maximum, float(width))
     member = lookup.find({}, constraint.function, f"{key}.function")
     guard = member.guard or Guard(lookup.source, f"{key}.function = {constraint.function!r}")
     if not callable(member.target):
@@ -185,11 +186,11 @@ def _bounds(constraint: Constraint, study: Study, characteristics: Characteristi
         columns = {name: column.copy() for name, column in zip(characteristics.names, settings.T, strict=True)}
         return guard.numbers("its call", "values", guard.call("its call", member.target, columns), (len(settings),))
 
-    ends = quantity(np.stack([characteristics.original, characteristics.lower, characteristics.upper]))
-    return _Bounds(constraint, legal, suffix, quantity, least, most, float(np.ptp(ends)) or max(1.0, abs(float(ends[0]))))
+    samples = quantity(np.stack([characteristics.original, characteristics.lower, characteristics.upper]))
+    return _Bounds(constraint, condition, suffix, quantity, minimum, maximum, float(np.ptp(samples)) or max(1.0, abs(float(samples[0]))))
 
 
-def _weighted(settings: FloatArray, weights: Sequence[tuple[int, float]]) -> FloatArray:
+def _weighted_sum(settings: FloatArray, weights: Sequence[tuple[int, float]]) -> FloatArray:
     """A weighted sum, added term by term so that it does not depend on the number of settings."""
     total = np.zeros(len(settings))
     for column, weight in weights:
@@ -198,32 +199,34 @@ def _weighted(settings: FloatArray, weights: Sequence[tuple[int, float]]) -> Flo
 
 
 def _refuse_unreachable(source: str, bound: _Bounds, characteristics: CharacteristicSet) -> None:
-    ends = np.array([[getattr(characteristics, side)[characteristics.names.index(name)] * weight for side in ("lower", "upper")]
-                     for name, weight in bound.constraint.sum.items()])
-    least, most = (float(side(ends, axis=1).sum()) for side in (np.min, np.max))
-    if most < bound.at_least or least > bound.at_most:
-        raise InputError(source, f"constraints: {bound.constraint.quantity} is between {least:g} and {most:g} in the domains", bound.legal)
+    terms = np.array([[getattr(characteristics, side)[characteristics.names.index(name)] * weight for side in ("lower", "upper")]
+                      for name, weight in bound.constraint.sum.items()])
+    smallest, largest = (float(extreme(terms, axis=1).sum()) for extreme in (np.min, np.max))
+    if largest < bound.minimum or smallest > bound.maximum:
+        problem = f"constraints: {bound.constraint.quantity} is between {smallest:g} and {largest:g} in the domains"
+        raise InputError(source, problem, bound.condition)
 
 
 @lru_cache(maxsize=16)
 def _vertices(linear: tuple[Any, ...], lower: tuple[float, ...], upper: tuple[float, ...]) -> FloatArray | None:
-    """Two settings per characteristic, with its least and its greatest value under the linear constraints; None if none satisfies them."""
+    """Two settings per characteristic, with its least and its greatest value under the linear constraints; None if no setting fits."""
     from scipy.optimize import linprog  # loading takes half a second
 
-    rows = [(sign * np.array(weights), sign * bound) for weights, least, most in linear for sign, bound in ((-1, least), (1, most))
-            if np.isfinite(bound)]
+    inequalities = [(sign * np.array(weights), sign * limit) for weights, minimum, maximum in linear
+                    for sign, limit in ((-1, minimum), (1, maximum)) if np.isfinite(limit)]
     vertices = []
     for column in range(len(lower)):
         for sign in (1.0, -1.0):
-            answer = linprog(sign * np.eye(len(lower))[column], A_ub=np.array([row for row, _ in rows]),
-                             b_ub=np.array([bound for _, bound in rows]), bounds=list(zip(lower, upper, strict=True)), method="highs")
-            if not answer.success:
+            result = linprog(sign * np.eye(len(lower))[column], A_ub=np.array([weights for weights, _ in inequalities]),
+                             b_ub=np.array([limit for _, limit in inequalities]), bounds=list(zip(lower, upper, strict=True)),
+                             method="highs")
+            if not result.success:
                 return None
-            vertices.append(np.clip(answer.x, lower, upper))
+            vertices.append(np.clip(result.x, lower, upper))
     return np.array(vertices)
 
 
-def _leaves_a_change(region: FeasibleRegion) -> bool:
+def _has_feasible_change(region: FeasibleRegion) -> bool:
     """Whether a feasible setting still differs from the original after the filter."""
     characteristics = region.characteristics
     for settings in _candidates(region):
@@ -240,5 +243,5 @@ def _candidates(region: FeasibleRegion) -> Iterator[FloatArray]:
                                              for end in (characteristics.lower, characteristics.upper))])
     rng = np.random.default_rng(0)
     probes = rng.uniform(characteristics.lower, characteristics.upper, (PROBES, size))
-    sparse = np.where(rng.random((PROBES, size)) < 2 / size, probes, original)
-    yield region.repaired(np.concatenate([probes, sparse]))
+    sparse_probes = np.where(rng.random((PROBES, size)) < 2 / size, probes, original)
+    yield region.repaired(np.concatenate([probes, sparse_probes]))

@@ -9,21 +9,21 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray, Observation
 
-LONGEST = 3600.0
+LONGEST_DELAY = 3600.0
 """Longest delay [s]."""
 
 
-def history(longest: float, step: float, sample: FloatArray) -> FloatArray:
-    """A history for delays up to `longest` seconds, filled with a first sample of shape (..., N); newest first.
+def history(longest_delay: float, step: float, sample: FloatArray) -> FloatArray:
+    """A history for delays up to `longest_delay` [s], filled with a first sample of shape (..., N); the newest sample comes first.
 
     Raises
     ------
     InputError
         If the delay is longer than any run.
     """
-    if not longest <= LONGEST:
-        raise InputError("vehicle", f"one of its delays is {longest:g} s", f"up to {LONGEST:g} s")
-    length = int(longest / step) + 2
+    if not longest_delay <= LONGEST_DELAY:
+        raise InputError("vehicle", f"one of its delays is {longest_delay:g} s", f"up to {LONGEST_DELAY:g} s")
+    length = int(longest_delay / step) + 2
     return np.repeat(sample[np.newaxis], length, axis=0)
 
 
@@ -35,14 +35,14 @@ def remembered(past: FloatArray, sample: FloatArray) -> FloatArray:
 def delayed(past: FloatArray, delay: FloatArray, step: float) -> FloatArray:
     """The signal of vehicle i `delay[i]` seconds ago, interpolated linearly; shape (..., N)."""
     age = delay / step
-    newer = np.floor(age)
-    share = age - newer
-    signals = past[0].size
-    place = newer.astype(np.intp) * signals + np.arange(signals).reshape(past.shape[1:])
-    after, before = past.take(place), past.take(place + signals)
-    with np.errstate(invalid="ignore"):  # infinite while out of sight, finite a step later
-        between = after * (1 - share) + before * share
-    return np.asarray(np.where(np.isnan(between), after, between))
+    whole_steps = np.floor(age)
+    share = age - whole_steps
+    size = past[0].size
+    index = whole_steps.astype(np.intp) * size + np.arange(size).reshape(past.shape[1:])
+    newer, older = past.take(index), past.take(index + size)
+    with np.errstate(invalid="ignore"):  # a signal is infinite while out of sight, finite a step later
+        signal = newer * (1 - share) + older * share
+    return np.asarray(np.where(np.isnan(signal), newer, signal))
 
 
 class Sensors(NamedTuple):
@@ -57,16 +57,16 @@ class Sensors(NamedTuple):
 
     @classmethod
     def perfect(cls, n: int) -> Sensors:
-        """Sensors without latency, with unlimited range."""
+        """Sensors without latency and with unlimited range."""
         return cls(np.zeros(n), np.full(n, np.inf), np.ones(n))
 
 
-def late_and_near(seen: Observation, past: FloatArray | None, latency: FloatArray, reach: FloatArray,
-                  step: float) -> tuple[Observation, FloatArray]:
-    """The observation `latency` [s] ago without obstacles beyond `reach` [m] times the visibility, and the history for the next call."""
+def sensed_observation(seen: Observation, past: FloatArray | None, latency: FloatArray, reach: FloatArray,
+                       step: float) -> tuple[Observation, FloatArray]:
+    """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility; also the history for the next call."""
     obstacle_speed = np.broadcast_to(seen.obstacle_speed, seen.gap.shape)
-    now = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed, obstacle_speed])
-    past = history(float(np.max(latency)), step, now) if past is None else remembered(past, now)
+    sample = np.stack([seen.gap, seen.closing_speed, seen.lateral, seen.lateral_speed, obstacle_speed])
+    past = history(float(np.max(latency)), step, sample) if past is None else remembered(past, sample)
     gap, closing_speed, lateral, lateral_speed, obstacle_speed = delayed(past, latency, step)
     detected = gap <= reach * seen.visibility
     return seen._replace(gap=np.where(detected, gap, np.inf), closing_speed=closing_speed, lateral=lateral,

@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType
-from safevar_sumo.vehicles.sensors import Sensors, delayed, history, late_and_near, remembered
+from safevar_sumo.vehicles.sensors import Sensors, delayed, history, remembered, sensed_observation
 
 
 class _Prepared(NamedTuple):
@@ -26,11 +26,11 @@ class _Prepared(NamedTuple):
     reaction_time: FloatArray
     brake_delay: FloatArray
     brake_gain: FloatArray
-    back: float | FloatArray
+    pull: float | FloatArray  # deceleration by the slope
 
 
 class SumoState(NamedTuple):
-    """State of N vehicles: speed [m/s], acceleration by the wheels [m/s^2], actuator positions, and the histories of delayed signals."""
+    """State of N vehicles: speed [m/s], acceleration by the wheels [m/s^2], actuator positions [-], and histories of delayed signals."""
 
     speed: FloatArray
     acceleration: FloatArray
@@ -49,7 +49,7 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     reference_mass
         Mass to which accel and decel refer [kg]; at another mass the forces stay the same.
     tyre_friction
-        Friction coefficient of the tyres on a dry road [-]; no acceleration exceeds this times g.
+        Friction coefficient of the tyres on a dry road [-]; no acceleration exceeds this coefficient times g.
     """
 
     UNITS = {
@@ -63,13 +63,13 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
                 wet: bool | BoolArray = False) -> _Prepared:
         c = characteristics
-        load = self.reference_mass / c["mass"]
+        mass_ratio = self.reference_mass / c["mass"]
         return _Prepared(
-            step=step, mass=c["mass"], accel=c["accel"] * load, decel=c["decel"] * load,
+            step=step, mass=c["mass"], accel=c["accel"] * mass_ratio, decel=c["decel"] * mass_ratio,
             grip=self.tyre_friction * road_friction * slope.down, max_speed=c["maxSpeed"], actuator_lag=c["tau"],
             sensor_range=c["sensorRange"],
             reaction_time=c["reactionTime"], brake_delay=c["brakeDelay"], brake_gain=c["brakeGain"],
-            back=slope.back)
+            pull=slope.back)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
@@ -84,30 +84,30 @@ class SumoVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> SumoState:
         """The pedals balance the slope, the only resistance; on a level road they are released."""
         p, rest = prepared, self.at_rest(prepared)
-        brake = np.minimum(np.maximum(-p.back / (p.brake_gain * p.decel), 0.0), 1.0)
-        throttle = np.minimum(np.maximum(p.back / p.accel, 0.0), 1.0)
-        return rest._replace(speed=speed, acceleration=rest.acceleration + p.back, throttle=throttle, brake=brake,
+        brake = np.minimum(np.maximum(-p.pull / (p.brake_gain * p.decel), 0.0), 1.0)
+        throttle = np.minimum(np.maximum(p.pull / p.accel, 0.0), 1.0)
+        return rest._replace(speed=speed, acceleration=rest.acceleration + p.pull, throttle=throttle, brake=brake,
                              brake_commands=rest.brake_commands + brake)
 
     def sensors(self, prepared: _Prepared) -> Sensors:
         return Sensors(prepared.reaction_time, prepared.sensor_range, np.ones_like(prepared.sensor_range))
 
     def sense(self, prepared: _Prepared, state: SumoState, seen: Observation) -> tuple[Observation, SumoState]:
-        """Sensors report the scene of `reactionTime` ago, and nothing beyond `sensorRange` times the visibility."""
-        late, past = late_and_near(seen, state.seen, prepared.reaction_time, prepared.sensor_range, prepared.step)
-        return late, state._replace(seen=past)
+        """Sensors report the scene as it was `reactionTime` ago, and nothing beyond `sensorRange` times the visibility."""
+        sensed, past = sensed_observation(seen, state.seen, prepared.reaction_time, prepared.sensor_range, prepared.step)
+        return sensed, state._replace(seen=past)
 
     def advance(self, prepared: _Prepared, state: SumoState, command: Command) -> SumoState:
-        """The wheels follow the pedals with the actuator lag T: dv/dt = a - g sin(slope), da/dt = (wanted - a) / T."""
+        """The wheels follow the pedals with the actuator lag T: dv/dt = a - g sin(slope), da/dt = (target - a) / T."""
         p = prepared
         commands = remembered(state.brake_commands, command.brake)
         brake = delayed(commands, p.brake_delay, p.step)
-        wanted = np.where(brake > 0, -brake * p.brake_gain * p.decel, command.throttle * p.accel)
-        wanted = np.minimum(np.maximum(wanted, -p.grip), p.grip)
-        acceleration = state.acceleration + (wanted - state.acceleration) * (p.step / (p.actuator_lag + p.step))
+        target = np.where(brake > 0, -brake * p.brake_gain * p.decel, command.throttle * p.accel)
+        target = np.minimum(np.maximum(target, -p.grip), p.grip)
+        acceleration = state.acceleration + (target - state.acceleration) * (p.step / (p.actuator_lag + p.step))
         # Braking ends a remaining positive acceleration at once.
         acceleration = np.where(brake > 0, np.minimum(acceleration, 0.0), acceleration)
-        speed = np.minimum(np.maximum(state.speed + (acceleration - p.back) * p.step, 0.0), np.maximum(p.max_speed, state.speed))
+        speed = np.minimum(np.maximum(state.speed + (acceleration - p.pull) * p.step, 0.0), np.maximum(p.max_speed, state.speed))
         return state._replace(
-            speed=speed, acceleration=(speed - state.speed) / p.step + p.back, throttle=np.where(brake > 0, 0.0, command.throttle),
+            speed=speed, acceleration=(speed - state.speed) / p.step + p.pull, throttle=np.where(brake > 0, 0.0, command.throttle),
             brake=brake, brake_commands=commands)

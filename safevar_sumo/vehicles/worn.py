@@ -9,15 +9,15 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.records import BoolArray, Command, FloatArray, Observation
 from safevar_sumo.vehicles.base import LEVEL, Characteristics, Slope, SumoType
-from safevar_sumo.vehicles.sensors import Sensors, delayed, history, late_and_near, remembered
+from safevar_sumo.vehicles.sensors import Sensors, delayed, history, remembered, sensed_observation
 
 DEEP_TREAD, HALF_WORN_TREAD, LEGAL_TREAD = 6.7, 3.0, 1.6
-"""Tread depths with published stopping distances; the last is the legal minimum in Europe [mm]."""
-FROM_DEEP = 1.368
-"""Stopping distance at 1.6 mm over that at 6.7 mm on wet hot rolled asphalt (MIRA for RoSPA) [-]."""
-FROM_HALF_WORN = 39.9 / 31.7
-"""Stopping distance at 1.6 mm over that at 3 mm, from 50 mph on a wet road (MIRA for Continental; both in m) [-]."""
-LOST_HALF_WORN = (1 - FROM_HALF_WORN / FROM_DEEP) / (1 - 1 / FROM_DEEP)
+"""Tread depths with published stopping distances [mm]; the last depth is the legal minimum in Europe."""
+DEEP_TREAD_RATIO = 1.368
+"""Stopping distance at 1.6 mm over the distance at 6.7 mm on wet hot rolled asphalt (MIRA for RoSPA) [-]."""
+HALF_WORN_RATIO = 39.9 / 31.7
+"""Stopping distance at 1.6 mm over the distance at 3 mm, from 50 mph on a wet road (MIRA for Continental; both in m) [-]."""
+HALF_WORN_LOSS = (1 - HALF_WORN_RATIO / DEEP_TREAD_RATIO) / (1 - 1 / DEEP_TREAD_RATIO)
 """Loss of friction at 3 mm over the loss at 1.6 mm [-]; friction is proportional to 1 / stopping distance."""
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 
@@ -27,19 +27,19 @@ class _Prepared(NamedTuple):
 
     step: float
     mass: FloatArray
-    drive: FloatArray
-    brake: FloatArray
+    drive_acceleration: FloatArray
+    brake_deceleration: FloatArray
     grip: FloatArray
     front_load: FloatArray
     rear_load: FloatArray
-    response: FloatArray
+    brake_lag: FloatArray
     sensor_range: FloatArray
     latency: FloatArray
     slope: Slope
 
 
 class WornState(NamedTuple):
-    """State of N vehicles: speed [m/s], actuator positions, and the histories of delayed signals."""
+    """State of N vehicles: speed [m/s], actuator positions [-], and histories of the delayed signals."""
 
     speed: FloatArray
     throttle: FloatArray
@@ -55,26 +55,26 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     Parameters
     ----------
     kerb_mass, kerb_centre, wheelbase, centre_height
-        Of the empty car: mass [kg], distance of its centre from the front axle, wheelbase, height of its centre [m].
+        The empty car: mass [kg], distance of the centre of mass from the front axle, wheelbase, height of the centre of mass [m].
     drive_force, brake_force, front_share
         Largest forces of engine and brakes [N], and the front axle's share of the brake force [-].
     tyre_friction
         Friction coefficient on a dry road [-].
     tread_loss
-        Share of the friction that tyres worn down to 1.6 mm have lost on a wet road [-]. By default 1 - 1 / 1.368: their stopping
-        distance was 36.8 % longer than with 6.7 mm (MIRA for RoSPA, hot rolled asphalt). See the notes for other depths.
+        Share of the friction that tyres worn down to 1.6 mm have lost on a wet road [-]. The default is 1 - 1 / 1.368: their
+        stopping distance was 36.8 % longer than with 6.7 mm (MIRA for RoSPA, hot rolled asphalt). See the notes for other depths.
     max_speed
         Top speed [m/s].
 
     Notes
     -----
     The loss of friction on a wet road is linear in tread depth between published points: none from 6.7 mm on, `tread_loss` at 1.6 mm,
-    and at 3 mm the loss for which stopping at 1.6 mm takes 39.9 / 31.7 times the distance (MIRA for Continental, from 50 mph). The last
-    line extends below 1.6 mm (assumption). The loss, measured from 50 mph, acts at every speed (assumption; slower, tyres lose less). The
-    weather determines whether a road is wet; on a dry road the tread has no effect.
+    and at 3 mm the loss for which stopping at 1.6 mm takes 39.9 / 31.7 times the distance (MIRA for Continental, from 50 mph). The line
+    from 3 mm to 1.6 mm continues below 1.6 mm (assumption). The loss was measured from 50 mph and acts at every speed (assumption; tyres
+    lose less at lower speeds). The weather determines whether a road is wet; on a dry road the tread has no effect.
 
-    The deceleration a is the smallest of a = F / m, a = mu g, and, for each axle, the a at which that axle is at its limit
-    mu m (g x -+ a h) / L while the other brakes with its share. On a slope g is the component onto the
+    The deceleration a is the smallest of a = F / m, a = mu g, and, for each axle, the a at which that axle reaches its limit
+    mu m (g x -+ a h) / L while the other axle brakes with its share. On a slope, g stands for the component of gravity onto the
     road, and the component along the road acts in addition to a. The vehicle never rolls back.
     """
 
@@ -91,7 +91,7 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     brake_force: Positive = 16500.0
     front_share: Annotated[float, Meta(gt=0, lt=1)] = 0.7
     tyre_friction: Positive = 0.9
-    tread_loss: Annotated[float, Meta(ge=0, lt=0.5)] = 1 - 1 / FROM_DEEP
+    tread_loss: Annotated[float, Meta(ge=0, lt=0.5)] = 1 - 1 / DEEP_TREAD_RATIO
     max_speed: Positive = 55.56
 
     def prepare(self, characteristics: Characteristics, road_friction: float, step: float, slope: Slope = LEVEL,
@@ -99,55 +99,57 @@ class WornVehicle(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         c = characteristics
         mass = self.kerb_mass + c["payload"]
         centre = (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"]) / mass / self.wheelbase
-        grip_kept = np.where(wet, 1 - self.tread_loss * _share_of_loss(np.maximum(c["treadDepth"], 0.0)), 1.0)
+        grip_share = np.where(wet, 1 - self.tread_loss * _share_of_loss(np.maximum(c["treadDepth"], 0.0)), 1.0)
         return _Prepared(
-            step=step, mass=mass, drive=self.drive_force / mass, brake=c["brakeTorque"] * (self.brake_force / mass),
-            grip=self.tyre_friction * road_friction * grip_kept, front_load=1 - centre, rear_load=centre, response=c["brakeResponse"],
-            sensor_range=c["sensorRange"], latency=c["sensorLatency"], slope=slope)
+            step=step, mass=mass, drive_acceleration=self.drive_force / mass,
+            brake_deceleration=c["brakeTorque"] * (self.brake_force / mass), grip=self.tyre_friction * road_friction * grip_share,
+            front_load=1 - centre, rear_load=centre, brake_lag=c["brakeResponse"], sensor_range=c["sensorRange"],
+            latency=c["sensorLatency"], slope=slope)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
-        full = self._deceleration(p, np.ones_like(p.mass))
-        return SumoType(mass=p.mass, accel=np.minimum(p.drive, p.grip * p.slope.down), decel=full,
-                        max_speed=np.full_like(p.mass, self.max_speed), tau=p.response + p.step)
+        decel = self._deceleration(p, np.ones_like(p.mass))
+        return SumoType(mass=p.mass, accel=np.minimum(p.drive_acceleration, p.grip * p.slope.down), decel=decel,
+                        max_speed=np.full_like(p.mass, self.max_speed), tau=p.brake_lag + p.step)
 
     def at_rest(self, prepared: _Prepared) -> WornState:
         zeros = np.zeros_like(prepared.mass)
-        return WornState(zeros, zeros, zeros, zeros + 1, None, history(float(np.max(prepared.response)), prepared.step, zeros))
+        return WornState(zeros, zeros, zeros, zeros + 1, None, history(float(np.max(prepared.brake_lag)), prepared.step, zeros))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> WornState:
         """The pedals balance the slope, the only resistance; on a level road they are released."""
         p, rest = prepared, self.at_rest(prepared)
-        brake = np.minimum(np.maximum(-p.slope.back / p.brake, 0.0), 1.0)
-        throttle = np.minimum(np.maximum(p.slope.back / p.drive, 0.0), 1.0)
+        brake = np.minimum(np.maximum(-p.slope.back / p.brake_deceleration, 0.0), 1.0)
+        throttle = np.minimum(np.maximum(p.slope.back / p.drive_acceleration, 0.0), 1.0)
         return rest._replace(speed=speed, throttle=throttle, brake=brake, brake_commands=rest.brake_commands + brake)
 
     def sensors(self, prepared: _Prepared) -> Sensors:
         return Sensors(prepared.latency, prepared.sensor_range, np.ones_like(prepared.sensor_range))
 
     def sense(self, prepared: _Prepared, state: WornState, seen: Observation) -> tuple[Observation, WornState]:
-        """Dirty sensors report the scene of `sensorLatency` ago, and nothing beyond `sensorRange` times the visibility."""
-        late, past = late_and_near(seen, state.seen, prepared.latency, prepared.sensor_range, prepared.step)
-        return late, state._replace(seen=past)
+        """The sensors report the scene as it was `sensorLatency` ago, and nothing beyond `sensorRange` times the visibility."""
+        sensed, past = sensed_observation(seen, state.seen, prepared.latency, prepared.sensor_range, prepared.step)
+        return sensed, state._replace(seen=past)
 
     def advance(self, prepared: _Prepared, state: WornState, command: Command) -> WornState:
         p = prepared
         commands = remembered(state.brake_commands, command.brake)
-        brake = delayed(commands, p.response, p.step)
-        gained = np.where(brake > 0, -self._deceleration(p, brake), np.minimum(command.throttle * p.drive, p.grip * p.slope.down))
-        speed = np.minimum(np.maximum(state.speed + (gained - p.slope.back) * p.step, 0.0), np.maximum(self.max_speed, state.speed))
+        brake = delayed(commands, p.brake_lag, p.step)
+        drive = np.minimum(command.throttle * p.drive_acceleration, p.grip * p.slope.down)
+        acceleration = np.where(brake > 0, -self._deceleration(p, brake), drive)
+        speed = np.minimum(np.maximum(state.speed + (acceleration - p.slope.back) * p.step, 0.0), np.maximum(self.max_speed, state.speed))
         return state._replace(speed=speed, throttle=np.where(brake > 0, 0.0, command.throttle), brake=brake, brake_commands=commands)
 
     def _deceleration(self, p: _Prepared, pedal: FloatArray) -> FloatArray:
-        """Deceleration by both axles together [m/s^2]."""
-        wanted, lever = pedal * p.brake, p.grip * (self.centre_height / self.wheelbase)
-        rear_slides = (self.front_share * wanted + p.grip * p.slope.down * p.rear_load) / (1 + lever)
-        front_slides = ((1 - self.front_share) * wanted + p.grip * p.slope.down * p.front_load) / (1 - lever)
-        return np.minimum(np.minimum(wanted, p.grip * p.slope.down), np.minimum(rear_slides, front_slides))
+        """Deceleration by the brakes of both axles together [m/s^2]."""
+        demand, lever = pedal * p.brake_deceleration, p.grip * (self.centre_height / self.wheelbase)
+        rear_limit = (self.front_share * demand + p.grip * p.slope.down * p.rear_load) / (1 + lever)
+        front_limit = ((1 - self.front_share) * demand + p.grip * p.slope.down * p.front_load) / (1 - lever)
+        return np.minimum(np.minimum(demand, p.grip * p.slope.down), np.minimum(rear_limit, front_limit))
 
 
 def _share_of_loss(depth: FloatArray) -> FloatArray:
     """Loss of friction on a wet road at a tread depth [mm] over the loss at 1.6 mm [-], shape (N,)."""
-    first = np.minimum(np.maximum((DEEP_TREAD - depth) / (DEEP_TREAD - HALF_WORN_TREAD), 0.0), 1.0)
-    second = np.maximum((HALF_WORN_TREAD - depth) / (HALF_WORN_TREAD - LEGAL_TREAD), 0.0)
-    return np.asarray(LOST_HALF_WORN * first + (1 - LOST_HALF_WORN) * second)
+    loss_to_half_worn = np.minimum(np.maximum((DEEP_TREAD - depth) / (DEEP_TREAD - HALF_WORN_TREAD), 0.0), 1.0)
+    loss_beyond_half_worn = np.maximum((HALF_WORN_TREAD - depth) / (HALF_WORN_TREAD - LEGAL_TREAD), 0.0)
+    return np.asarray(HALF_WORN_LOSS * loss_to_half_worn + (1 - HALF_WORN_LOSS) * loss_beyond_half_worn)

@@ -1,4 +1,4 @@
-"""Every ADS: element by element, pedals in range, and whatever a foreign one does wrong is told with its name."""
+"""Every ADS: vehicles are independent, pedals are in range, and a scalar ADS has an instance per vehicle."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STUDIES = {load_study(name).ads.model: load_study(name) for name in study_names(
 NATIVE = load_study("native")
 SYSTEMS = {name: assemble(STUDIES.get(name, msgspec.structs.replace(NATIVE, ads=ModelTable(model=name)))) for name in ADS}
 TAKE_OVER = {"aeb", "competent_driver", "full_braking", "fuzzy_safety", "r157", "rss"}
-"""They keep the speed that they are given."""
+"""ADSs that keep the initial speed."""
 KNOWN = assemble(load_study("sun")).nominal
 
 
@@ -36,7 +36,7 @@ def observation(time: float, speed: np.ndarray, gap: np.ndarray, lateral: np.nda
 
 
 def approach(ads: Ads, nominal: Nominal, speed: np.ndarray, gap: np.ndarray) -> np.ndarray:
-    """Pedals over time, shape (T, 2, N), of vehicles that go on at constant speed whatever they command."""
+    """Pedals over time, shape (T, 2, N), of vehicles whose speed stays constant whatever the pedals are."""
     memory, pedals = ads.start(len(speed), nominal, STEP), []
     for step in range(80):
         seen = observation(step * STEP, speed, gap - speed * step * STEP, np.zeros_like(speed))
@@ -53,7 +53,7 @@ def test_pedals_stay_in_range_and_no_vehicle_knows_of_another(speed: np.ndarray,
         nominal = system.nominal
         together = approach(system.ads, nominal, speed, gap)
         assert np.all((together >= 0) & (together <= 1))
-        assert not np.any((together[:, 0] > 0) & (together[:, 1] > 0)), "nobody drives and brakes at once"
+        assert not np.any((together[:, 0] > 0) & (together[:, 1] > 0)), "no vehicle accelerates and brakes at once"
         assert approach(system.ads, nominal, speed[2:3], gap[2:3])[..., 0].tobytes() == together[..., 2].tobytes()
 
 
@@ -80,22 +80,22 @@ def test_world_on_rails_brakes_up_to_a_gap_that_shrinks_before_and_past_its_plac
     seen = observation(1.0, np.full(1, speed), np.full(1, gap), np.full(1, lateral))._replace(visibility=0.9)
     command, memory = ads.drive(seen, ads.start(1, KNOWN, STEP))
     assert bool(command.brake[0]) == (gap < limit and abs(lateral) <= 2.5)
-    # Once it brakes it goes on, until he is out of what it watches.
-    further, _ = ads.drive(seen._replace(gap=np.full(1, 50.0)), memory)
-    assert further.brake[0] == command.brake[0]
-    gone, _ = ads.drive(seen._replace(lateral=np.full(1, 2.6)), memory)
-    assert gone.brake[0] == 0
+    # Once it brakes, it goes on until the obstacle has left its corridor.
+    farther_command, _ = ads.drive(seen._replace(gap=np.full(1, 50.0)), memory)
+    assert farther_command.brake[0] == command.brake[0]
+    free_command, _ = ads.drive(seen._replace(lateral=np.full(1, 2.6)), memory)
+    assert free_command.brake[0] == 0
 
 
 class Timid(ScalarAds):
-    """Brakes in front of everything, and counts how often it was asked."""
+    """Brakes in front of everything, and counts its calls."""
 
     def __init__(self, distance: float = 10.0) -> None:
-        self.distance, self.asked = distance, 0
+        self.distance, self.calls = distance, 0
 
     def drive(self, seen: Observation) -> tuple[float, float]:
-        self.asked += 1
-        return (0.0, 1.0) if seen.gap < self.distance else (0.1 * self.asked, 0.0)
+        self.calls += 1
+        return (0.0, 1.0) if seen.gap < self.distance else (0.1 * self.calls, 0.0)
 
 
 def test_a_scalar_ads_drives_every_vehicle_with_an_instance_of_its_own() -> None:

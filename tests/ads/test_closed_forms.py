@@ -1,4 +1,4 @@
-"""What the shipped ADSs command, against the formulas that they are made of."""
+"""The commands of the shipped ADSs, compared with the formulas of the ADSs."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_world_on_rails_begins_to_brake_for_nobody_beside_it_and_lets_go_a_metre
 
 
 def onset(ads: Apollo, speed: float, visibility: float = 1.0, start: float = 60.0) -> float:
-    """The gap at which it first brakes, driven on at constant speed."""
+    """The gap at which Apollo first brakes while its speed stays constant [m]."""
     memory, gap, time = ads.start(1, KNOWN, STEP), start, 0.0
     while gap > 0:
         command, memory = ads.drive(seen(time, speed, gap, visibility=visibility), memory)
@@ -85,19 +85,19 @@ def onset(ads: Apollo, speed: float, visibility: float = 1.0, start: float = 60.
 def test_apollo_begins_where_a_comfortable_stop_and_the_way_lost_in_pedals_and_jerk_need_it(speed: float, lag: float) -> None:
     """gap = stop gap + v^2 / (2 b) + v (lag + b / (2 jerk))."""
     expected = 5.0 + speed**2 / (2 * 2.0) + speed * (lag + 0.5 * 2.0 / 5.0)
-    begun = onset(apollo(pedal_lag=lag, cruise_speed=speed), speed)
-    assert expected - 2.5 * speed * STEP < begun < expected + 1e-9
+    onset_gap = onset(apollo(pedal_lag=lag, cruise_speed=speed), speed)
+    assert expected - 2.5 * speed * STEP < onset_gap < expected + 1e-9
 
 
 @pytest.mark.parametrize(("visibility", "detected"), [(1.0, 20.0), (0.5, 10.0)])
 def test_apollo_brakes_for_nobody_beyond_its_range_which_bad_sight_shortens(visibility: float, detected: float) -> None:
-    """At 8 m/s it would begin 23.4 m before somebody whom it sees from far; 20 m is its range in clear sight."""
-    begun = onset(apollo(perception_range=20.0), 8.0, visibility)
-    assert detected - 2.5 * 8.0 * STEP < begun <= detected
+    """At 8 m/s Apollo would begin to brake at a gap of 23.4 m; its range is 20 m in clear sight."""
+    onset_gap = onset(apollo(perception_range=20.0), 8.0, visibility)
+    assert detected - 2.5 * 8.0 * STEP < onset_gap <= detected
 
 
 def test_apollo_asks_for_what_is_needed_to_stand_at_its_gap_through_the_originals_brake_table() -> None:
-    """Once the jerk has let it: deceleration = v^2 / (2 (gap - stop gap)), up to the largest; pedal = (that - coasting) / braking."""
+    """Beyond the jerk limit: deceleration b = v^2 / (2 (gap - stop gap)), at most the largest; pedal = (b - coasting) / braking."""
     ads = apollo(jerk=1e4)
     memory = ads.start(1, KNOWN, STEP)
     _, memory = ads.drive(seen(0.0, 8.0, 20.0), memory)
@@ -109,7 +109,7 @@ def test_apollo_asks_for_what_is_needed_to_stand_at_its_gap_through_the_original
 
 @pytest.mark.parametrize(("speed", "deceleration"), [(1.1, 2.0), (0.95, 1.5), (0.8, 1.0), (0.65, 0.5)])
 def test_apollos_deceleration_fades_into_the_creep_within_three_tenths_of_a_second(speed: float, deceleration: float) -> None:
-    """5 cm before the end of its stop it would need its largest deceleration, 3 m/s^2; it takes (v - 0.5) / 0.3."""
+    """5 cm before its stop Apollo would need its largest deceleration, 3 m/s^2; it brakes with (v - 0.5) / 0.3."""
     ads = apollo(jerk=1e4)
     _, memory = ads.drive(seen(0.0, 8.0, 10.0), ads.start(1, KNOWN, STEP))
     command, _ = ads.drive(seen(STEP, speed, 5.05), memory)
@@ -140,7 +140,7 @@ def test_krauss_aims_at_the_speed_from_which_it_can_still_stop(speed: float, gap
     command, _ = ads.drive(seen(0.0, speed, gap), ads.start(1, KNOWN, STEP))
     b = 0.6 * KNOWN.decel
     room = max(gap - 2.5, 0.0)
-    safe = float(np.roots([1 / (2 * b), 1.0, -room]).max()) if room else 0.0
-    wanted = (min(safe, 13.89) - speed) / (STEP + KNOWN.actuator_lag)
-    assert command.throttle[0] == pytest.approx(min(max(wanted / KNOWN.accel, 0), 1), abs=1e-6)
-    assert command.brake[0] == pytest.approx(min(max(-wanted / KNOWN.decel, 0), 1), abs=1e-6)
+    safe_speed = float(np.roots([1 / (2 * b), 1.0, -room]).max()) if room else 0.0
+    acceleration = (min(safe_speed, 13.89) - speed) / (STEP + KNOWN.actuator_lag)
+    assert command.throttle[0] == pytest.approx(min(max(acceleration / KNOWN.accel, 0), 1), abs=1e-6)
+    assert command.brake[0] == pytest.approx(min(max(-acceleration / KNOWN.decel, 0), 1), abs=1e-6)

@@ -25,7 +25,7 @@ STEP = 0.05
 TABLE = np.arange(0.0, 20.5, 0.5)
 KNOWN = Nominal(mass=1500.0, accel=3.0, decel=10.0, max_speed=50.0, actuator_lag=0.1, tables=lambda: PedalTables(
     speeds=TABLE, full_throttle=np.full(len(TABLE), 3.0), coasting=np.zeros(len(TABLE)), braking=10.0))
-"""Its brake pedal is the deceleration over 10 m/s^2."""
+"""A vehicle whose brake pedal is the deceleration over 10 m/s^2."""
 GAPS, SPEEDS, LEADERS = (values.ravel() for values in np.meshgrid([1.0, 4.0, 12.0, 30.0, 80.0, 150.0], [2.0, 8.0, 13.0], [0.0, 5.0, 12.5]))
 
 
@@ -45,25 +45,25 @@ def sumo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         yield libsumo
 
 
-def theirs(sumo: Any, model: str, net_of: float) -> np.ndarray:
-    """Acceleration that SUMO's model makes of every state [m/s^2]."""
+def sumo_accelerations(sumo: Any, model: str, net_of: float) -> np.ndarray:
+    """Acceleration by SUMO's model in every state [m/s^2]."""
     speeds = [sumo.vehicle.getFollowSpeed(model, v, gap - net_of, u, 4.5) for gap, v, u in zip(GAPS, SPEEDS, LEADERS, strict=True)]
     return (np.array(speeds) - SPEEDS) / STEP
 
 
 def test_idm_is_sumos(sumo: Any) -> None:
-    expected, ours = theirs(sumo, "IDM", 2.5), Idm().acceleration_at(GAPS, SPEEDS, LEADERS)
-    stops = SPEEDS + ours * STEP <= 0  # nobody drives backwards
-    assert ours[~stops] == pytest.approx(expected[~stops], abs=1e-6)
+    expected, accelerations = sumo_accelerations(sumo, "IDM", 2.5), Idm().acceleration_at(GAPS, SPEEDS, LEADERS)
+    stops = SPEEDS + accelerations * STEP <= 0  # nobody drives backwards
+    assert accelerations[~stops] == pytest.approx(expected[~stops], abs=1e-6)
     assert expected[stops] == pytest.approx(-SPEEDS[stops] / STEP, abs=1e-6)
     assert np.count_nonzero(~stops) > 30
 
 
 def test_acc_is_sumos(sumo: Any) -> None:
-    expected, ours = theirs(sumo, "ACC", 2.5), Acc().acceleration_at(GAPS, SPEEDS, LEADERS)
-    compared = (SPEEDS + ours * STEP > 0) & (np.abs(expected - ours) < 1e-6)
-    braked = expected < ours - 1e-6  # in danger SUMO's brakes harder than its control law: its emergency override
-    assert np.all(compared | braked | (SPEEDS + ours * STEP <= 0))
+    expected, accelerations = sumo_accelerations(sumo, "ACC", 2.5), Acc().acceleration_at(GAPS, SPEEDS, LEADERS)
+    compared = (SPEEDS + accelerations * STEP > 0) & (np.abs(expected - accelerations) < 1e-6)
+    braked = expected < accelerations - 1e-6  # in danger, SUMO's emergency override brakes harder than the control law
+    assert np.all(compared | braked | (SPEEDS + accelerations * STEP <= 0))
     assert np.count_nonzero(compared) > 35
 
 
@@ -80,8 +80,8 @@ def test_krauss_means_to_keep_just_the_speed_that_sumos_keeps_behind_somebody_wh
 
 def braking(driver: Any, speed: float, gap: float, leader: float = 0.0, lateral: float = 0.0,
             lateral_speed: float = 0.0) -> tuple[float, np.ndarray]:
-    """Gap at which a driver first brakes, driven on at constant speed towards somebody, and its decelerations from then on."""
-    one, memory, first, asked = np.ones(1), driver.start(1, KNOWN, STEP), np.nan, []
+    """Gap at which a driver first brakes, at constant speed towards an obstacle, and the decelerations from then on."""
+    one, memory, first, decelerations = np.ones(1), driver.start(1, KNOWN, STEP), np.nan, []
     for k in range(400):
         now = gap - (speed - leader) * k * STEP
         if now <= 0:
@@ -92,27 +92,27 @@ def braking(driver: Any, speed: float, gap: float, leader: float = 0.0, lateral:
         if command.brake[0] > 0.05 and np.isnan(first):  # more than the accelerator let go
             first = now
         if not np.isnan(first):
-            asked.append(float(command.brake[0]) * 10)
-    return first, np.array(asked)
+            decelerations.append(float(command.brake[0]) * 10)
+    return first, np.array(decelerations)
 
 
 def test_the_competent_driver_brakes_three_quarters_of_a_second_after_two_seconds_to_collision() -> None:
-    begun, asked = braking(CompetentDriver(), 15.0, 60.0)
-    assert begun == pytest.approx(15.0 * (2.0 - 0.75), abs=2 * 15 * STEP)
-    rise = np.minimum(12.65 * STEP * np.arange(1, len(asked) + 1), 0.774 * 9.81)
-    assert asked == pytest.approx(rise, abs=12.65 * STEP + 1e-9)
-    assert asked[-1] == pytest.approx(0.774 * 9.81)
+    onset_gap, decelerations = braking(CompetentDriver(), 15.0, 60.0)
+    assert onset_gap == pytest.approx(15.0 * (2.0 - 0.75), abs=2 * 15 * STEP)
+    rise = np.minimum(12.65 * STEP * np.arange(1, len(decelerations) + 1), 0.774 * 9.81)
+    assert decelerations == pytest.approx(rise, abs=12.65 * STEP + 1e-9)
+    assert decelerations[-1] == pytest.approx(0.774 * 9.81)
 
 
 def test_the_competent_driver_lets_go_of_the_accelerator_while_it_reacts() -> None:
     """From 30 m on, 2 s before a collision, it slows down by 0.4 m/s^2 for its 0.75 s; before that it holds its speed."""
-    driver, one, asked = CompetentDriver(), np.ones(1), []
+    driver, one, decelerations = CompetentDriver(), np.ones(1), []
     memory = driver.start(1, KNOWN, STEP)
     for k in range(20):
         seen = Observation(k * STEP, 15 * one, (33.3 - 15 * k * STEP) * one, 15 * one, 0 * one, 0 * one, 1.0, 0 * one, 0 * one)
         command, memory = driver.drive(seen, memory)
-        asked.append(float(command.brake[0]) * 10)
-    assert asked == pytest.approx([0.0] * 5 + [0.4] * 15)
+        decelerations.append(float(command.brake[0]) * 10)
+    assert decelerations == pytest.approx([0.0] * 5 + [0.4] * 15)
 
 
 def test_the_competent_driver_keeps_its_headway_with_the_accelerator_alone() -> None:
@@ -125,23 +125,23 @@ def test_the_competent_driver_keeps_its_headway_with_the_accelerator_alone() -> 
 
 
 def test_the_competent_driver_perceives_a_crossing_pedestrian_after_a_stray_of_three_eighths_of_a_metre() -> None:
-    """Starts 2 m aside at 1 m/s, seen at once: strays at 0.375 s, perceived at 0.775 s, then TTC is below 2 s, 0.75 s to the brake."""
-    begun, _ = braking(CompetentDriver(), 10.0, 20.0, lateral=-2.0, lateral_speed=1.0)
-    assert begun == pytest.approx(20.0 - 10 * (0.375 + 0.4 + 0.75), abs=10 * 2.1 * STEP)
+    """From 2 m aside at 1 m/s, seen at once: it strays at 0.375 s, is perceived at 0.775 s with a TTC below 2 s, brakes 0.75 s later."""
+    onset_gap, _ = braking(CompetentDriver(), 10.0, 20.0, lateral=-2.0, lateral_speed=1.0)
+    assert onset_gap == pytest.approx(20.0 - 10 * (0.375 + 0.4 + 0.75), abs=10 * 2.1 * STEP)
 
 
 def test_r157_brakes_with_6_at_once_when_the_regulation_says() -> None:
-    begun, asked = braking(R157(), 12.0, 60.0)
-    assert begun == pytest.approx(12.0 * (12.0 / 12 + 0.45 - 0.35), abs=2 * 12 * STEP)
-    assert asked == pytest.approx(np.full(len(asked), 6.0))
+    onset_gap, decelerations = braking(R157(), 12.0, 60.0)
+    assert onset_gap == pytest.approx(12.0 * (12.0 / 12 + 0.45 - 0.35), abs=2 * 12 * STEP)
+    assert decelerations == pytest.approx(np.full(len(decelerations), 6.0))
 
 
 def test_rss_brakes_a_reaction_time_after_its_safe_distance() -> None:
     b = 0.774 * 9.81
     safe = 12 * 0.75 + (12**2 - 5**2) / (2 * b)
     assert Rss().safe_distance(np.array([12.0]), np.array([5.0]))[0] == pytest.approx(safe)
-    begun, _ = braking(Rss(), 12.0, 60.0, leader=5.0)
-    assert begun == pytest.approx(safe - 7 * 0.75, abs=2 * 7 * STEP)
+    onset_gap, _ = braking(Rss(), 12.0, 60.0, leader=5.0)
+    assert onset_gap == pytest.approx(safe - 7 * 0.75, abs=2 * 7 * STEP)
 
 
 def test_the_safe_distance_of_rss_allows_for_what_is_gained_while_reacting() -> None:
@@ -166,27 +166,28 @@ def test_fuzzy_metrics_are_those_worked_out_by_hand() -> None:
 
 def driven(driver: Any, seconds: float, speed: float, gap: float, leader: float = 0.0,
            lateral: Any = lambda time: (0.0, 0.0)) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gaps, speeds and brake pedals of a point mass that obeys its pedals, behind somebody at a constant speed [m, m/s, -]."""
+    """Gaps, speeds and brake pedals of a point mass behind a leader at a constant speed [m, m/s, -]."""
     one, memory, samples = np.ones(1), driver.start(1, KNOWN, STEP), []
     for k in range(round(seconds / STEP)):
-        aside, moves = lateral(k * STEP)
-        seen = Observation(k * STEP, speed * one, gap * one, (speed - leader) * one, aside * one, moves * one, 1.0, leader * one, 0 * one)
+        position, lateral_speed = lateral(k * STEP)
+        seen = Observation(k * STEP, speed * one, gap * one, (speed - leader) * one, position * one, lateral_speed * one, 1.0,
+                           leader * one, 0 * one)
         command, memory = driver.drive(seen, memory)
         samples.append((gap, speed, float(command.brake[0])))
-        faster = max(speed + (3 * float(command.throttle[0]) - 10 * samples[-1][2]) * STEP, 0.0)
-        gap, speed = gap + (leader - (speed + faster) / 2) * STEP, faster
+        next_speed = max(speed + (3 * float(command.throttle[0]) - 10 * samples[-1][2]) * STEP, 0.0)
+        gap, speed = gap + (leader - (speed + next_speed) / 2) * STEP, next_speed
     return tuple(np.array(samples).T)  # type: ignore[return-value]
 
 
 def test_who_has_stopped_for_a_pedestrian_waits_until_the_way_is_clear() -> None:
-    """He stands in the way for 10 s, walks out at 1 m/s, 1.4 m to the edge of the way; then on."""
+    """The pedestrian stands in the way for 10 s and leaves at 1 m/s, 1.4 m to the edge of the way; then the vehicle goes on."""
     def lateral(time: float) -> tuple[float, float]:
         return max(time - 10, 0.0), float(time >= 10)
 
     for driver in (CompetentDriver(), R157(), FuzzySafety(), FullBraking()):
         gaps, speeds, _ = driven(driver, 13.0, 8.0, 30.0, lateral=lateral)
         clear = round(11.4 / STEP)
-        assert np.diff(speeds[:clear]).max() <= 1e-9, "it starts again towards somebody who stands in front of it"
+        assert np.diff(speeds[:clear]).max() <= 1e-9, "the vehicle starts again towards an obstacle in front of it"
         assert speeds[clear - 1] < 0.2
-        assert speeds[-1] > 1, "it goes on once he is out of the way"
+        assert speeds[-1] > 1, "the vehicle goes on once the pedestrian is out of the way"
         assert gaps[clear] > 0

@@ -1,4 +1,4 @@
-"""Warnings to the driver: when they come, that they change nothing, and that an ADS of one's own has them too."""
+"""Warnings to the driver: their time, their lack of effect on the drive, and warnings of a user's own ADS."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def worn(scenario: Any, latency: float, ads: Any) -> SimulationRuns:
 @pytest.mark.parametrize("latency", [0.05, 0.25, 0.4])
 @pytest.mark.parametrize("scenario", [CarToCar(test="CCRs", speed=60), Along(test="CPLA", speed=60), Along(test="CBLA", speed=70)])
 def test_sensors_that_are_late_warn_as_much_later(scenario: Any, latency: float) -> None:
-    """gap / closing speed < 2.2 s in what is seen, in the first step in which it is: 2.2 s - latency, or less by a step."""
+    """The first step in which the observed gap / closing speed is below 2.2 s: a true TTC of 2.2 s - latency, or one step less."""
     warned = worn(scenario, latency, Aeb(warning_time=2.2)).warning_ttc[0]
     assert 2.2 - latency - STEP <= warned + 1e-9
     assert warned < 2.2 - latency + 1e-9
@@ -55,7 +55,7 @@ class Near(ScalarAds):
 
 
 class NearForMany(Hold):
-    """The same over arrays."""
+    """The ADS `Near` over arrays of vehicles."""
 
     def drive(self, seen: Any, memory: Any) -> tuple[Command, Any]:
         self._near = np.asarray(seen.gap < 20)

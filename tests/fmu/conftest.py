@@ -88,7 +88,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., System]:
-    """The system of an FMU that does something within a gap of 25 m, with the study's table changed; `edit` changes the FMU's file."""
+    """The system of an FMU that runs `then` within a gap of 25 m; `table` replaces the study's table, `edit` changes the FMU's file."""
     monkeypatch.chdir(tmp_path)
 
     def system(then: str = "self.pedal = 1.0", table: str = "", edit: Callable[[Path], object] = lambda fmu: None, time_limit: float = 300,

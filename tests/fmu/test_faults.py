@@ -1,4 +1,4 @@
-"""What is wrong with an FMU, or with how a study uses it, is told in one line; what it needs is given to it."""
+"""What is wrong with an FMU, or with how a study uses it, is message in one line; what it needs is given to it."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def without_binaries(fmu: Path) -> None:
     copy.replace(fmu)
 
 
-@pytest.mark.parametrize(("edit", "table", "told"), [
+@pytest.mark.parametrize(("edit", "table", "message"), [
     (edited('fmiVersion="2.0"', 'fmiVersion="1.0"'), "", "is of FMI 1.0"),
     (edited("CoSimulation", "ModelExchange"), "", "is for model exchange only"),
     (without_binaries, "", "has no binary for this machine"),
-    (lambda fmu: fmu.write_text("no archive"), "", "is no FMU that can be read: BadZipFile"),
+    (lambda fmu: fmu.write_text("no archive"), "", "cannot be read as an FMU: BadZipFile"),
     (Path.unlink, "", "there is no such file"),
     (lambda fmu: (fmu.unlink(), fmu.mkdir()), "", "ads.model = 'Small.fmu': is a directory"),
     (str, IN + '\noutputs = { throttle = "pedal", brake = "pedal" }', "ads.outputs.brake = 'pedal': that variable is ads.outputs.throttle"),
@@ -57,10 +57,10 @@ def without_binaries(fmu: Path) -> None:
     (edited('(name="gap"[^>]*>\\s*<Real) ', '\\1 unit="kg" '), IN + "\n" + OUT, "ads.inputs.gap = 'gap': its unit is 'kg'"),
     (edited('(name="gap"[^>]*>\\s*<Real) ', '\\1 unit="ell" '), IN + "\n" + OUT, "its unit 'ell' has no BaseUnit"),
 ])
-def test_what_cannot_be_used_is_refused_in_one_line(small: Make, edit: Callable[[Path], object], table: str, told: str) -> None:
+def test_what_cannot_be_used_is_refused_in_one_line(small: Make, edit: Callable[[Path], object], table: str, message: str) -> None:
     with pytest.raises(InputError) as error:
         small(table=table, edit=edit)
-    assert told in error.value.problem
+    assert message in error.value.problem
     assert "\n" not in error.value.problem
     assert error.value.exit_code == 2
 
@@ -94,7 +94,7 @@ def driven(system: System, gaps: list[float], step: float = 0.1) -> np.ndarray:
     return np.array(commands).T
 
 
-@pytest.mark.parametrize(("then", "told"), [
+@pytest.mark.parametrize(("then", "message"), [
     ("os.kill(os.getpid(), 11)", "crashed (signal SIGSEGV) while it is at 0.2 s"),
     ("os._exit(7)", "crashed (exit code 7) while it is at 0.2 s"),
     ("time.sleep(1000)", "takes longer than 1 s while it is at 0.2 s"),
@@ -102,11 +102,11 @@ def driven(system: System, gaps: list[float], step: float = 0.1) -> np.ndarray:
     ("self.pedal = 3.0", "returned brake = 3.0 from doStep"),
     ("self.pedal = float('nan')", "returned brake = nan from doStep"),
 ])
-def test_what_it_does_wrong_is_told_and_when(small: Make, then: str, told: str) -> None:
+def test_what_it_does_wrong_is_told_and_when(small: Make, then: str, message: str) -> None:
     system = small(then, time_limit=2)
     with pytest.raises(ForeignError) as error:
         driven(system, [100.0, 50.0, 20.0, 10.0])
     assert error.value.problem.startswith("ads.model = 'Small.fmu'")
-    assert told in error.value.problem
+    assert message in error.value.problem
     assert "\n" not in error.value.problem
-    np.testing.assert_array_equal(driven(system, [100.0, 50.0]), 0, err_msg="afterwards it drives again")
+    np.testing.assert_array_equal(driven(system, [100.0, 50.0]), 0, err_msg="it drives again after the fault")

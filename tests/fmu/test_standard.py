@@ -41,14 +41,14 @@ outputs = { brake = "wish" }
     (None, 0.1, [1, 2, 3, 4, 5, 6]), (0.02, 0.1, [5, 10, 15, 20, 25, 30]), (0.2, 0.1, [1, 1, 2, 2, 3, 3]),
     (0.06, 0.1, [2, 4, 5, 7, 9, 10]), (0.05, 0.025, [1, 1, 2, 2, 3, 3])])
 def test_an_fmu_is_called_at_its_own_step(small: Make, own: float | None, step: float, expected: list[int]) -> None:
-    """It has been called until it is past the end of step k: ceil((k + 1) step / own) times; in between it holds what it told."""
+    """By the end of step k it has been called ceil((k + 1) step / own) times; between calls its outputs hold."""
     table = TABLE + (f"step = {own}" if own else "")
     np.testing.assert_allclose(driven(small("self.pedal = self.steps / 100", table), [20.0] * 6, step)[1], np.array(expected) / 100)
     np.testing.assert_allclose(driven(small("self.pedal = step", table), [20.0] * 2, step)[1], own or step)
 
 
 def test_the_step_that_an_fmu_cannot_change_is_taken(small: Make) -> None:
-    """Of FMI 2.0: its usual one, where it handles no other."""
+    """In FMI 2.0: its default step, if it handles no other step."""
     def edit(fmu: Path) -> None:
         edited('canHandleVariableCommunicationStepSize="true"', 'canHandleVariableCommunicationStepSize="false"')(fmu)
         edited("<ModelVariables>", '<DefaultExperiment stepSize="0.025"/><ModelVariables>')(fmu)
@@ -58,7 +58,7 @@ def test_the_step_that_an_fmu_cannot_change_is_taken(small: Make) -> None:
 
 @pytest.mark.slow
 def test_one_instance_in_a_process_is_enough(small: Make) -> None:
-    """Each vehicle then has a process of its own, and fewer drive at once."""
+    """Each vehicle then has its own process, and fewer vehicles drive at once."""
     def degrees(system: System) -> np.ndarray:
         members = system.characteristics
         settings = members.original + np.linspace(0, 1, 9)[:, np.newaxis] * (members.upper - members.original)
@@ -108,7 +108,7 @@ def cart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_vehicles_characteristics_are_the_parameters_that_its_fmu_declares(cart: Path) -> None:
-    """With the study's rows on top, which may have another unit; what lacks a bound needs a row, or is no characteristic."""
+    """The study's rows override them and may have another unit; a parameter without a bound needs a row to be a characteristic."""
     def rows(more: str) -> dict[str, tuple[str, float, float, float]]:
         (cart / "cart.toml").write_text(CART_TABLE.format(more=more))
         study = load_study("cart.toml")
@@ -117,7 +117,7 @@ def test_a_vehicles_characteristics_are_the_parameters_that_its_fmu_declares(car
 
     declared = {"power": ("km/h/s", 3.0, 7.2, 14.4), "grip": ("m/s2", 8.0, 5.0, 9.0)}
     with pytest.raises(InputError, match=r"characteristics.power.original = 3.0"):
-        rows("")  # the start is a number in the unit that is declared, and outside of what is declared
+        rows("")  # the start value is in the declared unit, and outside the declared domain
     over = "[vehicle.characteristics]\npower = { original = 10.8 }"
     assert rows(over) == {**declared, "power": ("km/h/s", 10.8, 7.2, 14.4)}
     assert rows(f"parameters = {{ grip = 7.0 }}\n{over}").keys() == {"power"}
@@ -126,14 +126,14 @@ def test_a_vehicles_characteristics_are_the_parameters_that_its_fmu_declares(car
 
 
 def test_a_characteristic_reaches_its_fmu_in_the_unit_that_it_declares(cart: Path) -> None:
-    """Full throttle for 0.1 s: 3 m/s^2, whatever the unit of the row; a weight is no acceleration."""
+    """Full throttle for 0.1 s gives 3 m/s^2 for every unit of the row; a unit of mass is refused."""
     text = CART_TABLE.replace('accel = "power"', "accel = 3.0")
     for row, power in (("power = { original = 10.8 }", 10.8), ("power = { unit = 'm/s^2', original = 3.0 }", 3.0)):
         (cart / "cart.toml").write_text(text.format(more=f"[vehicle.characteristics]\n{row}"))
         vehicle = assemble(load_study("cart.toml")).vehicle
         prepared = vehicle.prepare({"power": np.array([power]), "grip": np.array([8.0])}, 1.0, 0.1)
         state = vehicle.advance(prepared, vehicle.at_rest(prepared), Command(np.ones(1), np.zeros(1)))
-        np.testing.assert_allclose(state.speed[0], 10.8 * 0.1)  # it reckons in its own unit
+        np.testing.assert_allclose(state.speed[0], 10.8 * 0.1)  # the FMU computes in its own unit
     row = "power = { unit = 'kg', original = 1, lower = 0.5, upper = 2 }"
     (cart / "cart.toml").write_text(text.format(more=f"[vehicle.characteristics]\n{row}"))
     with pytest.raises(InputError, match="its unit is 'km/h/s'"):
@@ -141,7 +141,7 @@ def test_a_characteristic_reaches_its_fmu_in_the_unit_that_it_declares(cart: Pat
 
 
 def test_a_characteristic_is_no_input_too(cart: Path) -> None:
-    """What the scenario or the weather says would be lost."""
+    """Otherwise the value from the scenario or the weather would be lost."""
     text = CART_TABLE.replace("inputs = {{", 'inputs = {{ initial_speed = "top",')
     (cart / "cart.toml").write_text(text.format(more="[vehicle.characteristics]\npower = { original = 10.8 }\ntop = { upper = 40 }"))
     with pytest.raises(InputError, match=r"vehicle\.inputs\.initial_speed = 'top': that variable is also a characteristic"):
@@ -153,7 +153,8 @@ def test_a_characteristic_is_no_input_too(cart: Path) -> None:
     ("[vehicle.ch", "sensors = { latency = -1 }\n[vehicle.ch", "vehicle.sensors.latency = -1\nexpected: a number of at least 0"),
     ("[vehicle.ch", 'sensors = { range = "v" }\n[vehicle.ch', "vehicle.sensors.range = 'v': there is no such characteristic"),
     ("mass = 1500", "mass = 0.0", "vehicle.sumo_type.mass = 0"),
-    ("10.8", "10.8, lower = 0", "vehicle.characteristics.power.lower = 0, and it is vehicle.sumo_type.accel\nexpected: a number above 0"),
+    ("10.8", "10.8, lower = 0",
+     "vehicle.characteristics.power.lower = 0, the value of vehicle.sumo_type.accel\nexpected: a number above 0"),
 ])
 def test_what_no_vehicle_has_is_refused(old: str, new: str, problem: str, cart: Path) -> None:
     text = CART_TABLE.format(more="[vehicle.characteristics]\npower = { original = 10.8 }")
@@ -164,7 +165,7 @@ def test_what_no_vehicle_has_is_refused(old: str, new: str, problem: str, cart: 
 
 
 def test_a_vehicle_of_another_step_is_where_its_line_between_two_points_is_and_goes_back_to_where_it_was(cart: Path) -> None:
-    """A step of 0.4 s in a simulation of 0.1 s; a second drive from a state in the middle is the same as the first."""
+    """A step of 0.4 s in a simulation with steps of 0.1 s; a second drive from a state in the middle is the same as the first."""
     (cart / "cart.toml").write_text(CART_TABLE.format(more="step = 0.4\n[vehicle.characteristics]\npower = { original = 10.8 }"))
     vehicle = assemble(load_study("cart.toml")).vehicle
     prepared = vehicle.prepare({"power": np.array([10.0]), "grip": np.array([8.0])}, 1.0, 0.1)

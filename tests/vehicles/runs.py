@@ -40,7 +40,7 @@ class Drive(NamedTuple):
 
 def drive(model: str, settings: np.ndarray, pedals: Pedals, duration: float, step: float = STEP, road: float = 1.0,
           rolling: float = 0.0, grade: float = 0.0, wet: bool = False) -> Drive:
-    """Drive settings, shape (N, n); pedals(t) -> (throttle, brake), for all or by vehicle. `rolling` is the speed at the start."""
+    """Drive settings, shape (N, n); pedals(t) -> (throttle, brake), for all vehicles or one each. `rolling` is the initial speed [m/s]."""
     system = SYSTEMS[model]
     values = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
     prepared = system.vehicle.prepare(values, road, step, slope_of(np.full(len(settings), grade)), wet)
@@ -53,7 +53,7 @@ def drive(model: str, settings: np.ndarray, pedals: Pedals, duration: float, ste
 
 
 def _rolling(state: Any, prepared: Any, speed: float) -> Any:
-    """The vehicle at rest, set rolling without slip; its gear stays what it was."""
+    """The state of the vehicle at rest, changed to rolling without slip in the same gear."""
     wheels = {"wheel_speed": speed / prepared.radius} if hasattr(state, "wheel_speed") else {}
     return state._replace(speed=state.speed + speed, **wheels)
 

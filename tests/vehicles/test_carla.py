@@ -21,7 +21,7 @@ def carla() -> Carla:
 
 
 def tyre_force(vehicle: Carla, friction: float, load: float, speed: float, rim: float) -> float:
-    """Of four tyres, from the shader's cubic as PhysX writes it."""
+    """Force of four tyres [N], from the shader's cubic as PhysX writes it."""
     slip = (rim - speed) / (max(rim, speed) + vehicle.slip_offset)
     k = min(4 * GRAVITY * vehicle.longitudinal_stiffness * abs(slip) / (friction * load), 3.0)
     return float(np.sign(slip) * friction * load * (k - k * k / 3 + k**3 / 27))
@@ -56,10 +56,10 @@ def test_driving_and_braking_follow_the_differential_equations() -> None:
         times = np.arange(begin, len(run.states)) * STEP
         exact = solve_ivp(changes, (times[0], times[-1]), [first.speed[0], first.wheel_speed[0], first.engine_speed[0]],
                           t_eval=times, method="LSODA", rtol=1e-8, atol=1e-8, max_step=0.01).y[0]
-        here = run.speed[begin:, 0]
+        simulated = run.speed[begin:, 0]
         moving = exact > 0.5
-        assert np.count_nonzero(moving & (times > 1.7)) > 5, "it brakes a while"
-        assert np.abs(here - exact)[moving].max() < 0.1
+        assert np.count_nonzero(moving & (times > 1.7)) > 5, "the vehicle brakes for some time"
+        assert np.abs(simulated - exact)[moving].max() < 0.1
 
 
 def test_a_camera_on_smaller_wheels_overestimates_the_gap() -> None:
@@ -88,7 +88,7 @@ def test_carla_shifts_up_above_its_engine_speed_and_not_before_its_latency() -> 
 
 
 SPEED, UNTIL = 15.0, 2.0
-"""Between these speeds the mean deceleration is compared [m/s]."""
+"""Speeds between which the tests compare the mean deceleration [m/s]."""
 
 SLOW = pytest.mark.slow
 
@@ -102,13 +102,13 @@ def multi_body(deceleration: float, **changed: float) -> float:
     unchanged, vehicle = parameters(), parameters()
     for name, value in changed.items():
         setattr(vehicle.tire if name == "p_dx1" else vehicle, name, value)
-    asked = -deceleration * unchanged.m * unchanged.R_w / (vehicle.m * vehicle.R_w)  # its input is a torque over m R_w
+    torque = -deceleration * unchanged.m * unchanged.R_w / (vehicle.m * vehicle.R_w)  # its input is a torque over m R_w
 
     def slow(_: float, x: Any) -> Any:
         return x[3] - UNTIL
 
     slow.terminal = True  # type: ignore[attr-defined]
-    result = solve_ivp(lambda _, x: vehicle_dynamics_mb(list(x), [0.0, asked], vehicle), (0, 12),
+    result = solve_ivp(lambda _, x: vehicle_dynamics_mb(list(x), [0.0, torque], vehicle), (0, 12),
                       init_mb([0, 0, 0, SPEED, 0, 0, 0], vehicle), events=slow, max_step=0.01, rtol=1e-4)
     return float((SPEED - result.y[3, -1]) / result.t[-1])
 
@@ -119,15 +119,15 @@ def parameters() -> Any:
     return parameters_vehicle2()
 
 
-def ours(deceleration: float, **changed: float) -> float:
-    """The same of CARLA's vehicle."""
-    other = parameters()
-    mass, radius = changed.get("m", other.m), changed.get("R_w", other.R_w)
-    vehicle = Carla(tyre_friction=1.0, longitudinal_stiffness=other.tire.p_kx1 * mass / WHEELS, slip_offset=0.1, engine_torque=1.0,
+def carla_deceleration(deceleration: float, **changed: float) -> float:
+    """Mean deceleration of the vehicle of CARLA for the same brake torque [m/s^2]."""
+    reference = parameters()
+    mass, radius = changed.get("m", reference.m), changed.get("R_w", reference.R_w)
+    vehicle = Carla(tyre_friction=1.0, longitudinal_stiffness=reference.tire.p_kx1 * mass / WHEELS, slip_offset=0.1, engine_torque=1.0,
                     brake_rise=1e3, camera_height=1.0)
     values = {"max_rpm": 5800.0, "dampRateFullT": 0.15, "dampRateZeroT_CE": 2.0, "dampRateZeroT_CD": 0.35, "gearSwitchTime": 0.5,
-              "clutchStrength": 10.0, "mass": mass, "dragCoeff": 0.0, "tireFric": changed.get("p_dx1", other.tire.p_dx1), "dampRate": 0.0,
-              "radius": 100 * radius, "maxBrakeTorque": deceleration * other.m * other.R_w / WHEELS}
+              "clutchStrength": 10.0, "mass": mass, "dragCoeff": 0.0, "tireFric": changed.get("p_dx1", reference.tire.p_dx1),
+              "dampRate": 0.0, "radius": 100 * radius, "maxBrakeTorque": deceleration * reference.m * reference.R_w / WHEELS}
     step = 0.005
     prepared = vehicle.prepare({name: np.full(1, value) for name, value in values.items()}, 1.0, step)
     neutral = np.zeros(1)
@@ -142,23 +142,23 @@ def ours(deceleration: float, **changed: float) -> float:
 @SLOW
 @pytest.mark.parametrize("deceleration", [2.0, 6.0, 8.0])
 def test_below_the_limit_both_brake_alike(deceleration: float) -> None:
-    """Within 3 %: the other one's wheels are heavier (1.7 against 1.2 kg m^2 each) and take a moment more to slow down."""
-    assert ours(deceleration) == pytest.approx(multi_body(deceleration), rel=0.03)
+    """Within 3 %: the wheels of the multi-body model are heavier (1.7 against 1.2 kg m^2 each) and slow down a little later."""
+    assert carla_deceleration(deceleration) == pytest.approx(multi_body(deceleration), rel=0.03)
 
 
 @SLOW
 @pytest.mark.parametrize(("name", "factor"), [("m", 1.2), ("R_w", 0.9)])
 def test_mass_and_radius_act_alike(name: str, factor: float) -> None:
-    """The ratio of the decelerations with and without the change: that of the closed form within 2 % on both sides."""
+    """In both models, the ratio of decelerations with and without the change agrees with the closed form within 2 %."""
     changed = {name: factor * getattr(parameters(), name)}
-    for model in (ours, multi_body):
+    for model in (carla_deceleration, multi_body):
         assert model(5.0, **changed) / model(5.0) == pytest.approx(1 / factor, rel=0.02)
 
 
 @SLOW
-@pytest.mark.parametrize(("friction", "least"), [(0.8, 0.6), (0.5, 0.55)])
-def test_beyond_the_limit_ours_holds_what_the_other_one_loses(friction: float, least: float) -> None:
-    """Friction is what limits both. Ours keeps it when the wheels lock, as PhysX's tyre does; Pacejka's loses up to a half."""
+@pytest.mark.parametrize(("friction", "least_share"), [(0.8, 0.6), (0.5, 0.55)])
+def test_beyond_the_limit_carla_keeps_the_friction_that_the_multi_body_model_loses(friction: float, least_share: float) -> None:
+    """Friction limits both models. PhysX's tyre keeps its friction when the wheels lock; Pacejka's tyre loses up to a half."""
     limit = friction * GRAVITY
-    assert ours(9.5, p_dx1=friction) == pytest.approx(limit, rel=0.03)
-    assert least * limit < multi_body(9.5, p_dx1=friction) < limit
+    assert carla_deceleration(9.5, p_dx1=friction) == pytest.approx(limit, rel=0.03)
+    assert least_share * limit < multi_body(9.5, p_dx1=friction) < limit

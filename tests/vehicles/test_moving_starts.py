@@ -1,4 +1,4 @@
-"""Vehicles that the traffic puts onto the road while they drive: in a steady state, in every part of them."""
+"""Vehicles that the traffic puts onto the road in motion: every part of them starts in a steady state."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_who_coasts_loses_or_gains_g_sin(model: str, grade: float, gained: float
 
 @pytest.mark.parametrize(("model", "wheels"), [("carla", 4 * 0.5 * 20.0), ("lgsvl", 4 * 0.5 * 30.0)])
 def test_wheels_have_inertia_and_no_weight_of_their_own_to_pull_them(model: str, wheels: float) -> None:
-    """Out of gear, against the level road: m g sin / (m + I / r^2)."""
+    """Out of gear, the slope changes the speed by m g sin / (m + I / r^2) per second, compared with a level road."""
     speeds = [drive(model, original(model), lambda time: (0.0, 0.0), 1.0, rolling=12.0, grade=grade).speed[-1, 0] for grade in (0.0, 8.0)]
     characteristics = SYSTEMS[model].characteristics
     mass = characteristics.original[characteristics.names.index("mass")]
@@ -100,14 +100,14 @@ def test_wheels_have_inertia_and_no_weight_of_their_own_to_pull_them(model: str,
 @pytest.mark.parametrize("model", sorted(SYSTEMS))
 @pytest.mark.parametrize("grade", [8.0, -8.0])
 def test_the_way_to_stop_is_v2_over_twice_what_the_tyres_hold_and_the_slope_adds(model: str, grade: float) -> None:
-    """On ice, where tyres are the limit and hold mu g cos; between 10 and 4 m/s, when the brake has built up."""
-    def way(grade: float) -> float:
+    """On ice, where the tyres limit the deceleration to mu g cos; between 10 and 4 m/s, after the brake has built up."""
+    def distance(grade: float) -> float:
         run = drive(model, original(model), lambda time: (0.0, 1.0), 25.0, rolling=12.0, road=0.25, grade=grade)
         return float(np.interp(-4.0, -run.speed[:, 0], run.distance[:, 0]) - np.interp(-10.0, -run.speed[:, 0], run.distance[:, 0]))
 
-    level = (10**2 - 4**2) / (2 * way(0.0))
+    level = (10**2 - 4**2) / (2 * distance(0.0))
     expected = level * math.cos(ANGLE) + math.copysign(G * math.sin(ANGLE), grade)
-    assert (10**2 - 4**2) / (2 * way(grade)) == pytest.approx(expected, rel=0.02)
+    assert (10**2 - 4**2) / (2 * distance(grade)) == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.parametrize("model", sorted(SYSTEMS))

@@ -1,4 +1,4 @@
-"""The numbers behind the vehicles, seen in how they drive: drag, gears, pedals, limits, and what SUMO is told."""
+"""Numbers of the vehicle models, measured in their motion: drag, gears, pedals, limits, and SUMO's types."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ GRAVITY = 9.81
 
 
 def prepared(model: str, **changes: float) -> object:
-    """One vehicle, the original with some characteristics changed."""
+    """The constants of one vehicle: the original with some characteristics changed."""
     characteristics = SYSTEMS[model].characteristics
     values = {member.name: np.full(1, changes.get(member.name, float(member.original))) for member in characteristics}
     return SYSTEMS[model].vehicle.prepare(values, 1.0, STEP)
@@ -36,7 +36,7 @@ def test_air_slows_carlas_vehicle_by_half_rho_cd_a_v_squared() -> None:
 
 
 def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_and_waits_two_seconds() -> None:
-    vehicle = replace(SYSTEMS["carla"].vehicle, shift_up=0.65, shift_down=0.5, shift_latency=2.0)  # sun's are fitted
+    vehicle = replace(SYSTEMS["carla"].vehicle, shift_up=0.65, shift_down=0.5, shift_latency=2.0)  # the values of sun are fitted
     p = vehicle.prepare({member.name: np.full(1, float(member.original)) for member in SYSTEMS["carla"].characteristics}, 1.0, STEP)
     limit = 5800 * 2 * np.pi / 60
 
@@ -53,7 +53,7 @@ def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_
 
 
 def test_carlas_gearbox_shifts_as_soon_as_the_selector_lets_go_of_the_gear() -> None:
-    """In first gear at 90 % of the engine's maximum: it waits as long as it is held, and no latency after that."""
+    """In first gear at 90 % of the engine's maximum: the gearbox waits while the selector holds the gear, and has no latency afterwards."""
     vehicle, p, one = SYSTEMS["carla"].vehicle, prepared("carla"), np.ones(1)
     rim = 0.9 * 5800 * 2 * np.pi / 60 / (2.85 * 4)
     state = vehicle.at_rest(p)._replace(gear=one, target_gear=one, speed=rim * 0.355 * one, wheel_speed=rim * one,

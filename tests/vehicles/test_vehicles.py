@@ -30,13 +30,13 @@ MODELS = sorted(VEHICLES)
 
 
 def kinetic_energy(model: str, run: Drive) -> np.ndarray:
-    """Of everything that moves [J], shape (T, N)."""
+    """Kinetic energy of all moving parts [J], shape (T, N)."""
     p, states = run.prepared, run.states
     if isinstance(SYSTEMS[model].vehicle, Carla):
         wheels_and_engine = [p.wheel_inertia * s.wheel_speed**2 + ENGINE_INERTIA * s.engine_speed**2 for s in states]
         return np.stack([(p.mass * s.speed**2 + spins) / 2 for s, spins in zip(states, wheels_and_engine, strict=True)])
     if isinstance(SYSTEMS[model].vehicle, Lgsvl):
-        return np.stack([(p.body * s.speed**2 + p.inertia * s.wheel_speed**2) / 2 for s in states])
+        return np.stack([(p.body_mass * s.speed**2 + p.inertia * s.wheel_speed**2) / 2 for s in states])
     return np.stack([p.mass * s.speed**2 / 2 for s in states])
 
 
@@ -55,13 +55,13 @@ def at_random(model: str, then_brake: float | None = None) -> Drive:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_energy_is_never_created(model: str) -> None:
-    """No more energy comes in than the engine can give; with the throttle closed none does."""
+    """The energy grows at most by the power of the engine; with the throttle closed it does not grow."""
     run = at_random(model)
     energy = kinetic_energy(model, run)
     gained = np.diff(energy, axis=0)
     throttle = np.stack([state.throttle for state in run.states])
     closed = (throttle[1:] == 0) & (throttle[:-1] == 0)
-    if model == "sumo":  # its actuator is a lag of the acceleration: the throttle is closed when that has died away
+    if model == "sumo":  # its acceleration lags behind the throttle, which counts as closed when the acceleration has died away
         closed &= np.stack([state.acceleration for state in run.states[1:]]) <= 0
     assert np.count_nonzero(closed) > 1000
     assert np.all(gained[closed] <= 1e-9 * (1 + energy[:-1][closed]))
@@ -72,9 +72,9 @@ def test_energy_is_never_created(model: str) -> None:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_braking_never_raises_speed(model: str) -> None:
-    """Whatever was done before: who brakes is never faster than who only releases the throttle in the same gear, and slows down.
+    """After any drive, a braking vehicle is never faster than a coasting vehicle in the same gear, and it slows down.
 
-    An engine that turns faster than its wheels ask gives its momentum away through the clutch first.
+    An engine that turns faster than its wheels first loses its momentum through the clutch.
     """
     coasting, braking = at_random(model, 0.0), at_random(model, 1.0)
     slower = braking.speed <= coasting.speed + 1e-9
@@ -112,7 +112,7 @@ def test_no_vehicle_knows_of_another(model: str) -> None:
     assert together[:, 4].tobytes() == alone[:, 0].tobytes()
 
 
-# Situations in which a characteristic acts: what is measured, at the end of its domain or of a fine grid over it.
+# Measurements in which a characteristic acts, over a grid of its domain.
 def speed_at(time: float, pedals: Callable[[float], tuple[float, float]] = full_throttle, road: float = 1.0) -> Callable[..., np.ndarray]:
     return lambda model, population: drive(model, population, pedals, time, road=road).speed[-1]
 
@@ -158,7 +158,7 @@ ACTS = {
     },
 }
 SENSED = {"sumo": {"sensorRange", "reactionTime"}, "worn": {"sensorRange", "sensorLatency", "payloadCentre"}}
-"""They act on what is seen, or on the limits of single axles (test_worn.py)."""
+"""Characteristics that act on the observation, or on the limits of single axles (test_worn.py)."""
 
 
 @pytest.mark.parametrize(("model", "name"), [(model, name) for model, acting in ACTS.items() for name in acting])

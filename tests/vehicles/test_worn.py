@@ -27,33 +27,33 @@ def prepared(road: float, wet: bool = False, step: float = 0.05, **changes: floa
 
 
 def stopping_distance(tread: float, wet: bool = True) -> float:
-    """Full braking from 50 mph on a straight road of the weather `wet` [m]."""
+    """Full braking from 50 mph on a straight road: the distance [m]; `wet` is the weather."""
     p = prepared(0.71, wet, 0.001, treadDepth=tread, brakeResponse=0.001)
-    state, way = CAR.at_speed(p, np.full(1, 22.352)), 0.0
+    state, distance = CAR.at_speed(p, np.full(1, 22.352)), 0.0
     while state.speed[0] > 0:
-        before, state = state.speed[0], CAR.advance(p, state, Command(np.zeros(1), np.ones(1)))
-        way += (before + state.speed[0]) / 2 * 0.001
-    return way
+        last_speed, state = state.speed[0], CAR.advance(p, state, Command(np.zeros(1), np.ones(1)))
+        distance += (last_speed + state.speed[0]) / 2 * 0.001
+    return distance
 
 
 @pytest.mark.parametrize("road", [1.0, 0.85, 0.5, 0.2])
 @pytest.mark.parametrize("changes", [
     {}, {"payload": 525.0, "payloadCentre": 3.2}, {"payload": 525.0, "payloadCentre": 1.2}, {"brakeTorque": 0.5}])
-def test_deceleration_is_that_of_two_axles_of_which_none_brakes_more_than_its_load_holds(road: float, changes: dict[str, float]) -> None:
-    """Found here by bisection of m a = sum of min(share F, mu N(a)), with the load going forward as it brakes."""
+def test_two_axles_brake_together_and_none_beyond_the_friction_of_its_load(road: float, changes: dict[str, float]) -> None:
+    """Expected: the bisection of m a = sum of min(share F, mu N(a)); the load N moves forward with the deceleration a."""
     p = prepared(road, **changes)
-    mass, mu, force = float(p.mass[0]), float(p.grip[0]), float(p.brake[0] * p.mass[0])
+    mass, mu, force = float(p.mass[0]), float(p.grip[0]), float(p.brake_deceleration[0] * p.mass[0])
     values = {**HEALTHY, **changes}
     centre = (CAR.kerb_mass * CAR.kerb_centre + values["payload"] * values["payloadCentre"]) / mass
 
-    def left(a: float) -> float:
+    def excess_force(a: float) -> float:
         front = mass * (GRAVITY * (CAR.wheelbase - centre) + a * CAR.centre_height) / CAR.wheelbase
         return min(CAR.front_share * force, mu * front) + min((1 - CAR.front_share) * force, mu * (mass * GRAVITY - front)) - mass * a
 
     low, high = 0.0, 20.0
     for _ in range(80):
         middle = (low + high) / 2
-        low, high = (middle, high) if left(middle) > 0 else (low, middle)
+        low, high = (middle, high) if excess_force(middle) > 0 else (low, middle)
     assert CAR.sumo_type(p).decel[0] == pytest.approx(low, rel=1e-9)
 
 
