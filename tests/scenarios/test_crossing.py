@@ -19,7 +19,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios.car_to_car import CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
-from safevar_sumo.scenarios.euro_ncap import VUT_WIDTH, Walk
+from safevar_sumo.scenarios.euro_ncap import VUT_WIDTH, SpeedProfile
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate
@@ -62,12 +62,12 @@ def test_the_pedestrian_is_where_the_closed_form_has_him(test: str) -> None:
 
 @settings(max_examples=40)
 @given(speed=st.floats(1, 5), run_up=st.just(0.0) | st.floats(0.1, 3), rest=st.floats(0.01, 8), time=st.floats(20, 60))
-def test_a_walk_arrives_in_time_whatever_it_is(speed: float, run_up: float, rest: float, time: float) -> None:
-    walk = Walk.reaching(run_up + rest, time, speed, run_up)
-    assert walk.travelled(time) == pytest.approx(run_up + rest)
-    assert walk.travelled(walk.begin) == 0
+def test_a_target_arrives_in_time_with_any_speed_profile(speed: float, run_up: float, rest: float, time: float) -> None:
+    profile = SpeedProfile.reaching(run_up + rest, time, speed, run_up)
+    assert profile.travelled(time) == pytest.approx(run_up + rest)
+    assert profile.travelled(profile.begin) == 0
     if run_up:
-        assert walk.travelled(walk.begin + 2 * run_up / speed) == pytest.approx(run_up, abs=1e-9)
+        assert profile.travelled(profile.begin + 2 * run_up / speed) == pytest.approx(run_up, abs=1e-9)
 
 
 def test_sumo_reports_a_crash_just_where_bodies_overlap() -> None:
