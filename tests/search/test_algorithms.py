@@ -282,7 +282,7 @@ def test_ranges_narrow_to_means_of_the_unsafe_alone_and_never_across_the_origina
 def test_the_number_of_changes_is_rounded_half_up(settings: list[list[float]], most: int) -> None:
     ranges = _Ranges(problem())
     ranges.narrow(window(settings, [1.0] * len(settings)))
-    assert ranges.most_changed == most, "a mean of 1.5 makes 2, of 4/3 makes 1"
+    assert ranges.max_changes == most, "a mean of 1.5 makes 2, of 4/3 makes 1"
 
 
 def test_a_score_weighs_safety_six_times_and_the_others_once() -> None:
