@@ -23,10 +23,10 @@ from safevar_sumo.shipped import NETWORKS, PACKAGE, STUDIES
 DIGITS = 16
 """Length of a file's digest."""
 Files = dict[str, str]
-"""Digests of files by file name."""
+"""Digests of files by the names that `digests` gives them."""
 LIBRARY_FOLDERS = ("site-packages", "dist-packages")
 """Names of folders of installed libraries; such folders may be anywhere."""
-FOLDERS_NOT_FOREIGN = tuple(f"{folder}{os.sep}" for folder in sorted({
+KNOWN_FOLDERS = tuple(f"{folder}{os.sep}" for folder in sorted({
     str(PACKAGE), str(STUDIES), str(NETWORKS),
     *(os.path.realpath(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
     *(os.path.realpath(os.path.join(prefix, name)) for prefix in (sys.prefix, sys.base_prefix, "/", "/usr", "/usr/local")
@@ -113,8 +113,8 @@ def noted_reading() -> Iterator[Reading]:
 
 
 def is_foreign(path: str) -> bool:
-    """Whether a file belongs neither to the interpreter, an installed library, this package nor the operating system."""
-    return not path.startswith(FOLDERS_NOT_FOREIGN) and not any(name in Path(path).parts for name in LIBRARY_FOLDERS)
+    """Whether a file lies outside the interpreter, installed libraries, this package and the operating system."""
+    return not path.startswith(KNOWN_FOLDERS) and not any(name in Path(path).parts for name in LIBRARY_FOLDERS)
 
 
 def _source_of(path: str) -> str:
@@ -135,7 +135,7 @@ def _is_input(path: str, packages: Sequence[str]) -> bool:
 def digest_of(path: Path | str) -> str:
     """Digest of a file's content; "" for a missing file.
 
-    The digest of a Python file is of its syntax tree without docstrings; the digest of any other file ignores the kind of line ends.
+    The digest of a Python file covers its syntax tree without docstrings; any other digest does not depend on the kind of line ends.
     """
     try:
         status = os.stat(path)
@@ -149,7 +149,7 @@ def _digest(path: str, *_: int) -> str:
     """Digest of a file, cached by its time, size and inode."""
     content = Path(path).read_bytes()
     if path.endswith(".py"):
-        with suppress(SyntaxError, ValueError, RecursionError):  # the digest of invalid Python is of the file's content
+        with suppress(SyntaxError, ValueError, RecursionError):  # the digest of invalid Python covers the file's content
             content = "".join(_syntax_text(ast.parse(content))).encode()
     return sha256(content.replace(b"\r\n", b"\n")).hexdigest()[:DIGITS]
 
@@ -216,7 +216,7 @@ def changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> list[str
 
 
 def named_files(value: Any, places: Sequence[str]) -> Iterator[str]:
-    """Files beside a study's file that texts anywhere in a value name."""
+    """Files beside a study's file whose names occur as texts anywhere in a value."""
     if isinstance(value, dict):
         value = list(value.values())
     if isinstance(value, list | tuple):

@@ -62,7 +62,7 @@ class Contract(NamedTuple):
     def violation(self, candidate: Any) -> str:
         """The reason why `candidate` does not meet the contract, found by inspection only; "" if `candidate` meets it."""
         if not inspect.isclass(candidate):
-            kind = "module" if inspect.ismodule(candidate) else "function" if callable(candidate) else f"value of type {_type_name(candidate)}"
+            kind = "module" if inspect.ismodule(candidate) else "function" if callable(candidate) else f"value of type {_type(candidate)}"
             return f"is a {kind}, not a class"
         for name, parameters in {**self.methods, **self.optional}.items():
             member = getattr(candidate, name, None)
@@ -121,7 +121,7 @@ def read_only_copy(value: Any) -> Any:
 
 @contextmanager
 def guard_process_state(source: str, names: Sequence[str]) -> Iterator[None]:
-    """Restore the working directory, environment variables and numpy's error state after a block that uses plug-ins; `names` lists them."""
+    """Restore the working directory, environment variables and numpy's error state after a block; nothing without plug-ins in `names`."""
     if not names:
         yield
         return
@@ -181,7 +181,7 @@ class Guard(NamedTuple):
         return ForeignError(self.source, problem, error.legal if isinstance(error, InputError) else "")
 
     def wrong(self, method: str, part: str, value: object, expected: str) -> ForeignError:
-        """The error for a result of which `part` has a wrong value."""
+        """The error for a result whose part `part` has a wrong value."""
         return self._returned(f"{part} = {_short(value)}", method, expected)
 
     def _returned(self, result: str, method: str, expected: str) -> ForeignError:
@@ -212,7 +212,7 @@ class Guard(NamedTuple):
         shape
             Expected shape; a plain number is accepted as the value of all elements.
         lowest, highest
-            Bounds; with `above` the lowest self_count is excluded.
+            Bounds; `above` excludes `lowest` itself.
         infinite, undefined
             Whether infinities and NaN are legal.
         """
@@ -256,7 +256,7 @@ class Guard(NamedTuple):
         return "{}:{}".format(*(own_frames or outside_frames)[-1]) if outside_frames else ""
 
 
-def _type_name(value: object) -> str:
+def _type(value: object) -> str:
     return type(value).__name__
 
 
@@ -265,4 +265,4 @@ def _short(value: object) -> str:
     if isinstance(value, np.ndarray) and value.size > 4:
         return f"an array of {value.dtype}, shape {value.shape}"
     text = " ".join(repr(value).split())
-    return text if len(text) <= 80 else f"a {_type_name(value)}"
+    return text if len(text) <= 80 else f"a {_type(value)}"

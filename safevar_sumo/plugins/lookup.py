@@ -25,7 +25,8 @@ from safevar_sumo.plugins.files import file_beside, is_foreign, watch
 from safevar_sumo.plugins.guard import Contract, Guard
 from safevar_sumo.study import converted
 
-_MODULES_NOT_FOREIGN = {__name__.partition(".")[0], *sys.stdlib_module_names}
+_KNOWN_MODULES = {__name__.partition(".")[0], *sys.stdlib_module_names}
+"""Names of top modules that are not foreign: of this package and of Python."""
 
 
 class Member(NamedTuple):
@@ -206,7 +207,7 @@ def forget_foreign() -> None:
     for name in sorted(watch.imported_modules):
         module = sys.modules.get(name)
         place = getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", [])), "")  # a namespace package has no file
-        if place and is_foreign(str(place)) and name.partition(".")[0] not in _MODULES_NOT_FOREIGN:
+        if place and is_foreign(str(place)) and name.partition(".")[0] not in _KNOWN_MODULES:
             del sys.modules[name]
     watch.imported_modules.clear()
 
@@ -238,7 +239,7 @@ def remember(names: Iterable[str], places: Iterable[str]) -> None:
             continue
         file = str(getattr(sys.modules.get(name), "__file__", None) or "")
         folder = next((place for place in places if file and Path(place) in Path(file).parents), "")
-        if folder and name.partition(".")[0] not in _MODULES_NOT_FOREIGN and "site-packages" not in Path(file).parts:
+        if folder and name.partition(".")[0] not in _KNOWN_MODULES and "site-packages" not in Path(file).parts:
             _loaded_modules[name] = _LoadedModule(folder, file, _digest(file))
 
 
@@ -309,7 +310,7 @@ class OwnModules:
 
     @contextmanager
     def inside(self) -> Iterator[None]:
-        """A context in which an import finds these copies, and loads further copies."""
+        """A context in which imports find these copies; a module imported for the first time is added to them."""
         shared = self._remove()
         sys.modules.update(self._modules)
         number, writes_bytecode, sys.dont_write_bytecode = len(sys.modules), sys.dont_write_bytecode, True

@@ -33,8 +33,7 @@ class DrivingRobot:
     points
         Scenario points, each with an equal part of the vehicles; the robot drives only where the scenario has a `test_speed`.
     vehicle, prepared, state
-        The vehicle model, its prepared settings, and the state at the start; the pedals in this state hold the speed and are the robot's
-        first command.
+        The vehicle model, its prepared settings, and the state at the start, whose pedals hold the speed and are the first command.
     step
         Time between two commands [s].
     """
@@ -71,7 +70,7 @@ class DrivingRobot:
         self._integral = np.minimum(np.maximum(self._integral - error * self._step, -1 / INTEGRAL_GAIN), 1 / INTEGRAL_GAIN)
         pedal = self._pedal - PROPORTIONAL_GAIN * error + INTEGRAL_GAIN * self._integral
         robot_command = Command(np.where(self._drives, np.minimum(np.maximum(pedal, 0.0), 1.0), command.throttle),
-                               np.where(self._drives, np.minimum(np.maximum(-pedal, 0.0), 1.0), command.brake))
+                                np.where(self._drives, np.minimum(np.maximum(-pedal, 0.0), 1.0), command.brake))
         return robot_command, state if self._hold_gear is None else self._hold_gear(self._prepared, state, self._drives)
 
     @property
