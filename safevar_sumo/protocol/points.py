@@ -29,7 +29,7 @@ DECIMALS = 2
 SHARE_DECIMALS = 6
 """Decimals to which the calculator rounds shares before a comparison."""
 REQUIRED = ("CCRs", 20.0)
-"""Test, and speed [km/h] up to which its standard-range cells must be green; otherwise all frontal collisions score nothing.
+"""Test and speed [km/h]: its standard-range cells up to this speed must be green, otherwise all frontal collisions score nothing.
 
 The calculator also intends to require CPNA at 10 km/h and 75 %, but version 5.4.9 does not find those cells.
 """

@@ -59,10 +59,9 @@ class PersonMover(NamedTuple):
             nearest, farthest = half_length - max(edge_start, edge_end), half_length - min(edge_start, edge_end)
             raise InputError("scenario.parameters", f"lateral_start = {-self.start:g} m is not on the footpath",
                              f"a number in [{nearest:.2f}, {farthest:.2f}] m")
-        return {
-            "person[@id='pedestrian']": {"type": self.target, "departPos": repr(abs(start_position - edge_start))},
-            "person[@id='pedestrian']/walk": {
-                "edges": " ".join(edges), "speed": repr(profile.speed), "arrivalPos": "-1" if self.sign > 0 else "1"}}
+        person = {"type": self.target, "departPos": repr(abs(start_position - edge_start))}
+        walk = {"edges": " ".join(edges), "speed": repr(profile.speed), "arrivalPos": "-1" if self.sign > 0 else "1"}
+        return {"person[@id='pedestrian']": person, "person[@id='pedestrian']/walk": walk}
 
     def begin(self, world: World, profile: SpeedProfile) -> float:
         """Make the pedestrian stand; returns 0, the initial speed [m/s]."""
